@@ -1,0 +1,156 @@
+"""The nominal arm: where its joints sit, what its links weigh, how far its joints may turn."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import resources
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from core.errors import ArmError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class JointLimits:
+    """Limits per joint, all (n,); infinite where unlimited or unknown."""
+
+    lower: Array  # rad
+    upper: Array  # rad
+    velocity: Array  # rad/s
+    effort: Array  # Nm
+
+    @classmethod
+    def none(cls, n: int) -> JointLimits:
+        """Return limits that forbid nothing."""
+        wide = np.full(n, np.inf)
+        return cls(-wide, wide, wide.copy(), wide.copy())
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A serial arm of n revolute joints, each turning about the z axis of its own joint frame.
+
+    ``link_in_link[0]`` places joint 1 in base; ``link_in_link[i]`` places joint i+1 (``[n]``: the
+    flange) in the frame of link i, which is joint i's frame after its rotation. For standard DH
+    rows, the frame of joint i is DH frame i-1 and ``link_in_link[i]`` is Tz(d_i) Tx(a_i)
+    Rx(alpha_i).
+    """
+
+    name: str
+    link_in_link: Array  # (n+1, 4, 4) m
+    mass: Array  # (n,) kg
+    cog: Array  # (n, 3) m, of link i in the frame of link i
+    inertia: Array  # (n, 3, 3) kg m2, about the centre of gravity, axes of link i
+    limits: JointLimits
+    payload: float = np.inf  # kg, rated
+    joint_names: tuple[str, ...] = field(default=())
+
+    @property
+    def n(self) -> int:
+        """Return the number of joints."""
+        return len(self.mass)
+
+
+def dh_transform(a: float, alpha: float, d: float) -> Array:
+    """Return Tz(d) Tx(a) Rx(alpha) (4, 4): a standard DH row behind the joint's own rotation."""
+    ca, sa = np.cos(alpha), np.sin(alpha)
+    return np.array([[1, 0, 0, a], [0, ca, -sa, 0], [0, sa, ca, d], [0, 0, 0, 1]], dtype=float)
+
+
+def arm_from_dh(
+    rows: Sequence[Mapping[str, Any]], name: str = "dh", limits: JointLimits | None = None
+) -> Arm:
+    """Return the arm of standard DH rows ``{a, alpha, d, offset, mass, cog}`` (CONTRACT, cell).
+
+    ``cog`` is in the row's own frame (DH frame i). Mass and cog may be left out (zero). Raises
+    ArmError where a row lacks a, alpha or d, or holds something that is not a finite number.
+    """
+    if not rows:
+        raise ArmError("robot.dh: found no rows, expected one row {a, alpha, d} per joint")
+    n = len(rows)
+    links = np.tile(np.eye(4), (n + 1, 1, 1))
+    mass, cog = np.zeros(n), np.zeros((n, 3))
+    turn = np.eye(4)
+    for i, row in enumerate(rows):
+        where = f"robot.dh row {i + 1}"
+        a, alpha, d = (_number(row, key, where) for key in ("a", "alpha", "d"))
+        offset = _number(row, "offset", where, 0.0)
+        c, s = np.cos(offset), np.sin(offset)
+        turn[:2, :2] = [[c, -s], [s, c]]
+        links[i] = links[i] @ turn
+        links[i + 1] = dh_transform(a, alpha, d)
+        mass[i] = _number(row, "mass", where, 0.0)
+        if mass[i] < 0:
+            raise ArmError(f"{where}: mass: found {mass[i]:g}, expected 0 or more kg")
+        in_row = np.asarray(row.get("cog") if row.get("cog") is not None else np.zeros(3), float)
+        if in_row.shape != (3,) or not np.isfinite(in_row).all():
+            raise ArmError(f"{where}: cog: found {row.get('cog')}, expected three numbers (m)")
+        cog[i] = links[i + 1][:3, :3] @ in_row + links[i + 1][:3, 3]
+    return Arm(name, links, mass, cog, np.zeros((n, 3, 3)), limits or JointLimits.none(n))
+
+
+def _number(row: Mapping[str, Any], key: str, where: str, default: float | None = None) -> float:
+    value = row.get(key, default)
+    if value is None:
+        raise ArmError(f"{where}: {key}: found nothing, expected a number")
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise ArmError(f"{where}: {key}: found {value!r}, expected a number") from None
+    if not np.isfinite(number):
+        raise ArmError(f"{where}: {key}: found {value!r}, expected a finite number")
+    return number
+
+
+def builtin_names() -> tuple[str, ...]:
+    """Return the names of the built-in arms."""
+    files = resources.files("core").joinpath("arms").iterdir()
+    return tuple(sorted(f.name.removesuffix(".yaml") for f in files if f.name.endswith(".yaml")))
+
+
+def builtin_rows(name: str) -> dict[str, Any]:
+    """Return a built-in table as it stands in its file (``core/arms/NAME.yaml``).
+
+    Raises ArmError naming the nearest known arm where there is no such table.
+    """
+    names = builtin_names()
+    if name not in names:
+        near = difflib.get_close_matches(str(name), names, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise ArmError(
+            f"robot.model: found {name!r}, expected one of {', '.join(names)}{hint}"
+        )
+    text = resources.files("core").joinpath("arms", f"{name}.yaml").read_text(encoding="utf-8")
+    table: dict[str, Any] = yaml.safe_load(text)
+    return table
+
+
+def builtin_arm(name: str, calibration: Mapping[str, Sequence[float]] | None = None) -> Arm:
+    """Return a built-in arm, with its factory calibration where one is given.
+
+    ``calibration`` holds UR's ``delta_theta``, ``delta_a``, ``delta_d``, ``delta_alpha`` (n each),
+    the entries of the controller's calibration.conf, which are added to the DH rows.
+    """
+    table = builtin_rows(name)
+    rows = table["dh"]
+    for delta, key in (("theta", "offset"), ("a", "a"), ("d", "d"), ("alpha", "alpha")):
+        values = (calibration or {}).get(f"delta_{delta}")
+        if values is None:
+            continue
+        if len(values) != len(rows):
+            raise ArmError(
+                f"robot.calibration.delta_{delta}: found {len(values)} values, "
+                f"expected {len(rows)}"
+            )
+        for row, value in zip(rows, values, strict=True):
+            row[key] = row.get(key, 0.0) + float(value)
+    columns = {key: np.array([float(r[key]) for r in table["limits"]]) for key in table["limits"][0]}
+    arm = arm_from_dh(rows, name, JointLimits(**columns))
+    return replace(arm, payload=float(table["payload"]))

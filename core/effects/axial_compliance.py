@@ -1,0 +1,33 @@
+"""Compliance of joints about their axes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from core.effects.effect import JointEffect, Parameter, Site, Term, typical_moment
+
+if TYPE_CHECKING:
+    from core.arm import Arm
+    from core.kernel import Chain
+
+
+class AxialCompliance(JointEffect):
+    """The joint gives way about its own axis, in proportion to the torque: theta_a = C_a M_a.
+
+    Comes from gears and shafts. Needs poses, or better loads, that change the joint's torque. A
+    vertical joint 1 carries no torque by weight: only a sideways pull shows it.
+    Source: Li, Gao, Liu 2020, eqs. 13-18 (our compensation core).
+    """
+
+    identifier = "axial_compliance"
+    channels = ("position",)
+    motion = "payloads or pulls that change the torque about the joint's axis"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the flexibility beyond the model's."""
+        return (Parameter("", "rad/Nm", 1e-3 / typical_moment(arm)),)
+
+    def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
+        """Soften the joint about z."""
+        assert term.site.joint is not None
+        chain.compliance[term.site.joint - 1, 2] += term.values[0]

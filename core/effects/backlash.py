@@ -1,0 +1,41 @@
+"""Play in the gears."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from core.effects.effect import JointEffect, Parameter, Site, Term
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from core.arm import Arm
+    from core.kernel import Rows
+    from core.loads import Loads
+
+
+class Backlash(JointEffect):
+    """The joint has play, taken up against its last motion: - half the clearance times approach.
+
+    Comes from worn gears and belts. Needs poses that are reached from both sides; without reversals
+    nothing can be said.
+    Source: CONTRACT; He et al. 2024 on joint hysteresis (SMART5 NJ220).
+    """
+
+    identifier = "backlash"
+    channels = ("position",)
+    motion = "poses reached from both sides of the joint"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the whole clearance."""
+        return (Parameter("", "rad", 3e-4, 0.0, 0.1),)
+
+    def condition(
+        self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]
+    ) -> None:
+        """Turn the joint back by half the clearance."""
+        assert term.site.joint is not None
+        if loads.approach is not None:
+            i = term.site.joint - 1
+            rows.q[:, i] -= 0.5 * term.values[0] * loads.approach[:, i]

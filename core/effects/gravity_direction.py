@@ -1,0 +1,35 @@
+"""A base that does not stand level."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from core.effects.effect import Effect, Parameter, Site, Term
+from core.rotation import rotation_matrix
+
+if TYPE_CHECKING:
+    from core.arm import Arm
+    from core.kernel import Chain
+
+
+class GravityDirection(Effect):
+    """Gravity points elsewhere in base than the cell says: the base does not stand level.
+
+    Two rotations of the gravity vector about x and y of base. Shows only through something that
+    bends: a rigid model's positions do not depend on gravity.
+    """
+
+    identifier = "gravity_direction"
+    channels = ("position",)
+    motion = "a compliant model and poses all around the base"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the rotation vector's x and y, base axes."""
+        return (Parameter("x", "rad", 0.02, -0.5, 0.5), Parameter("y", "rad", 0.02, -0.5, 0.5))
+
+    def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
+        """Turn gravity."""
+        turn = rotation_matrix(np.array([term.values[0], term.values[1], 0.0]))
+        chain.gravity[:] = turn @ chain.gravity

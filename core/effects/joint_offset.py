@@ -1,0 +1,41 @@
+"""Zero offsets of joint encoders."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from core.effects.effect import JointEffect, Parameter, Site, Term
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from core.arm import Arm
+    from core.kernel import Rows
+    from core.loads import Loads
+
+
+class JointOffset(JointEffect):
+    """The encoder's zero stands elsewhere than the model's: true angle = ``actual_q`` + offset.
+
+    Comes from mastering, a changed motor, a collision. Shows as a rotation of everything beyond the
+    joint about its axis, the same at every pose and load. Joint 1 hides behind an unregistered
+    metrology frame, the last joint behind the tool.
+    Source: mastering and level-1 calibration, Mooring, Roth, Driels, "Fundamentals of Manipulator
+    Calibration" (1991), ch. 1.
+    """
+
+    identifier = "joint_offset"
+    channels = ("position",)
+    motion = "poses that differ in the other joints"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the offset."""
+        return (Parameter("", "rad", 1e-3, -0.5, 0.5),)
+
+    def condition(
+        self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]
+    ) -> None:
+        """Turn the joint further."""
+        assert term.site.joint is not None
+        rows.q[:, term.site.joint - 1] += term.values[0]

@@ -1,0 +1,94 @@
+"""Lengths and twists of links."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from core.effects.effect import Effect, Parameter, Site, Term
+from core.rotation import rotation_matrix
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from core.arm import Arm
+    from core.kernel import Chain
+
+PARALLEL = 1e-6  # sine of the angle below which two axes count as parallel
+
+
+class LinkForm(NamedTuple):
+    """A link from its joint's axis z to the next one's, as Tz(d) Tx(a) Rx(alpha) Tz(shift)."""
+
+    z: NDArray[np.float64]
+    x: NDArray[np.float64]  # the common normal
+    next_z: NDArray[np.float64]
+    shift: float  # m, how far the next frame lies along its own axis from the common normal
+    parallel: bool
+
+
+def link_form(arm: Arm, joint: int) -> LinkForm:
+    """Return the common normal of link ``joint`` (from 1), in the frame of that link."""
+    step = arm.link_in_link[joint]
+    z, next_z, p = np.array([0, 0, 1.0]), step[:3, 2], step[:3, 3]
+    sine = float(np.hypot(next_z[0], next_z[1]))
+    parallel = sine < PARALLEL
+    if parallel:
+        across = np.array([p[0], p[1], 0.0])
+        length = float(np.linalg.norm(across))
+        # standard DH rows have x along the frame's own x, whatever the sign of a
+        along_x = length < 1e-9 or abs(p[1]) < 1e-9
+        x = np.array([1.0, 0, 0]) if along_x else across / length
+        return LinkForm(z, x, next_z, 0.0, True)
+    x = np.cross(z, next_z) / sine
+    if abs(next_z[0]) < 1e-9:
+        x = np.array([1.0, 0, 0])
+    _, _, shift = np.linalg.solve(np.column_stack([z, x, next_z]), p)
+    return LinkForm(z, x, next_z, float(shift), False)
+
+
+class LinkGeometry(Effect):
+    """A link is longer, offset or twisted otherwise than its drawing: a, d, alpha of a link.
+
+    Comes from machining and assembly; for UR arms it is what the factory calibration holds. Between
+    parallel axes d of one link cannot be told from d of the next, and a small twist beta about y is
+    added (Hayati), because alpha alone cannot describe a slight misalignment there. The last link
+    is part of the tool frame. The joint's zero is ``joint_offset``.
+    Source: Hayati, Mirmirani, J. Robotic Systems 2 (1985) 397; standard DH rows.
+    """
+
+    identifier = "link_geometry"
+    channels = ("position",)
+    motion = "poses that differ in the joint before the link"
+
+    def sites(self, arm: Arm) -> tuple[Site, ...]:
+        """Return the links between two joints."""
+        return tuple(Site(joint=i + 1) for i in range(arm.n - 1))
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return a, d, alpha, and beta between parallel axes."""
+        assert site.joint is not None
+        own = (
+            Parameter("a", "m", 1e-3, -0.1, 0.1),
+            Parameter("d", "m", 1e-3, -0.1, 0.1),
+            Parameter("alpha", "rad", 1e-3, -0.1, 0.1),
+        )
+        beta = (Parameter("beta", "rad", 1e-3, -0.1, 0.1),)
+        return own + (beta if link_form(arm, site.joint).parallel else ())
+
+    def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
+        """Move and twist the next joint's frame."""
+        joint = term.site.joint
+        assert joint is not None
+        form = link_form(arm, joint)
+        a, d, alpha = term.values[:3]
+        twist = rotation_matrix(form.x * alpha)
+        old = chain.rotation[joint].copy()
+        turned = twist @ old
+        if form.parallel and len(term.values) > 3:
+            y_in_link = twist @ np.cross(form.next_z, form.x)
+            turned = rotation_matrix(y_in_link * term.values[3]) @ turned
+        chain.rotation[joint] = turned
+        moved = form.shift * (twist @ form.next_z - form.next_z)
+        chain.position[joint] += d * form.z + a * form.x + moved

@@ -1,0 +1,37 @@
+"""A payload that weighs more than declared."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from core.effects.effect import Effect, Parameter, Site, Term
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from core.arm import Arm
+    from core.kernel import Rows
+    from core.loads import Loads
+
+
+class Payload(Effect):
+    """The load weighs more than declared: true payload = declared + this, at its declared cog.
+
+    Comes from a wrong entry, a tool that was left out, a hose. Shows as bending (position), as
+    weight (flange sensor) and as torque; positions of a rigid model do not show it.
+    """
+
+    identifier = "payload"
+    channels = ("position", "wrench", "torque")
+    motion = "poses that change how the load pulls"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the extra mass."""
+        return (Parameter("", "kg", 1.0),)
+
+    def condition(
+        self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]
+    ) -> None:
+        """Add the mass."""
+        rows.payload_mass[:] += term.values[0]

@@ -1,0 +1,32 @@
+"""Compliance of joints across their axes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from core.effects.effect import JointEffect, Parameter, Site, Term, typical_moment
+
+if TYPE_CHECKING:
+    from core.arm import Arm
+    from core.kernel import Chain
+
+
+class RadialCompliance(JointEffect):
+    """The joint tilts across its axis, in proportion to the moment there: theta_r = C_r M_r.
+
+    Comes from bearings and housings. At joint 1 it is the same as an isotropic tilt of the base.
+    Source: Li, Gao, Liu 2020, eqs. 13 and 19-33 (our compensation core).
+    """
+
+    identifier = "radial_compliance"
+    channels = ("position",)
+    motion = "payloads or pulls that change the moment across the joint's axis"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the flexibility beyond the model's."""
+        return (Parameter("", "rad/Nm", 1e-3 / typical_moment(arm)),)
+
+    def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
+        """Soften the joint about x and y alike."""
+        assert term.site.joint is not None
+        chain.compliance[term.site.joint - 1, :2] += term.values[0]

@@ -1,0 +1,61 @@
+"""Joints that stiffen under load."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from core.effects.effect import JointEffect, Parameter, Reported, Site, Term, typical_moment
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from core.arm import Arm
+    from core.kernel import Chain
+
+
+class StiffnessNonlinearity(JointEffect):
+    """The joint stiffens under load: theta = c M / sqrt(1 + (M / M0)^2) about its axis.
+
+    Comes from strain-wave gears, whose teeth engage further under torque. It holds the linear part
+    too, so it stands instead of the joint's ``axial_compliance``. Needs several loads: with one, it
+    looks like a linear compliance.
+    Source: CONTRACT; stiffening curves of harmonic drives in makers' catalogues (K1 < K2 < K3).
+    """
+
+    identifier = "stiffness_nonlinearity"
+    channels = ("position",)
+    motion = "at least three well separated torques about the joint's axis"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return c and the softening 1/M0^2, in which the curve starts linear."""
+        moment = typical_moment(arm)
+        return (
+            Parameter("compliance", "rad/Nm", 1e-3 / moment, 0.0),
+            Parameter("softening", "1/(Nm)2", 1 / moment**2, 0.0),
+        )
+
+    def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
+        """Soften the joint about z by the bent curve."""
+        assert term.site.joint is not None
+        i = term.site.joint - 1
+        chain.compliance[i, 2] += term.values[0]
+        chain.softening[i] += max(term.values[1], 0.0)
+
+    def reported(
+        self, arm: Arm, term: Term, covariance: NDArray[np.float64] | None
+    ) -> tuple[Reported, ...]:
+        """Return c and M0."""
+        c, softening = term.values
+        moment = float(1 / np.sqrt(softening)) if softening > 0 else float("inf")
+        spread: list[float | None] = [None, None]
+        if covariance is not None:
+            slope = 0.5 * moment**3 if np.isfinite(moment) else float("inf")
+            deviation = np.sqrt(np.maximum(np.diag(covariance), 0))
+            spread = [float(deviation[0]), float(deviation[1] * slope)]
+        base = f"{self.identifier}_{term.site.joint}"
+        return (
+            Reported(f"{base}_compliance", c, spread[0], "rad/Nm"),
+            Reported(f"{base}_moment", moment, spread[1], "Nm"),
+        )

@@ -1,0 +1,40 @@
+"""Growth of the links with their temperature."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from core.effects.effect import Effect, Parameter, Site, Term
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from core.arm import Arm
+    from core.kernel import Rows
+    from core.loads import Loads
+
+
+class ThermalDrift(Effect):
+    """The links grow with their joints' temperature: a and d of link i by alpha (T_i - reference).
+
+    One coefficient of expansion for the arm; base, tool and centres of gravity do not grow. Needs
+    joint temperatures that change over the session. Steel 12e-6, aluminium 23e-6 per kelvin.
+    Source: CONTRACT; VSB Ostrava 2021 on IRB1200 thermal drift.
+    """
+
+    identifier = "thermal_drift"
+    channels = ("position",)
+    needs = ("joint_temperatures",)
+    motion = "joint temperatures that change by several degrees"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the coefficient of expansion."""
+        return (Parameter("", "1/K", 1e-5, -1e-3, 1e-3),)
+
+    def condition(
+        self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]
+    ) -> None:
+        """Lengthen the links."""
+        if loads.temperature is not None:
+            rows.growth[:, :] += term.values[0] * loads.temperature

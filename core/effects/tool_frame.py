@@ -1,0 +1,37 @@
+"""Where the tool centre point sits in the flange."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from core.effects.effect import Effect, Parameter, Site, Term
+from core.rotation import rotation_matrix
+
+if TYPE_CHECKING:
+    from core.arm import Arm
+    from core.kernel import Chain
+
+
+class ToolFrame(Effect):
+    """The TCP sits elsewhere in the flange than the cell file says (flange axes).
+
+    Comes from a bent or changed tool, or a TCP taught by hand. Its rotation shows only where the
+    instrument measures rotations too. A zero offset of the last joint is a part of it.
+    """
+
+    identifier = "tool_frame"
+    channels = ("position",)
+    motion = "poses that differ in the orientation of the flange"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the shift (m) and the rotation vector (rad), flange axes."""
+        shift = tuple(Parameter(k, "m", 1e-3, -0.5, 0.5) for k in "xyz")
+        return shift + tuple(Parameter(k, "rad", 3e-3, -0.5, 0.5) for k in ("rx", "ry", "rz"))
+
+    def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
+        """Move the TCP."""
+        chain.tool_position[:] += term.values[:3]
+        turn = rotation_matrix(np.array(term.values[3:]))
+        chain.tool_rotation[:] = turn @ chain.tool_rotation

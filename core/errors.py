@@ -1,0 +1,71 @@
+"""The one error tree of Gapbridge.
+
+::
+
+    GapbridgeError
+    ├── InputError            the user's input cannot be used: exit 2, one clear line
+    │   ├── ArmError          an arm table, URDF or DH list
+    │   ├── CellError         a cell file
+    │   ├── LogError          a log or a trajectory
+    │   └── ExcitationError   the data cannot speak about what was asked of it
+    └── RunError              something failed while running: exit 1, one clear line
+        ├── LinkError         a controller cannot be reached, or broke off
+        │   ├── StaleStateError     no fresh state in time
+        │   ├── InvalidStateError   a state that is torn, not finite or implausible
+        │   └── WriteError          a setpoint could not be delivered
+        └── LimitError        a setpoint that must not leave
+"""
+
+from __future__ import annotations
+
+
+class GapbridgeError(Exception):
+    """Base of everything that Gapbridge raises on purpose."""
+
+    exit_code = 1
+
+
+class InputError(GapbridgeError):
+    """The user's input cannot be used; the message names file, key or row, found and expected."""
+
+    exit_code = 2
+
+
+class ArmError(InputError):
+    """An arm description (table, URDF, DH rows) cannot be used."""
+
+
+class CellError(InputError):
+    """A cell file cannot be used."""
+
+
+class LogError(InputError):
+    """A log or a trajectory file cannot be used."""
+
+
+class ExcitationError(InputError):
+    """The data cannot speak about what was asked of it; the message names what is missing."""
+
+
+class RunError(GapbridgeError):
+    """Something failed at run time."""
+
+
+class LinkError(RunError):
+    """A controller cannot be reached, or the link to it broke."""
+
+
+class StaleStateError(LinkError):
+    """The controller's own clock stood still for longer than allowed."""
+
+
+class InvalidStateError(LinkError):
+    """A state that is torn, not finite, of the wrong length or implausible."""
+
+
+class WriteError(LinkError):
+    """A setpoint could not be delivered, or the controller refused it."""
+
+
+class LimitError(RunError):
+    """A setpoint that must not leave: not finite, or outside its limits."""

@@ -1,0 +1,26 @@
+"""What acts on the arm, row by row: payload, pull on the tool, temperatures, last motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Loads:
+    """Loads of N rows; a field left None takes the model's own value (payload) or nothing."""
+
+    payload_mass: Array | None = None  # (N,) kg
+    payload_cog: Array | None = None  # (N, 3) m, flange axes
+    wrench: Array | None = None  # (N, 6) N, Nm: surroundings on the tool, at the TCP, base axes
+    temperature: Array | None = None  # (N, n) °C, joint temperatures
+    approach: Array | None = None  # (N, n) sign of each joint's last motion: -1, 0, +1
+
+    def __getitem__(self, rows: slice | Array) -> Loads:
+        """Return the loads of some of the rows."""
+        given = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Loads(**{k: None if v is None else v[rows] for k, v in given.items()})

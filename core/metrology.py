@@ -1,0 +1,14 @@
+"""What is known of the instrument that measured the TCP."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Metrology:
+    """The instrument: its frame and its noise (CONTRACT, "metrology")."""
+
+    registered: bool = False  # True: measured_* are in base; False: their frame is estimated along
+    sigma: float = 2.0e-5  # m, 1 sigma of one coordinate, the instrument alone
+    repeatability: float | None = None  # m, 1 sigma of one coordinate, of the arm; None: estimated

@@ -1,0 +1,154 @@
+"""The model: arm, tool, payload, gravity and effects; it predicts where the TCP really is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core import kernel
+from core.arm import Arm
+from core.effects import CATALOGUE, Site, Term
+from core.errors import InputError
+from core.kernel import Chain, Rows
+from core.loads import Loads
+from core.rotation import rotation_vector
+
+Array = NDArray[np.float64]
+STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Poses of the TCP in base."""
+
+    position: Array  # (N, 3) m
+    rotation: Array  # (N, 3, 3)
+
+    @property
+    def rotation_vector(self) -> Array:
+        """Return the rotations as rotation vectors (N, 3), rad."""
+        return rotation_vector(self.rotation)
+
+
+@dataclass(frozen=True)
+class LinearForm:
+    """The paper's linear model at given shapes: pose change = ``regressor`` @ flexibilities."""
+
+    regressor: Array  # (N, 6, 2n) m/(rad/Nm), Nm: axial 1..n, then radial 1..n
+    jacobian: Array  # (N, 6, n) of the TCP, base axes
+    moment: Array  # (N, n, 3) Nm, of everything beyond each joint, base axes
+
+
+@dataclass(frozen=True)
+class Model:
+    """One arm in one cell. Immutable; the ``with_`` functions return changed copies."""
+
+    arm: Arm
+    tool_in_flange: Array = field(default_factory=lambda: np.eye(4))  # (4, 4)
+    payload_mass: float = 0.0  # kg
+    payload_cog: Array = field(default_factory=lambda: np.zeros(3))  # (3,) m, flange axes
+    gravity: Array = field(default_factory=lambda: np.array(STANDARD_GRAVITY))  # base axes
+    reference_temperature: float = 25.0  # °C
+    terms: tuple[Term, ...] = ()
+
+    def with_terms(self, terms: Sequence[Term]) -> Model:
+        """Return the model with further effects in it."""
+        return replace(self, terms=self.terms + tuple(terms))
+
+    def without_terms(self) -> Model:
+        """Return the rigid, effect-free model."""
+        return replace(self, terms=())
+
+    def with_compliance(self, axial: Sequence[float], radial: Sequence[float]) -> Model:
+        """Return the model with these joint flexibilities (n each, rad/Nm) instead of its own."""
+        kept = [t for t in self.terms if t.effect not in ("axial_compliance", "radial_compliance")]
+        for effect, values in (("axial_compliance", axial), ("radial_compliance", radial)):
+            if len(values) != self.arm.n:
+                raise InputError(f"{effect}: found {len(values)} values, expected {self.arm.n}")
+            kept += [Term(effect, Site(i + 1), (float(v),)) for i, v in enumerate(values) if v]
+        return replace(self, terms=tuple(kept))
+
+    def compliance(self) -> tuple[Array, Array]:
+        """Return the axial and radial joint flexibilities (n,), (n,) in rad/Nm."""
+        chain = self.chain()
+        return chain.compliance[:, 2].copy(), chain.compliance[:, 0].copy()
+
+    def chain(self) -> Chain:
+        """Return what holds for all rows, effects included."""
+        arm, n = self.arm, self.arm.n
+        chain = Chain(
+            rotation=np.array(arm.link_in_link[:, :3, :3], dtype=float, order="C"),
+            position=np.array(arm.link_in_link[:, :3, 3], dtype=float, order="C"),
+            tool_rotation=np.array(self.tool_in_flange[:3, :3], dtype=float, order="C"),
+            tool_position=np.array(self.tool_in_flange[:3, 3], dtype=float, order="C"),
+            mass=np.array(arm.mass, dtype=float),
+            cog=np.array(arm.cog, dtype=float, order="C"),
+            gravity=np.array(self.gravity, dtype=float),
+            compliance=np.zeros((n, 3)),
+            softening=np.zeros(n),
+            flexibility=np.zeros(n),
+            base_compliance=np.zeros(3),
+        )
+        for term in self.terms:
+            CATALOGUE[term.effect].shape(term, arm, chain)
+        return chain
+
+    def rows(self, q: Array, loads: Loads | None = None) -> Rows:
+        """Return what differs from row to row, effects included; ``q`` is (N, n) encoder angles."""
+        loads = loads or Loads()
+        count, n = q.shape
+        mass = np.full(count, float(self.payload_mass)) if loads.payload_mass is None else (
+            np.array(loads.payload_mass, dtype=float, order="C")
+        )  # fmt: skip
+        cog = np.tile(self.payload_cog, (count, 1)) if loads.payload_cog is None else (
+            np.array(loads.payload_cog, dtype=float, order="C")
+        )  # fmt: skip
+        wrench = np.zeros((count, 6)) if loads.wrench is None else (
+            np.array(loads.wrench, dtype=float, order="C")
+        )  # fmt: skip
+        rows = Rows(np.array(q, dtype=float, order="C"), np.ones((count, n)), mass, cog, wrench)
+        for term in self.terms:
+            CATALOGUE[term.effect].condition(term, self.arm, rows, self._warmed(loads), q)
+        return rows
+
+    def _warmed(self, loads: Loads) -> Loads:
+        """Return loads whose temperatures count from the reference."""
+        if loads.temperature is None:
+            return loads
+        return replace(loads, temperature=loads.temperature - self.reference_temperature)
+
+    def predict(self, q: Array, loads: Loads | None = None) -> Poses:
+        """Return the TCP poses in base for encoder angles ``q`` (N, n): the exact equilibrium.
+
+        Loads act where the bent arm really is. Raises InputError where a row has no equilibrium
+        (the arm would buckle).
+        """
+        chain, rows = self.chain(), self.rows(np.atleast_2d(q), loads)
+        count = len(rows.q)
+        position, rotation = np.empty((count, 3)), np.empty((count, 3, 3))
+        bad = kernel.predict_rows(chain, rows, position, rotation)
+        if bad >= 0:
+            raise InputError(f"row {bad + 1}: the arm finds no equilibrium under its load; expected "
+                             "smaller flexibilities or loads")
+        return Poses(position, rotation)
+
+    def rigid_pose(self, q: Array) -> Poses:
+        """Return the TCP poses of the rigid, effect-free arm at ``q`` (N, n)."""
+        return self.without_terms().predict(q)
+
+    def linear_form(self, q: Array, loads: Loads | None = None) -> LinearForm:
+        """Return the linear form (paper eqs. 18, 33, 35) at the model's present shape.
+
+        For a model without compliance this is the paper's A(q, F), to be multiplied with the 2n
+        flexibilities.
+        """
+        chain, rows = self.chain(), self.rows(np.atleast_2d(q), loads)
+        count, n = rows.q.shape
+        form = LinearForm(
+            np.zeros((count, 6, 2 * n)), np.zeros((count, 6, n)), np.zeros((count, n, 3))
+        )
+        kernel.regressor_rows(chain, rows, form.regressor, form.jacobian, form.moment)
+        return form

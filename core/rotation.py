@@ -1,0 +1,88 @@
+"""Rotations as matrices and as rotation vectors, many rows at once."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def rotation_matrix(rotation_vector: Array) -> Array:
+    """Return the rotation matrices of rotation vectors (Rodrigues' formula; paper eq. 19).
+
+    ``rotation_vector`` is (..., 3) in rad; the result (..., 3, 3).
+    """
+    vector = np.asarray(rotation_vector, dtype=float)
+    angle = np.linalg.norm(vector, axis=-1)[..., None, None]
+    K = skew(vector)
+    # sin(x)/x and (1 - cos(x))/x^2 through sinc: exact at zero, no division
+    first = np.sinc(angle / np.pi)
+    second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    return np.asarray(np.eye(3) + first * K + second * (K @ K))
+
+
+def rotation_vector(matrix: Array) -> Array:
+    """Return the rotation vectors (..., 3), angle in [0, pi], of rotation matrices (..., 3, 3)."""
+    R = np.asarray(matrix, dtype=float)
+    # through the quaternion of the largest component: accurate at 0 and at pi
+    trace = np.trace(R, axis1=-2, axis2=-1)
+    diagonal = np.diagonal(R, axis1=-2, axis2=-1)
+    squares = np.concatenate([(1 + trace)[..., None], 1 + 2 * diagonal - trace[..., None]], axis=-1)
+    x, y, z = (
+        R[..., 2, 1] - R[..., 1, 2],
+        R[..., 0, 2] - R[..., 2, 0],
+        R[..., 1, 0] - R[..., 0, 1],
+    )
+    xy, xz, yz = (
+        R[..., 0, 1] + R[..., 1, 0],
+        R[..., 0, 2] + R[..., 2, 0],
+        R[..., 1, 2] + R[..., 2, 1],
+    )
+    candidates = np.stack(
+        [
+            np.stack([squares[..., 0], x, y, z], -1),
+            np.stack([x, squares[..., 1], xy, xz], -1),
+            np.stack([y, xy, squares[..., 2], yz], -1),
+            np.stack([z, xz, yz, squares[..., 3]], -1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(squares, axis=-1)[..., None, None]
+    quaternion = np.take_along_axis(candidates, best, axis=-2)[..., 0, :]
+    quaternion = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    quaternion = np.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+    sine = np.linalg.norm(quaternion[..., 1:], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, quaternion[..., :1])
+    scale = np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1), 2.0)
+    return np.asarray(scale * quaternion[..., 1:])
+
+
+def skew(vector: Array) -> Array:
+    """Return the matrices (..., 3, 3) whose product with b is vector (..., 3) x b."""
+    v = np.asarray(vector, dtype=float)
+    zero = np.zeros_like(v[..., 0])
+    rows = [
+        np.stack([zero, -v[..., 2], v[..., 1]], -1),
+        np.stack([v[..., 2], zero, -v[..., 0]], -1),
+        np.stack([-v[..., 1], v[..., 0], zero], -1),
+    ]
+    return np.stack(rows, axis=-2)
+
+
+def transform(rotation: Array, position: Array) -> Array:
+    """Return one homogeneous transform (4, 4) of a rotation (3, 3) and a position (3,)."""
+    T = np.eye(4)
+    T[:3, :3] = rotation
+    T[:3, 3] = position
+    return T
+
+
+def rpy_matrix(roll_pitch_yaw: Array) -> Array:
+    """Return the rotation matrix (3, 3) of fixed-axis roll, pitch, yaw (rad), as URDF has them."""
+    roll, pitch, yaw = (float(v) for v in roll_pitch_yaw)
+    return np.asarray(
+        rotation_matrix(np.array([0, 0, yaw]))
+        @ rotation_matrix(np.array([0, pitch, 0]))
+        @ rotation_matrix(np.array([roll, 0, 0]))
+    )

@@ -1,0 +1,26 @@
+"""What goes to a controller: one offset-corrected setpoint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Setpoint:
+    """One corrected joint setpoint, as it leaves the limiter.
+
+    ``offset_in_base`` is the same correction seen at the rigid arm's TCP: where ``q`` puts it minus
+    where ``nominal_q`` puts it, position (m) and rotation vector (rad) in base axes. Drivers whose
+    controller takes a Cartesian offset send it instead of ``q``.
+    """
+
+    q: Vector  # (n,) rad, the setpoint to be commanded
+    nominal_q: Vector  # (n,) rad, what was wanted before correction
+    offset_in_base: Vector  # (6,) m, rad
+    state_timestamp: float  # s, controller clock of the state behind this setpoint
+    state_received: float  # s, time.monotonic() when that state was first seen here

@@ -1,0 +1,36 @@
+"""What a controller tells: one sample, in RTDE's field names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class RobotState:
+    """One sample of a controller's state, all fields of the same cycle.
+
+    Field names, units and frames are those of UR's RTDE guide (output names); a driver of another
+    controller translates into them. A field that the controller does not have is None.
+    """
+
+    timestamp: float  # s, the controller's own clock
+    received: float  # s, time.monotonic() when the sample was first seen here
+    actual_q: Vector  # (n,) rad, joint encoders
+    actual_qd: Vector  # (n,) rad/s
+    target_q: Vector  # (n,) rad, the controller's own joint command
+    actual_TCP_force: Vector  # (6,) N, Nm: surroundings on the tool, at the TCP, base axes
+    ft_raw_wrench: Vector | None = None  # (6,) N, Nm: flange sensor, flange axes
+    joint_temperatures: Vector | None = None  # (n,) °C
+    actual_current_as_torque: Vector | None = None  # (n,) Nm
+    payload: float | None = None  # kg, declared in the controller
+    payload_cog: Vector | None = None  # (3,) m, in the flange frame
+    robot_mode: int = 7  # RTDE robot_mode; 7 = running
+    safety_mode: int = 1  # RTDE safety_mode; 1 = normal, 2 = reduced
+    runtime_state: int = 2  # RTDE runtime_state; 2 = playing
+    safety_status_bits: int = 1  # RTDE safety_status_bits; bit 0 = normal mode
+    speed_scaling: float = 1.0

@@ -1,0 +1,222 @@
+"""Arms from URDF files: the chain of revolute joints from the root to the tip link."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arm import Arm, JointLimits
+from core.errors import ArmError
+from core.rotation import rotation_matrix, rpy_matrix, transform
+
+Array = NDArray[np.float64]
+TURNING = ("revolute", "continuous")
+
+
+@dataclass
+class _Body:
+    """What is rigidly joined to one moving link, in that link's frame."""
+
+    mass: float
+    first: Array  # sum of mass x position
+    second: Array  # inertia about the frame's origin
+
+
+def arm_from_urdf(path: Path | str, tip: str | None = None) -> Arm:
+    """Return the arm of a URDF file, from its root link to ``tip`` (default: the last link).
+
+    Fixed joints are folded into the links they join; side branches (grippers, covers) must be
+    fixed and their masses count where they hang. Joint frames are turned so that z is the axis.
+    Raises ArmError where the file is not a URDF, the tip is unknown or ambiguous, or a joint on the
+    way is neither revolute, continuous nor fixed.
+    """
+    path = Path(path)
+    robot = _parse(path)
+    joints = {j.find("child").get("link"): j for j in robot.findall("joint")}  # type: ignore[union-attr]
+    links = {str(link.get("name")): link for link in robot.findall("link")}
+    tip = tip or _only_leaf(path, links, joints)
+    if tip not in links:
+        raise ArmError(f"{path}: robot.tip: found {tip!r}, expected a link of the file: "
+                       f"{', '.join(links)}")
+    chain = _chain(tip, joints)
+    return _assemble(path, str(robot.get("name", path.stem)), chain, joints, links)
+
+
+def _parse(path: Path) -> ElementTree.Element:
+    try:
+        root = ElementTree.fromstring(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ArmError(f"{path}: robot.urdf: file not found") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ArmError(f"{path}: robot.urdf: cannot be read: {error}") from None
+    except ElementTree.ParseError as error:
+        raise ArmError(f"{path}: found broken XML ({error}), expected a URDF") from None
+    if root.tag != "robot":
+        raise ArmError(f"{path}: found a <{root.tag}> file, expected a URDF <robot>")
+    for joint in root.findall("joint"):
+        if joint.find("child") is None or joint.find("parent") is None:
+            raise ArmError(f"{path}: joint {joint.get('name')!r}: found no parent or child link")
+    return root
+
+
+def _only_leaf(
+    path: Path, links: dict[str, ElementTree.Element], joints: dict[str, ElementTree.Element]
+) -> str:
+    parents = {_parent(j) for j in joints.values()}
+    leaves = [name for name in links if name not in parents]
+    if len(leaves) == 1:
+        return leaves[0]
+    moving = [leaf for leaf in leaves if any(j.get("type") in TURNING for j in _chain(leaf, joints))]
+    depth = {leaf: sum(j.get("type") in TURNING for j in _chain(leaf, joints)) for leaf in moving}
+    deepest = [leaf for leaf in moving if depth[leaf] == max(depth.values())]
+    if len(deepest) == 1:
+        return deepest[0]
+    raise ArmError(
+        f"{path}: robot.tip: found {len(leaves)} ends ({', '.join(leaves)}), expected robot.tip to "
+        "name the flange link"
+    )
+
+
+def _parent(joint: ElementTree.Element) -> str:
+    parent = joint.find("parent")
+    return "" if parent is None else str(parent.get("link"))
+
+
+def _chain(tip: str, joints: dict[str, ElementTree.Element]) -> list[ElementTree.Element]:
+    chain: list[ElementTree.Element] = []
+    link = tip
+    while link in joints and joints[link] not in chain:
+        chain.append(joints[link])
+        link = _parent(joints[link])
+    return chain[::-1]
+
+
+def _assemble(
+    path: Path,
+    name: str,
+    chain: list[ElementTree.Element],
+    joints: dict[str, ElementTree.Element],
+    links: dict[str, ElementTree.Element],
+) -> Arm:
+    fixed, bodies, moving = [np.eye(4)], [_Body(0, np.zeros(3), np.zeros((3, 3)))], []
+    on_chain = {_child(j) for j in chain}
+    root = _parent(chain[0]) if chain else ""
+    _add_branches(path, root, np.eye(4), bodies[-1], joints, links, on_chain)
+    for joint in chain:
+        kind, label = joint.get("type"), f"{path}: joint {joint.get('name')!r}"
+        step = fixed[-1] @ _origin(joint, label)
+        if kind in TURNING:
+            align = _align_z(_vector(joint.find("axis"), "xyz", "1 0 0", label))
+            fixed[-1] = step @ align
+            moving.append(joint)
+            fixed.append(align.T)  # align is a pure rotation
+            bodies.append(_Body(0, np.zeros(3), np.zeros((3, 3))))
+        elif kind == "fixed":
+            fixed[-1] = step
+        else:
+            raise ArmError(f"{label}: found type {kind!r}, expected revolute, continuous or fixed")
+        _add_link(path, links[_child(joint)], fixed[-1], bodies[-1])
+        _add_branches(path, _child(joint), fixed[-1], bodies[-1], joints, links, on_chain)
+    if not moving:
+        raise ArmError(f"{path}: found no revolute joint on the way to the tip")
+    return _arm(name, np.array(fixed), bodies[1:], moving)
+
+
+def _arm(
+    name: str, fixed: Array, bodies: list[_Body], moving: list[ElementTree.Element]
+) -> Arm:
+    mass = np.array([b.mass for b in bodies])
+    cog = np.array([b.first / b.mass if b.mass > 0 else np.zeros(3) for b in bodies])
+    inertia = np.array([b.second - b.mass * _point(c) for b, c in zip(bodies, cog, strict=True)])
+    columns: dict[str, list[float]] = {"lower": [], "upper": [], "velocity": [], "effort": []}
+    for joint in moving:
+        limit = joint.find("limit")
+        free = joint.get("type") == "continuous"
+        for key, default in (("lower", -np.inf), ("upper", np.inf)):
+            given = None if limit is None or free else limit.get(key)
+            columns[key].append(default if given is None else float(given))
+        for key in ("velocity", "effort"):
+            given = None if limit is None else limit.get(key)
+            columns[key].append(np.inf if given is None or float(given) <= 0 else float(given))
+    limits = JointLimits(**{key: np.array(values) for key, values in columns.items()})
+    names = tuple(str(j.get("name")) for j in moving)
+    return Arm(name, fixed, mass, cog, inertia, limits, joint_names=names)
+
+
+def _child(joint: ElementTree.Element) -> str:
+    child = joint.find("child")
+    return "" if child is None else str(child.get("link"))
+
+
+def _add_branches(
+    path: Path, link: str, frame: Array, body: _Body,
+    joints: dict[str, ElementTree.Element], links: dict[str, ElementTree.Element],
+    on_chain: set[str],
+) -> None:  # fmt: skip
+    for child, joint in joints.items():
+        if _parent(joint) != link or child in on_chain:
+            continue
+        # a gripper's fingers count where they stand at zero
+        beyond = frame @ _origin(joint, f"{path}: joint {joint.get('name')!r}")
+        _add_link(path, links[child], beyond, body)
+        _add_branches(path, child, beyond, body, joints, links, on_chain)
+
+
+def _add_link(path: Path, link: ElementTree.Element, frame: Array, body: _Body) -> None:
+    inertial = link.find("inertial")
+    if inertial is None:
+        return
+    label = f"{path}: link {link.get('name')!r}"
+    element = inertial.find("mass")
+    mass = _vector(element, "value", "0", label)[0]
+    pose = frame @ _origin(inertial, label)
+    tensor = inertial.find("inertia")
+    I = np.zeros((3, 3))
+    if tensor is not None:
+        for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
+            key = "i" + "xyz"[i] + "xyz"[j]
+            I[i, j] = I[j, i] = _vector(tensor, key, "0", label)[0]
+    R, c = pose[:3, :3], pose[:3, 3]
+    body.mass += mass
+    body.first = body.first + mass * c
+    body.second = body.second + R @ I @ R.T + mass * _point(c)
+
+
+def _point(c: Array) -> Array:
+    """Return the inertia (3, 3) of a unit point mass at c about the origin."""
+    return np.asarray(c @ c * np.eye(3) - np.outer(c, c))
+
+
+def _origin(element: ElementTree.Element, label: str) -> Array:
+    origin = element.find("origin")
+    xyz = _vector(origin, "xyz", "0 0 0", label)
+    return transform(rpy_matrix(_vector(origin, "rpy", "0 0 0", label)), xyz)
+
+
+def _vector(element: ElementTree.Element | None, key: str, default: str, label: str) -> Array:
+    text = default if element is None else str(element.get(key, default))
+    try:
+        values = np.array([float(v) for v in text.split()])
+    except ValueError:
+        values = np.array([])
+    if len(values) != len(default.split()) or not np.isfinite(values).all():
+        raise ArmError(
+            f"{label}: {key}: found {text!r}, expected {len(default.split())} finite number(s)"
+        )
+    return values
+
+
+def _align_z(axis: Array) -> Array:
+    """Return a rotation (4, 4) whose z axis is ``axis``, by the shortest turn from z."""
+    z = axis / np.linalg.norm(axis)
+    cross = np.cross([0, 0, 1.0], z)
+    sine = float(np.linalg.norm(cross))
+    if sine < 1e-12:
+        turn = np.eye(3) if z[2] > 0 else np.diag([1.0, -1.0, -1.0])
+    else:
+        turn = rotation_matrix(cross / sine * np.arctan2(sine, z[2]))
+    return transform(turn, np.zeros(3))
