@@ -1,0 +1,82 @@
+"""One accepted TCP connection: non-blocking, bounded in both directions."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+
+SEND_BUFFER = 65536  # bytes the kernel may hold for a client that does not read
+MOST_PENDING = 262144  # bytes of replies kept for it here
+MOST_INPUT = 1 << 20  # bytes of an unfinished request
+CHUNK = 65536
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """Return a listening socket on `host` only. Raises OSError where the port is taken."""
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+    try:
+        listener.bind((host, port))
+        listener.listen(16)
+    except OSError:
+        listener.close()
+        raise
+    listener.setblocking(False)
+    return listener
+
+
+class Connection:
+    """A client's socket with its unread requests and unsent replies."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        sock.setblocking(False)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.sock = sock
+        self.received = bytearray()
+        self.pending = bytearray()
+        self.open = True
+
+    def fileno(self) -> int:
+        """Return the descriptor, for select."""
+        return self.sock.fileno()
+
+    def read(self) -> bool:
+        """Take what has arrived; False where the client is gone or floods."""
+        try:
+            data = self.sock.recv(CHUNK)
+        except BlockingIOError:
+            return self.open
+        except OSError:
+            data = b""
+        self.received += data
+        if not data or len(self.received) > MOST_INPUT:
+            self.close()
+        return self.open
+
+    def send(self, data: bytes) -> None:
+        """Send `data` after everything pending; a client that lets too much pile up is closed."""
+        self.pending += data
+        self.flush()
+        if len(self.pending) > MOST_PENDING:
+            self.close()
+
+    def flush(self) -> None:
+        """Send as much of the pending bytes as the kernel takes."""
+        if not self.open or not self.pending:
+            return
+        try:
+            sent = self.sock.send(self.pending)
+        except BlockingIOError:
+            return
+        except OSError:
+            self.close()
+            return
+        del self.pending[:sent]
+
+    def close(self) -> None:
+        """Close the socket; does nothing the second time."""
+        if self.open:
+            self.open = False
+            with contextlib.suppress(OSError):
+                self.sock.close()

@@ -1,0 +1,249 @@
+"""The controller: memory of RTDE fields, modes, the running program, one cycle at a time."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from drivers.simulated import modes
+from drivers.simulated.declared import Declared
+from drivers.simulated.inputs import apply_inputs
+from drivers.simulated.kinematics import Joints, within_limits
+from drivers.simulated.motion import Hold, Motion, Stop
+from drivers.simulated.plant import Plant
+from drivers.simulated.rtde_names import INPUTS, OUTPUTS, blank
+from drivers.simulated.sensors import Sensors
+
+log = logging.getLogger("drivers.simulated")
+
+CYCLE = 0.002  # s
+PROGRAM_START = 0.04  # s between the arrival of a program and its first line
+DEFAULT_STOP = 12.0  # rad/s^2
+
+Steps = Generator[None, None, None]
+
+
+@dataclass(slots=True)
+class Program:
+    """A running script: one generator step per cycle."""
+
+    name: str
+    steps: Steps
+    wait: float = PROGRAM_START
+
+
+@dataclass(slots=True)
+class Watchdog:
+    """Stops the program when a client stops writing an input variable."""
+
+    name: str
+    period: float  # s
+    left: float  # s
+
+
+@dataclass(slots=True)
+class Controller:
+    """A UR controller's state; the servers read and write it, ``cycle`` advances it by 2 ms."""
+
+    plant: Plant
+    declared: Declared
+    memory: dict[str, Any] = field(default_factory=dict)
+    target_q: Joints = ()
+    target_qd: Joints = ()
+    motion: Motion = field(default_factory=Hold)
+    program: Program | None = None
+    watchdogs: dict[str, Watchdog] = field(default_factory=dict)
+    clock: float = 0.0  # s since the controller started; never stands still
+    frozen: bool = False  # the timestamp stands still
+    stall_until: float = 0.0  # controller clock until which no RTDE packet leaves
+    stopped_at: float = -math.inf  # controller clock of the last protective stop
+    loaded_program: str = ""
+    sensors: Sensors = field(init=False)
+
+    def __post_init__(self) -> None:
+        memory = self.memory
+        memory.update({name: blank(kind) for name, kind in (OUTPUTS | INPUTS).items()})
+        self.target_q = self.plant.q
+        self.target_qd = (0.0,) * len(self.target_q)
+        memory.update(modes.AT_REST)
+        self.sensors = Sensors(self.plant, self.declared, memory)
+        self.set_runtime(modes.STOPPED)
+        self.refresh()
+
+    # -- the cycle ------------------------------------------------------------------------------
+
+    def cycle(self, dt: float = CYCLE) -> None:
+        """Advance program, motion, plant and sensors by one cycle."""
+        self.clock += dt
+        if not self.frozen:
+            self.memory["timestamp"] = self.clock
+        if self.watchdogs:
+            self._check_watchdogs(dt)
+        if self.program is not None:
+            self._step_program(self.program, dt)
+        self._step_motion(dt)
+        self.plant.step(self.target_q, dt)
+        self.refresh(dt)
+
+    def _step_program(self, program: Program, dt: float) -> None:
+        if program.wait > 0.0:
+            program.wait -= dt
+            if program.wait <= 0.0:
+                self.set_runtime(modes.PLAYING)
+            return
+        if self.memory["runtime_state"] != modes.PLAYING:
+            return
+        try:
+            next(program.steps)
+        except StopIteration:
+            self.end_program()
+        except ScriptError as error:
+            log.warning("program %s stops: %s", program.name, error)
+            self.end_program()
+
+    def _step_motion(self, dt: float) -> None:
+        """Move the joint target by one cycle of the running motion."""
+        scaled = dt * self.memory["speed_scaling"] if self.motion.scaled else dt
+        target = self.motion.step(self.target_q, self.target_qd, scaled)
+        if target != self.target_q and not within_limits(self.plant.arm, target):
+            log.warning("joint target %s is outside the joint limits", target)
+            self.protective_stop()
+            return
+        before = self.target_qd
+        if target is self.target_q:
+            self.target_qd = (0.0,) * len(target)
+        else:
+            self.target_qd = tuple((b - a) / dt for a, b in zip(self.target_q, target, strict=True))
+        self.target_q = target
+        memory = self.memory
+        memory["target_qdd"] = tuple(
+            (b - a) / dt for a, b in zip(before, self.target_qd, strict=True)
+        )
+
+    def _check_watchdogs(self, dt: float) -> None:
+        if self.program is None:
+            self.watchdogs.clear()
+            return
+        for watchdog in list(self.watchdogs.values()):
+            watchdog.left -= dt
+            if watchdog.left < 0.0:
+                log.warning("watchdog on %s expired, the program stops", watchdog.name)
+                self.end_program()
+                return
+
+    def refresh(self, dt: float = CYCLE) -> None:
+        """Bring the memory up to the present state."""
+        memory, declared = self.memory, self.declared
+        memory["target_q"], memory["target_qd"] = self.target_q, self.target_qd
+        memory["actual_q"], memory["actual_qd"] = self.plant.q, self.plant.qd
+        memory["payload"], memory["payload_cog"] = declared.payload_mass, declared.payload_cog
+        memory["payload_inertia"] = declared.payload_inertia
+        memory["tcp_offset"] = declared.tcp
+        self.sensors.update(self.target_q, dt)
+
+    # -- programs -------------------------------------------------------------------------------
+
+    def start_program(self, name: str, steps: Steps) -> None:
+        """Start a script; a running one ends first. Without brakes released nothing starts."""
+        if self.program is not None:
+            self.end_program()
+        if not self.can_move:
+            log.warning("program %s refused: the robot is not running", name)
+            return
+        log.info("program %s starts", name)
+        self.program = Program(name, steps)
+
+    def end_program(self) -> None:
+        """End the running script; the arm brakes."""
+        program, self.program = self.program, None
+        self.watchdogs.clear()
+        if program is not None:
+            program.steps.close()
+            log.info("program %s ended", program.name)
+        if not isinstance(self.motion, (Stop, Hold)):
+            self.motion = Stop(self.target_qd, DEFAULT_STOP)
+        self.set_runtime(modes.STOPPED)
+
+    def run_motion(self, motion: Motion) -> Steps:
+        """Run a motion to its end, cycle by cycle (for use inside a program)."""
+        self.motion = motion
+        yield
+        while not motion.done:
+            yield
+
+    def set_watchdog(self, name: str, frequency: float) -> None:
+        """Watch that `name` is written at least at `frequency` (Hz); 0 switches it off."""
+        self.watchdogs.pop(name, None)
+        if frequency > 0.0:
+            self.watchdogs[name] = Watchdog(name, 1.0 / frequency, 1.0 / frequency)
+
+    def write_inputs(self, values: dict[str, Any]) -> None:
+        """Take the input fields that a client has sent."""
+        apply_inputs(self.memory, values)
+        for name, watchdog in self.watchdogs.items():
+            if name in values:
+                watchdog.left = watchdog.period
+
+    # -- modes ----------------------------------------------------------------------------------
+
+    @property
+    def can_move(self) -> bool:
+        """Whether brakes are released and no stop is active."""
+        memory = self.memory
+        return memory["robot_mode"] == modes.RUNNING and memory["safety_mode"] in (1, 2)
+
+    def set_runtime(self, state: int) -> None:
+        """Set runtime_state and what follows from it."""
+        memory = self.memory
+        memory["runtime_state"] = state
+        bits = 1 if memory["robot_mode"] >= modes.POWER_ON else 0
+        memory["robot_status_bits"] = bits | (2 if state == modes.PLAYING else 0)
+
+    def set_robot_mode(self, mode: int) -> None:
+        """Set robot_mode and the power bit."""
+        self.memory["robot_mode"] = mode
+        self.memory["joint_mode"] = (253 if mode == modes.RUNNING else 239,) * 6
+        self.set_runtime(self.memory["runtime_state"])
+
+    def pause(self) -> None:
+        """Pause the program; the arm brakes."""
+        self.motion = Stop(self.target_qd, DEFAULT_STOP)
+        self.set_runtime(modes.PAUSED)
+
+    def set_safety(self, mode: int) -> None:
+        """Set safety_mode, safety_status and safety_status_bits together."""
+        self.memory["safety_mode"] = self.memory["safety_status"] = mode
+        self.memory["safety_status_bits"] = modes.SAFETY_BITS[mode]
+
+    def protective_stop(self) -> None:
+        """Stop category 2: the arm brakes, the program pauses."""
+        if self.memory["safety_mode"] != modes.SAFETY_NORMAL:
+            return
+        log.warning("protective stop")
+        self.stopped_at = self.clock
+        self.set_safety(modes.SAFETY_PROTECTIVE)
+        self.motion = Stop(self.target_qd, 2.0 * DEFAULT_STOP)
+        if self.program is not None:
+            self.set_runtime(modes.PAUSED)
+
+    def emergency_stop(self) -> None:
+        """Stop: the program is gone, power is off."""
+        log.warning("emergency stop")
+        self.end_program()
+        self.motion = Stop(self.target_qd, 2.0 * DEFAULT_STOP)
+        self.set_safety(modes.SAFETY_ROBOT_EMERGENCY)
+        self.set_robot_mode(modes.POWER_OFF)
+
+    def finite(self, values: Sequence[float], what: str) -> Joints:
+        """Return `values` as joints or pose; raises ScriptError where one is not finite."""
+        found = tuple(float(v) for v in values)
+        if not all(map(math.isfinite, found)):
+            raise ScriptError(f"{what} is not finite: {found}")
+        return found
+
+
+class ScriptError(Exception):
+    """A run-time error of a script: the program stops, as on a real controller."""

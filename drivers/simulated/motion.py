@@ -1,0 +1,239 @@
+"""Motions: what turns a command into one joint target per cycle.
+
+A motion is stepped once per cycle and says when it is done. Servo and speed motions never are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from drivers.simulated.kinematics import Joints, between, gap, jacobian, solve, tcp_in_base
+from drivers.simulated.plant_arm import Frame, PlantArm
+
+SERVO_ACCELERATION = 40.0  # rad/s^2
+
+
+class Motion(Protocol):
+    """One running motion; `scaled` ones slow down with the speed slider."""
+
+    done: bool
+    scaled: bool
+
+    def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
+        """Return the next joint target (n, rad) after `q`, which moves at `qd` (rad/s)."""
+        ...
+
+
+def ramp_share(distance: float, speed: float, acceleration: float, t: float) -> tuple[float, bool]:
+    """Return how far (0..1) a trapezoid of speed has gone after `t` s, and whether it is over."""
+    if distance <= 0.0:
+        return 1.0, True
+    rise = min(speed / acceleration, math.sqrt(distance / acceleration))
+    top = acceleration * rise
+    cruise = distance / top - rise
+    total = 2.0 * rise + cruise
+    if t >= total:
+        return 1.0, True
+    if t < rise:
+        way = 0.5 * acceleration * t * t
+    elif t < rise + cruise:
+        way = top * (t - 0.5 * rise)
+    else:
+        way = distance - 0.5 * acceleration * (total - t) ** 2
+    return way / distance, False
+
+
+class Hold:
+    """Stay."""
+
+    scaled = False
+    done = True
+
+    def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
+        """Return `q`."""
+        return q
+
+
+class MoveJoints:
+    """moveJ: all joints along one trapezoid; speed and acceleration are the leading joint's."""
+
+    scaled = True
+
+    def __init__(self, start: Joints, goal: Joints, speed: float, acceleration: float) -> None:
+        self.done = False
+        self._start, self._goal = start, goal
+        self._way = max(abs(b - a) for a, b in zip(start, goal, strict=True))
+        self._speed, self._acceleration, self._t = speed, acceleration, 0.0
+
+    def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
+        """Return the next joint target."""
+        self._t += dt
+        share, self.done = ramp_share(self._way, self._speed, self._acceleration, self._t)
+        if self.done:
+            return self._goal
+        return tuple(a + share * (b - a) for a, b in zip(self._start, self._goal, strict=True))
+
+
+class MoveLine:
+    """moveL: the TCP along a straight line, inverse kinematics in every cycle."""
+
+    scaled = True
+
+    def __init__(
+        self,
+        arm: PlantArm,
+        tool: Frame,
+        start: Joints,
+        goal: Frame,
+        speed: float,
+        acceleration: float,
+    ) -> None:
+        self.done = False
+        self.failed = False
+        self._arm, self._tool = arm, tool
+        self._start, self._goal = tcp_in_base(arm, start, tool), goal
+        step = gap(self._start, goal)
+        shift = math.sqrt(sum(v * v for v in step[:3]))
+        turn = math.sqrt(sum(v * v for v in step[3:]))
+        self._way = max(shift, 0.2 * turn)  # a pure turn has a pace too: 1 rad as 0.2 m
+        self._speed, self._acceleration, self._t = speed, acceleration, 0.0
+
+    def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
+        """Return the next joint target; the motion fails where the line leaves the workspace."""
+        self._t += dt
+        share, self.done = ramp_share(self._way, self._speed, self._acceleration, self._t)
+        found = solve(self._arm, between(self._start, self._goal, share), q, self._tool, steps=12)
+        if found is None:
+            self.failed = self.done = True
+            return q
+        return found
+
+
+class Servo:
+    """servoJ: follow a target that may change every cycle, smoothed over the lookahead time."""
+
+    scaled = False
+    done = False
+
+    def __init__(self, arm: PlantArm, goal: Joints, lookahead: float) -> None:
+        self.goal = goal
+        self.lookahead = lookahead
+        self._limits = arm.velocity
+
+    def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
+        """Return the next joint target."""
+        share = dt / max(0.25 * self.lookahead, dt)
+        most = SERVO_ACCELERATION * dt
+        found = []
+        for now, speed, goal, limit in zip(q, qd, self.goal, self._limits, strict=True):
+            left = goal - now
+            if abs(left) < 1e-9 and abs(speed) < 2.0 * most:
+                found.append(goal)
+                continue
+            # Never faster than what can still be braked before the goal.
+            brake = math.sqrt(1.6 * SERVO_ACCELERATION * abs(left))
+            wanted = min(max(left * share / dt, -brake, -limit), brake, limit)
+            wanted = min(max(wanted, speed - most), speed + most)
+            found.append(now + wanted * dt)
+        return tuple(found)
+
+
+class SpeedJoints:
+    """speedJ: joints approach a velocity with an acceleration (leading joint)."""
+
+    scaled = False
+    done = False
+
+    def __init__(self, goal: Sequence[float], acceleration: float) -> None:
+        self.goal = tuple(float(v) for v in goal)
+        self.acceleration = acceleration
+        self._now: Joints | None = None
+
+    def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
+        """Return the next joint target."""
+        now = qd if self._now is None else self._now
+        most = self.acceleration * dt
+        self._now = tuple(
+            v + min(max(g - v, -most), most) for v, g in zip(now, self.goal, strict=True)
+        )
+        return tuple(a + v * dt for a, v in zip(q, self._now, strict=True))
+
+
+class SpeedTool:
+    """speedL: the TCP approaches a velocity in base axes (m/s, rad/s)."""
+
+    scaled = False
+    done = False
+
+    def __init__(
+        self, arm: PlantArm, tool: Frame, goal: Sequence[float], acceleration: float
+    ) -> None:
+        self.goal = tuple(float(v) for v in goal)
+        self.acceleration = acceleration
+        self._arm, self._tool = arm, tool
+        self._now = (0.0,) * 6
+
+    def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
+        """Return the next joint target."""
+        most = self.acceleration * dt
+        self._now = tuple(
+            v + min(max(g - v, -most), most) for v, g in zip(self._now, self.goal, strict=True)
+        )
+        J = jacobian(self._arm, q, self._tool)
+        rates = J.T @ np.linalg.solve(J @ J.T + 1e-6 * np.eye(6), self._now)
+        largest = max(
+            abs(float(r)) / limit for r, limit in zip(rates, self._arm.velocity, strict=True)
+        )
+        rates = rates / max(1.0, largest)
+        return tuple(a + float(v) * dt for a, v in zip(q, rates, strict=True))
+
+
+class Stop:
+    """stopJ: every joint brakes along its way, the fastest with `deceleration` (rad/s^2)."""
+
+    scaled = False
+
+    def __init__(self, qd: Joints, deceleration: float) -> None:
+        fastest = max(map(abs, qd))
+        self.done = fastest < 1e-9
+        self._qd, self._left, self._fastest = qd, fastest, fastest
+        self._deceleration = deceleration
+
+    def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
+        """Return the next joint target."""
+        self._left = max(self._left - self._deceleration * dt, 0.0)
+        self.done = self._left <= 0.0
+        if self._fastest <= 0.0:
+            return q
+        share = self._left / self._fastest
+        return tuple(a + v * share * dt for a, v in zip(q, self._qd, strict=True))
+
+
+class MovePath:
+    """Several motions, one after the other; each is made when its turn comes."""
+
+    scaled = True
+
+    def __init__(
+        self, makers: Sequence[Callable[[Joints], Motion]], reached: Callable[[int], None]
+    ) -> None:
+        self.done = not makers
+        self._makers, self._reached = list(makers), reached
+        self._index = -1
+        self._motion: Motion | None = None
+
+    def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
+        """Return the next joint target."""
+        if self._motion is None:
+            self._index += 1
+            self._reached(self._index)
+            self._motion = self._makers[self._index](q)
+        found = self._motion.step(q, qd, dt)
+        if self._motion.done:
+            self._motion = None
+            self.done = self._index + 1 >= len(self._makers)
+        return found

@@ -1,0 +1,128 @@
+"""The arm that the plant and its controller are made of: plain numbers, no mathematics of core."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from core.errors import ArmError
+from drivers.simulated.rotations import (
+    IDENTITY,
+    Rotation,
+    Vector3,
+    add,
+    compose,
+    rotate,
+    turn_z,
+)
+
+JOINTS = 6  # a UR controller's fields hold six
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A frame seen from base: rotation and origin (m)."""
+
+    rotation: Rotation
+    origin: Vector3
+
+
+BASE = Frame(IDENTITY, (0.0, 0.0, 0.0))
+
+
+def place(outer: Frame, inner: Frame) -> Frame:
+    """Return `inner`, which is given in `outer`, as seen from where `outer` is seen."""
+    return Frame(
+        compose(outer.rotation, inner.rotation),
+        add(outer.origin, rotate(outer.rotation, inner.origin)),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class PlantArm:
+    """A six-joint arm.
+
+    ``links`` are n + 1 fixed frames: base to joint 1 at zero, link i to joint i + 1, link n to
+    flange; every joint turns about its own z. ``cog`` (m) is in the link's own joint frame.
+    """
+
+    name: str
+    links: tuple[Frame, ...]
+    mass: tuple[float, ...]  # kg
+    cog: tuple[Vector3, ...]  # m
+    lower: tuple[float, ...]  # rad
+    upper: tuple[float, ...]  # rad
+    velocity: tuple[float, ...]  # rad/s
+    effort: tuple[float, ...]  # Nm
+    payload: float  # kg, rated
+
+    @property
+    def reach(self) -> float:
+        """Length of the stretched chain, m."""
+        return sum(sum(x * x for x in link.origin) ** 0.5 for link in self.links)
+
+    def frames(self, q: Sequence[float]) -> list[Frame]:
+        """Return the n joint frames (after their own rotation) and the flange, rigid, in base."""
+        found: list[Frame] = []
+        rotation, origin = IDENTITY, (0.0, 0.0, 0.0)
+        for i, link in enumerate(self.links):
+            origin = add(origin, rotate(rotation, link.origin))
+            rotation = compose(rotation, link.rotation)
+            if i < len(q):
+                rotation = turn_z(rotation, q[i])
+            found.append(Frame(rotation, origin))
+        return found
+
+    def flange(self, q: Sequence[float]) -> Frame:
+        """Return the flange of the rigid arm in base."""
+        rotation, origin = IDENTITY, (0.0, 0.0, 0.0)
+        for link, angle in zip(self.links, q, strict=False):
+            origin = add(origin, rotate(rotation, link.origin))
+            rotation = turn_z(compose(rotation, link.rotation), angle)
+        last = self.links[-1]
+        return Frame(compose(rotation, last.rotation), add(origin, rotate(rotation, last.origin)))
+
+
+def _vector3(values: Sequence[float]) -> Vector3:
+    x, y, z = (float(v) for v in values)
+    return (x, y, z)
+
+
+def _frame(matrix: Sequence[Sequence[float]]) -> Frame:
+    """Return the frame of a 4 x 4 transform."""
+    r = [[float(v) for v in row] for row in matrix]
+    rotation: Rotation = (
+        r[0][0], r[0][1], r[0][2], r[1][0], r[1][1], r[1][2], r[2][0], r[2][1], r[2][2],
+    )  # fmt: skip
+    return Frame(rotation, (r[0][3], r[1][3], r[2][3]))
+
+
+# ---- temporary until core.arm exists
+def plant_arm(name: str) -> PlantArm:
+    import math
+    from importlib import resources
+    import yaml
+    from drivers.simulated.rotations import from_vector
+
+    data = yaml.safe_load(resources.files("core.arms").joinpath(f"{name}.yaml").read_text())
+    links = [BASE]
+    cogs = []
+    offset = 0.0
+    for row in data["dh"]:
+        ct, st = 1.0, 0.0
+        frame = Frame(from_vector((row["alpha"], 0, 0)), (row["a"], 0.0, row["d"]))
+        links.append(frame)
+        c = rotate(frame.rotation, row["cog"])
+        cogs.append(add(frame.origin, c))
+    lim = data["limits"]
+    return PlantArm(
+        data["name"],
+        tuple(links),
+        tuple(float(r["mass"]) for r in data["dh"]),
+        tuple(cogs),
+        tuple(float(x["lower"]) for x in lim),
+        tuple(float(x["upper"]) for x in lim),
+        tuple(float(x["velocity"]) for x in lim),
+        tuple(float(x["effort"]) for x in lim),
+        float(data["payload"]),
+    )

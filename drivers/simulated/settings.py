@@ -1,0 +1,69 @@
+"""What a simulated controller is made of: addresses, arm, plant, and how it starts."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from drivers.simulated.controller import Controller
+from drivers.simulated.declared import Declared
+from drivers.simulated.plant import Plant
+from drivers.simulated.plant_arm import Frame, PlantArm
+from drivers.simulated.plant_settings import PlantSettings
+
+START_Q = (0.0, -1.5, 1.8, -1.87, -1.57, 0.0)  # rad: elbow up, tool pointing down
+RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, BENCH_PORT = 30004, 29999, 30003, 30100
+
+
+@dataclass(frozen=True, slots=True)
+class ServerSettings:
+    """One simulated controller.
+
+    start_q: joints at power-on (6,), rad.
+    declare: whether the controller is told the plant's true TCP and payload at the start.
+    version: announced to clients: major, minor, bugfix.
+    """
+
+    arm: PlantArm
+    plant: PlantSettings
+    host: str = "127.0.0.2"
+    start_q: tuple[float, ...] = START_Q
+    declare: bool = True
+    version: tuple[int, int, int] = (5, 15, 0)
+    serial: str = "20215500001"
+    rtde_port: int = RTDE_PORT
+    dashboard_port: int = DASHBOARD_PORT
+    script_port: int = SCRIPT_PORT
+    bench_port: int = BENCH_PORT
+
+
+def make_controller(settings: ServerSettings) -> Controller:
+    """Return the controller at rest in its start position, brakes released."""
+    declared = Declared()
+    if settings.declare:
+        declared.set_tcp(settings.plant.tcp)
+        declared.payload_mass = settings.plant.payload_mass
+        declared.payload_cog = settings.plant.payload_cog
+    return Controller(Plant(settings.arm, settings.plant, settings.start_q), declared)
+
+
+def to_json(settings: ServerSettings) -> dict[str, Any]:
+    """Return the settings as JSON-able data, for a server in another process."""
+    return asdict(settings)
+
+
+def from_json(data: dict[str, Any]) -> ServerSettings:
+    """Return the settings that `to_json` has written."""
+    arm = dict(data["arm"])
+    arm["links"] = [Frame(_tuple(f["rotation"]), _tuple(f["origin"])) for f in arm["links"]]
+    rest = {k: _tuple(v) for k, v in data.items() if k not in ("arm", "plant")}
+    return ServerSettings(
+        arm=PlantArm(**{k: _tuple(v) for k, v in arm.items()}),
+        plant=PlantSettings(**{k: _tuple(v) for k, v in data["plant"].items()}),
+        **rest,
+    )
+
+
+def _tuple(value: Any) -> Any:
+    """Return nested lists as nested tuples, anything else as it is."""
+    return tuple(_tuple(v) for v in value) if isinstance(value, list | tuple) else value
