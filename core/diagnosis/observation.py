@@ -1,0 +1,47 @@
+"""What one channel shows: measured values, how to predict them, and what they may depend on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.effects import Term
+
+Array = NDArray[np.float64]
+Predict = Callable[[Sequence[Term]], Array]
+
+
+@dataclass(frozen=True)
+class NotObservable:
+    """A channel that the log does not show, and the columns it would need."""
+
+    channel: str
+    needs: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One channel of one log, ready to be diagnosed. N samples of k coordinates each.
+
+    ``predict(terms)`` gives the channel's values with these terms added to the cell's own model;
+    the gap is ``measured - predict(())``. ``nuisance`` columns (frames, biases that are nobody's
+    fault) are estimated along with everything else.
+    """
+
+    channel: str
+    unit: str
+    measured: Array  # (N, k)
+    predict: Predict
+    nuisance: Array  # (N, k, p) d measured / d nuisance
+    weight: Array  # (k,) 1/unit: makes the coordinates comparable (1 for the channel's own unit)
+    sigma: float  # 1 sigma of one coordinate that is known beforehand; 0: nothing is
+    sigma_is_whole: bool  # True: nothing comes on top of sigma
+    quantities: Mapping[str, Array]  # column name -> (N,): what a leftover may depend on
+    groups: NDArray[np.int64]  # (N,) condition of each sample: held out as a whole
+    rows: NDArray[np.int64]  # (N,) row of each sample in the log
+    axes: tuple[str, ...]  # name of each coordinate
+    joint_columns: Array | None = None  # (N, k, n) d prediction / d joint angle, where it has one
+    order_in_time: bool = False  # True: neighbours in time are correlated (a moving log)
