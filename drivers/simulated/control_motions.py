@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 from drivers.simulated.control_registers import Registers
@@ -29,6 +30,7 @@ from drivers.simulated.motion import (
 )
 from drivers.simulated.path_program import path_motion
 from drivers.simulated.plant_arm import BASE, Frame, place
+from drivers.simulated.rotations import Vector3
 
 CONTACT_FORCE = 10.0  # N: a pull against the way that is taken for a touch
 JOG_ACCELERATION = 0.5  # m/s^2
@@ -187,11 +189,13 @@ def _move_until_contact(r: Registers) -> Steps:
 def touches(r: Registers) -> bool:
     """Return whether the surroundings push against the direction of motion, or hard at all."""
     memory = r.controller.memory
-    force, speed = memory["actual_TCP_force"][:3], memory["target_TCP_speed"][:3]
-    pace = sum(v * v for v in speed) ** 0.5
+    force: Vector3 = memory["actual_TCP_force"][:3]
+    speed: Vector3 = memory["target_TCP_speed"][:3]
+    pace = math.hypot(*speed)
     if pace > 1e-4:
-        return -sum(f * v for f, v in zip(force, speed, strict=True)) / pace > CONTACT_FORCE
-    return sum(f * f for f in force) ** 0.5 > CONTACT_FORCE
+        against = -sum(f * v for f, v in zip(force, speed, strict=True)) / pace
+        return against > CONTACT_FORCE
+    return math.hypot(*force) > CONTACT_FORCE
 
 
 MOTIONS: dict[int, Callable[[Registers], Steps | None]] = {

@@ -138,7 +138,7 @@ def _step_time(r: Registers) -> None:
 
 
 def _joint_history(r: Registers) -> None:
-    """Old joint positions: the arm as it was `steps` cycles ago, at its present speed."""
+    """Answer joint positions of some cycles ago, as far back as the present speed tells."""
     q, qd, back = r.controller.plant.q, r.controller.plant.qd, max(r.integer(1), 0) * CYCLE
     r.answer_vector([a - v * back for a, v in zip(q, qd, strict=True)])
 
@@ -152,7 +152,7 @@ def _joint_accelerations(r: Registers) -> None:
 
 
 def _jacobian(r: Registers) -> None:
-    """The first column only: later controllers spread all 36 numbers over other registers."""
+    """Answer the first column only: later controllers spread all 36 over other registers."""
     c = r.controller
     J = jacobian(c.plant.arm, c.plant.q, c.declared.tool)
     r.answer_vector([float(v) for v in np.ravel(J, order="F")[:6]])
@@ -163,7 +163,7 @@ def _free_drive_status(r: Registers) -> None:
 
 
 def _nothing(r: Registers) -> None:
-    """Accepted without an effect on this plant: teach mode, damping, gains, force mode."""
+    """Accept without an effect on this plant: teach mode, damping, gains, force mode."""
 
 
 QUERIES: dict[int, Callable[[Registers], None]] = {

@@ -98,7 +98,7 @@ class Registers:
         self.progress(-1)
 
     def progress(self, value: int) -> None:
-        """Write the progress word: bits 0-14 progress, 15 running, 16-22 changes, 24-30 operation."""
+        """Write the progress word: bits 0-14 progress, 15 running, 16-22 changes, 24-30 number."""
         self._changes = (self._changes + 1) % 128
         if value == 0:
             self._operation = (self._operation + 1) % 128

@@ -71,7 +71,7 @@ def jacobian(arm: PlantArm, q: Sequence[float], tool: Frame) -> np.ndarray:
 def solve(
     arm: PlantArm, target: Frame, near: Sequence[float], tool: Frame, steps: int = 60
 ) -> Joints | None:
-    """Return the joints (n, rad) that bring the TCP to `target`, from `near`; None if there are none.
+    """Return the joints (n, rad), found from `near`, that bring the TCP to `target`, or None.
 
     Newton steps with a little damping; each joint moves at most 0.3 rad a step.
     """
@@ -114,7 +114,7 @@ def holding_torque(
     wrench: Sequence[float],
     tool: Frame,
 ) -> Joints:
-    """Return the joint torques (n, Nm) that hold the rigid arm against weight, payload and wrench."""
+    """Return the joint torques (n, Nm) that hold the rigid arm under weight and load."""
     frames = arm.frames(q)
     flange = frames[-1]
     tip = place(flange, tool).origin

@@ -175,7 +175,7 @@ class SpeedTool:
         self.goal = tuple(float(v) for v in goal)
         self.acceleration = acceleration
         self._arm, self._tool = arm, tool
-        self._now = (0.0,) * 6
+        self._now: Joints = (0.0,) * 6
 
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
         """Return the next joint target."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from functools import partial
 
 from drivers.simulated.controller import Controller, ScriptError
 from drivers.simulated.kinematics import Joints, frame_of, solve, tcp_in_base
@@ -43,6 +44,10 @@ def make_move(controller: Controller, call: Call, start: Joints) -> Motion:
     return MoveJoints(start, joints, speed, acceleration)
 
 
+def _move_from(controller: Controller, call: Call, start: Joints) -> Motion:
+    return make_move(controller, call, start)
+
+
 def path_motion(
     controller: Controller, lines: tuple[str, ...], progress: Callable[[int], None]
 ) -> Motion:
@@ -51,7 +56,7 @@ def path_motion(
     for line in lines:
         call = parse_call(line)
         if call is not None and call.name in MOVES:
-            makers.append(lambda q, call=call: make_move(controller, call, q))
+            makers.append(partial(_move_from, controller, call))
         elif call is None or "progress" not in call.name:
             log.warning("path: line %r is ignored", line)
 

@@ -78,7 +78,7 @@ class Plant:
         return tuple(float(s * d) for s, d in zip(self.settings.joint_scatter, drawn, strict=True))
 
     def step(self, target: Sequence[float], dt: float) -> None:
-        """Let the joints follow `target` (n, rad) for `dt` s: lag, then velocity and acceleration."""
+        """Let the joints follow `target` (n, rad) for `dt` s, with lag and within limits."""
         gain = 1.0 - math.exp(-dt / self.settings.servo_lag)
         most = self.settings.acceleration_limit * dt
         q, qd = [], []

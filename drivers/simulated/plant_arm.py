@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
+from core.arm import Arm, builtin_arm
 from core.errors import ArmError
 from drivers.simulated.rotations import (
     IDENTITY,
@@ -17,6 +21,7 @@ from drivers.simulated.rotations import (
 )
 
 JOINTS = 6  # a UR controller's fields hold six
+FASTEST = 6.2831853  # rad/s, for an arm without velocity limits
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +64,7 @@ class PlantArm:
     @property
     def reach(self) -> float:
         """Length of the stretched chain, m."""
-        return sum(sum(x * x for x in link.origin) ** 0.5 for link in self.links)
+        return sum(math.dist(link.origin, (0.0, 0.0, 0.0)) for link in self.links)
 
     def frames(self, q: Sequence[float]) -> list[Frame]:
         """Return the n joint frames (after their own rotation) and the flange, rigid, in base."""
@@ -97,32 +102,24 @@ def _frame(matrix: Sequence[Sequence[float]]) -> Frame:
     return Frame(rotation, (r[0][3], r[1][3], r[2][3]))
 
 
-# ---- temporary until core.arm exists
-def plant_arm(name: str) -> PlantArm:
-    import math
-    from importlib import resources
-    import yaml
-    from drivers.simulated.rotations import from_vector
+def plant_arm(arm: Arm | str) -> PlantArm:
+    """Return the plant's arm from the data of a nominal arm, or of a built-in one by its name.
 
-    data = yaml.safe_load(resources.files("core.arms").joinpath(f"{name}.yaml").read_text())
-    links = [BASE]
-    cogs = []
-    offset = 0.0
-    for row in data["dh"]:
-        ct, st = 1.0, 0.0
-        frame = Frame(from_vector((row["alpha"], 0, 0)), (row["a"], 0.0, row["d"]))
-        links.append(frame)
-        c = rotate(frame.rotation, row["cog"])
-        cogs.append(add(frame.origin, c))
-    lim = data["limits"]
+    Raises ArmError unless it has six joints: a UR controller's fields hold no other number.
+    """
+    if isinstance(arm, str):
+        arm = builtin_arm(arm)
+    if arm.n != JOINTS:
+        raise ArmError(f"robot: found {arm.n} joints, expected {JOINTS}: a UR controller has six")
+    limits = arm.limits
     return PlantArm(
-        data["name"],
-        tuple(links),
-        tuple(float(r["mass"]) for r in data["dh"]),
-        tuple(cogs),
-        tuple(float(x["lower"]) for x in lim),
-        tuple(float(x["upper"]) for x in lim),
-        tuple(float(x["velocity"]) for x in lim),
-        tuple(float(x["effort"]) for x in lim),
-        float(data["payload"]),
+        name=arm.name,
+        links=tuple(_frame(matrix) for matrix in arm.link_in_link.tolist()),
+        mass=tuple(arm.mass.tolist()),
+        cog=tuple(_vector3(row) for row in arm.cog.tolist()),
+        lower=tuple(limits.lower.tolist()),
+        upper=tuple(limits.upper.tolist()),
+        velocity=tuple(np.minimum(limits.velocity, FASTEST).tolist()),
+        effort=tuple(limits.effort.tolist()),
+        payload=float(arm.payload),
     )

@@ -65,6 +65,8 @@ _MOTION = {
     "actual_TCP_force": VECTOR6D,
     "target_TCP_pose": VECTOR6D,
     "target_TCP_speed": VECTOR6D,
+    "actual_TCP_acceleration": VECTOR6D,
+    "target_TCP_acceleration": VECTOR6D,
     "joint_temperatures": VECTOR6D,
     "elbow_position": VECTOR3D,
     "elbow_velocity": VECTOR3D,
@@ -79,10 +81,15 @@ _MOTION = {
     "collision_detection_ratio": DOUBLE,
     "actual_momentum": DOUBLE,
     "actual_tool_accelerometer": VECTOR3D,
+    "target_gravity": VECTOR3D,
+    "target_base_acceleration": VECTOR6D,
+    "target_base_wrench": VECTOR6D,
 }
 
 _STATE = {
     "actual_execution_time": DOUBLE,
+    "target_execution_time": DOUBLE,
+    "control_step": UINT64,
     "robot_mode": INT32,
     "joint_mode": VECTOR6INT32,
     "safety_mode": INT32,
@@ -99,6 +106,10 @@ _STATE = {
 _ELECTRICAL = {
     "actual_digital_input_bits": UINT64,
     "actual_digital_output_bits": UINT64,
+    "actual_configurable_digital_input_bits": UINT64,
+    "actual_configurable_digital_output_bits": UINT64,
+    "encoder0_raw": INT32,
+    "encoder1_raw": INT32,
     "actual_main_voltage": DOUBLE,
     "actual_robot_voltage": DOUBLE,
     "actual_robot_current": DOUBLE,
