@@ -107,7 +107,13 @@ class Controller:
     def _step_motion(self, dt: float) -> None:
         """Move the joint target by one cycle of the running motion."""
         scaled = dt * self.memory["speed_scaling"] if self.motion.scaled else dt
-        target = self.motion.step(self.target_q, self.target_qd, scaled)
+        try:
+            target = self.motion.step(self.target_q, self.target_qd, scaled)
+        except ScriptError as error:
+            log.warning("motion stops: %s", error)
+            self.end_program()
+            self.motion = Stop(self.target_qd, DEFAULT_STOP)
+            return
         if target != self.target_q and not within_limits(self.plant.arm, target):
             log.warning("joint target %s is outside the joint limits", target)
             self.protective_stop()
@@ -236,6 +242,11 @@ class Controller:
         self.motion = Stop(self.target_qd, 2.0 * DEFAULT_STOP)
         self.set_safety(modes.SAFETY_ROBOT_EMERGENCY)
         self.set_robot_mode(modes.POWER_OFF)
+
+    def release_emergency_stop(self) -> None:
+        """Release the button: power stays off until it is switched on again."""
+        if self.memory["safety_mode"] == modes.SAFETY_ROBOT_EMERGENCY:
+            self.set_safety(modes.SAFETY_NORMAL)
 
     def finite(self, values: Sequence[float], what: str) -> Joints:
         """Return `values` as joints or pose; raises ScriptError where one is not finite."""

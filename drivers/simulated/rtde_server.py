@@ -74,6 +74,11 @@ class RtdeServer:
             log.warning("an RTDE client has not read for %.0f s and is closed", session.unread)
             session.close()
 
+    def close_all(self) -> None:
+        """Close every client's connection."""
+        for session in self.sessions:
+            session.close()
+
     def drop_closed(self) -> None:
         """Forget closed sessions; their claims go with them."""
         if not all(session.open for session in self.sessions):

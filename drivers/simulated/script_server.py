@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 
+from drivers.simulated import offset_program
 from drivers.simulated.connection import Connection
 from drivers.simulated.control_script import control_script, read_control_text
 from drivers.simulated.controller import Controller
@@ -29,6 +30,10 @@ class ScriptServer:
         control = read_control_text(script)
         if control is not None:
             controller.start_program(script.name, control_script(controller, control))
+            return
+        if script.name == offset_program.NAME:
+            steps = offset_program.offset_program(controller)
+            controller.start_program(script.name, steps)
             return
         log.info("program %s uploaded (%d lines)", script.name, len(script.lines))
         steps = script_program(controller, script.name, script.lines)

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from core.errors import LinkError
+from drivers.simulated.bench import BenchServer
 from drivers.simulated.connection import Connection, listen
 from drivers.simulated.controller import CYCLE, Controller
 from drivers.simulated.dashboard_server import DashboardServer
@@ -42,6 +43,7 @@ class Server:
         self.rtde = RtdeServer(self.controller, (*settings.version, 0))
         self._dashboard = DashboardServer(self.controller, version, settings.serial)
         self._script = ScriptServer(self.controller)
+        self._bench = BenchServer(self.controller, self.rtde.close_all)
         self._clients: dict[socket.socket, tuple[Connection, Callable[[Connection], None]]] = {}
         self._listeners: dict[socket.socket, Listener] = {}
         self._open_ports(settings)
@@ -52,6 +54,7 @@ class Server:
             self._add(listen(host, settings.rtde_port), self.rtde.accept, self._handle_rtde)
             self._add(listen(host, settings.dashboard_port), self._greeted, self._dashboard.handle)
             self._add(listen(host, settings.script_port), Connection, self._script.handle)
+            self._add(listen(host, settings.bench_port), Connection, self._bench.handle)
         except OSError as error:
             self.close()
             raise LinkError(f"simulated controller on {host}: {error.strerror or error}") from error

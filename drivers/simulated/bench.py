@@ -1,0 +1,209 @@
+"""The bench on port 30100: what a person and a laser tracker do beside a real cell.
+
+One command a line, one line back; `help` lists them. None of it is known to a UR controller.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drivers.simulated.connection import Connection
+from drivers.simulated.controller import Controller
+from drivers.simulated.kinematics import pose_of
+from drivers.simulated.motion import MoveJoints
+from drivers.simulated.offset_program import OffsetMotion
+from drivers.simulated.plant import Load
+from drivers.simulated.plant_arm import place
+from drivers.simulated.rotations import compose, from_vector, to_vector
+
+if TYPE_CHECKING:
+    from drivers.simulated.plant_arm import Frame
+
+log = logging.getLogger("drivers.simulated")
+
+HEAVIEST = 200.0  # kg
+LONGEST_LINE = 1000  # characters
+DEFAULT_SPEED = 0.5  # rad/s
+
+
+class BenchError(ValueError):
+    """A command that cannot be done; the message goes back to the person."""
+
+
+class BenchServer:
+    """Answers bench commands on one plant."""
+
+    def __init__(self, controller: Controller, drop_clients: Callable[[], None]) -> None:
+        self._controller = controller
+        self._drop_clients = drop_clients
+        self._random = np.random.default_rng((controller.plant.settings.seed, 2))
+        self._commands: dict[str, tuple[int, Callable[[list[float]], str], str]] = {
+            "measure": (0, self._measure, "timestamp,x,y,z,rx,ry,rz of the true TCP, with noise"),
+            "payload": (4, self._payload, "MASS CX CY CZ: hang a load on the flange, kg, m"),
+            "wrench": (6, self._wrench, "FX FY FZ TX TY TZ: pull at the TCP, base axes, N, Nm"),
+            "move": (6, self._move, "Q1..Q6: the robot's own program moves there, rad"),
+            "protective_stop": (0, self._protective_stop, "as a collision would"),
+            "emergency_stop": (0, self._emergency_stop, "press the button"),
+            "release": (0, self._release, "release the emergency stop button"),
+            "freeze": (0, self._freeze, "the timestamp stands still, packets go on"),
+            "thaw": (0, self._thaw, "the timestamp goes on"),
+            "stall": (1, self._stall, "SECONDS: no RTDE packet leaves"),
+            "drop": (0, self._drop, "close every RTDE connection"),
+            "truth": (0, self._truth, "the hidden plant as JSON, for scoring only"),
+            "help": (0, self._help, "this list"),
+        }
+
+    def handle(self, connection: Connection) -> None:
+        """Answer every whole line."""
+        while connection.open and b"\n" in connection.received:
+            end = connection.received.index(b"\n")
+            line = connection.received[:end].decode("utf-8", "replace").strip()
+            del connection.received[: end + 1]
+            if line:
+                connection.send(self.answer(line).encode() + b"\n")
+
+    def answer(self, line: str) -> str:
+        """Return the reply to one command; a mistake is told as ``error: ...``."""
+        name, *words = line[:LONGEST_LINE].split()
+        try:
+            if name not in self._commands:
+                raise BenchError(f"unknown command {name!r}, try help")
+            count, action, _ = self._commands[name]
+            return action(_numbers(name, words, count))
+        except BenchError as error:
+            return f"error: {error}"
+
+    # -- the tracker ------------------------------------------------------------------------------
+
+    def _measure(self, _: list[float]) -> str:
+        controller = self._controller
+        s = controller.plant.settings
+        tcp = controller.plant.true_tcp()
+        shift = self._random.normal(0.0, s.tracker_noise, 3)
+        turn = self._random.normal(0.0, s.tracker_rotation_noise, 3)
+        position = [a + float(b) for a, b in zip(tcp.origin, shift, strict=True)]
+        rotation = to_vector(compose(from_vector([float(v) for v in turn]), tcp.rotation))
+        values = (controller.memory["timestamp"], *position, *rotation)
+        return ",".join(f"{v:.9g}" for v in values)
+
+    # -- hands ------------------------------------------------------------------------------------
+
+    def _payload(self, numbers: list[float]) -> str:
+        mass, x, y, z = numbers
+        if not 0.0 <= mass <= HEAVIEST:
+            raise BenchError(f"payload: found {mass:g} kg, expected 0 to {HEAVIEST:g}")
+        load = self._controller.plant.load
+        self._controller.plant.load = Load(mass, (x, y, z), load.force, load.torque)
+        return "ok"
+
+    def _wrench(self, numbers: list[float]) -> str:
+        fx, fy, fz, tx, ty, tz = numbers
+        load = self._controller.plant.load
+        self._controller.plant.load = Load(load.mass, load.cog, (fx, fy, fz), (tx, ty, tz))
+        return "ok"
+
+    def _move(self, numbers: list[float]) -> str:
+        controller, goal = self._controller, tuple(numbers)
+        if not controller.can_move:
+            raise BenchError("move: the robot is not running")
+        motion = controller.motion
+        if isinstance(motion, OffsetMotion):
+            motion.own = MoveJoints(motion.nominal, goal, DEFAULT_SPEED, 2.0 * DEFAULT_SPEED)
+            return "ok"
+        if controller.program is not None:
+            raise BenchError("move: another program runs")
+        controller.motion = MoveJoints(controller.target_q, goal, DEFAULT_SPEED, 1.0)
+        return "ok"
+
+    def _protective_stop(self, _: list[float]) -> str:
+        self._controller.protective_stop()
+        return "ok"
+
+    def _emergency_stop(self, _: list[float]) -> str:
+        self._controller.emergency_stop()
+        return "ok"
+
+    def _release(self, _: list[float]) -> str:
+        self._controller.release_emergency_stop()
+        return "ok"
+
+    # -- faults of the link -----------------------------------------------------------------------
+
+    def _freeze(self, _: list[float]) -> str:
+        self._controller.frozen = True
+        return "ok"
+
+    def _thaw(self, _: list[float]) -> str:
+        self._controller.frozen = False
+        return "ok"
+
+    def _stall(self, numbers: list[float]) -> str:
+        self._controller.stall_until = self._controller.clock + max(numbers[0], 0.0)
+        return "ok"
+
+    def _drop(self, _: list[float]) -> str:
+        self._drop_clients()
+        return "ok"
+
+    # -- for scoring ------------------------------------------------------------------------------
+
+    def _truth(self, _: list[float]) -> str:
+        plant = self._controller.plant
+        s, load = plant.settings, plant.load
+        rigid = place(plant.arm.flange(plant.q), plant.tool)
+        return json.dumps(
+            {
+                "compliance": {"axial": s.axial, "radial": s.radial},
+                "payload": {"mass": load.mass, "cog": load.cog},
+                "wrench": [*load.force, *load.torque],
+                "tcp": s.tcp,
+                "joint_error": plant.scatter,
+                "joint_scatter": s.joint_scatter,
+                "repeatability": tcp_scatter(self._controller),
+                "placements": plant.placements,
+                "true_tcp": pose_of(plant.true_tcp()),
+                "rigid_tcp": pose_of(rigid),
+                "sensor_bias": s.sensor_bias,
+                "servo_lag": s.servo_lag,
+                "tracker_noise": s.tracker_noise,
+                "seed": s.seed,
+            }
+        )
+
+    def _help(self, _: list[float]) -> str:
+        return "; ".join(f"{name}: {text}" for name, (_n, _a, text) in self._commands.items())
+
+
+def tcp_scatter(controller: Controller) -> float:
+    """Return the rms length (m) of the TCP's placement error at the present joints."""
+    plant = controller.plant
+    step = 1e-6
+
+    def tip(q: tuple[float, ...]) -> Frame:
+        return place(plant.arm.flange(q), plant.tool)
+
+    here = tip(plant.q).origin
+    total = 0.0
+    for i, sigma in enumerate(plant.settings.joint_scatter):
+        q = (*plant.q[:i], plant.q[i] + step, *plant.q[i + 1 :])
+        total += (math.dist(tip(q).origin, here) / step * sigma) ** 2
+    return math.sqrt(total)
+
+
+def _numbers(name: str, words: list[str], count: int) -> list[float]:
+    """Return exactly `count` finite numbers."""
+    if len(words) != count:
+        raise BenchError(f"{name}: found {len(words)} numbers, expected {count}")
+    try:
+        found = [float(word) for word in words]
+    except ValueError:
+        raise BenchError(f"{name}: found {' '.join(words)!r}, expected numbers") from None
+    if not all(map(math.isfinite, found)):
+        raise BenchError(f"{name}: found {' '.join(words)!r}, expected finite numbers")
+    return found
