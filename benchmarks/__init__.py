@@ -1,0 +1,1 @@
+"""Benchmarks of Gapbridge: code that the product does not import and that shares nothing with it."""

@@ -1,0 +1,166 @@
+"""Cases of the position channel: a session of a real arm with known causes, or with none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.random import Generator
+
+from benchmarks.blind import draws
+from benchmarks.blind.bench import Bench, all_clear, combined, draw_bench, size
+from benchmarks.blind.draws import Redraw
+from benchmarks.blind.ingredients import Ingredient
+from benchmarks.blind.label import Cause
+from benchmarks.blind.measuring import read_arm, without
+from benchmarks.blind.mechanics import Array, RealArm
+from benchmarks.blind.session import Plan
+from benchmarks.blind.writing import write_cell, write_log
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A cell with its causes: everything from which data and label follow."""
+
+    bench: Bench
+    parts: tuple[Ingredient, ...]
+    real: RealArm
+
+    @property
+    def gap_rms(self) -> float:
+        """Return the gap of all causes, frame taken out, m rms per coordinate."""
+        shown = without(self.bench.frame(), self.bench.whitened_gap(self.real))
+        position = shown.reshape(len(self.bench.session.q), -1)[:, :3]
+        return float(np.sqrt(np.mean(position**2))) * self.bench.floor
+
+
+def draw_plan(rng: Generator, poses: int = 70) -> Plan:
+    """Return a well laid out session."""
+    return Plan(
+        poses=poses,
+        blocks=int(rng.integers(3, 6)),
+        pulled=float(rng.uniform(0.15, 0.35)),
+        approach_written=bool(rng.random() < 0.6),
+        reference_temperature=25.0 if rng.random() < 0.7 else 20.0,
+    )
+
+
+def draw_static(
+    effects: tuple[str, ...],
+    rng: Generator,
+    plan: Plan | None = None,
+    sigma: float = 2e-5,
+    target_floor: tuple[float, float] = (2.2e-5, 4.5e-5),
+    need_clear: bool = True,
+    arm: str | None = None,
+    joints: dict[str, list[int]] | None = None,
+) -> Drawn:
+    """Return a cell whose real arm has these effects, each clear of the others."""
+    soft = True if set(effects) & set(draws.NEEDS_COMPLIANCE) else None
+    for _ in range(200):
+        bench = draw_bench(
+            rng, plan or draw_plan(rng), arm=arm, compliant=soft, sigma=sigma,
+            target_floor=target_floor,
+        )  # fmt: skip
+        try:
+            bench, parts = _draw_parts(bench, effects, rng, joints or {})
+        except Redraw:
+            continue
+        if parts and need_clear and not all_clear(bench, parts):
+            continue
+        return Drawn(bench, tuple(parts), combined(bench, parts))
+    raise RuntimeError(f"no clear draw of {effects} in 200")
+
+
+def _draw_parts(
+    bench: Bench, effects: tuple[str, ...], rng: Generator, joints: dict[str, list[int]]
+) -> tuple[Bench, list[Ingredient]]:
+    """Return the parts, sized. The nominal axial compliance of a stiffening joint is taken out."""
+    parts: list[Ingredient] = []
+    for effect in effects:
+        low, high = draws.RATIO.get(effect, (3.0, 18.0))
+        where: list[int | None] = [None]
+        if effect in draws.PER_JOINT:
+            most = 3 if len(effects) == 1 else 2
+            free = draws.sites(effect, bench.kind)
+            if effect in ("stiffness_nonlinearity", "axial_compliance"):
+                taken = [p.joint for p in parts if p.effect.startswith(("stiff", "axial"))]
+                free = [j for j in free if j not in taken]
+            count = int(rng.choice([1, 2, 3], p=[0.55, 0.3, 0.15]))
+            chosen = rng.permutation(free)[: min(count, most)]
+            where = sorted(joints.get(effect, [int(j) for j in chosen]))  # type: ignore[assignment]
+        for joint in where:
+            if effect == "stiffness_nonlinearity" and joint is not None:
+                bench = _stiff_about(bench, joint)
+            for part in draws.draw(
+                effect, joint, bench.kind, bench.nominal, bench.session,
+                bench.instrument.sigma_turn is not None, rng,
+            ):  # fmt: skip
+                ratio = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+                parts.append(size(bench, part, ratio))
+    return bench, parts
+
+
+def _stiff_about(bench: Bench, joint: int) -> Bench:
+    """Return the bench whose model holds this joint stiff about its axis: no linear part twice."""
+    from benchmarks.blind.mechanics import stand
+
+    axial = bench.nominal.axial.copy()
+    axial[joint - 1] = 0.0
+    nominal = replace(bench.nominal, axial=axial)
+    return replace(bench, nominal=nominal, model=stand(nominal, bench.session))
+
+
+def causes_of(parts: tuple[Ingredient, ...]) -> tuple[Cause, ...]:
+    """Return the label's causes: parts of one effect put together."""
+    out: list[Cause] = []
+    for effect in dict.fromkeys(p.effect for p in parts):
+        own = [p for p in parts if p.effect == effect]
+        joints = tuple(sorted({p.joint for p in own if p.joint is not None}))
+        values = {n: float(v) for p in own for n, v in zip(p.names, p.values, strict=True)}
+        out.append(Cause(effect, joints, values))
+    return tuple(out)
+
+
+def write_static(
+    folder: Path, drawn: Drawn, rng: Generator, measured: tuple[Array, Array | None] | None = None
+) -> dict[str, str | float | bool]:
+    """Write log.csv and cell.yaml; return how they were laid out."""
+    bench, session = drawn.bench, drawn.bench.session
+    folder.mkdir(parents=True, exist_ok=True)
+    position, rotation = measured or read_arm(drawn.real, session, bench.instrument, rng)
+    columns: dict[str, Array] = {"timestamp": session.time}
+    if rng.random() < 0.3:
+        columns["target_q"] = session.q + rng.normal(0, 1e-5, session.q.shape)
+    columns["actual_q"] = session.q
+    constant = np.ptp(session.payload_mass) == 0
+    if not (constant and rng.random() < 0.5):
+        columns["payload"] = session.payload_mass
+        columns["payload_cog"] = session.payload_cog
+    if np.any(session.tcp_wrench) or rng.random() < 0.5:
+        columns["actual_TCP_force"] = session.tcp_wrench
+    columns["joint_temperatures"] = session.temperature
+    if bench.plan.approach_written:
+        columns["approach"] = session.approach
+    columns["measured_position"] = position
+    if rotation is not None:
+        columns["measured_rotation"] = rotation
+    write_log(folder / "log.csv", columns)
+    metrology: dict[str, float | bool] = {
+        "registered": bench.instrument.registered, "sigma": bench.instrument.sigma,
+    }  # fmt: skip
+    tells = bool(rng.random() < 0.25)
+    if tells:
+        extra = float(np.sqrt(bench.floor**2 - bench.instrument.sigma**2))
+        metrology["repeatability"] = float(f"{extra:.3g}")
+    load = (float(session.payload_mass[0]), session.payload_cog[0])
+    write_cell(folder, bench.kind, bench.nominal, load, metrology)
+    return {
+        "registered": bench.instrument.registered,
+        "rotations": rotation is not None,
+        "compliant": bool(np.any(bench.nominal.axial)),
+        "approach_written": bench.plan.approach_written,
+        "repeatability_given": tells,
+        "poses": len(session.q),
+    }
