@@ -1,1 +1,1 @@
-"""Benchmarks of Gapbridge: code that the product does not import and that shares nothing with it."""
+"""Benchmarks of Gapbridge: code that shares nothing with the product."""

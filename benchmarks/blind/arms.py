@@ -7,7 +7,7 @@ Softness is what such arms have when their nominal model is already compliant.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import pi
+from math import cos, pi, sin
 
 from benchmarks.blind.mechanics import Row
 
@@ -33,9 +33,10 @@ class ArmKind:
         return len(self.rows)
 
 
-def _row(
-    a: float, alpha: float, d: float, mass: float, cog: tuple[float, float, float], offset: float = 0
-) -> Row:
+Point = tuple[float, float, float]
+
+
+def _row(a: float, alpha: float, d: float, mass: float, cog: Point, offset: float = 0) -> Row:
     return Row(a, alpha, d, offset, mass, cog)
 
 
@@ -152,8 +153,6 @@ def urdf_text(arm: ArmKind) -> str:
 
 def _cog_in_joint(row: Row) -> tuple[float, float, float]:
     """Return the centre of gravity in the joint's frame; DH states it at the row's far end."""
-    from math import cos, sin
-
     x, y, z = row.cog
     ca, sa = cos(row.alpha), sin(row.alpha)
     return (row.a + x, ca * y - sa * z, row.d + sa * y + ca * z)

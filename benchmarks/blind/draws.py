@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import Generator
@@ -10,6 +11,7 @@ from numpy.random import Generator
 from benchmarks.blind import ingredients as put
 from benchmarks.blind.arms import ArmKind
 from benchmarks.blind.ingredients import Ingredient
+from benchmarks.blind.measuring import axial_moments
 from benchmarks.blind.mechanics import RealArm, Session
 
 PER_JOINT = (
@@ -58,63 +60,73 @@ def draw(
     if effect == "thermal_drift":
         return [put.thermal_drift(1.5e-5)]
     assert joint is not None
-    return _JOINT_DRAWS[effect](joint, kind, arm, session, rng)
+    return _JOINT_DRAWS[effect](joint, Site(kind, arm, session, rng))
 
 
-def _joint_offset(j: int, kind: ArmKind, _a: RealArm, _s: Session, rng: Generator) -> list[Ingredient]:
-    return [put.joint_offset(j, rng.choice([-1, 1]) * 1e-3)]
+@dataclass(frozen=True)
+class Site:
+    """What a draw at one joint may look at."""
+
+    kind: ArmKind
+    arm: RealArm
+    session: Session
+    rng: Generator
 
 
-def _link_geometry(j: int, kind: ArmKind, _a: RealArm, _s: Session, rng: Generator) -> list[Ingredient]:
+def _joint_offset(j: int, at: Site) -> list[Ingredient]:
+    return [put.joint_offset(j, at.rng.choice([-1, 1]) * 1e-3)]
+
+
+def _link_geometry(j: int, at: Site) -> list[Ingredient]:
     keys = ["a", "d", "alpha"]
-    if abs(np.sin(kind.rows[j - 1].alpha)) < 1e-6:
+    if abs(np.sin(at.kind.rows[j - 1].alpha)) < 1e-6:
         keys.append("beta")
-    chosen = rng.permutation(keys)[: rng.integers(1, 4)]
+    chosen = at.rng.permutation(keys)[: at.rng.integers(1, 4)]
     scale = {"a": 5e-4, "d": 5e-4, "alpha": 8e-4, "beta": 8e-4}
-    return [put.link_geometry(j, {k: rng.normal() * scale[k] for k in keys if k in chosen})]
+    return [put.link_geometry(j, {k: at.rng.normal() * scale[k] for k in keys if k in chosen})]
 
 
-def _transmission(j: int, kind: ArmKind, _a: RealArm, _s: Session, rng: Generator) -> list[Ingredient]:
-    lines = 1 if rng.random() < 0.65 else 2
-    many = int(rng.integers(8, 130))
-    orders = rng.permutation([1, 2, many, many])[:2] if lines == 2 else [rng.choice([1, 2, many])]
+def _transmission(j: int, at: Site) -> list[Ingredient]:
+    lines = 1 if at.rng.random() < 0.65 else 2
+    many = int(at.rng.integers(8, 130))
+    orders = (
+        at.rng.permutation([1, 2, many, many])[:2] if lines == 2 else [at.rng.choice([1, 2, many])]
+    )
     return [
-        put.transmission_error(j, float(o), 3e-4 * rng.uniform(0.7, 1.4), rng.uniform(-np.pi, np.pi))
-        for o in sorted(set(int(o) for o in orders))
+        put.transmission_error(
+            j, float(o), 3e-4 * at.rng.uniform(0.7, 1.4), at.rng.uniform(-np.pi, np.pi)
+        )
+        for o in sorted({int(o) for o in orders})
     ]
 
 
-def _axial(j: int, kind: ArmKind, _a: RealArm, _s: Session, rng: Generator) -> list[Ingredient]:
-    return [put.axial_compliance(j, kind.axial[j - 1], 10 * kind.axial[j - 1])]
+def _axial(j: int, at: Site) -> list[Ingredient]:
+    return [put.axial_compliance(j, at.kind.axial[j - 1], 10 * at.kind.axial[j - 1])]
 
 
-def _radial(j: int, kind: ArmKind, _a: RealArm, _s: Session, rng: Generator) -> list[Ingredient]:
-    return [put.radial_compliance(j, kind.radial[j - 1], 15 * kind.radial[j - 1])]
+def _radial(j: int, at: Site) -> list[Ingredient]:
+    return [put.radial_compliance(j, at.kind.radial[j - 1], 15 * at.kind.radial[j - 1])]
 
 
-def _link_flexibility(j: int, kind: ArmKind, _a: RealArm, _s: Session, rng: Generator) -> list[Ingredient]:
-    row = kind.rows[j - 1]
-    soft = kind.axial[j - 1] / max(float(np.hypot(row.a, row.d)), 0.1)
+def _link_flexibility(j: int, at: Site) -> list[Ingredient]:
+    row = at.kind.rows[j - 1]
+    soft = at.kind.axial[j - 1] / max(float(np.hypot(row.a, row.d)), 0.1)
     return [put.link_flexibility(j, soft, 10 * soft)]
 
 
-def _nonlinear(j: int, kind: ArmKind, arm: RealArm, session: Session, rng: Generator) -> list[Ingredient]:
-    from benchmarks.blind.measuring import axial_moments
-
-    usual = float(np.quantile(np.abs(axial_moments(arm, session)[:, j - 1]), 0.9))
-    if usual < 1e-3 * kind.rated:
+def _nonlinear(j: int, at: Site) -> list[Ingredient]:
+    usual = float(np.quantile(np.abs(axial_moments(at.arm, at.session)[:, j - 1]), 0.9))
+    if usual < 1e-3 * at.kind.rated:
         raise Redraw
-    soft = kind.axial[j - 1]
-    return [put.stiffness_nonlinearity(j, soft, usual * rng.uniform(0.2, 0.6), 15 * soft)]
+    soft = at.kind.axial[j - 1]
+    return [put.stiffness_nonlinearity(j, soft, usual * at.rng.uniform(0.2, 0.6), 15 * soft)]
 
 
-def _backlash(j: int, kind: ArmKind, _a: RealArm, _s: Session, rng: Generator) -> list[Ingredient]:
+def _backlash(j: int, at: Site) -> list[Ingredient]:
     return [put.backlash(j, 3e-4)]
 
 
-_JOINT_DRAWS: dict[
-    str, Callable[[int, ArmKind, RealArm, Session, Generator], list[Ingredient]]
-] = {
+_JOINT_DRAWS: dict[str, Callable[[int, Site], list[Ingredient]]] = {
     "joint_offset": _joint_offset,
     "link_geometry": _link_geometry,
     "transmission_error": _transmission,

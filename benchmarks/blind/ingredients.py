@@ -67,7 +67,7 @@ def _with_angle(arm: RealArm, joint: int, error: Callable[[Session], Array]) -> 
 
 
 def joint_offset(joint: int, value: float) -> Ingredient:
-    """A zero error: true angle = encoder + value (rad)."""
+    """Return a zero error: true angle = encoder + value (rad)."""
 
     def change(arm: RealArm, v: Array) -> RealArm:
         return _at_row(arm, joint - 1, lambda r: replace(r, offset=r.offset + v[0]))
@@ -80,7 +80,7 @@ GEOMETRY = {"a": 0.01, "d": 0.01, "alpha": 0.03, "beta": 0.03}
 
 
 def link_geometry(joint: int, values: dict[str, float]) -> Ingredient:
-    """Other a, d, alpha, beta of a link."""
+    """Return other a, d, alpha, beta of a link."""
     keys = tuple(values)
 
     def change(arm: RealArm, v: Array) -> RealArm:
@@ -97,7 +97,7 @@ def link_geometry(joint: int, values: dict[str, float]) -> Ingredient:
 
 
 def tool_frame(shift: Array, rotation: Array) -> Ingredient:
-    """A TCP that sits elsewhere (flange axes)."""
+    """Return a TCP that sits elsewhere (flange axes)."""
 
     def change(arm: RealArm, v: Array) -> RealArm:
         return replace(
@@ -112,7 +112,7 @@ def tool_frame(shift: Array, rotation: Array) -> Ingredient:
 
 
 def transmission_error(joint: int, order: float, amplitude: float, phase: float) -> Ingredient:
-    """A periodic angle error: + amplitude sin(order q + phase)."""
+    """Return a periodic angle error: + amplitude sin(order q + phase)."""
 
     def change(arm: RealArm, v: Array) -> RealArm:
         def wave(s: Session) -> Array:
@@ -126,7 +126,7 @@ def transmission_error(joint: int, order: float, amplitude: float, phase: float)
 
 
 def axial_compliance(joint: int, value: float, limit: float) -> Ingredient:
-    """A joint soft about its axis (rad/Nm)."""
+    """Return a joint soft about its axis (rad/Nm)."""
 
     def change(arm: RealArm, v: Array) -> RealArm:
         return replace(arm, axial=_plus(arm.axial, joint - 1, v[0]))
@@ -136,7 +136,7 @@ def axial_compliance(joint: int, value: float, limit: float) -> Ingredient:
 
 
 def radial_compliance(joint: int, value: float, limit: float) -> Ingredient:
-    """A joint soft across its axis (rad/Nm)."""
+    """Return a joint soft across its axis (rad/Nm)."""
 
     def change(arm: RealArm, v: Array) -> RealArm:
         return replace(arm, radial=_plus(arm.radial, joint - 1, v[0]))
@@ -146,7 +146,7 @@ def radial_compliance(joint: int, value: float, limit: float) -> Ingredient:
 
 
 def link_flexibility(joint: int, value: float, limit: float) -> Ingredient:
-    """A link that bends: 1/EI."""
+    """Return a link that bends: 1/EI."""
 
     def change(arm: RealArm, v: Array) -> RealArm:
         now = np.zeros(arm.n) if arm.link_softness is None else arm.link_softness
@@ -157,7 +157,7 @@ def link_flexibility(joint: int, value: float, limit: float) -> Ingredient:
 
 
 def stiffness_nonlinearity(joint: int, soft: float, knee: float, limit: float) -> Ingredient:
-    """A joint that stiffens: theta = c M / sqrt(1 + (M / M0)^2)."""
+    """Return a joint that stiffens: theta = c M / sqrt(1 + (M / M0)^2)."""
 
     def change(arm: RealArm, v: Array) -> RealArm:
         return replace(arm, bent={**arm.bent, joint - 1: (float(v[0]), float(v[1]))})
@@ -168,7 +168,7 @@ def stiffness_nonlinearity(joint: int, soft: float, knee: float, limit: float) -
 
 
 def base_compliance(x: float, y: float, limit: float) -> Ingredient:
-    """A foundation that tilts about x and y of base under its moment."""
+    """Return a foundation that tilts about x and y of base under its moment."""
 
     def change(arm: RealArm, v: Array) -> RealArm:
         old = arm.base_softness
@@ -179,7 +179,7 @@ def base_compliance(x: float, y: float, limit: float) -> Ingredient:
 
 
 def gravity_direction(x: float, y: float) -> Ingredient:
-    """A base that is not level: gravity turned about x and y of base."""
+    """Return a base that is not level: gravity turned about x and y of base."""
 
     def change(arm: RealArm, v: Array) -> RealArm:
         tilt = turn(np.array([[v[0], v[1], 0.0]]))[0]
@@ -190,7 +190,7 @@ def gravity_direction(x: float, y: float) -> Ingredient:
 
 
 def payload(value: float, limit: float) -> Ingredient:
-    """A load that weighs more than declared."""
+    """Return a load that weighs more than declared."""
 
     def change(arm: RealArm, v: Array) -> RealArm:
         return replace(arm, more_payload=arm.more_payload + float(v[0]))
@@ -199,7 +199,7 @@ def payload(value: float, limit: float) -> Ingredient:
 
 
 def backlash(joint: int, gap: float) -> Ingredient:
-    """Play in a joint, with memory."""
+    """Return play in a joint, with memory."""
 
     def change(arm: RealArm, v: Array) -> RealArm:
         return _with_angle(arm, joint - 1, lambda s: play(s, joint - 1, float(v[0])))
@@ -208,7 +208,7 @@ def backlash(joint: int, gap: float) -> Ingredient:
 
 
 def thermal_drift(value: float) -> Ingredient:
-    """Links that grow with their joints' temperatures."""
+    """Return links that grow with their joints' temperatures."""
 
     def change(arm: RealArm, v: Array) -> RealArm:
         return replace(arm, expansion=arm.expansion + float(v[0]))

@@ -1,4 +1,4 @@
-"""What a measuring session looks like: poses, loads in blocks, pulls, warming joints, approaches."""
+"""A measuring session: poses, loads in blocks, pulls, warming joints, approaches."""
 
 from __future__ import annotations
 
@@ -68,8 +68,10 @@ def _angles(kind: ArmKind, plan: Plan, rng: Generator) -> Array:
 
 
 def _payloads(kind: ArmKind, plan: Plan, rng: Generator) -> tuple[Array, Array]:
-    levels = kind.rated * np.linspace(0.05, 0.95, plan.blocks) if plan.blocks > 1 else np.array(
-        [kind.rated * 0.5]
+    levels = (
+        kind.rated * np.linspace(0.05, 0.95, plan.blocks)
+        if plan.blocks > 1
+        else np.array([kind.rated * 0.5])
     )
     levels = np.round(rng.permutation(levels) * rng.uniform(0.9, 1.05), 3)
     lever = 0.35 * kind.tool
