@@ -25,7 +25,7 @@ from drivers.simulated.rotations import (
     unrotate,
 )
 
-NOISE_BATCH = 500  # rows drawn at once
+NOISE_BATCH = 250  # rows drawn at once
 SLOW_EVERY = 10  # cycles between the costly fields
 TORQUE_PER_AMPERE = 11.0  # Nm/A, about that of the larger joints
 
@@ -83,17 +83,18 @@ class Sensors:
         self._memory[f"{which}_TCP_pose"] = pose_of(tcp)
         self._memory[f"{which}_TCP_speed"] = tuple(v / dt for v in step)
 
-    def _draw(self) -> list[float]:
-        if not self._noise:
-            s = self._plant.settings
-            size = (3 * (s.force_noise,), 3 * (s.torque_noise,), 6 * (s.joint_torque_noise,))
-            drawn = self._random.standard_normal((NOISE_BATCH, 12)) * np.concatenate(size)
-            self._noise = drawn.tolist()
-        return self._noise.pop()
+    def _draw_noise(self) -> None:
+        """Draw the noise of the next cycles: force (3), torque (3), joint torques (6)."""
+        s = self._plant.settings
+        size = (3 * (s.force_noise,), 3 * (s.torque_noise,), 6 * (s.joint_torque_noise,))
+        drawn = self._random.standard_normal((NOISE_BATCH, 12)) * np.concatenate(size)
+        self._noise = drawn.tolist()
 
     def _sense_force(self, dt: float) -> None:
         """Set ft_raw_wrench (flange axes) and actual_TCP_force (base axes, payload taken off)."""
-        plant, memory, noise = self._plant, self._memory, self._draw()
+        if not self._noise:
+            self._draw_noise()
+        plant, memory, noise = self._plant, self._memory, self._noise.pop()
         load, r = plant.load, self._flange.rotation
         sensor = compose(r, self._bend)
         pull = self._apparent_gravity(dt)
@@ -155,6 +156,8 @@ class Sensors:
     def after_cycle(self, clock: float) -> None:
         """Refresh the costly fields every few cycles; called when the packets have left."""
         self._count += 1
+        if not self._noise:
+            self._draw_noise()
         if self._count >= SLOW_EVERY:
             self._count = 0
             self.update_slowly(clock)
