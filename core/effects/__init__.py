@@ -7,17 +7,28 @@ import difflib
 from core.effects.axial_compliance import AxialCompliance
 from core.effects.backlash import Backlash
 from core.effects.base_compliance import BaseCompliance
+from core.effects.coulomb_friction import CoulombFriction
 from core.effects.effect import CHANNELS, Effect, Parameter, Reported, Site, Term
+from core.effects.ft_bias import FtBias
+from core.effects.ft_drift import FtDrift
+from core.effects.ft_gain import FtGain
+from core.effects.ft_misalignment import FtMisalignment
 from core.effects.gravity_direction import GravityDirection
 from core.effects.joint_offset import JointOffset
+from core.effects.latency import Latency
 from core.effects.link_flexibility import LinkFlexibility
 from core.effects.link_geometry import LinkGeometry
+from core.effects.link_inertia import LinkInertia
 from core.effects.payload import Payload
 from core.effects.radial_compliance import RadialCompliance
+from core.effects.rotor_inertia import RotorInertia
 from core.effects.stiffness_nonlinearity import StiffnessNonlinearity
 from core.effects.thermal_drift import ThermalDrift
 from core.effects.tool_frame import ToolFrame
+from core.effects.torque_constant import TorqueConstant
+from core.effects.tracking_lag import TrackingLag
 from core.effects.transmission_error import TransmissionError
+from core.effects.viscous_friction import ViscousFriction
 from core.errors import InputError
 
 CATALOGUE: dict[str, Effect] = {
@@ -36,6 +47,17 @@ CATALOGUE: dict[str, Effect] = {
         Payload(),
         Backlash(),
         ThermalDrift(),
+        FtBias(),
+        FtDrift(),
+        FtGain(),
+        FtMisalignment(),
+        Latency(),
+        TrackingLag(),
+        CoulombFriction(),
+        ViscousFriction(),
+        RotorInertia(),
+        LinkInertia(),
+        TorqueConstant(),
     )
 }
 

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from core.arm import Arm
     from core.kernel import Rows
     from core.loads import Loads
+    from core.motion import Motion
 
 
 class Payload(Effect):
@@ -35,3 +36,17 @@ class Payload(Effect):
     ) -> None:
         """Add the mass."""
         rows.payload_mass[:] += term.values[0]
+
+    def sense(
+        self, term: Term, arm: Arm, wrench: NDArray[np.float64], motion: Motion
+    ) -> NDArray[np.float64]:
+        """Add the mass's weight and inertia to what the flange sensor carries."""
+        assert motion.pieces is not None
+        return wrench + term.values[0] * motion.pieces.payload_wrench
+
+    def drive(
+        self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion
+    ) -> NDArray[np.float64]:
+        """Add what holds and moves the mass."""
+        assert motion.pieces is not None
+        return torque + term.values[0] * motion.pieces.payload_torque

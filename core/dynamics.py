@@ -1,0 +1,194 @@
+"""Rigid dynamics of many rows: joint torques and the wrench at the flange sensor.
+
+Newton-Euler in base axes, one part of the arm at a time: what part i takes to be moved and held is
+f = m (a - g) at its centre of gravity and the moment I alpha + omega x I omega; the motor of joint
+j delivers the part of its moment about axis j. Parts are kept apart (``Pieces``) because effects
+scale them one by one. Signs: a torque is what the motor must deliver, positive about the joint's
+axis, so the weight it holds up counts positive against gravity, and a pull of the surroundings on
+the tool enters with -J^T F; this is the sign of UR's ``actual_current_as_torque`` and
+``target_moment``. A wrench is what the load does to the sensor: m (g - a), plus the pull. The
+payload is a point mass (a log declares no inertia for it). Bending is left out: it changes torques
+and wrenches by its own small angle. Source: Featherstone, "Rigid Body Dynamics Algorithms" (2008),
+ch. 5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.effects import CATALOGUE, Term
+from core.kernel import Chain
+from core.model import Model
+from core.motion import Motion, Pieces
+
+Array = NDArray[np.float64]
+
+# The way from load to reading: effects act in this order, whatever order they were found in.
+SENSING = ("payload", "ft_misalignment", "ft_gain", "ft_drift", "ft_bias")
+TRACKING = ("latency", "tracking_lag")
+DRIVING = (
+    "payload",
+    "link_inertia",
+    "rotor_inertia",
+    "viscous_friction",
+    "coulomb_friction",
+    "torque_constant",
+)
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Where the frames of N rows are and how they move, base axes."""
+
+    origin: Array  # (N, n+1, 3) m: joints, then the flange
+    rotation: Array  # (N, n+1, 3, 3): links, then the flange
+    omega: Array  # (N, n, 3) rad/s of each link
+    alpha: Array  # (N, n, 3) rad/s2
+    acceleration: Array  # (N, n+1, 3) m/s2 of each origin
+
+    def at(self, link: int, offset: Array) -> tuple[Array, Array]:
+        """Return position and acceleration (N, 3) of a point ``offset`` (N, 3) from an origin.
+
+        ``link`` counts from 0; n is the flange. ``offset`` is in base axes.
+        """
+        body = min(link, self.omega.shape[1] - 1)
+        omega, alpha = self.omega[:, body], self.alpha[:, body]
+        turning = np.cross(alpha, offset) + np.cross(omega, np.cross(omega, offset))
+        return self.origin[:, link] + offset, self.acceleration[:, link] + turning
+
+
+def frames_of(chain: Chain, q: Array, qd: Array, qdd: Array) -> Frames:
+    """Return the frames of a rigid chain at angles, speeds, accelerations (N, n each)."""
+    count, n = q.shape
+    origin, acceleration = np.empty((count, n + 1, 3)), np.empty((count, n + 1, 3))
+    rotation = np.empty((count, n + 1, 3, 3))
+    omega, alpha = np.empty((count, n, 3)), np.empty((count, n, 3))
+    R = np.tile(np.eye(3), (count, 1, 1))
+    o, a = np.zeros((count, 3)), np.zeros((count, 3))
+    w, dw = np.zeros((count, 3)), np.zeros((count, 3))
+    for i in range(n + 1):
+        step = R @ chain.position[i]
+        o = o + step
+        a = a + np.cross(dw, step) + np.cross(w, np.cross(w, step))
+        R = R @ chain.rotation[i]
+        if i < n:
+            R = _turned(R, q[:, i])
+            axis = R[:, :, 2]
+            dw = dw + axis * qdd[:, i, None] + np.cross(w, axis) * qd[:, i, None]
+            w = w + axis * qd[:, i, None]
+            omega[:, i], alpha[:, i] = w, dw
+        origin[:, i], rotation[:, i], acceleration[:, i] = o, R, a
+    return Frames(origin, rotation, omega, alpha, acceleration)
+
+
+def _turned(R: Array, q: Array) -> Array:
+    """Return R Rz(q), row by row."""
+    c, s = np.cos(q)[:, None], np.sin(q)[:, None]
+    x, y, z = R[:, :, 0], R[:, :, 1], R[:, :, 2]
+    return np.stack([c * x + s * y, c * y - s * x, z], axis=-1)
+
+
+def pieces_of(model: Model, motion: Motion) -> Pieces:
+    """Return what each part of the model's rigid arm contributes along a motion.
+
+    The model's own effects count where they move the geometry or the gravity (joint offsets, say);
+    its payload effect does not count here, it enters by ``sense`` and ``drive``.
+    """
+    geometry = replace(model, terms=tuple(t for t in model.terms if t.effect != "payload"))
+    chain, rows = geometry.chain(), geometry.rows(motion.q, motion.loads)
+    frames = frames_of(chain, rows.q, motion.qd, motion.qdd)
+    n, count = model.arm.n, len(motion)
+    gravity, axis = chain.gravity, frames.rotation[:, :n, :, 2]
+    link_torque = np.zeros((count, n, n))
+    for i in range(n):
+        R = frames.rotation[:, i]
+        point, acceleration = frames.at(i, R @ chain.cog[i])
+        inertia = R @ model.arm.inertia[i] @ np.swapaxes(R, 1, 2)
+        omega, alpha = frames.omega[:, i], frames.alpha[:, i]
+        moment = _times(inertia, alpha) + np.cross(omega, _times(inertia, omega))
+        force = chain.mass[i] * (acceleration - gravity)
+        link_torque[:, i, : i + 1] = _about_axes(frames, axis, i + 1, point, force, moment)
+    hand = frames.rotation[:, n]
+    payload_at, acceleration = frames.at(n, _times(hand, rows.payload_cog))
+    payload_force = acceleration - gravity
+    tcp = frames.origin[:, n] + hand @ chain.tool_position
+    pull, couple = rows.wrench[:, :3], rows.wrench[:, 3:]
+    nothing = np.zeros((count, 3))
+    return Pieces(
+        link_torque=link_torque,
+        payload_torque=_about_axes(frames, axis, n, payload_at, payload_force, nothing),
+        external_torque=-_about_axes(frames, axis, n, tcp, pull, couple),
+        payload_wrench=_at_flange(frames, payload_at, -payload_force, nothing),
+        external_wrench=_at_flange(frames, tcp, pull, couple),
+        payload_mass=rows.payload_mass,
+    )
+
+
+def _times(matrix: Array, vector: Array) -> Array:
+    return np.asarray(np.einsum("rij,rj->ri", matrix, vector))
+
+
+def _about_axes(
+    frames: Frames, axis: Array, joints: int, point: Array, force: Array, moment: Array
+) -> Array:
+    """Return the torques (N, joints) that hold ``force`` at ``point`` and ``moment``."""
+    arm = point[:, None] - frames.origin[:, :joints]
+    whole = np.cross(arm, force[:, None]) + moment[:, None]
+    return np.asarray(np.einsum("rjk,rjk->rj", axis[:, :joints], whole))
+
+
+def _at_flange(frames: Frames, point: Array, force: Array, moment: Array) -> Array:
+    """Return a force at a point and a moment as wrench (N, 6) in flange axes, about its origin."""
+    hand = np.swapaxes(frames.rotation[:, -1], 1, 2)
+    whole = moment + np.cross(point - frames.origin[:, -1], force)
+    return np.concatenate([_times(hand, force), _times(hand, whole)], axis=1)
+
+
+def with_pieces(model: Model, motion: Motion) -> Motion:
+    """Return the motion with the model's contributions, which effects and predictions need."""
+    return replace(motion, pieces=pieces_of(model, motion))
+
+
+def predict_torque(model: Model, motion: Motion, terms: Sequence[Term] = ()) -> Array:
+    """Return the joint torques (N, n), Nm, that would be measured, with further ``terms``."""
+    pieces = _pieces(model, motion)
+    torque: Array = pieces.link_torque.sum(axis=1) + pieces.external_torque
+    torque = torque + pieces.payload_mass[:, None] * pieces.payload_torque
+    for term in _in_order(model, terms, DRIVING):
+        torque = CATALOGUE[term.effect].drive(term, model.arm, torque, motion)
+    return torque
+
+
+def predict_wrench(model: Model, motion: Motion, terms: Sequence[Term] = ()) -> Array:
+    """Return the wrenches (N, 6), N and Nm, that the flange sensor would read, with ``terms``.
+
+    Flange axes, about the flange origin, payload included (CONTRACT, ``ft_raw_wrench``).
+    """
+    pieces = _pieces(model, motion)
+    wrench = pieces.payload_mass[:, None] * pieces.payload_wrench + pieces.external_wrench
+    for term in _in_order(model, terms, SENSING):
+        wrench = CATALOGUE[term.effect].sense(term, model.arm, wrench, motion)
+    return wrench
+
+
+def predict_tracking(model: Model, motion: Motion, terms: Sequence[Term] = ()) -> Array:
+    """Return where the encoders (N, n), rad, would stand for the motion's commands."""
+    if motion.target_q is None:
+        raise ValueError("the motion has no target_q")
+    q = motion.target_q
+    for term in _in_order(model, terms, TRACKING):
+        q = CATALOGUE[term.effect].track(term, model.arm, q, motion)
+    return q
+
+
+def _pieces(model: Model, motion: Motion) -> Pieces:
+    return pieces_of(model, motion) if motion.pieces is None else motion.pieces
+
+
+def _in_order(model: Model, terms: Sequence[Term], order: tuple[str, ...]) -> list[Term]:
+    acting = [t for t in (*model.terms, *terms) if t.effect in order]
+    return sorted(acting, key=lambda term: order.index(term.effect))

@@ -1,0 +1,45 @@
+"""A constant error of the flange sensor."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from core.effects.effect import Effect, Parameter, Site, Term
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from core.arm import Arm
+    from core.motion import Motion
+
+
+AXES = ("fx", "fy", "fz", "mx", "my", "mz")
+
+
+class FtBias(Effect):
+    """The flange sensor reads a constant too much: reading = wrench + bias, in flange axes.
+
+    Comes from mounting strain, temperature, an old zero. Shows the same at every pose, while the
+    weight of a payload turns with the flange: poses that turn the flange separate it from a
+    payload; sessions of some length from a drift.
+    Source: CONTRACT; Hollerbach, Khalil, Gautier, "Model Identification", Springer Handbook of
+    Robotics (2016), ch. 6.
+    """
+
+    identifier = "ft_bias"
+    channels = ("wrench",)
+    motion = "poses that turn the flange by tens of degrees against gravity"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return force (N) and torque (Nm) along the flange axes."""
+        units = ("N",) * 3 + ("Nm",) * 3
+        scales = (1.0,) * 3 + (0.1,) * 3
+        return tuple(Parameter(*p) for p in zip(AXES, units, scales, strict=True))
+
+    def sense(
+        self, term: Term, arm: Arm, wrench: NDArray[np.float64], motion: Motion
+    ) -> NDArray[np.float64]:
+        """Add the constant."""
+        return wrench + np.array(term.values)

@@ -1,0 +1,43 @@
+"""Scale errors of the flange sensor."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from core.effects.effect import Effect, Parameter, Site, Term
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from core.arm import Arm
+    from core.motion import Motion
+
+
+AXES = ("fx", "fy", "fz", "mx", "my", "mz")
+
+
+class FtGain(Effect):
+    """Each axis of the flange sensor is scaled: reading = (1 + gain) wrench, axis by axis.
+
+    Comes from a wrong calibration matrix, an amplifier, an overload. An axis whose wrench stays
+    zero tells nothing of its gain. With one payload for the whole log, six equal gains are the
+    same as another payload; other payloads or pulls separate them.
+    Source: CONTRACT; Hollerbach, Khalil, Gautier, "Model Identification", Springer Handbook of
+    Robotics (2016), ch. 6.
+    """
+
+    identifier = "ft_gain"
+    channels = ("wrench",)
+    motion = "a load on every axis: the flange turned every way, with pulls or several payloads"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the relative errors along the flange axes."""
+        return tuple(Parameter(axis, "", 0.02, -0.95, 10.0) for axis in AXES)
+
+    def sense(
+        self, term: Term, arm: Arm, wrench: NDArray[np.float64], motion: Motion
+    ) -> NDArray[np.float64]:
+        """Scale the axes."""
+        return wrench * (1.0 + np.array(term.values))

@@ -1,0 +1,42 @@
+"""A flange sensor mounted askew."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from core.effects.effect import Effect, Parameter, Site, Term
+from core.rotation import rotation_matrix
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from core.arm import Arm
+    from core.motion import Motion
+
+
+class FtMisalignment(Effect):
+    """The flange sensor is turned against the flange: reading = R(r)^T wrench.
+
+    r is the rotation vector of the sensor's axes in flange axes; force and torque turn alike,
+    about the flange origin. Comes from a wrong bolt pattern or adapter. About z it looks like a
+    joint offset of the last joint, which the encoders and a pose measurement tell apart.
+    Source: CONTRACT; Hollerbach, Khalil, Gautier, "Model Identification", Springer Handbook of
+    Robotics (2016), ch. 6.
+    """
+
+    identifier = "ft_misalignment"
+    channels = ("wrench",)
+    motion = "loads along at least two directions of the flange"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the rotation vector of the sensor in the flange."""
+        return tuple(Parameter(axis, "rad", 0.01, -np.pi, np.pi) for axis in ("rx", "ry", "rz"))
+
+    def sense(
+        self, term: Term, arm: Arm, wrench: NDArray[np.float64], motion: Motion
+    ) -> NDArray[np.float64]:
+        """Express the wrench in the sensor's own axes."""
+        R = rotation_matrix(np.array(term.values))
+        return np.concatenate([wrench[:, :3] @ R, wrench[:, 3:] @ R], axis=1)

@@ -1,0 +1,51 @@
+"""Pure delay between command and motion."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from core.effects.effect import JointEffect, Parameter, Site, Term
+from core.interpolation import interpolate, stretches
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from core.arm import Arm
+    from core.motion import Motion
+
+
+class Latency(JointEffect):
+    """The joint does what it was told, but later: actual_q(t) = target_q(t - latency).
+
+    Comes from communication, buffering, interpolation. A delay of the whole arm shows as the same
+    delay at every joint that moved; told per joint, because one joint's drive can have it alone
+    and a joint that stood still cannot tell. Differs from a lag in that corners stay sharp: only
+    fast changes of the command separate the two, slow motion gives their sum.
+    Exact: the command is interpolated by local cubics (Catmull, Rom 1974) at t - latency. Rows
+    right after the start of a recording, or after a gap, hold the first command.
+    Source: CONTRACT; Astrom, Wittenmark, "Computer-Controlled Systems" (1997), ch. 2.
+    """
+
+    identifier = "latency"
+    channels = ("tracking",)
+    needs = ("timestamp",)
+    motion = "a recording of changing speeds of the joint"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the delay."""
+        return (Parameter("", "s", 5e-3, 0.0, 2.0),)
+
+    def track(
+        self, term: Term, arm: Arm, q: NDArray[np.float64], motion: Motion
+    ) -> NDArray[np.float64]:
+        """Look the command up in the past."""
+        assert term.site.joint is not None
+        if not motion.moving:
+            return q
+        i = term.site.joint - 1
+        result = q.copy()
+        for part in stretches(motion):
+            time = motion.t[part]
+            result[part, i] = interpolate(time, q[part, i], time - term.values[0])
+        return result

@@ -1,0 +1,41 @@
+"""A link heavier than in the model."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from core.effects.effect import JointEffect, Parameter, Site, Term
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from core.arm import Arm
+    from core.motion import Motion
+
+
+class LinkInertia(JointEffect):
+    """A link weighs more than in the model: its mass and inertia are scaled by 1 + value.
+
+    Comes from cables, covers, another revision. Shows in the weight that the joints hold as well
+    as in accelerations, on its own joint and on those before. Links beyond joint 1 need poses
+    that change how they pull; link 1 turns about the vertical and shows in accelerations only.
+    Links that keep their direction to each other (the last ones, with a payload) look alike.
+    Source: CONTRACT; Swevers, Verdonck, De Schutter, IEEE Control Systems 27 (2007) 58.
+    """
+
+    identifier = "link_inertia"
+    channels = ("torque",)
+    motion = "many poses, and accelerations of all joints up to the link"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the relative increase; joint i stands for link i, which it turns."""
+        return (Parameter("", "", 0.05, -1.0, 20.0),)
+
+    def drive(
+        self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion
+    ) -> NDArray[np.float64]:
+        """Add the link's torques once more, scaled."""
+        assert term.site.joint is not None
+        assert motion.pieces is not None
+        return torque + term.values[0] * motion.pieces.link_torque[:, term.site.joint - 1]

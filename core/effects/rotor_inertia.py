@@ -1,0 +1,45 @@
+"""Inertia of motors and gears."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from core.effects.coulomb_friction import joint_scale
+from core.effects.effect import JointEffect, Parameter, Site, Term
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from core.arm import Arm
+    from core.motion import Motion
+
+
+class RotorInertia(JointEffect):
+    """The motor turns an inertia of its own, seen at the joint: + I qdd of that joint alone.
+
+    The rotor's inertia times the square of the gear ratio; often as large as the arm's own and
+    missing in URDFs. Needs accelerations; a link's inertia differs in that it also loads the
+    joints before it and changes with the pose.
+    Source: Siciliano et al., "Robotics" (2009), ch. 7; MuJoCo's ``armature``.
+    """
+
+    identifier = "rotor_inertia"
+    channels = ("torque",)
+    motion = "accelerations of the joint, at several poses of those beyond"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the inertia at the joint's side of the gear."""
+        scale = max(1e-3 * joint_scale(arm, site), 1e-3)
+        return (Parameter("", "kg m2", scale, 0.0, np.inf),)
+
+    def drive(
+        self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion
+    ) -> NDArray[np.float64]:
+        """Add what accelerates the rotor."""
+        assert term.site.joint is not None
+        i = term.site.joint - 1
+        result = torque.copy()
+        result[:, i] += term.values[0] * motion.qdd[:, i]
+        return result

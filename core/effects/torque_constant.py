@@ -1,0 +1,40 @@
+"""Torque that is measured on a wrong scale."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from core.effects.effect import JointEffect, Parameter, Site, Term
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from core.arm import Arm
+    from core.motion import Motion
+
+
+class TorqueConstant(JointEffect):
+    """The measured torque of a joint is scaled: measured = (1 + value) torque.
+
+    Torque is motor current times a constant that falls with temperature and differs from motor to
+    motor. Scales everything that the joint delivers, weight, inertia and friction alike.
+    Source: Gautier, Briot, "Global identification of joint drive gains", ASME JDSMC 136 (2014).
+    """
+
+    identifier = "torque_constant"
+    channels = ("torque",)
+    motion = "a joint that carries torque, the more changing the better"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the relative increase."""
+        return (Parameter("", "", 0.05, -0.95, 10.0),)
+
+    def drive(
+        self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion
+    ) -> NDArray[np.float64]:
+        """Scale the joint's torque."""
+        assert term.site.joint is not None
+        result = torque.copy()
+        result[:, term.site.joint - 1] *= 1.0 + term.values[0]
+        return result

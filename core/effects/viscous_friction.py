@@ -1,0 +1,43 @@
+"""Friction that grows with speed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from core.effects.coulomb_friction import joint_scale
+from core.effects.effect import JointEffect, Parameter, Site, Term
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from core.arm import Arm
+    from core.motion import Motion
+
+
+class ViscousFriction(JointEffect):
+    """The motor delivers a torque more that grows with speed: + c qd.
+
+    Comes from grease and damping; colder joints have more. Needs several speeds, else it is the
+    same as Coulomb friction.
+    Source: Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30 (1994) 1083.
+    """
+
+    identifier = "viscous_friction"
+    channels = ("torque",)
+    motion = "the joint moved at several speeds"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the coefficient."""
+        return (Parameter("", "Nm s/rad", 0.03 * joint_scale(arm, site), 0.0, np.inf),)
+
+    def drive(
+        self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion
+    ) -> NDArray[np.float64]:
+        """Add the friction that the motor overcomes."""
+        assert term.site.joint is not None
+        i = term.site.joint - 1
+        result = torque.copy()
+        result[:, i] += term.values[0] * motion.qd[:, i]
+        return result

@@ -1,0 +1,78 @@
+"""Signals between their samples: looked up in the past, or followed by a first-order lag."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from core.motion import Motion
+
+Array = NDArray[np.float64]
+FINE_STEP = 2e-3  # s: a lag's command is filled in to at least this rate
+
+
+def stretches(motion: Motion) -> list[slice]:
+    """Return the rows of each stretch without a gap in time."""
+    cuts = np.flatnonzero(np.diff(motion.stretch)) + 1
+    edges = [0, *(int(c) for c in cuts), len(motion)]
+    return [slice(a, b) for a, b in pairwise(edges)]
+
+
+def interpolate(time: Array, value: Array, at: Array) -> Array:
+    """Return a signal (N,) at other times (M,) by local cubics through its samples.
+
+    Slopes are those of the parabola through three neighbours (Catmull-Rom on uneven steps), so a
+    corner spoils no more than its two neighbours. Beyond the ends the end values hold.
+    """
+    if len(time) < 3:
+        return np.interp(at, time, value)
+    step = np.diff(time)
+    secant = np.diff(value) / step
+    slope = np.empty_like(value)
+    slope[1:-1] = (step[1:] * secant[:-1] + step[:-1] * secant[1:]) / (step[1:] + step[:-1])
+    slope[0], slope[-1] = secant[0], secant[-1]
+    inside = np.clip(at, time[0], time[-1])
+    k = np.clip(np.searchsorted(time, inside, side="right") - 1, 0, len(time) - 2)
+    h = step[k]
+    s = (inside - time[k]) / h
+    rest = 1 - s
+    ends = value[k] * (1 + 2 * s) * rest**2 + value[k + 1] * s**2 * (3 - 2 * s)
+    return np.asarray(ends + h * (slope[k] * s * rest**2 - slope[k + 1] * s**2 * rest))
+
+
+def lagged(time: Array, command: Array, constant: float, first: float) -> Array:
+    """Return the response (N,) of a first-order lag to a command (N,): T dy/dt = u - y.
+
+    ``constant`` is T in s, 0 or more; ``first`` the response at the first sample. Exact for a
+    command that runs as a ramp from sample to sample; where the log is coarse, cubics fill in.
+    """
+    if constant <= 0.0 or len(time) < 2:
+        return command.copy()
+    fine = max(int(np.ceil(float(np.median(np.diff(time))) / FINE_STEP - 1e-6)), 1)
+    if fine == 1:
+        return np.asarray(_follow(time, command, constant, first))
+    grid = time[:-1, None] + np.diff(time)[:, None] * (np.arange(fine) / fine)
+    dense = np.append(grid.ravel(), time[-1])
+    late = _follow(dense, interpolate(time, command, dense), constant, first)
+    return np.asarray(late[::fine])
+
+
+@njit(cache=True, nogil=True)  # type: ignore[misc,untyped-decorator,unused-ignore]
+def _follow(time: Array, command: Array, constant: float, first: float) -> Array:
+    late = np.empty_like(command)
+    late[0] = first
+    for k in range(1, len(command)):
+        ratio = (time[k] - time[k - 1]) / constant
+        gone = -np.expm1(-ratio)  # share of the difference that has decayed
+        ramp = gone / ratio
+        late[k] = (
+            (1.0 - gone) * late[k - 1]
+            + (ramp - 1.0 + gone) * command[k - 1]
+            + (1.0 - ramp) * command[k]
+        )
+    return late

@@ -1,0 +1,205 @@
+"""The motion that a log shows: angles, speeds and accelerations, and what acted meanwhile.
+
+A log is either a recording of motion (sampled trajectory) or a list of poses at rest; only the
+first has derivatives. Which one it is follows from its timestamps and steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from core.derivatives import differentiate
+from core.errors import LogError
+from core.loads import Loads
+from core.log import Log
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+SLOWEST_SAMPLING = 0.2  # s between rows beyond which they count as poses at rest
+FASTEST_JOINT = 15.0  # rad/s: rows that jump faster are poses, whatever their timestamps say
+GAP = 4.0  # sampling steps without a row that end a stretch
+MOST_REPEATS = 0.2  # share of repeated timestamps beyond which a log cannot be used
+SMALLEST_MOTION = 1e-4  # rad/s, what counts as standing still at least
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """What the rigid arm's parts contribute, row by row: the effects scale and add them.
+
+    Torques are those the motors must deliver; wrenches are what the load does to the flange sensor
+    (flange axes, about the flange origin).
+    """
+
+    link_torque: Array  # (N, n, n) Nm: [:, i, j] of link i+1's mass and inertia at joint j+1
+    payload_torque: Array  # (N, n) Nm per kg of payload at its declared centre of gravity
+    external_torque: Array  # (N, n) Nm against the pull of the surroundings on the tool
+    payload_wrench: Array  # (N, 6) N, Nm per kg of payload at its declared centre of gravity
+    external_wrench: Array  # (N, 6) N, Nm of the surroundings
+    payload_mass: Array  # (N,) kg, declared
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Motion of N rows of a log. Derivatives are zero where the log lists poses at rest."""
+
+    t: Array  # (N,) s; zeros where the log has no timestamps
+    q: Array  # (N, n) rad, encoders (or the command where the log has no encoders)
+    qd: Array  # (N, n) rad/s
+    qdd: Array  # (N, n) rad/s2
+    target_q: Array | None  # (N, n) rad
+    loads: Loads
+    rows: Index  # (N,) row in the log
+    valid: NDArray[np.bool_]  # (N,) False near the ends of a stretch
+    stretch: Index  # (N,) number of the stretch without a gap in time
+    start: float  # s, the log's first timestamp
+    moving: bool  # False: poses at rest
+    still: Array  # (n,) rad/s below which the direction of motion is unsure
+    pieces: Pieces | None = None
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def pick(self, rows: Index | NDArray[np.bool_]) -> Motion:
+        """Return the motion of some of the rows (derivatives stay those of the full rate)."""
+        return replace(
+            self, t=self.t[rows], q=self.q[rows], qd=self.qd[rows], qdd=self.qdd[rows],
+            target_q=None if self.target_q is None else self.target_q[rows],
+            loads=self.loads[rows], rows=self.rows[rows], valid=self.valid[rows],
+            stretch=self.stretch[rows], pieces=None,
+        )  # fmt: skip
+
+    @property
+    def direction(self) -> Array:
+        """Return the sign of motion (N, n), smooth within the speeds at which it is unsure."""
+        return np.asarray(np.tanh(4.0 * self.qd / self.still))
+
+    @property
+    def turning(self) -> NDArray[np.bool_]:
+        """Return where (N, n) a joint that moves in this log stands or turns round."""
+        moves = np.abs(self.qd).max(axis=0, initial=0.0) > 3 * self.still
+        return np.asarray(moves & (np.abs(self.qd) < self.still))
+
+
+def motion_of(log: Log) -> Motion:
+    """Return the motion that a log shows.
+
+    Needs ``actual_q`` or ``target_q``; speeds come from ``actual_qd`` where the log has them.
+    Repeated timestamps (the same cycle recorded twice) are dropped, see ``time_finding``. Raises
+    LogError naming the row where time runs backwards or mostly stands still.
+    """
+    q = log.require("actual_q", "target_q")
+    time = log.require("timestamp") if log.has("timestamp") else None
+    rows = np.arange(len(q))
+    moving = time is not None and is_moving(time, q, log.get("actual_qd"))
+    if time is not None:
+        _check_order(log, time)
+        if moving:
+            rows = _fresh_rows(log, time)
+    t = np.zeros(len(q)) if time is None else time
+    still = np.full(q.shape[1], SMALLEST_MOTION)
+    given = log.require("actual_qd")[rows] if log.has("actual_qd") else None
+    target = log.require("target_q")[rows] if log.has("target_q") else None
+    motion = Motion(
+        t=t[rows], q=q[rows], qd=np.zeros_like(q[rows]) if given is None else given,
+        qdd=np.zeros_like(q[rows]), target_q=target, loads=log.loads()[rows], rows=rows,
+        valid=np.ones(len(rows), dtype=bool), stretch=np.zeros(len(rows), dtype=np.int64),
+        start=float(t[0]), moving=moving, still=still,
+    )  # fmt: skip
+    return _with_derivatives(motion, given) if moving else motion
+
+
+def is_moving(time: Array, q: Array, speed: Array | None = None) -> bool:
+    """Return whether rows sample a motion (True) or list poses at rest (False)."""
+    steps = np.diff(time)
+    fresh = steps > 0
+    if len(time) < 20 or fresh.sum() < 10 or np.median(steps[fresh]) > SLOWEST_SAMPLING:
+        return False
+    jump = np.abs(np.diff(q, axis=0)).max(axis=1)[fresh] / steps[fresh]
+    if np.median(jump) > FASTEST_JOINT:
+        return False
+    # speeds of zero between poses that differ: each row was taken at rest
+    rests = speed is not None and float(np.abs(speed).max()) < SMALLEST_MOTION
+    return not (rests and float(np.median(jump)) > 0.01)
+
+
+def time_finding(log: Log) -> str | None:
+    """Return one sentence on repeated timestamps of a moving log, or None."""
+    time, q = log.get("timestamp"), log.get("actual_q")
+    if time is None or q is None or not is_moving(time, q, log.get("actual_qd")):
+        return None
+    repeats = np.flatnonzero(np.diff(time) == 0) + 1
+    if not len(repeats):
+        return None
+    return (
+        f"{len(repeats)} of {len(time)} rows repeat the timestamp before (the first is row "
+        f"{repeats[0] + log.first_row}); they were left out of the moving channels"
+    )
+
+
+def _check_order(log: Log, time: Array) -> None:
+    back = np.flatnonzero(np.diff(time) < 0)
+    if len(back):
+        row = int(back[0]) + 1
+        raise LogError(
+            f"{log.path}: row {row + log.first_row}, column timestamp: found {time[row]:g} after "
+            f"{time[row - 1]:g}, expected rows in time order"
+        )
+
+
+def _fresh_rows(log: Log, time: Array) -> Index:
+    fresh = np.concatenate([[True], np.diff(time) > 0])
+    if np.mean(~fresh) > MOST_REPEATS:
+        row = int(np.argmin(fresh))
+        raise LogError(
+            f"{log.path}: row {row + log.first_row}, column timestamp: found {time[row]:g} again "
+            f"(as in {int((~fresh).sum())} of {len(time)} rows), expected a time of its own per row"
+        )
+    return np.flatnonzero(fresh)
+
+
+def _with_derivatives(motion: Motion, given: Array | None) -> Motion:
+    steps = np.diff(motion.t)
+    step = float(np.median(steps))
+    stretch = np.concatenate([[0], np.cumsum(steps > GAP * step)])
+    qd, qdd = np.zeros_like(motion.q), np.zeros_like(motion.q)
+    valid, noise = np.zeros(len(motion), dtype=bool), np.zeros(motion.q.shape[1])
+    for number in range(int(stretch[-1]) + 1):
+        part = np.flatnonzero(stretch == number)
+        if len(part) < 15:
+            continue
+        result = _derivatives(
+            motion.t[part], step, motion.q[part], None if given is None else given[part]
+        )
+        qd[part], qdd[part], edge, noise_here = result
+        noise = np.maximum(noise, noise_here)
+        valid[part[edge : len(part) - edge]] = True
+    peak = np.abs(qd[valid]).max(axis=0) if valid.any() else np.zeros(motion.q.shape[1])
+    still = np.maximum(np.maximum(5 * noise, 0.02 * peak), SMALLEST_MOTION)
+    return replace(motion, qd=qd, qdd=qdd, valid=valid, stretch=stretch, still=still)
+
+
+def _derivatives(
+    t: Array, step: float, q: Array, given: Array | None
+) -> tuple[Array, Array, int, Array]:
+    """Return speeds, accelerations, rows to drop at either end, and noise of the speeds (n,)."""
+    grid = np.linspace(t[0], t[-1], max(round((t[-1] - t[0]) / step), 14) + 1)
+    even = len(grid) == len(t) and bool(np.abs(grid - t).max() < 1e-2 * step)
+    step = float(grid[1] - grid[0])
+    on_grid = q if even else CubicSpline(t, q)(grid)
+    speed, acceleration = differentiate(on_grid, step, 1), differentiate(on_grid, step, 2)
+    qd, qdd, noise = speed.value.copy(), acceleration.value.copy(), speed.noise.copy()
+    edge = max(speed.half_width, acceleration.half_width)
+    if given is not None:
+        known = given if even else CubicSpline(t, given)(grid)
+        slope = differentiate(known, step, 1)
+        # speeds that were measured count, unless their noise is worse than that of angles
+        better = slope.noise <= np.maximum(acceleration.noise, 1e-9)
+        qdd[:, better] = slope.value[:, better]
+        edge = max(edge, slope.half_width)
+    if not even:
+        qd, qdd = CubicSpline(grid, qd)(t), CubicSpline(grid, qdd)(t)
+    return qd, qdd, edge, noise
