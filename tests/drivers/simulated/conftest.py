@@ -1,0 +1,21 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from drivers.simulated.process import SimulatedController
+from simulated_cell import Bench, cell_settings
+
+
+@pytest.fixture
+def controller() -> Iterator[SimulatedController]:
+    with SimulatedController(cell_settings(), log_level="INFO") as running:
+        yield running
+
+
+@pytest.fixture
+def bench(controller: SimulatedController) -> Iterator[Bench]:
+    found = Bench(controller.host)
+    yield found
+    found.close()

@@ -1,0 +1,76 @@
+"""A simulated cell for tests: an address of its own, a bench, clients in processes of their own."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import socket
+import subprocess
+import sys
+import textwrap
+from dataclasses import replace
+from typing import Any
+
+from drivers.simulated.plant_arm import plant_arm
+from drivers.simulated.plant_settings import PlantSettings, draw_plant_settings
+from drivers.simulated.settings import BENCH_PORT, ServerSettings
+
+_numbers = itertools.count(2)
+
+
+def own_address() -> str:
+    """Return a loopback address that no other test process uses."""
+    pid = os.getpid()
+    return f"127.{1 + (pid >> 8) % 250}.{pid % 256}.{next(_numbers)}"
+
+
+def cell_settings(seed: int = 7, arm: str = "ur10e", **plant: Any) -> ServerSettings:
+    table = plant_arm(arm)
+    drawn: PlantSettings = replace(draw_plant_settings(table, seed), **plant)
+    return ServerSettings(arm=table, plant=drawn, host=own_address())
+
+
+class Bench:
+    """The bench's line protocol."""
+
+    def __init__(self, host: str) -> None:
+        self._socket = socket.create_connection((host, BENCH_PORT), timeout=5)
+        self._lines = self._socket.makefile("r")
+
+    def ask(self, line: str) -> str:
+        self._socket.sendall(line.encode() + b"\n")
+        return self._lines.readline().strip()
+
+    def do(self, line: str) -> None:
+        assert self.ask(line) == "ok"
+
+    def truth(self) -> dict[str, Any]:
+        found: dict[str, Any] = json.loads(self.ask("truth"))
+        return found
+
+    def measure(self) -> list[float]:
+        return [float(v) for v in self.ask("measure").split(",")]
+
+    def close(self) -> None:
+        self._lines.close()
+        self._socket.close()
+
+
+def run_client(host: str, body: str, timeout: float = 60.0) -> dict[str, Any]:
+    """Run ur_rtde code in a process of its own; returns what it puts into `out`.
+
+    The library can hang, abort or crash its process, so it never shares one with a test.
+    """
+    code = (
+        "import json, os, sys, time, math\n"
+        f"host = {host!r}\nout = {{}}\n"
+        + textwrap.dedent(body)
+        + "\nsys.stdout.write('\\n' + json.dumps(out) + '\\n')\nsys.stdout.flush()\nos._exit(0)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=timeout, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
+    return found
