@@ -42,4 +42,4 @@ class FtBias(Effect):
         self, term: Term, arm: Arm, wrench: NDArray[np.float64], motion: Motion
     ) -> NDArray[np.float64]:
         """Add the constant."""
-        return wrench + np.array(term.values)
+        return np.asarray(wrench + np.array(term.values))
