@@ -146,7 +146,7 @@ def derivatives(bench: Bench, parts: list[Ingredient]) -> list[Array]:
     for i, part in enumerate(parts):
         columns = np.empty((len(at), len(part.values)))
         for k, value in enumerate(part.values):
-            step = 1e-4 * max(abs(value), 1e-3 * max(abs(v) for v in part.values)) or 1e-9
+            step = 1e-4 * (abs(value) or max(abs(v) for v in part.values))
             values = np.array(part.values)
             values[k] += step
             arm = bench.nominal

@@ -1,20 +1,39 @@
 """Draws cases by kind and seed.
 
-Kinds: ``none``; an effect of the position channel (``backlash``); several (``backlash+payload``);
-``pair``, ``triple`` (at random); ``withheld:EFFECT``; ``hard:EFFECT``.
+Kinds of the position channel: ``none``; an effect (``backlash``); several (``backlash+payload``);
+``pair``, ``triple`` (at random); ``withheld:EFFECT``; ``outside:NAME``; ``hard:EFFECT`` and
+``hard:none``; ``bad:NAME``. Other channels: ``wrench:``, ``tracking:``, ``torque:`` with an effect,
+several, ``none``, or one outside the catalogue.
 """
 
 from __future__ import annotations
 
 import zlib
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.random import Generator
 
-from benchmarks.blind import draws
+from benchmarks.blind import draws, special_cases
 from benchmarks.blind.label import Label
-from benchmarks.blind.static_cases import causes_of, draw_static, write_static
+from benchmarks.blind.measuring import read_arm
+from benchmarks.blind.mechanics import Array
+from benchmarks.blind.outside import OUTSIDE
+from benchmarks.blind.special_cases import Strange
+from benchmarks.blind.static_cases import Drawn, causes_of, draw_static, write_static
+
+CHANNELS = ("wrench", "tracking", "torque")
+
+
+@dataclass(frozen=True)
+class Static:
+    """A drawn case of the position channel, before it is measured."""
+
+    drawn: Drawn
+    strange: Strange | None
+    gap: Array  # whitened and noise-free, the frame not taken out
+    wild: bool
 
 
 def generator_of(kind: str, seed: int) -> Generator:
@@ -28,7 +47,11 @@ def effects_of(kind: str, rng: Generator) -> tuple[str, ...]:
         return ()
     if kind in ("pair", "triple"):
         count = 2 if kind == "pair" else 3
-        return tuple(str(e) for e in rng.choice(draws.POSITION_EFFECTS, count, replace=False))
+        while True:
+            chosen = tuple(str(e) for e in rng.choice(draws.POSITION_EFFECTS, count, replace=False))
+            # the stiffening of a joint holds its linear part: together only at other joints
+            if not {"axial_compliance", "stiffness_nonlinearity"} <= set(chosen):
+                return chosen
     effects = tuple(kind.split("+"))
     for effect in effects:
         if effect not in draws.POSITION_EFFECTS:
@@ -36,21 +59,65 @@ def effects_of(kind: str, rng: Generator) -> tuple[str, ...]:
     return effects
 
 
+def draw_case(kind: str, rng: Generator) -> Static:
+    """Return the truth of a case of the position channel."""
+    group, _, rest = kind.rpartition(":")
+    if group == "outside":
+        strange = special_cases.draw_outside(rest, rng)
+        return Static(strange.drawn, strange, strange.gap, wild=False)
+    if group == "bad":
+        drawn = special_cases.draw_bad(rest, rng)
+    elif group == "hard":
+        drawn = special_cases.draw_hard(effects_of(rest, rng), rng)
+    elif group in ("", "withheld"):
+        drawn = draw_static(effects_of(rest, rng), rng)
+    else:
+        raise ValueError(f"kind: found {kind!r}, expected one of those that --list shows")
+    return Static(drawn, None, drawn.bench.whitened_gap(drawn.real), wild=group == "hard")
+
+
 def make_case(kind: str, seed: int, folder: Path) -> Label:
-    """Write the case's log.csv and cell.yaml into ``folder``; return its truth."""
+    """Write the case's log.csv and cell.yaml into ``folder``; return its truth.
+
+    Nothing of the label is written there. Raises ValueError where the kind is unknown.
+    """
+    if kind.partition(":")[0] in CHANNELS:
+        raise ValueError(f"kind: found {kind!r}: not there yet")
     rng = generator_of(kind, seed)
-    plain = kind.removeprefix("withheld:")
-    effects = effects_of(plain, rng)
-    drawn = draw_static(effects, rng)
-    facts = write_static(Path(folder), drawn, rng)
+    case = draw_case(kind, rng)
+    drawn, bench = case.drawn, case.drawn.bench
+    if case.wild:
+        measured = special_cases.wild_readings(drawn, rng)
+    else:
+        misread = case.strange.misread if case.strange else None
+        measured = read_arm(drawn.real, bench.session, bench.instrument, rng, misread)
+    facts = write_static(Path(folder), drawn, rng, measured)
+    causes = causes_of(drawn.parts)
+    outside = case.strange.outside if case.strange else None
     return Label(
         kind=kind,
         seed=seed,
-        arm=drawn.bench.kind.name,
+        arm=bench.kind.name,
         channel="position",
-        causes=causes_of(drawn.parts),
-        floor_rms=drawn.bench.floor,
-        gap_rms=drawn.gap_rms,
-        withhold=effects if kind.startswith("withheld:") else (),
+        causes=causes,
+        floor_rms=bench.floor,
+        gap_rms=drawn.shown_rms(case.gap),
+        depends_on=outside.depends_on if outside else (),
+        outside=outside.name if outside else None,
+        withhold=tuple(c.effect for c in causes) if kind.startswith("withheld:") else (),
         facts=facts,
     )
+
+
+def position_kinds() -> dict[str, tuple[str, ...]]:
+    """Return the kinds of the position channel by group."""
+    known = draws.POSITION_EFFECTS
+    return {
+        "clean": ("none",),
+        "known": known,
+        "several": ("pair", "triple"),
+        "withheld": tuple(f"withheld:{e}" for e in known),
+        "outside": tuple(f"outside:{n}" for n in OUTSIDE),
+        "hard": tuple(f"hard:{e}" for e in (*known, "none")),
+        "bad": tuple(f"bad:{n}" for n in special_cases.BAD),
+    }

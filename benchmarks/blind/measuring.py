@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import Generator
+from scipy.spatial.transform import Rotation
 
 from benchmarks.blind.mechanics import Array, RealArm, Session, Shape, loads_of, stand, turn
 
@@ -85,7 +87,11 @@ def floor_of(shape: Shape, instrument: Instrument) -> float:
 
 
 def read_arm(
-    arm: RealArm, session: Session, instrument: Instrument, rng: Generator
+    arm: RealArm,
+    session: Session,
+    instrument: Instrument,
+    rng: Generator,
+    misread: Callable[[Session, Array], Array] | None = None,
 ) -> tuple[Array, Array | None]:
     """Return measured positions (N, 3) and rotation vectors (N, 3) or None, in the tracker."""
     shaken = replace(
@@ -97,16 +103,16 @@ def read_arm(
     )
     shape = stand(shaken, session)
     position = shape.tcp @ instrument.rotation.T + instrument.position
+    if misread is not None:
+        position = misread(session, position)
     position = position + rng.normal(0, instrument.sigma, position.shape)
     if instrument.sigma_turn is None:
         return position, None
-    from scipy.spatial.transform import Rotation
-
     shake = turn(rng.normal(0, instrument.sigma_turn, position.shape))
     return position, Rotation.from_matrix(
         shake @ instrument.rotation @ shape.tcp_rotation
     ).as_rotvec()
 
 
-def _constant(values: Array):  # type: ignore[no-untyped-def]
+def _constant(values: Array) -> Callable[[Session], Array]:
     return lambda session: values

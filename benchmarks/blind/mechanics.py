@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-EQUILIBRIUM = 1e-13  # rad, change of the deflections at which the shape stands still
+EQUILIBRIUM = 1e-12  # rad, change of the deflections at which the shape stands still
 
 
 @dataclass(frozen=True)
@@ -136,6 +136,13 @@ def turn_z(angle: Array) -> Array:
     return out
 
 
+def cross(a: Array, b: Array) -> Array:
+    """Return the vector product along the last axis; leaner than numpy's for small arrays."""
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+
+
 def _apply(rotation: Array, vector: Array) -> Array:
     return (rotation @ vector[..., None])[..., 0]
 
@@ -193,12 +200,13 @@ def _place(arm: RealArm, session: Session, angle: Array, bend: _Bend) -> Shape:
     rotation, position = turn(tilt), np.zeros((poses, 3))
     origin, end, cog = (np.empty((n, poses, 3)) for _ in range(3))
     axes = np.empty((n, poses, 3, 3))
+    soft = arm.soft
     soft_links = arm.link_softness is not None and bool(np.any(arm.link_softness))
     warmth = arm.expansion * (session.temperature - arm.reference_temperature)
     for i, row in enumerate(arm.rows):
         origin[i] = position
         rotation = rotation @ turn_z(angle[:, i] + row.offset)
-        if arm.soft:
+        if soft:
             rotation = rotation @ turn(bend.joint[i])
         axes[i] = rotation
         twist = turn(np.array([[row.alpha, 0, 0]]))[0]
@@ -230,7 +238,7 @@ class Loads:
 
     def about(self, point: Array, first_link: int) -> Array:
         """Return the moment (N, 3) about a point of everything from ``first_link`` on."""
-        return self.moment[first_link] - np.cross(point, self.force[first_link])
+        return self.moment[first_link] - cross(point, self.force[first_link])
 
 
 def loads_of(arm: RealArm, session: Session, shape: Shape) -> Loads:
@@ -239,16 +247,16 @@ def loads_of(arm: RealArm, session: Session, shape: Shape) -> Loads:
     weights = np.array([row.mass for row in arm.rows])[:, None, None] * arm.gravity
     force = np.concatenate([np.broadcast_to(weights, (n, poses, 3)), np.zeros((1, poses, 3))])
     moment = np.zeros((n + 1, poses, 3))
-    moment[:n] = np.cross(shape.cog, force[:n])
+    moment[:n] = cross(shape.cog, force[:n])
     carried = (session.payload_mass + arm.more_payload)[:, None] * arm.gravity
     where = shape.flange_position + _apply(shape.flange_rotation, session.payload_cog)
     force[n] = carried + session.tcp_wrench[:, :3]
-    moment[n] = np.cross(where, carried) + np.cross(shape.tcp, session.tcp_wrench[:, :3])
+    moment[n] = cross(where, carried) + cross(shape.tcp, session.tcp_wrench[:, :3])
     moment[n] += session.tcp_wrench[:, 3:]
     for pull in arm.pulls:
         extra = pull(session, shape.flange_position, shape.flange_rotation)
         force[n] += extra[:, :3]
-        moment[n] += extra[:, 3:] + np.cross(shape.flange_position, extra[:, :3])
+        moment[n] += extra[:, 3:] + cross(shape.flange_position, extra[:, :3])
     beyond = np.cumsum(force[::-1], axis=0)[::-1], np.cumsum(moment[::-1], axis=0)[::-1]
     return Loads(*beyond)
 
@@ -285,6 +293,6 @@ def _cantilever(arm: RealArm, loads: Loads, shape: Shape, i: int) -> tuple[Array
     across = force - (force @ along)[:, None] * along
     bending = moment - (moment @ along)[:, None] * along  # a beam in bending does not twist
     soft = arm.link_softness[i]
-    shift = soft * (across * length**3 / 3 + np.cross(bending, along) * length**2 / 2)
-    slope = soft * (np.cross(along, across) * length**2 / 2 + bending * length)
+    shift = soft * (across * length**3 / 3 + cross(bending, along) * length**2 / 2)
+    slope = soft * (cross(along, across) * length**2 / 2 + bending * length)
     return shift, slope

@@ -13,8 +13,8 @@ from benchmarks.blind.bench import Bench, all_clear, combined, draw_bench, size
 from benchmarks.blind.draws import Redraw
 from benchmarks.blind.ingredients import Ingredient
 from benchmarks.blind.label import Cause
-from benchmarks.blind.measuring import read_arm, without
-from benchmarks.blind.mechanics import Array, RealArm
+from benchmarks.blind.measuring import without
+from benchmarks.blind.mechanics import Array, RealArm, stand
 from benchmarks.blind.session import Plan
 from benchmarks.blind.writing import write_cell, write_log
 
@@ -27,10 +27,9 @@ class Drawn:
     parts: tuple[Ingredient, ...]
     real: RealArm
 
-    @property
-    def gap_rms(self) -> float:
-        """Return the gap of all causes, frame taken out, m rms per coordinate."""
-        shown = without(self.bench.frame(), self.bench.whitened_gap(self.real))
+    def shown_rms(self, gap: Array) -> float:
+        """Return a whitened gap, frame taken out, in m rms per coordinate."""
+        shown = without(self.bench.frame(), gap)
         position = shown.reshape(len(self.bench.session.q), -1)[:, :3]
         return float(np.sqrt(np.mean(position**2))) * self.bench.floor
 
@@ -104,8 +103,6 @@ def _draw_parts(
 
 def _stiff_about(bench: Bench, joint: int) -> Bench:
     """Return the bench whose model holds this joint stiff about its axis: no linear part twice."""
-    from benchmarks.blind.mechanics import stand
-
     axial = bench.nominal.axial.copy()
     axial[joint - 1] = 0.0
     nominal = replace(bench.nominal, axial=axial)
@@ -124,12 +121,12 @@ def causes_of(parts: tuple[Ingredient, ...]) -> tuple[Cause, ...]:
 
 
 def write_static(
-    folder: Path, drawn: Drawn, rng: Generator, measured: tuple[Array, Array | None] | None = None
+    folder: Path, drawn: Drawn, rng: Generator, measured: tuple[Array, Array | None]
 ) -> dict[str, str | float | bool]:
     """Write log.csv and cell.yaml; return how they were laid out."""
     bench, session = drawn.bench, drawn.bench.session
     folder.mkdir(parents=True, exist_ok=True)
-    position, rotation = measured or read_arm(drawn.real, session, bench.instrument, rng)
+    position, rotation = measured
     columns: dict[str, Array] = {"timestamp": session.time}
     if rng.random() < 0.3:
         columns["target_q"] = session.q + rng.normal(0, 1e-5, session.q.shape)

@@ -1,0 +1,120 @@
+"""Cases beside the plain ones: effects in no catalogue, hard data, badly excited data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.random import Generator
+
+from benchmarks.blind.bench import Bench, draw_bench
+from benchmarks.blind.measuring import read_arm, without
+from benchmarks.blind.mechanics import Array, Session
+from benchmarks.blind.outside import NEED_COMPLIANCE, OUTSIDE, Outside
+from benchmarks.blind.session import Plan
+from benchmarks.blind.static_cases import Drawn, draw_plan, draw_static
+from benchmarks.blind.twins import columns_of, singles
+
+HARD_SIGMA = 5e-5
+BAD = ("no_reversals", "one_load", "few_joints", "tiny_range")
+UNLIKE = 100.0  # chi-square that any single effect of the catalogue must leave
+
+
+@dataclass(frozen=True)
+class Strange:
+    """A cell with an effect outside the catalogue."""
+
+    drawn: Drawn
+    outside: Outside
+    strength: float
+    gap: Array  # whitened, the frame not taken out
+
+    @property
+    def misread(self) -> Callable[[Session, Array], Array] | None:
+        """Return what the tracker reads instead of true positions, where it errs."""
+        read = self.outside.read
+        if read is None:
+            return None
+        return lambda session, position: read(session, position, self.strength)
+
+
+def draw_outside(name: str, rng: Generator) -> Strange:
+    """Return a cell with this effect, unlike any single effect of the catalogue."""
+    soft = True if name in NEED_COMPLIANCE else None
+    for _ in range(100):
+        bench = draw_bench(rng, draw_plan(rng), compliant=soft)
+        outside = OUTSIDE[name](bench, rng)
+        ratio = float(np.exp(rng.uniform(*np.log(outside.ratio))))
+        strength = outside.first
+        for _step in range(2):
+            gap = outside_gap(bench, outside, strength)
+            shown = without(bench.frame(), gap).reshape(len(bench.session.q), -1)[:, :3]
+            strength *= ratio / max(float(np.sqrt(np.mean(shown**2))), 1e-12)
+        if abs(strength) > 1e4 * outside.first:
+            continue
+        gap = outside_gap(bench, outside, strength)
+        if _unlike_known(bench, gap):
+            real = outside.arm(bench.nominal, strength)
+            return Strange(Drawn(bench, (), real), outside, strength, gap)
+    raise RuntimeError(f"no clear draw of {name} in 100")
+
+
+def outside_gap(bench: Bench, outside: Outside, strength: float) -> Array:
+    """Return the whitened gap of an effect outside the catalogue, misreadings included."""
+    arm = outside.arm(bench.nominal, strength)
+    gap = bench.whitened_gap(arm).reshape(len(bench.session.q), -1)
+    if outside.read is not None:
+        instrument = bench.instrument
+        seen = bench.model.tcp @ instrument.rotation.T + instrument.position
+        error = outside.read(bench.session, seen, strength) - seen
+        gap[:, :3] += (error @ instrument.rotation) * bench.weights[:3]
+    return gap.ravel()
+
+
+def _unlike_known(bench: Bench, gap: Array) -> bool:
+    """Return whether no single effect of the catalogue takes the gap up."""
+    frame = bench.frame()
+    for hypothesis in singles(bench):
+        columns = columns_of(bench, [hypothesis], bench.nominal)
+        left = without(np.column_stack([frame, columns]), gap)
+        if float(left @ left) < UNLIKE:
+            return False
+    return True
+
+
+def draw_hard(effects: tuple[str, ...], rng: Generator) -> Drawn:
+    """Return a cell seen in 30 poses with 50 um of noise."""
+    plan = replace(draw_plan(rng, poses=30), blocks=3)
+    return draw_static(effects, rng, plan, HARD_SIGMA, (5.5e-5, 7e-5))
+
+
+def wild_readings(drawn: Drawn, rng: Generator, share: float = 0.03) -> tuple[Array, Array | None]:
+    """Return readings of which a share (at least one) is off by millimetres."""
+    position, rotation = read_arm(drawn.real, drawn.bench.session, drawn.bench.instrument, rng)
+    count = max(1, round(share * len(position)))
+    rows = rng.choice(len(position), count, replace=False)
+    way = rng.normal(size=(count, 3))
+    way /= np.linalg.norm(way, axis=1)[:, None]
+    position[rows] += way * np.exp(rng.uniform(np.log(2e-3), np.log(3e-2), count))[:, None]
+    return position, rotation
+
+
+def draw_bad(name: str, rng: Generator) -> Drawn:
+    """Return badly excited data: something that the effect needs does not happen."""
+    good = draw_plan(rng)
+    if name == "no_reversals":
+        return draw_static(("backlash",), rng, replace(good, both_sides=False))
+    if name == "one_load":
+        effect = str(rng.choice(["axial_compliance", "radial_compliance", "link_flexibility"]))
+        return draw_static((effect,), rng, replace(good, blocks=1, pulled=0.0))
+    effect = str(rng.choice(["joint_offset", "axial_compliance", "backlash", "transmission_error"]))
+    if name == "few_joints":
+        # never the same arm twice in number of joints: all have joints 2 and 3
+        moving = (1, int(rng.integers(2, 6)))
+        joint = int(rng.choice(moving)) + 1
+        plan = replace(good, moving=moving, approach_written=True)
+        return draw_static((effect,), rng, plan, joints={effect: [joint]})
+    if name == "tiny_range":
+        return draw_static((effect,), rng, Plan(poses=70, blocks=1, pulled=0.0, span=0.08))
+    raise ValueError(f"kind: found bad:{name}, expected one of {', '.join(BAD)}")
