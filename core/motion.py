@@ -22,7 +22,8 @@ Index = NDArray[np.int64]
 SLOWEST_SAMPLING = 0.2  # s between rows beyond which they count as poses at rest
 FASTEST_JOINT = 15.0  # rad/s: rows that jump faster are poses, whatever their timestamps say
 GAP = 4.0  # sampling steps without a row that end a stretch
-MOST_REPEATS = 0.2  # share of repeated timestamps beyond which a log cannot be used
+COPIES = 0.9  # share of repeated rows alike in every column that makes them copies of one cycle
+FEW_REPEATS = 0.01  # share of repeated timestamps that may simply be left out
 SMALLEST_MOTION = 1e-4  # rad/s, what counts as standing still at least
 
 
@@ -88,23 +89,23 @@ def motion_of(log: Log) -> Motion:
     """Return the motion that a log shows.
 
     Needs ``actual_q`` or ``target_q``; speeds come from ``actual_qd`` where the log has them.
-    Repeated timestamps (the same cycle recorded twice) are dropped, see ``time_finding``. Raises
-    LogError naming the row where time runs backwards or mostly stands still.
+    A cycle that was recorded twice counts once; timestamps rounded so far that they repeat are
+    replaced by an even clock if they fit one (``time_finding`` tells). Raises LogError naming the
+    row where time runs backwards or repeats in any other way.
     """
     q = log.require("actual_q", "target_q")
     time = log.require("timestamp") if log.has("timestamp") else None
-    rows = np.arange(len(q))
+    rows, t = np.arange(len(q)), np.zeros(len(q)) if time is None else time
     moving = time is not None and is_moving(time, q, log.get("actual_qd"))
     if time is not None:
         _check_order(log, time)
         if moving:
-            rows = _fresh_rows(log, time)
-    t = np.zeros(len(q)) if time is None else time
+            rows, t, _ = _clock(log, time)
     still = np.full(q.shape[1], SMALLEST_MOTION)
     given = log.require("actual_qd")[rows] if log.has("actual_qd") else None
     target = log.require("target_q")[rows] if log.has("target_q") else None
     motion = Motion(
-        t=t[rows], q=q[rows], qd=np.zeros_like(q[rows]) if given is None else given,
+        t=t, q=q[rows], qd=np.zeros_like(q[rows]) if given is None else given,
         qdd=np.zeros_like(q[rows]), target_q=target, loads=log.loads()[rows], rows=rows,
         valid=np.ones(len(rows), dtype=bool), stretch=np.zeros(len(rows), dtype=np.int64),
         start=float(t[0]), moving=moving, still=still,
@@ -127,17 +128,14 @@ def is_moving(time: Array, q: Array, speed: Array | None = None) -> bool:
 
 
 def time_finding(log: Log) -> str | None:
-    """Return one sentence on repeated timestamps of a moving log, or None."""
+    """Return one sentence on repeated timestamps of a moving log, or None.
+
+    Raises LogError where they cannot be worked with, as ``motion_of``.
+    """
     time, q = log.get("timestamp"), log.get("actual_q")
     if time is None or q is None or not is_moving(time, q, log.get("actual_qd")):
         return None
-    repeats = np.flatnonzero(np.diff(time) == 0) + 1
-    if not len(repeats):
-        return None
-    return (
-        f"{len(repeats)} of {len(time)} rows repeat the timestamp before (the first is row "
-        f"{repeats[0] + log.first_row}); they were left out of the moving channels"
-    )
+    return _clock(log, time)[2]
 
 
 def _check_order(log: Log, time: Array) -> None:
@@ -150,15 +148,33 @@ def _check_order(log: Log, time: Array) -> None:
         )
 
 
-def _fresh_rows(log: Log, time: Array) -> Index:
-    fresh = np.concatenate([[True], np.diff(time) > 0])
-    if np.mean(~fresh) > MOST_REPEATS:
-        row = int(np.argmin(fresh))
-        raise LogError(
-            f"{log.path}: row {row + log.first_row}, column timestamp: found {time[row]:g} again "
-            f"(as in {int((~fresh).sum())} of {len(time)} rows), expected a time of its own per row"
+def _clock(log: Log, time: Array) -> tuple[Index, Array, str | None]:
+    """Return the rows of a recording that count, their times, and what was made of repeats."""
+    repeats = np.flatnonzero(np.diff(time) <= 0) + 1
+    everything = np.arange(len(time))
+    if not len(repeats):
+        return everything, time, None
+    first = f"the first is row {repeats[0] + log.first_row}"
+    same = np.ones(len(repeats), dtype=bool)
+    for column in log.columns.values():
+        flat = column.reshape(len(column), -1)
+        same &= (flat[repeats] == flat[repeats - 1]).all(axis=1)
+    if same.mean() >= COPIES or len(repeats) < FEW_REPEATS * len(time):
+        kept = np.delete(everything, repeats)
+        told = f"{len(repeats)} of {len(time)} rows repeat the timestamp before ({first})"
+        return kept, time[kept], f"{told}; the moving channels leave them out"
+    even = np.polyval(np.polyfit(everything, time, 1), everything)
+    grain = float(np.diff(time)[np.diff(time) > 0].min())
+    if np.abs(time - even).max() <= grain:
+        told = (
+            f"timestamps are rounded to {grain:.3g} s and repeat in {len(repeats)} rows ({first})"
         )
-    return np.flatnonzero(fresh)
+        return everything, even, f"{told}; the rows were taken as evenly spaced"
+    raise LogError(
+        f"{log.path}: row {repeats[0] + log.first_row}, column timestamp: found "
+        f"{time[repeats[0]]:g} again (as in {len(repeats)} of {len(time)} rows), expected a time "
+        "of its own per row"
+    )
 
 
 def _with_derivatives(motion: Motion, given: Array | None) -> Motion:

@@ -32,7 +32,8 @@ def conditions(motion: Motion) -> Index:
     """
     if motion.moving:
         span = max(float(motion.t[-1] - motion.t[0]), 1e-9)
-        return np.minimum((motion.t - motion.t[0]) / span * STRETCHES, STRETCHES - 1).astype(int)
+        number = (motion.t - motion.t[0]) / span * STRETCHES
+        return np.minimum(number.astype(np.int64), STRETCHES - 1)
     loads = motion.loads
     groups = pose_groups(motion.q)
     if groups.max() + 1 >= FEWEST_CONDITIONS:
