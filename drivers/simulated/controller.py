@@ -22,6 +22,7 @@ log = logging.getLogger("drivers.simulated")
 CYCLE = 0.002  # s
 PROGRAM_START = 0.04  # s between the arrival of a program and its first line
 DEFAULT_STOP = 12.0  # rad/s^2
+HOLD = Hold()
 
 Steps = Generator[None, None, None]
 
@@ -103,6 +104,9 @@ class Controller:
         except ScriptError as error:
             log.warning("program %s stops: %s", program.name, error)
             self.end_program()
+        except Exception:
+            log.exception("program %s stops", program.name)
+            self.end_program()
 
     def _step_motion(self, dt: float) -> None:
         """Move the joint target by one cycle of the running motion."""
@@ -114,6 +118,8 @@ class Controller:
             self.end_program()
             self.motion = Stop(self.target_qd, DEFAULT_STOP)
             return
+        if self.motion.done:
+            self.motion = HOLD
         if target != self.target_q and not within_limits(self.plant.arm, target):
             log.warning("joint target %s is outside the joint limits", target)
             self.protective_stop()

@@ -222,18 +222,22 @@ class MovePath:
         self, makers: Sequence[Callable[[Joints], Motion]], reached: Callable[[int], None]
     ) -> None:
         self.done = not makers
+        self.failed = False
         self._makers, self._reached = list(makers), reached
         self._index = -1
         self._motion: Motion | None = None
 
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
-        """Return the next joint target."""
+        """Return the next joint target; the path fails with any of its moves."""
+        if self.done:
+            return q
         if self._motion is None:
             self._index += 1
             self._reached(self._index)
             self._motion = self._makers[self._index](q)
         found = self._motion.step(q, qd, dt)
         if self._motion.done:
+            self.failed = getattr(self._motion, "failed", False)
             self._motion = None
-            self.done = self._index + 1 >= len(self._makers)
+            self.done = self.failed or self._index + 1 >= len(self._makers)
         return found

@@ -18,7 +18,7 @@ log = logging.getLogger("drivers.simulated")
 
 
 def script_program(controller: Controller, name: str, lines: tuple[str, ...]) -> Steps:
-    """Run the lines of a program."""
+    """Run the lines of a program; it ends in the cycle of its last line, as clients expect."""
     variables: dict[str, Any] = {"True": True, "False": False}
     for raw in lines:
         line = raw.split("#")[0].strip()
@@ -33,7 +33,6 @@ def script_program(controller: Controller, name: str, lines: tuple[str, ...]) ->
             variables[assigned[0]] = assigned[1]
         else:
             log.warning("program %s: line %r is not understood and passed over", name, line)
-    yield
 
 
 def _run(controller: Controller, name: str, call: Call) -> Steps:

@@ -3,9 +3,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
+from simulated_cell import Bench, cell_settings
 
 from drivers.simulated.process import SimulatedController
-from simulated_cell import Bench, cell_settings
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from rtde_client import RtdeClient
 from simulated_cell import Bench, cell_settings, run_client
 
 from drivers.simulated.process import SimulatedController
@@ -150,7 +151,8 @@ out["forward"] = c.getForwardKinematics(q, [0, 0, 0.1, 0, 0, 0])
 out["pose"] = pose
 out["joints_safe"] = [c.isJointsWithinSafetyLimits(q), c.isJointsWithinSafetyLimits([9.0] + q[1:])]
 out["pose_safe"] = c.isPoseWithinSafetyLimits(pose)
-out["has"] = [c.getInverseKinematicsHasSolution(pose), c.getInverseKinematicsHasSolution([9.0] * 3 + pose[3:])]
+has = c.getInverseKinematicsHasSolution
+out["has"] = [has(pose), has([9.0] * 3 + pose[3:])]
 out["steady"] = c.isSteady()
 c.getStepTime()
 time.sleep(0.02)
@@ -199,9 +201,9 @@ def test_paths_and_custom_scripts_run_and_the_control_script_comes_back(
 a = [q[0] + 0.1] + q[1:]
 b = [q[0] + 0.15] + q[1:]
 out["path"] = c.moveJ([a + [1.0, 2.0, 0.0], b + [1.0, 2.0, 0.0]]) and near(b)
-out["script"] = c.sendCustomScriptFunction(
-    "wiggle", "movej(%s, a=2.0, v=1.0)\\nset_payload(1.5, [0, 0, 0.1])\\nsleep(0.02)\\nnonsense here" % q
-)
+lines = ["movej(%s, a=2.0, v=1.0)" % q, "m = 1.5", "set_payload(m, [0, 0, 0.1])",
+    "sleep(0.02)", "nonsense here"]
+out["script"] = c.sendCustomScriptFunction("wiggle", "\\n".join(lines))
 out["there"] = near(q)
 out["payload"] = r.getPayload()
 out["after"] = c.moveJ(a, 1.0, 2.0) and near(a)
@@ -232,8 +234,9 @@ def test_the_upper_register_range_works_as_the_lower_one(controller: SimulatedCo
         """
         from rtde_control import RTDEControlInterface
         from rtde_receive import RTDEReceiveInterface
-        flags = RTDEControlInterface.FLAG_UPLOAD_SCRIPT | RTDEControlInterface.FLAG_UPPER_RANGE_REGISTERS
-        c = RTDEControlInterface(host, 500.0, flags)
+        kind = RTDEControlInterface
+        flags = kind.FLAG_UPLOAD_SCRIPT | kind.FLAG_UPPER_RANGE_REGISTERS
+        c = kind(host, 500.0, flags)
         r = RTDEReceiveInterface(host)
         q = r.getActualQ()
         begun = time.monotonic()
@@ -276,9 +279,7 @@ def test_registers_written_by_io_are_seen_on_the_robot(controller: SimulatedCont
         from rtde_io import RTDEIOInterface
         from rtde_receive import RTDEReceiveInterface
         io = RTDEIOInterface(host)
-        r = RTDEReceiveInterface(host, 500.0, ["timestamp", "input_int_register_19",
-            "input_double_register_22", "actual_digital_output_bits", "speed_scaling",
-            "standard_analog_output0"])
+        r = RTDEReceiveInterface(host)
         out["written"] = [io.setInputIntRegister(19, 123), io.setInputDoubleRegister(22, 0.125),
             io.setStandardDigitalOut(3, True), io.setConfigurableDigitalOut(1, True),
             io.setToolDigitalOut(0, True), io.setSpeedSlider(0.5),
@@ -289,6 +290,10 @@ def test_registers_written_by_io_are_seen_on_the_robot(controller: SimulatedCont
         out["analog"] = r.getStandardAnalogOutput0()
         """,
     )
+    raw = RtdeClient(controller.host)
+    raw.outputs("input_int_register_19,input_double_register_22")
+    raw.start()
+    assert raw.sample() == {"input_int_register_19": 123, "input_double_register_22": 0.125}
     assert all(out["written"])
     assert out["bits"] == 1 << 3 | 1 << 9 | 1 << 16
     assert out["speed"] == 0.5

@@ -1,0 +1,151 @@
+from __future__ import annotations
+
+import math
+import socket
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from rtde_client import RtdeClient
+from simulated_cell import Bench
+
+from drivers.simulated.offset_program import checksum
+from drivers.simulated.process import SimulatedController
+
+OUT = ",".join(
+    ["timestamp", "output_int_register_12", "output_int_register_13"]
+    + ["actual_TCP_pose", "actual_q", "target_q"]
+    + [f"output_double_register_{i}" for i in range(12, 18)]
+)
+IN = ",".join(
+    [f"input_double_register_{i}" for i in range(18, 23)]
+    + [f"input_int_register_{i}" for i in range(18, 22)]
+)
+OFFSET = (1.0e-3, -5.0e-4, 2.0e-3, 1.0e-3, 0.0, -2.0e-3)
+
+
+class Stream:
+    """A client that streams offsets as the driver does."""
+
+    def __init__(self, host: str) -> None:
+        self.client = RtdeClient(host)
+        self.client.outputs(OUT)
+        self.recipe, _ = self.client.inputs(IN)
+        self.client.start()
+        self.sequence = 0
+        self.beat = 0
+
+    def send(self, offset: tuple[float, ...], spoil: int = 0, beat: bool = True) -> None:
+        self.sequence += 1
+        self.beat += beat
+        rz = round(offset[5] * 1e9)
+        total = checksum((*offset[:5], rz * 1e-9), self.sequence)
+        self.client.write(
+            self.recipe, "5d4i", *offset[:5], rz, self.sequence, total + spoil, self.beat
+        )
+
+    def hold(self, offset: tuple[float, ...], cycles: int) -> dict[str, Any]:
+        for _ in range(cycles):
+            self.send(offset)
+            sample = self.client.sample()
+        return sample
+
+    def wait(self, cycles: int) -> dict[str, Any]:
+        for _ in range(cycles):
+            sample = self.client.sample()
+        return sample
+
+
+def applied(sample: dict[str, Any]) -> list[float]:
+    return [sample[f"output_double_register_{i}"] for i in range(12, 18)]
+
+
+def shift(before: dict[str, Any], after: dict[str, Any]) -> list[float]:
+    pair = zip(before["actual_TCP_pose"][:3], after["actual_TCP_pose"][:3], strict=True)
+    return [b - a for a, b in pair]
+
+
+@pytest.fixture
+def stream(controller: SimulatedController) -> Iterator[Stream]:
+    upload = socket.create_connection((controller.host, 30003), timeout=5)
+    upload.sendall(b"def gapbridge_offset():\n  while True:\n    sync()\n  end\nend\n")
+    found = Stream(controller.host)
+    found.wait(60)
+    yield found
+    found.client.close()
+    upload.close()
+
+
+def test_an_offset_is_applied_in_base_axes_and_echoed(stream: Stream) -> None:
+    before = stream.client.sample()
+    after = stream.hold(OFFSET, 200)
+    assert after["output_int_register_13"] == 1
+    assert after["output_int_register_12"] >= stream.sequence - 2
+    assert applied(after) == pytest.approx(OFFSET, abs=1e-12)
+    moved = shift(before, after)
+    assert moved == pytest.approx(OFFSET[:3], abs=1e-8)
+    assert after["target_q"] != before["target_q"]
+    assert after["actual_q"] == pytest.approx(after["target_q"], abs=1e-6)
+
+
+def test_offsets_are_ramped_never_jumped(stream: Stream) -> None:
+    lengths = []
+    for _ in range(40):
+        stream.send((5.0e-3, 0.0, 0.0, 0.0, 0.0, 0.0))
+        lengths.append(applied(stream.client.sample())[0])
+    steps = [b - a for a, b in pairwise(lengths)]
+    assert max(steps) <= 2.0e-4 + 1e-12
+    assert lengths[-1] > 2.0e-3
+
+
+def test_a_wrong_checksum_is_rejected_until_a_good_one_comes(stream: Stream) -> None:
+    good = stream.hold(OFFSET, 100)
+    accepted = good["output_int_register_12"]
+    stream.send((9.0e-3, 0.0, 0.0, 0.0, 0.0, 0.0), spoil=1)
+    bad = stream.wait(10)
+    assert bad["output_int_register_13"] == 3
+    assert bad["output_int_register_12"] in (accepted, accepted + 1, accepted + 2)
+    assert applied(bad) == pytest.approx(OFFSET, abs=1e-12)
+    again = stream.hold(OFFSET, 10)
+    assert again["output_int_register_13"] == 1
+
+
+def test_an_offset_that_is_no_number_is_rejected(stream: Stream) -> None:
+    stream.sequence += 1
+    stream.client.write(stream.recipe, "5d4i", math.nan, 0, 0, 0, 0, 0, stream.sequence, 0, 5)
+    assert stream.wait(10)["output_int_register_13"] == 3
+
+
+def test_without_a_heartbeat_the_offset_goes_to_zero(stream: Stream) -> None:
+    stream.hold(OFFSET, 100)
+    begun = time.monotonic()
+    while stream.client.sample()["output_int_register_13"] != 2:
+        assert time.monotonic() - begun < 1.0
+    assert applied(stream.wait(60)) == [0.0] * 6
+    assert stream.hold(OFFSET, 100)["output_int_register_13"] == 1
+
+
+def test_the_robots_own_motion_goes_on_under_the_offset(
+    stream: Stream, controller: SimulatedController, bench: Bench
+) -> None:
+    start = controller.settings.start_q
+    stream.hold(OFFSET, 100)
+    bench.do("move 0.2 " + " ".join(map(str, start[1:])))
+    moved = stream.hold(OFFSET, 800)
+    assert abs(moved["actual_q"][0] - 0.2) < 0.01
+    plain = stream.hold((0.0,) * 6, 200)
+    assert plain["actual_q"] == pytest.approx((0.2, *start[1:]), abs=1e-7)
+    assert shift(plain, moved) == pytest.approx(OFFSET[:3], abs=1e-7)
+
+
+def test_stopping_the_program_leaves_no_state_behind(
+    stream: Stream, controller: SimulatedController
+) -> None:
+    stream.hold(OFFSET, 50)
+    dashboard = socket.create_connection((controller.host, 29999), timeout=5)
+    dashboard.sendall(b"stop\n")
+    stopped = stream.wait(50)
+    assert stopped["output_int_register_13"] == 0
+    dashboard.close()
