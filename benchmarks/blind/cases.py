@@ -16,6 +16,13 @@ import numpy as np
 from numpy.random import Generator
 
 from benchmarks.blind import draws, special_cases
+from benchmarks.blind.channel_cases import (
+    EFFECTS,
+    ChannelCase,
+    channel_kinds,
+    draw_channel_case,
+    write_channel_case,
+)
 from benchmarks.blind.label import Label
 from benchmarks.blind.measuring import read_arm
 from benchmarks.blind.mechanics import Array
@@ -23,7 +30,7 @@ from benchmarks.blind.outside import OUTSIDE
 from benchmarks.blind.special_cases import Strange
 from benchmarks.blind.static_cases import Drawn, causes_of, draw_static, write_static
 
-CHANNELS = ("wrench", "tracking", "torque")
+CHANNELS = tuple(EFFECTS)
 
 
 @dataclass(frozen=True)
@@ -59,9 +66,11 @@ def effects_of(kind: str, rng: Generator) -> tuple[str, ...]:
     return effects
 
 
-def draw_case(kind: str, rng: Generator) -> Static:
-    """Return the truth of a case of the position channel."""
-    group, _, rest = kind.rpartition(":")
+def draw_case(kind: str, rng: Generator) -> Static | ChannelCase:
+    """Return the truth of a case, before it is measured."""
+    group, _, rest = kind.removeprefix("withheld:").rpartition(":")
+    if group in CHANNELS:
+        return draw_channel_case(group, rest, rng)
     if group == "outside":
         strange = special_cases.draw_outside(rest, rng)
         return Static(strange.drawn, strange, strange.gap, wild=False)
@@ -69,7 +78,7 @@ def draw_case(kind: str, rng: Generator) -> Static:
         drawn = special_cases.draw_bad(rest, rng)
     elif group == "hard":
         drawn = special_cases.draw_hard(effects_of(rest, rng), rng)
-    elif group in ("", "withheld"):
+    elif group == "":
         drawn = draw_static(effects_of(rest, rng), rng)
     else:
         raise ValueError(f"kind: found {kind!r}, expected one of those that --list shows")
@@ -81,10 +90,11 @@ def make_case(kind: str, seed: int, folder: Path) -> Label:
 
     Nothing of the label is written there. Raises ValueError where the kind is unknown.
     """
-    if kind.partition(":")[0] in CHANNELS:
-        raise ValueError(f"kind: found {kind!r}: not there yet")
     rng = generator_of(kind, seed)
     case = draw_case(kind, rng)
+    if isinstance(case, ChannelCase):
+        write_channel_case(Path(folder), case, rng)
+        return _channel_label(kind, seed, case)
     drawn, bench = case.drawn, case.drawn.bench
     if case.wild:
         measured = special_cases.wild_readings(drawn, rng)
@@ -107,6 +117,41 @@ def make_case(kind: str, seed: int, folder: Path) -> Label:
         withhold=tuple(c.effect for c in causes) if kind.startswith("withheld:") else (),
         facts=facts,
     )
+
+
+def _channel_label(kind: str, seed: int, case: ChannelCase) -> Label:
+    causes = case.truth.causes(case.values)
+    facts: dict[str, str | float | bool] = {"rows": len(case.gap) / len(case.truth.sigma)}
+    return Label(
+        kind=kind,
+        seed=seed,
+        arm=case.bench.kind.name,
+        channel=case.channel,
+        causes=causes,
+        floor_rms=case.floor_rms,
+        gap_rms=float(np.sqrt(np.mean(case.gap**2))) * case.floor_rms,
+        depends_on=case.depends_on,
+        outside=case.outside,
+        withhold=tuple(c.effect for c in causes) if kind.startswith("withheld:") else (),
+        facts=facts,
+    )
+
+
+def kinds() -> dict[str, tuple[str, ...]]:
+    """Return all kinds by group."""
+    position, others = position_kinds(), channel_kinds()
+    return {group: own + others.get(group, ()) for group, own in position.items()}
+
+
+def group_of(kind: str) -> str:
+    """Return the group that a kind is scored in; also of kinds made up on the command line."""
+    for group, own in kinds().items():
+        if kind in own:
+            return group
+    head = kind.partition(":")[0]
+    if head in ("withheld", "outside", "hard", "bad"):
+        return head
+    return "several" if "+" in kind else "known"
 
 
 def position_kinds() -> dict[str, tuple[str, ...]]:

@@ -1,0 +1,164 @@
+"""Cases of the tracking and torque channels: 30 s of motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.random import Generator
+
+from benchmarks.blind.arms import ARMS, ArmKind
+from benchmarks.blind.bench import Bench, draw_bench
+from benchmarks.blind.mechanics import Array
+from benchmarks.blind.moving import Motion, draw_motion, torque_shares
+from benchmarks.blind.parametric import Candidate, Parametric, Place, Values
+from benchmarks.blind.session import Plan
+
+TRACKING = ("latency", "tracking_lag")
+TRACKING_OUTSIDE = ("droop", "track_step", "speed_loss")
+TORQUE = (
+    "coulomb_friction", "viscous_friction", "rotor_inertia", "link_inertia", "torque_constant",
+    "payload",
+)  # fmt: skip
+TORQUE_OUTSIDE = ("cogging", "stribeck", "warm_friction")
+
+
+@dataclass(frozen=True)
+class MovingCell:
+    """A cell with a motion in it and what its encoders are worth."""
+
+    bench: Bench  # its session is not used, but for a declared payload
+    motion: Motion
+    time: Array  # (N,)
+    truth: Parametric
+    encoder: float  # rad, step of the encoder
+    shake: float  # rad, noise before the step
+
+    @property
+    def kind(self) -> ArmKind:
+        """Return the arm."""
+        return self.bench.kind
+
+    def encoded(self, q: Array, rng: Generator) -> Array:
+        """Return angles as the encoder gives them."""
+        noisy = q + rng.normal(0, self.shake, q.shape)
+        return np.asarray(np.round(noisy / self.encoder) * self.encoder)
+
+
+def _clock(rng: Generator, seconds: float) -> Array:
+    rate = float(rng.choice([125.0, 250.0, 500.0], p=[0.2, 0.3, 0.5]))
+    return np.asarray(np.arange(int(seconds * rate)) / rate)
+
+
+def draw_tracking_cell(rng: Generator, seconds: float = 30.0) -> MovingCell:
+    """Return a cell whose joints follow their commands late."""
+    bench = draw_bench(rng, Plan(poses=12, blocks=1), with_rotation=False, compliant=False)
+    kind = bench.kind
+    motion, time = draw_motion(kind, rng, swift=1.5), _clock(rng, seconds)
+    encoder = 2 * np.pi / 2 ** int(rng.integers(17, 21))
+    shake = float(rng.uniform(5e-6, 3e-5))
+    candidates: dict[Place, Candidate] = {
+        ("latency", None): Candidate(("latency",), np.array([8e-3]), 8),
+        **{
+            ("tracking_lag", j): Candidate((f"tracking_lag_{j}",), np.array([1e-2]), 8)
+            for j in range(1, kind.n + 1)
+        },
+    }
+
+    def read(values: Values) -> Array:
+        delay = float(values.get(("latency", None), np.zeros(1))[0])
+        lag = np.array(
+            [values.get(("tracking_lag", j), np.zeros(1))[0] for j in range(1, kind.n + 1)]
+        )
+        return motion.lagged(time, delay, lag)
+
+    sigma = np.full(kind.n, np.hypot(shake, encoder / np.sqrt(12)))
+    return MovingCell(bench, motion, time, Parametric(read, sigma, candidates), encoder, shake)
+
+
+def draw_torque_cell(rng: Generator, seconds: float = 30.0) -> MovingCell:
+    """Return a cell whose joint torques are measured along an exciting motion."""
+    arm = str(rng.choice(list(ARMS)))
+    bench = draw_bench(rng, Plan(poses=12, blocks=1), arm=arm, with_rotation=False, compliant=False)
+    kind, session = bench.kind, bench.session
+    motion, time = draw_motion(kind, rng), _clock(rng, seconds)
+    q, qd, qdd = (motion.at(time, k) for k in range(3))
+    mass = float(session.payload_mass[0])
+    links, carried = torque_shares(
+        kind.rows, bench.nominal.gravity, (mass, session.payload_cog[0]), q, qd, qdd
+    )
+    rigid = links.sum(axis=0) + mass * carried
+    usual = np.sqrt(np.mean(rigid**2, axis=0)) + 0.02 * np.sqrt(np.mean(rigid**2))
+    sigma = usual * rng.uniform(0.01, 0.03)
+    speed, swing = np.sqrt(np.mean(qd**2, axis=0)), np.sqrt(np.mean(qdd**2, axis=0))
+    candidates: dict[Place, Candidate] = {
+        ("payload", None): Candidate(("payload",), np.array([0.05 * kind.rated]), 8)
+    }
+    for j in range(1, kind.n + 1):
+        u = usual[j - 1]
+        for effect, scale in (
+            ("coulomb_friction", 0.1 * u),
+            ("viscous_friction", 0.1 * u / speed[j - 1]),
+            ("rotor_inertia", 0.1 * u / swing[j - 1]),
+            ("link_inertia", 0.05),
+            ("torque_constant", 0.05),
+        ):
+            candidates[(effect, j)] = Candidate((f"{effect}_{j}",), np.array([scale]), 8)
+
+    def read(values: Values) -> Array:
+        def of(effect: str, j: int) -> float:
+            return float(values[(effect, j)][0]) if (effect, j) in values else 0.0
+
+        joints = range(1, kind.n + 1)
+        more = float(values.get(("payload", None), np.zeros(1))[0])
+        out = rigid + more * carried
+        for j in joints:
+            out = out + of("link_inertia", j) * links[j - 1]
+        coulomb = np.array([of("coulomb_friction", j) for j in joints])
+        viscous = np.array([of("viscous_friction", j) for j in joints])
+        rotor = np.array([of("rotor_inertia", j) for j in joints])
+        scale = 1 + np.array([of("torque_constant", j) for j in joints])
+        return (out + coulomb * np.sign(qd) + viscous * qd + rotor * qdd) * scale
+
+    encoder = 2 * np.pi / 2 ** int(rng.integers(19, 22))
+    truth = Parametric(read, sigma, candidates)
+    return MovingCell(bench, motion, time, truth, encoder, float(rng.uniform(1e-6, 5e-6)))
+
+
+def tracking_error(cell: MovingCell, name: str, rng: Generator) -> tuple[Array, tuple[str, ...]]:
+    """Return a following error (N, n) outside the catalogue, and the columns it depends on."""
+    j = int(rng.integers(1, cell.kind.n))
+    q, qd = cell.motion.at(cell.time), cell.motion.at(cell.time, 1)
+    if name == "droop":
+        shape, columns = np.cos(q[:, j] - 0.4) - 0.5 * q[:, j], (f"actual_q_{j}", f"target_q_{j}")
+    elif name == "track_step":
+        when = cell.time[-1] * rng.uniform(0.3, 0.7)
+        shape, columns = (cell.time > when).astype(float), ("timestamp",)
+    else:
+        shape, columns = -(np.maximum(qd[:, j] - 0.3 * qd[:, j].max(), 0) ** 2), (f"actual_qd_{j}",)
+    return _on_joint(cell, j, shape, rng), columns
+
+
+def torque_error(cell: MovingCell, name: str, rng: Generator) -> tuple[Array, tuple[str, ...]]:
+    """Return a torque (N, n) outside the catalogue, and the columns it depends on."""
+    j = int(rng.integers(0, cell.kind.n))
+    q, qd = cell.motion.at(cell.time), cell.motion.at(cell.time, 1)
+    if name == "cogging":
+        shape = np.sin(int(rng.integers(6, 40)) * q[:, j] + rng.uniform(-3, 3))
+        columns: tuple[str, ...] = (f"actual_q_{j}",)
+    elif name == "stribeck":
+        shape = np.sign(qd[:, j]) * np.exp(-((qd[:, j] / 0.1) ** 2))
+        columns = (f"actual_qd_{j}",)
+    else:
+        # the amount decays in time, so both the speed and the time are true answers
+        shape = qd[:, j] * (np.exp(-cell.time / 10.0) - 0.35)
+        columns = ("timestamp", f"actual_qd_{j}")
+    return _on_joint(cell, j, shape, rng), columns
+
+
+def _on_joint(cell: MovingCell, j: int, shape: Array, rng: Generator) -> Array:
+    """Return a shape put on one joint, 3 to 10 floors of that joint, its mean taken out."""
+    out = np.zeros((len(cell.time), cell.kind.n))
+    spread = float(np.std(shape))
+    out[:, j] = shape / spread * cell.truth.sigma[j] * rng.uniform(3, 10)
+    return out
