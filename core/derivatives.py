@@ -1,8 +1,10 @@
 """Derivatives of sampled signals: Savitzky-Golay filters whose window follows the noise.
 
 A short window lets noise through, a long one flattens the motion. The window grows as long as the
-derivative changes by no more than its own noise explains (Lepski's rule), joint by joint. Source
-of the filter: Savitzky, Golay, Analytical Chemistry 36 (1964) 1627.
+derivative changes by no more than its own noise explains (Lepski's rule), joint by joint. Where
+the motion jumps (the corners of a trapezoidal speed), no window is right: there short and long
+windows disagree, and the rows are marked. Source of the filter: Savitzky, Golay, Analytical
+Chemistry 36 (1964) 1627.
 """
 
 from __future__ import annotations
@@ -17,6 +19,10 @@ Array = NDArray[np.float64]
 HALF_WIDTHS = (3, 4, 6, 9, 13, 19, 28, 42, 63)  # samples either side
 LONGEST = 0.3  # s, no window reaches further either side
 BIAS_SHARE = 0.5  # of the noise: how much flattening a longer window may bring
+SMOOTH_SHARE = 0.7  # of the rows decide on the window; the rest may hold jumps
+TRIMMED = 0.3096  # mean square of the smallest 70 % of normal deviates, sigma 1
+CLEAR = 4.5  # sigma of the noise beyond which windows disagree
+COARSE = 0.01  # of the derivative's rms: a smaller disagreement matters to nobody
 
 
 @dataclass(frozen=True)
@@ -26,6 +32,7 @@ class Derivative:
     value: Array  # (N, n) unit of the signal per s^order
     noise: Array  # (n,) 1 sigma that the signal's noise makes in it
     half_width: int  # samples at either end that the longest window did not cover
+    unsure: NDArray[np.bool_]  # (N, n) the signal jumps here
 
 
 def signal_noise(signal: Array) -> Array:
@@ -42,31 +49,35 @@ def signal_noise(signal: Array) -> Array:
     return np.asarray(np.sqrt(np.nanmean(kept**2, axis=0)) / 0.871)
 
 
-def differentiate(signal: Array, step: float, order: int) -> Derivative:
+def differentiate(signal: Array, step: float, order: int, longest: float = LONGEST) -> Derivative:
     """Return the ``order``-th derivative (1 or 2) of ``signal`` (N, n), sampled every ``step`` s.
 
-    N must be at least 7.
+    No window reaches further than ``longest`` (s) either side. N must be at least 7.
     """
     count, n = signal.shape
-    widest = max(min(LONGEST / step, (count - 1) // 4), 3)
+    widest = max(min(longest / step, (count - 1) // 4), 3)
     halves = [h for h in HALF_WIDTHS if h <= widest]
     sigma = signal_noise(signal)
     filters = [_coefficients(h, order, step) for h in halves]
     value, noise, chosen = np.empty((count, n)), np.zeros(n), np.zeros(n, dtype=int)
-    candidates = [_filtered(signal, halves[0], order, step)]
+    unsure = np.zeros((count, n), dtype=bool)
+    tried = [_filtered(signal, halves[0], order, step)]
     for j in range(n):
         k = 0
         while k + 1 < len(halves):
-            if len(candidates) < k + 2:
-                candidates.append(_filtered(signal, halves[k + 1], order, step))
-            if not _may_grow(
-                candidates[k][:, j], candidates[k + 1][:, j], sigma[j], filters[k], filters[k + 1]
-            ):
+            if len(tried) < k + 2:
+                tried.append(_filtered(signal, halves[k + 1], order, step))
+            change = tried[k + 1][:, j] - tried[k][:, j]
+            if not _may_grow(change, sigma[j], filters[k], filters[k + 1]):
                 break
             k += 1
-        value[:, j], chosen[j] = candidates[k][:, j], halves[k]
+        value[:, j], chosen[j] = tried[k][:, j], halves[k]
         noise[j] = sigma[j] * np.linalg.norm(filters[k])
-    return Derivative(value, noise, int(chosen.max(initial=3)))
+        other = k - 1 if k else min(1, len(tried) - 1)
+        change = np.abs(tried[other][:, j] - tried[k][:, j])
+        typical = float(np.sqrt(np.mean(value[:, j] ** 2)))
+        unsure[:, j] = _jumps(change, typical, sigma[j], filters[other], filters[k])
+    return Derivative(value, noise, int(chosen.max(initial=3)), unsure)
 
 
 def _polynomial(order: int) -> int:
@@ -85,11 +96,29 @@ def _filtered(signal: Array, half: int, order: int, step: float) -> Array:
     )
 
 
-def _may_grow(now: Array, wider: Array, sigma: float, h: Array, h_wider: Array) -> bool:
+def _may_grow(change: Array, sigma: float, h: Array, wider: Array) -> bool:
     """Return whether a wider window changes the derivative by no more than noise explains."""
-    change = h_wider.copy()
-    margin = (len(h_wider) - len(h)) // 2
+    squares = np.sort(change**2)[: int(SMOOTH_SHARE * len(change))]
+    explained = sigma**2 * _difference(h, wider)
+    allowed = BIAS_SHARE**2 * sigma**2 * (wider @ wider)
+    return bool(squares.mean() / TRIMMED <= 1.1 * explained + allowed)
+
+
+def _jumps(
+    change: Array, typical: float, sigma: float, h: Array, other: Array
+) -> NDArray[np.bool_]:
+    """Return where (N,) two windows disagree, and the rows beside that the wider one mixes in."""
+    limit = max(CLEAR * sigma * np.sqrt(_difference(h, other)), COARSE * typical)
+    clear = (change > limit).astype(float)
+    half = max(len(h), len(other)) // 2
+    return np.asarray(np.convolve(clear, np.ones(2 * half + 1), mode="same") > 0.5)
+
+
+def _difference(h: Array, wider: Array) -> float:
+    """Return the squared norm of the difference of two filters, the shorter one in the middle."""
+    if len(h) > len(wider):
+        h, wider = wider, h
+    change = wider.copy()
+    margin = (len(wider) - len(h)) // 2
     change[margin : margin + len(h)] -= h
-    explained = sigma**2 * (change @ change)
-    allowed = BIAS_SHARE**2 * sigma**2 * (h_wider @ h_wider)
-    return bool(np.mean((wider - now) ** 2) <= 1.1 * explained + allowed)
+    return float(change @ change)

@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 SLOWEST_SAMPLING = 0.2  # s between rows beyond which they count as poses at rest
 FASTEST_JOINT = 15.0  # rad/s: rows that jump faster are poses, whatever their timestamps say
+FEWEST_SMOOTH = 0.5  # share of rows without jumps that windows must leave, or be shorter
+WINDOWS = (0.3, 0.1, 0.05, 0.025)  # s either side at most, tried in turn
 GAP = 4.0  # sampling steps without a row that end a stretch
 COPIES = 0.9  # share of repeated rows alike in every column that makes them copies of one cycle
 FEW_REPEATS = 0.01  # share of repeated timestamps that may simply be left out
@@ -190,9 +192,8 @@ def _with_derivatives(motion: Motion, given: Array | None) -> Motion:
         result = _derivatives(
             motion.t[part], step, motion.q[part], None if given is None else given[part]
         )
-        qd[part], qdd[part], edge, noise_here = result
+        qd[part], qdd[part], valid[part], noise_here = result
         noise = np.maximum(noise, noise_here)
-        valid[part[edge : len(part) - edge]] = True
     peak = np.abs(qd[valid]).max(axis=0) if valid.any() else np.zeros(motion.q.shape[1])
     still = np.maximum(np.maximum(5 * noise, 0.02 * peak), SMALLEST_MOTION)
     return replace(motion, qd=qd, qdd=qdd, valid=valid, stretch=stretch, still=still)
@@ -200,22 +201,42 @@ def _with_derivatives(motion: Motion, given: Array | None) -> Motion:
 
 def _derivatives(
     t: Array, step: float, q: Array, given: Array | None
-) -> tuple[Array, Array, int, Array]:
-    """Return speeds, accelerations, rows to drop at either end, and noise of the speeds (n,)."""
+) -> tuple[Array, Array, NDArray[np.bool_], Array]:
+    """Return speeds, accelerations, the rows where they are good, and noise of the speeds (n,)."""
     grid = np.linspace(t[0], t[-1], max(round((t[-1] - t[0]) / step), 14) + 1)
     even = len(grid) == len(t) and bool(np.abs(grid - t).max() < 1e-2 * step)
     step = float(grid[1] - grid[0])
     on_grid = q if even else CubicSpline(t, q)(grid)
-    speed, acceleration = differentiate(on_grid, step, 1), differentiate(on_grid, step, 2)
-    qd, qdd, noise = speed.value.copy(), acceleration.value.copy(), speed.noise.copy()
-    edge = max(speed.half_width, acceleration.half_width)
-    if given is not None:
-        known = given if even else CubicSpline(t, given)(grid)
-        slope = differentiate(known, step, 1)
-        # speeds that were measured count, unless their noise is worse than that of angles
-        better = slope.noise <= np.maximum(acceleration.noise, 1e-9)
-        qdd[:, better] = slope.value[:, better]
-        edge = max(edge, slope.half_width)
+    known = given if even or given is None else CubicSpline(t, given)(grid)
+    speed = differentiate(on_grid, step, 1)
+    for longest in WINDOWS:
+        qdd, unsure, edge = _accelerations(on_grid, known, step, longest)
+        good = ~unsure.any(axis=1)
+        if good.mean() >= FEWEST_SMOOTH:
+            break
+    else:
+        good[:] = True  # no smooth motion at all: better rough accelerations than none
+    edge = max(edge, speed.half_width)
+    good[:edge] = good[len(good) - edge :] = False
+    qd = speed.value
     if not even:
         qd, qdd = CubicSpline(grid, qd)(t), CubicSpline(grid, qdd)(t)
-    return qd, qdd, edge, noise
+        good = np.interp(t, grid, good) > 0.999
+    return qd, qdd, good, speed.noise
+
+
+def _accelerations(
+    q: Array, qd: Array | None, step: float, longest: float
+) -> tuple[Array, NDArray[np.bool_], int]:
+    """Return accelerations (N, n), where (N, n) they jump, and the rows to drop at either end."""
+    bend = differentiate(q, step, 2, longest)
+    if qd is None:
+        return bend.value, bend.unsure, bend.half_width
+    slope = differentiate(qd, step, 1, longest)
+    # speeds that were measured count, unless their noise is worse than that of angles
+    better = slope.noise <= np.maximum(bend.noise, 1e-9)
+    return (
+        np.where(better, slope.value, bend.value),
+        np.where(better, slope.unsure, bend.unsure),
+        max(slope.half_width, bend.half_width),
+    )
