@@ -46,18 +46,24 @@ class Session:
         """Return the session with the values of one log column shuffled over the poses."""
         name, _, index = column.rpartition("_")
         order = rng.permutation(len(self.time))
-        fields = {
-            "actual_q": "q", "joint_temperatures": "temperature", "approach": "approach",
-            "actual_TCP_force": "tcp_wrench", "payload_cog": "payload_cog",
-        }  # fmt: skip
         if column in ("payload", "timestamp"):
             key = "payload_mass" if column == "payload" else "time"
             return replace(self, **{key: getattr(self, key)[order]})
-        values = getattr(self, fields[name]).copy()
+        key = LOG_FIELDS[name]
+        values = getattr(self, key).copy()
         values[:, int(index)] = values[order, int(index)]
-        return replace(self, **{fields[name]: values})
+        changed = replace(self, **{key: values})
+        overshoot = np.abs(self.q - self.from_where)
+        return replace(changed, from_where=changed.q - overshoot * changed.approach)
 
 
+LOG_FIELDS = {
+    "actual_q": "q",
+    "joint_temperatures": "temperature",
+    "approach": "approach",
+    "actual_TCP_force": "tcp_wrench",
+    "payload_cog": "payload_cog",
+}
 AngleError = Callable[[Session], Array]  # -> (N, n) rad, true joint angle minus encoder angle
 ToolShift = Callable[[Session, Array], Array]  # (session, gravity in flange (N, 3)) -> (N, 3) m
 Pull = Callable[[Session, Array, Array], Array]  # (session, flange p, flange R) -> (N, 6) at flange
@@ -238,7 +244,7 @@ class Loads:
 
     def about(self, point: Array, first_link: int) -> Array:
         """Return the moment (N, 3) about a point of everything from ``first_link`` on."""
-        return self.moment[first_link] - cross(point, self.force[first_link])
+        return np.asarray(self.moment[first_link] - cross(point, self.force[first_link]))
 
 
 def loads_of(arm: RealArm, session: Session, shape: Shape) -> Loads:

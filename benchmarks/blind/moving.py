@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pinocchio as pin
 from numpy.random import Generator
 
 from benchmarks.blind.arms import ArmKind
 from benchmarks.blind.mechanics import Array, Row, turn
+
+if TYPE_CHECKING:
+    import pinocchio as pin
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,8 @@ def torque_shares(
 
     Rigid point masses at their centres of gravity, exact inverse dynamics.
     """
+    import pinocchio as pin  # of the test extra: only the torque channel needs it
+
     model, masses = pinocchio_arm(rows, gravity)
     data = model.createData()
     n, count = len(rows), len(q)
@@ -79,6 +84,8 @@ def torque_shares(
 
 def pinocchio_arm(rows: tuple[Row, ...], gravity: Array) -> tuple[pin.Model, list[pin.Inertia]]:
     """Return the arm as a Pinocchio model, and the inertia of each link in its joint's frame."""
+    import pinocchio as pin
+
     model = pin.Model()
     model.gravity.linear = np.asarray(gravity, dtype=float)
     parent, place = 0, pin.SE3.Identity()

@@ -118,7 +118,7 @@ def draw_torque_cell(rng: Generator, seconds: float = 30.0) -> MovingCell:
         viscous = np.array([of("viscous_friction", j) for j in joints])
         rotor = np.array([of("rotor_inertia", j) for j in joints])
         scale = 1 + np.array([of("torque_constant", j) for j in joints])
-        return (out + coulomb * np.sign(qd) + viscous * qd + rotor * qdd) * scale
+        return np.asarray((out + coulomb * np.sign(qd) + viscous * qd + rotor * qdd) * scale)
 
     encoder = 2 * np.pi / 2 ** int(rng.integers(19, 22))
     truth = Parametric(read, sigma, candidates)
@@ -129,6 +129,7 @@ def tracking_error(cell: MovingCell, name: str, rng: Generator) -> tuple[Array, 
     """Return a following error (N, n) outside the catalogue, and the columns it depends on."""
     j = int(rng.integers(1, cell.kind.n))
     q, qd = cell.motion.at(cell.time), cell.motion.at(cell.time, 1)
+    columns: tuple[str, ...]
     if name == "droop":
         shape, columns = np.cos(q[:, j] - 0.4) - 0.5 * q[:, j], (f"actual_q_{j}", f"target_q_{j}")
     elif name == "track_step":

@@ -110,7 +110,7 @@ def tracker_drift(bench: Bench, rng: Generator) -> Outside:
     pace = bench.session.time[-1] * rng.uniform(0.15, 0.5)
 
     def read(s: Session, p: Array, strength: float) -> Array:
-        return p + strength * np.exp(-s.time / pace)[:, None] * way
+        return np.asarray(p + strength * np.exp(-s.time / pace)[:, None] * way)
 
     return Outside("tracker_drift", TIME, read=read)
 
@@ -130,7 +130,7 @@ def tracker_refraction(bench: Bench, rng: Generator) -> Outside:
 
     def read(s: Session, p: Array, strength: float) -> Array:
         distance = np.linalg.norm(p - head, axis=1)
-        return p + strength * (distance**2)[:, None] * up
+        return np.asarray(p + strength * (distance**2)[:, None] * up)
 
     return Outside("tracker_refraction", _reading_columns(bench, read), read=read, first=1e-3)
 
@@ -144,7 +144,7 @@ def tracker_eccentric(bench: Bench, rng: Generator) -> Outside:
         beam = p - head
         azimuth = np.arctan2(beam[:, 1], beam[:, 0])
         across = np.column_stack([-beam[:, 1], beam[:, 0], 0 * azimuth])
-        return p + strength * np.sin(order * azimuth + phase)[:, None] * across
+        return np.asarray(p + strength * np.sin(order * azimuth + phase)[:, None] * across)
 
     return Outside("tracker_eccentric", _reading_columns(bench, read), read=read)
 
@@ -209,7 +209,7 @@ def tower_bending(bench: Bench, rng: Generator) -> Outside:
 
     def change(arm: RealArm, strength: float) -> RealArm:
         def tilt(s: Session) -> Array:
-            return strength * (s.temperature[:, :1] - arm.reference_temperature) * axis
+            return np.asarray(strength * (s.temperature[:, :1] - arm.reference_temperature) * axis)
 
         return replace(arm, base_tilts=(*arm.base_tilts, tilt))
 

@@ -64,7 +64,7 @@ def _angles(kind: ArmKind, plan: Plan, rng: Generator) -> Array:
     if plan.moving is not None:
         still = [i for i in range(kind.n) if i not in plan.moving]
         q[:, still] = middle[still] + half[still] * rng.uniform(-0.5, 0.5, len(still))
-    return np.round(q, 8)
+    return np.asarray(np.round(q, 8))
 
 
 def _payloads(kind: ArmKind, plan: Plan, rng: Generator) -> tuple[Array, Array]:
@@ -100,7 +100,7 @@ def _temperatures(time: Array, n: int, plan: Plan, rng: Generator) -> Array:
     rise = plan.warming * rng.uniform(0.5, 1.5, n)
     pace = time[-1] * rng.uniform(0.2, 0.8, n)
     warm = start + rise * (1 - np.exp(-(time[:, None] - time[0]) / pace))
-    return (warm + rng.normal(0, 0.1, warm.shape)).round(1)
+    return np.asarray((warm + rng.normal(0, 0.1, warm.shape)).round(1))
 
 
 def play(session: Session, joint: int, gap: float) -> Array:

@@ -10,7 +10,7 @@ from numpy.random import Generator
 
 from benchmarks.blind.bench import Bench, draw_bench
 from benchmarks.blind.mechanics import Array, cross, turn
-from benchmarks.blind.parametric import Candidate, Parametric, Values
+from benchmarks.blind.parametric import Candidate, Parametric, Place, Values
 from benchmarks.blind.session import Plan
 
 EFFECTS = ("ft_bias", "ft_drift", "ft_gain", "ft_misalignment", "payload")
@@ -37,7 +37,7 @@ def draw_wrench_cell(rng: Generator, plan: Plan) -> WrenchCell:
     saturating = bool(rng.random() < 0.3)
     span = float(np.ptp(bench.session.time))
     names = {e: tuple(f"{e}_{a}" for a in AXES) for e in ("ft_bias", "ft_drift", "ft_gain")}
-    candidates = {
+    candidates: dict[Place, Candidate] = {
         ("ft_bias", None): Candidate(names["ft_bias"], 3 * sigma, 100),
         ("ft_drift", None): Candidate(names["ft_drift"], 5 * sigma / span, 100),
         ("ft_gain", None): Candidate(names["ft_gain"], np.full(6, 0.02), 12),

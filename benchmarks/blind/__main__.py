@@ -1,0 +1,79 @@
+"""Run the blind benchmark: ``python -m benchmarks.blind --seeds 20 --workers 2``."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.progress import track
+
+from benchmarks.blind import cases
+from benchmarks.blind.page import write_page
+from benchmarks.blind.report import print_report
+from benchmarks.blind.run import (
+    Command,
+    Diagnose,
+    chosen_kinds,
+    fresh_seed,
+    has_pinocchio,
+    jobs_of,
+    run_blind,
+)
+
+
+@click.command()
+@click.option("--seeds", default=20, show_default=True, help="Cases of each kind.")
+@click.option("--kinds", "names", default=None, help="Kinds or groups, by commas; see --list.")
+@click.option("--quick", is_flag=True, help="Two cases of each kind.")
+@click.option("--workers", default=1, show_default=True, help="Processes side by side.")
+@click.option("--seed", "first", type=int, default=None, help="First seed, to repeat a run.")
+@click.option("--out", type=click.Path(path_type=Path), default=None,
+              help="Folder for blind.html and the diagnoses.")  # fmt: skip
+@click.option("--command", default="gapbridge diagnose", show_default=True,
+              help="The diagnosis, as a program of its own.")  # fmt: skip
+@click.option("--in-process", "inside", default=None,
+              help="module:function(log, cell, withhold) -> dict, instead.")  # fmt: skip
+@click.option("--list", "listing", is_flag=True, help="Show the kinds and stop.")
+def main(
+    seeds: int, names: str | None, quick: bool, workers: int, first: int | None,
+    out: Path | None, command: str, inside: str | None, listing: bool,
+) -> None:  # fmt: skip
+    """Draw cases whose effect is withheld, have them diagnosed, and score the answers."""
+    console = Console()
+    if listing:
+        for group, own in cases.kinds().items():
+            console.print(f"[bold]{group}[/]: {' '.join(own)}")
+        return
+    wanted = names.split(",") if names else None
+    count = 2 if quick else seeds
+    first = fresh_seed() if first is None else first
+    console.print(f"first seed {first} (repeat with --seed {first})")
+    if not has_pinocchio():
+        console.print("the torque channel is left out: its truth needs Pinocchio (the test extra)")
+    how: Diagnose = _function(inside) if inside else Command.parse(command)
+    total = len(jobs_of(chosen_kinds(wanted), count, first))
+    try:
+        run = run_blind(count, wanted, workers, out, how, first)
+        scores = list(track(run, description="blind", total=total, console=console))
+    except ValueError as error:
+        raise click.UsageError(str(error)) from None
+    order = {k: i for i, k in enumerate(chosen_kinds(wanted))}
+    scores.sort(key=lambda s: (order.get(s.kind, 0), s.seed))
+    print_report(scores, console)
+    if out is not None:
+        page = out / "blind.html"
+        write_page(page, scores, "Gapbridge: the blind benchmark",
+                   f"{len(scores)} cases, first seed {first}.")  # fmt: skip
+        console.print(f"written: {page}")
+
+
+def _function(name: str) -> Diagnose:
+    module, _, function = name.partition(":")
+    found: Diagnose = getattr(importlib.import_module(module), function)
+    return found
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,165 @@
+"""Runs the blind benchmark: draw a case, have it diagnosed, score it, forget it."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import shlex
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.blind.cases import group_of, kinds, make_case
+from benchmarks.blind.score import CaseScore, failed, score
+
+Diagnose = Callable[[Path, Path, tuple[str, ...]], dict[str, Any]]
+CLEAN_FACTOR = 10  # clean cases of the position channel: this many times the seeds of the others
+
+
+class DiagnosisError(RuntimeError):
+    """Raised where a diagnosis ends without an answer."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """A diagnosis by a program of its own: ``COMMAND LOG --cell CELL --json FILE``."""
+
+    words: tuple[str, ...] = ("gapbridge", "diagnose")
+    timeout: float = 300.0
+
+    @classmethod
+    def parse(cls, text: str) -> Command:
+        """Return the command of a line as one would type it."""
+        return cls(tuple(shlex.split(text)))
+
+    def __call__(self, log: Path, cell: Path, withhold: tuple[str, ...]) -> dict[str, Any]:
+        """Return the diagnosis' JSON; raises DiagnosisError with what the program said."""
+        with tempfile.TemporaryDirectory(prefix="gapbridge-") as folder:
+            file = Path(folder) / "diagnosis.json"
+            words = [*self.words, str(log), "--cell", str(cell), "--json", str(file)]
+            for effect in withhold:
+                words += ["--withhold", effect]
+            try:
+                done = subprocess.run(
+                    words, capture_output=True, text=True, timeout=self.timeout, check=False
+                )
+            except subprocess.TimeoutExpired:
+                raise DiagnosisError(f"no answer in {self.timeout:g} s") from None
+            except OSError as error:
+                raise DiagnosisError(f"{self.words[0]}: {error}") from None
+            if done.returncode != 0 or not file.exists():
+                said = (done.stderr.strip() or done.stdout.strip()).splitlines()
+                raise DiagnosisError(f"exit {done.returncode}: {said[-1] if said else 'silent'}")
+            answer: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+            return answer
+
+
+@dataclass(frozen=True)
+class Job:
+    """One case to run."""
+
+    kind: str
+    seed: int
+
+
+def fresh_seed() -> int:
+    """Return a seed from the system's own randomness."""
+    return int.from_bytes(os.urandom(4), "big")
+
+
+def chosen_kinds(names: Iterable[str] | None) -> tuple[str, ...]:
+    """Return kinds by their names or their groups' names; all where none are given."""
+    table = kinds()
+    if names is None:
+        return tuple(k for own in table.values() for k in own)
+    out: list[str] = []
+    for name in names:
+        out += table.get(name, (name,))
+    return tuple(dict.fromkeys(out))
+
+
+def jobs_of(chosen: Sequence[str], seeds: int, first_seed: int) -> list[Job]:
+    """Return the cases to run; clean ones of the position channel in larger number."""
+    jobs = []
+    for kind in chosen:
+        count = seeds * CLEAN_FACTOR if kind == "none" else seeds
+        jobs += [Job(kind, first_seed + k) for k in range(count)]
+    return jobs
+
+
+def run_job(job: Job, diagnose: Diagnose, keep: Path | None = None) -> CaseScore:
+    """Run one case. Its folder's name tells nothing, and its label never leaves this process."""
+    with tempfile.TemporaryDirectory(prefix="case-") as scratch:
+        folder = Path(scratch)
+        label = make_case(job.kind, job.seed, folder)
+        start = time.perf_counter()
+        try:
+            answer = diagnose(folder / "log.csv", folder / "cell.yaml", label.withhold)
+        except Exception as error:
+            said = f"{type(error).__name__}: {error}"
+            return failed(label, said, time.perf_counter() - start)
+        seconds = time.perf_counter() - start
+    if keep is not None:
+        name = f"{job.kind.replace(':', '_')}-{job.seed}.json"
+        (keep / name).write_text(json.dumps(answer, indent=1), encoding="utf-8")
+    try:
+        return score(label, answer, seconds)
+    except (KeyError, TypeError, ValueError) as error:
+        return failed(label, f"the JSON breaks the contract: {error!r}", seconds)
+
+
+def run_blind(
+    seeds: int = 20,
+    kinds: Iterable[str] | None = None,
+    workers: int = 1,
+    out: Path | None = None,
+    diagnose: Diagnose | None = None,
+    first_seed: int | None = None,
+) -> Iterator[CaseScore]:
+    """Yield scores as they come. ``out`` keeps the diagnoses' JSON; seeds are fresh by default.
+
+    Raises ValueError where a kind is unknown.
+    """
+    chosen = chosen_kinds(kinds)
+    known = {k for own in _all_kinds().values() for k in own}
+    for kind in chosen:
+        if kind not in known and "+" not in kind:
+            raise ValueError(f"kind: found {kind!r}, expected a kind or group that --list shows")
+    if not has_pinocchio():
+        chosen = tuple(k for k in chosen if "torque:" not in k)
+    first = fresh_seed() if first_seed is None else first_seed
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+    jobs = jobs_of(chosen, seeds, first)
+    how: Diagnose = diagnose or Command()
+    if workers <= 1:
+        for job in jobs:
+            yield run_job(job, how, out)
+        return
+    with ProcessPoolExecutor(workers, initializer=_one_thread) as pool:
+        waiting = [pool.submit(run_job, job, how, out) for job in jobs]
+        for done in as_completed(waiting):
+            yield done.result()
+
+
+def _all_kinds() -> dict[str, tuple[str, ...]]:
+    return kinds()
+
+
+def has_pinocchio() -> bool:
+    """Return whether the torque channel's truth can be made here (it needs the test extra)."""
+    return importlib.util.find_spec("pinocchio") is not None
+
+
+def _one_thread() -> None:
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = "1"
+
+
+__all__ = ["Command", "Diagnose", "Job", "chosen_kinds", "group_of", "run_blind", "run_job"]
