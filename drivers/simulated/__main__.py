@@ -8,13 +8,12 @@ import logging
 import signal
 import sys
 import threading
+from dataclasses import replace
 
 from core.errors import GapbridgeError
 from drivers.simulated import settings as defaults
-from drivers.simulated.plant_arm import plant_arm
-from drivers.simulated.plant_settings import draw_plant_settings
 from drivers.simulated.server import serve
-from drivers.simulated.settings import ServerSettings, from_json
+from drivers.simulated.settings import ServerSettings, from_json, simulated_cell
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -22,6 +21,14 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--arm", default="ur10e", help="a built-in arm")
     parser.add_argument("--host", default="127.0.0.2", help="loopback address to bind")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--tcp", type=float, nargs=6, default=(0.0,) * 6, metavar="V",
+        help="TCP in the flange frame: x y z (m) and rotation vector (rad)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--payload", type=float, nargs=4, default=(0.0,) * 4, metavar="V",
+        help="mass (kg) and centre of gravity in the flange frame (m)",
+    )  # fmt: skip
     parser.add_argument("--rtde-port", type=int, default=defaults.RTDE_PORT)
     parser.add_argument("--dashboard-port", type=int, default=defaults.DASHBOARD_PORT)
     parser.add_argument("--script-port", type=int, default=defaults.SCRIPT_PORT)
@@ -35,11 +42,17 @@ def _parser() -> argparse.ArgumentParser:
 
 def _settings(options: argparse.Namespace) -> ServerSettings:
     """Return the settings that the options ask for."""
-    arm = plant_arm(options.arm)
-    return ServerSettings(
-        arm=arm,
-        plant=draw_plant_settings(arm, options.seed),
-        host=options.host,
+    mass, *cog = options.payload
+    cell = simulated_cell(
+        options.arm,
+        options.host,
+        options.seed,
+        tcp=tuple(options.tcp),
+        payload_mass=mass,
+        payload_cog=tuple(cog),
+    )
+    return replace(
+        cell,
         rtde_port=options.rtde_port,
         dashboard_port=options.dashboard_port,
         script_port=options.script_port,

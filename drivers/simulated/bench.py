@@ -167,6 +167,7 @@ class BenchServer:
                 "joint_scatter": s.joint_scatter,
                 "repeatability": tcp_scatter(self._controller),
                 "placements": plant.placements,
+                "largest_servo_step": self._controller.largest_servo_step,
                 "true_tcp": pose_of(plant.true_tcp()),
                 "rigid_tcp": pose_of(rigid),
                 "sensor_bias": s.sensor_bias,

@@ -42,12 +42,6 @@ def _move(r: Registers, motion: Motion) -> Steps:
         r.start_operation(motion)
         return
     yield from r.controller.run_motion(motion)
-    _check(motion)
-
-
-def _check(motion: Motion) -> None:
-    if getattr(motion, "failed", False):
-        raise ScriptError("the line leaves the workspace")
 
 
 def _joint_motion(c: Controller, goal: Joints, speed: float, acceleration: float) -> Motion:
@@ -95,6 +89,8 @@ def _move_line_to_joints(r: Registers) -> Steps:
 def _servo_to(r: Registers, goal: Joints) -> None:
     c, lookahead = r.controller, r.number(9)
     if isinstance(c.motion, Servo):
+        step = max(abs(b - a) for a, b in zip(c.motion.goal, goal, strict=True))
+        c.largest_servo_step = max(c.largest_servo_step, step)
         c.motion.goal, c.motion.lookahead = goal, lookahead
     else:
         c.motion = Servo(c.plant.arm, goal, lookahead)

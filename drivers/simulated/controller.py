@@ -54,7 +54,9 @@ class Controller:
     memory: dict[str, Any] = field(default_factory=dict)
     target_q: Joints = ()
     target_qd: Joints = ()
-    motion: Motion = field(default_factory=Hold)
+    motion: Motion = HOLD
+    paused: Motion = HOLD  # what goes on after a pause
+    largest_servo_step: float = 0.0  # rad, between two setpoints of a servo stream
     program: Program | None = None
     watchdogs: dict[str, Watchdog] = field(default_factory=dict)
     clock: float = 0.0  # s since the controller started; never stands still
@@ -172,6 +174,7 @@ class Controller:
         """End the running script; the arm brakes."""
         program, self.program = self.program, None
         self.watchdogs.clear()
+        self.paused = HOLD
         if program is not None:
             program.steps.close()
             log.info("program %s ended", program.name)
@@ -180,11 +183,16 @@ class Controller:
         self.set_runtime(modes.STOPPED)
 
     def run_motion(self, motion: Motion) -> Steps:
-        """Run a motion to its end, cycle by cycle (for use inside a program)."""
+        """Run a motion to its end, cycle by cycle (for use inside a program).
+
+        Raises ScriptError where the motion cannot be carried on.
+        """
         self.motion = motion
         yield
         while not motion.done:
             yield
+        if motion.failed:
+            raise ScriptError("the line leaves the workspace")
 
     def set_watchdog(self, name: str, frequency: float) -> None:
         """Watch that `name` is written at least at `frequency` (Hz); 0 switches it off."""
@@ -220,10 +228,19 @@ class Controller:
         self.memory["joint_mode"] = (253 if mode == modes.RUNNING else 239,) * 6
         self.set_runtime(self.memory["runtime_state"])
 
-    def pause(self) -> None:
-        """Pause the program; the arm brakes."""
-        self.motion = Stop(self.target_qd, DEFAULT_STOP)
+    def pause(self, deceleration: float = DEFAULT_STOP) -> None:
+        """Pause the program; the arm brakes (rad/s^2)."""
+        if self.program is None or self.memory["runtime_state"] != modes.PLAYING:
+            self.motion = Stop(self.target_qd, deceleration)
+            return
+        self.paused, self.motion = self.motion, Stop(self.target_qd, deceleration)
         self.set_runtime(modes.PAUSED)
+
+    def resume(self) -> None:
+        """Go on with a paused program and its motion."""
+        self.motion, self.paused = self.paused, HOLD
+        self.motion.restart(self.target_q)
+        self.set_runtime(modes.PLAYING)
 
     def set_safety(self, mode: int) -> None:
         """Set safety_mode, safety_status and safety_status_bits together."""
@@ -237,9 +254,7 @@ class Controller:
         log.warning("protective stop")
         self.stopped_at = self.clock
         self.set_safety(modes.SAFETY_PROTECTIVE)
-        self.motion = Stop(self.target_qd, 2.0 * DEFAULT_STOP)
-        if self.program is not None:
-            self.set_runtime(modes.PAUSED)
+        self.pause(2.0 * DEFAULT_STOP)
 
     def emergency_stop(self) -> None:
         """Stop: the program is gone, power is off."""

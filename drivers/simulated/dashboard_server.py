@@ -116,7 +116,8 @@ class DashboardServer:
         if not controller.can_move:
             return "Failed to execute: play"
         if controller.program is not None:
-            controller.set_runtime(modes.PLAYING)
+            if controller.memory["runtime_state"] == modes.PAUSED:
+                controller.resume()
             return "Starting program"
         if not controller.loaded_program:
             return "Failed to execute: play"

@@ -22,9 +22,14 @@ class Motion(Protocol):
 
     done: bool
     scaled: bool
+    failed: bool
 
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
         """Return the next joint target (n, rad) after `q`, which moves at `qd` (rad/s)."""
+        ...
+
+    def restart(self, q: Joints) -> None:
+        """Go on from `q` after a pause."""
         ...
 
 
@@ -47,7 +52,16 @@ def ramp_share(distance: float, speed: float, acceleration: float, t: float) -> 
     return way / distance, False
 
 
-class Hold:
+class _Stateless:
+    """A motion that cannot fail and that a pause does not set back."""
+
+    failed = False
+
+    def restart(self, q: Joints) -> None:
+        """Do nothing: every step starts from where the arm is."""
+
+
+class Hold(_Stateless):
     """Stay."""
 
     scaled = False
@@ -61,13 +75,18 @@ class Hold:
 class MoveJoints:
     """moveJ: all joints along one trapezoid; speed and acceleration are the leading joint's."""
 
+    failed = False
     scaled = True
 
     def __init__(self, start: Joints, goal: Joints, speed: float, acceleration: float) -> None:
         self.done = False
-        self._start, self._goal = start, goal
-        self._way = max(abs(b - a) for a, b in zip(start, goal, strict=True))
-        self._speed, self._acceleration, self._t = speed, acceleration, 0.0
+        self._goal, self._speed, self._acceleration = goal, speed, acceleration
+        self.restart(start)
+
+    def restart(self, q: Joints) -> None:
+        """Begin anew from `q`, with the same goal."""
+        self._start, self._t = q, 0.0
+        self._way = max(abs(b - a) for a, b in zip(q, self._goal, strict=True))
 
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
         """Return the next joint target."""
@@ -95,12 +114,15 @@ class MoveLine:
         self.done = False
         self.failed = False
         self._arm, self._tool = arm, tool
-        self._start, self._goal = tcp_in_base(arm, start, tool), goal
-        step = gap(self._start, goal)
-        shift = math.sqrt(sum(v * v for v in step[:3]))
-        turn = math.sqrt(sum(v * v for v in step[3:]))
+        self._goal, self._speed, self._acceleration = goal, speed, acceleration
+        self.restart(start)
+
+    def restart(self, q: Joints) -> None:
+        """Begin anew from `q`, with the same goal."""
+        self._start, self._t = tcp_in_base(self._arm, q, self._tool), 0.0
+        step = gap(self._start, self._goal)
+        shift, turn = math.hypot(*step[:3]), math.hypot(*step[3:])
         self._way = max(shift, 0.2 * turn)  # a pure turn has a pace too: 1 rad as 0.2 m
-        self._speed, self._acceleration, self._t = speed, acceleration, 0.0
 
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
         """Return the next joint target; the motion fails where the line leaves the workspace."""
@@ -113,7 +135,7 @@ class MoveLine:
         return found
 
 
-class Servo:
+class Servo(_Stateless):
     """servoJ: follow a target that may change every cycle, smoothed over the lookahead time."""
 
     scaled = False
@@ -145,6 +167,7 @@ class Servo:
 class SpeedJoints:
     """speedJ: joints approach a velocity with an acceleration (leading joint)."""
 
+    failed = False
     scaled = False
     done = False
 
@@ -152,6 +175,10 @@ class SpeedJoints:
         self.goal = tuple(float(v) for v in goal)
         self.acceleration = acceleration
         self._now: Joints | None = None
+
+    def restart(self, q: Joints) -> None:
+        """Gather speed anew."""
+        self._now = (0.0,) * len(q)
 
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
         """Return the next joint target."""
@@ -166,6 +193,7 @@ class SpeedJoints:
 class SpeedTool:
     """speedL: the TCP approaches a velocity in base axes (m/s, rad/s)."""
 
+    failed = False
     scaled = False
     done = False
 
@@ -176,6 +204,10 @@ class SpeedTool:
         self.acceleration = acceleration
         self._arm, self._tool = arm, tool
         self._now: Joints = (0.0,) * 6
+
+    def restart(self, q: Joints) -> None:
+        """Gather speed anew."""
+        self._now = (0.0,) * 6
 
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
         """Return the next joint target."""
@@ -192,7 +224,7 @@ class SpeedTool:
         return tuple(a + float(v) * dt for a, v in zip(q, rates, strict=True))
 
 
-class Stop:
+class Stop(_Stateless):
     """stopJ: every joint brakes along its way, the fastest with `deceleration` (rad/s^2)."""
 
     scaled = False
@@ -227,6 +259,11 @@ class MovePath:
         self._index = -1
         self._motion: Motion | None = None
 
+    def restart(self, q: Joints) -> None:
+        """Go on with the move that was interrupted."""
+        if self._motion is not None:
+            self._motion.restart(q)
+
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
         """Return the next joint target; the path fails with any of its moves."""
         if self.done:
@@ -237,7 +274,7 @@ class MovePath:
             self._motion = self._makers[self._index](q)
         found = self._motion.step(q, qd, dt)
         if self._motion.done:
-            self.failed = getattr(self._motion, "failed", False)
+            self.failed = self._motion.failed
             self._motion = None
             self.done = self.failed or self._index + 1 >= len(self._makers)
         return found

@@ -47,6 +47,7 @@ class OffsetMotion:
 
     done = False
     scaled = False
+    failed = False
 
     def __init__(self, controller: Controller, own: Motion) -> None:
         self.own = own
@@ -59,6 +60,16 @@ class OffsetMotion:
     def nominal(self) -> Joints:
         """Where the robot's own program wants the joints (n, rad)."""
         return self._nominal
+
+    def restart(self, q: Joints) -> None:
+        """Go on after a pause: the own motion from where `q` is without the offset."""
+        if self.applied != NOTHING:
+            x, y, z, rx, ry, rz = (-v for v in self.applied)
+            arm, tool = self._controller.plant.arm, self._controller.declared.tool
+            bare = offset_frame(tcp_in_base(arm, q, tool), (x, y, z, rx, ry, rz))
+            q = solve(arm, bare, self._nominal, tool) or self._nominal
+        self._nominal = q
+        self.own.restart(q)
 
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
         """Return the next joint target: the own motion's, moved by the offset."""
@@ -141,9 +152,6 @@ def offset_program(controller: Controller) -> Steps:
             motion.applied = approach(motion.applied, registers.wanted)
             memory["output_int_register_13"] = state
             memory.update(zip(_APPLIED, motion.applied, strict=True))
-            if controller.motion is not motion:  # after a pause: go on from where the arm stands
-                controller.motion = motion = OffsetMotion(controller, Hold())
-                registers.wanted = NOTHING
             yield
     finally:
         memory["output_int_register_13"] = 0

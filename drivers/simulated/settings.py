@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from core.arm import Arm
+from core.errors import ArmError
 from drivers.simulated.controller import Controller
 from drivers.simulated.declared import Declared
+from drivers.simulated.kinematics import within_limits
 from drivers.simulated.plant import Plant
-from drivers.simulated.plant_arm import Frame, PlantArm
-from drivers.simulated.plant_settings import PlantSettings
+from drivers.simulated.plant_arm import Frame, PlantArm, plant_arm
+from drivers.simulated.plant_settings import PlantSettings, draw_plant_settings
 
 START_Q = (0.0, -1.5, 1.8, -1.87, -1.57, 0.0)  # rad: elbow up, tool pointing down
 RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, BENCH_PORT = 30004, 29999, 30003, 30100
@@ -35,6 +39,28 @@ class ServerSettings:
     dashboard_port: int = DASHBOARD_PORT
     script_port: int = SCRIPT_PORT
     bench_port: int = BENCH_PORT
+
+
+def simulated_cell(
+    arm: Arm | str,
+    host: str = "127.0.0.2",
+    seed: int = 0,
+    start_q: Sequence[float] | None = None,
+    **plant: Any,
+) -> ServerSettings:
+    """Return a controller whose plant is drawn from `seed`.
+
+    `plant` sets single fields of PlantSettings (tcp, payload_mass, payload_cog, gravity, ...).
+    Without `start_q` (6,) (rad) the arm starts elbow up, tool down, within its joint limits.
+    Raises ArmError for an arm that is unknown or has not six joints.
+    """
+    table = plant_arm(arm)
+    limits = zip(START_Q, table.lower, table.upper, strict=True)
+    start = [min(max(q, lo), hi) for q, lo, hi in limits] if start_q is None else start_q
+    if not within_limits(table, start):
+        raise ArmError(f"start_q: found {list(start)}, expected joints within the arm's limits")
+    drawn = replace(draw_plant_settings(table, seed), **plant)
+    return ServerSettings(table, drawn, host, tuple(float(q) for q in start))
 
 
 def make_controller(settings: ServerSettings) -> Controller:

@@ -9,12 +9,9 @@ import socket
 import subprocess
 import sys
 import textwrap
-from dataclasses import replace
 from typing import Any
 
-from drivers.simulated.plant_arm import plant_arm
-from drivers.simulated.plant_settings import PlantSettings, draw_plant_settings
-from drivers.simulated.settings import BENCH_PORT, ServerSettings
+from drivers.simulated.settings import BENCH_PORT, ServerSettings, simulated_cell
 
 _numbers = itertools.count(2)
 
@@ -26,9 +23,7 @@ def own_address() -> str:
 
 
 def cell_settings(seed: int = 7, arm: str = "ur10e", **plant: Any) -> ServerSettings:
-    table = plant_arm(arm)
-    drawn: PlantSettings = replace(draw_plant_settings(table, seed), **plant)
-    return ServerSettings(arm=table, plant=drawn, host=own_address())
+    return simulated_cell(arm, own_address(), seed, **plant)
 
 
 class Bench:
