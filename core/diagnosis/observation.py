@@ -44,4 +44,6 @@ class Observation:
     rows: NDArray[np.int64]  # (N,) row of each sample in the log
     axes: tuple[str, ...]  # name of each coordinate
     joint_columns: Array | None = None  # (N, k, n) d prediction / d joint angle, where it has one
+    tool_axes: Array | None = None  # (N, 3, 3) axes of the TCP in base, as columns
     order_in_time: bool = False  # True: neighbours in time are correlated (a moving log)
+    rebase: Callable[[Array], Observation] | None = None  # the same with the nuisance moved (p,)

@@ -79,12 +79,15 @@ def _noise(sensor: Array, whole: Motion, value: Array, predicted: Array, motion:
     if whole.moving:
         kept = sensor[np.isfinite(sensor).all(axis=1)]
         return signal_noise(kept)
+    assert motion.pieces is not None
     time = (motion.t - motion.t[0]) / max(float(np.ptp(motion.t)), 1.0)
-    loose = np.column_stack([np.ones(len(motion)), time, predicted])
-    loose = loose[:, np.abs(loose).max(axis=0) > 1e-12]
-    spare = len(motion) - np.linalg.matrix_rank(loose)
-    if spare < 5:
-        return np.zeros(6)
-    left = value - loose @ np.linalg.lstsq(loose, value, rcond=None)[0]
-    typical = 1.4826 * np.median(np.abs(left), axis=0)
-    return np.asarray(typical * np.sqrt(len(motion) / spare))
+    design = [np.ones((len(motion), 1)), time[:, None], predicted, motion.pieces.payload_wrench]
+    while design:
+        loose = np.column_stack(design)
+        spare = len(motion) - np.linalg.matrix_rank(loose)
+        if spare >= max(5, len(motion) // 4):
+            left = value - loose @ np.linalg.lstsq(loose, value, rcond=None)[0]
+            typical = 1.4826 * np.median(np.abs(left), axis=0)
+            return np.asarray(typical * np.sqrt(len(motion) / spare))
+        design.pop()
+    return np.zeros(6)

@@ -41,7 +41,7 @@ class StiffnessNonlinearity(JointEffect):
         assert term.site.joint is not None
         i = term.site.joint - 1
         chain.compliance[i, 2] += term.values[0]
-        chain.softening[i] += max(term.values[1], 0.0)
+        chain.softening[i] += term.values[1]
 
     def reported(
         self, arm: Arm, term: Term, covariance: NDArray[np.float64] | None

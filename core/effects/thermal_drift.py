@@ -30,7 +30,7 @@ class ThermalDrift(Effect):
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the coefficient of expansion."""
-        return (Parameter("", "1/K", 1e-5, -1e-3, 1e-3),)
+        return (Parameter("", "1/K", 1e-5, 0.0, 1e-3),)
 
     def condition(
         self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]

@@ -1,0 +1,136 @@
+"""The judgement: what is accused, what is withdrawn, and what is said to be unexplained.
+
+A set of terms is believed only if nothing structured is left and no unnamed function is needed
+beside it. Otherwise the accusations are weak: they may be what the catalogue can do to imitate a
+cause that it does not hold. Then only what much data makes sure of is kept.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.leftover import dependence, structure_p_value
+from core.diagnosis.search import Found, Space, fit, rivals
+from core.diagnosis.selection import Selection
+
+Array = NDArray[np.float64]
+SURE = 0.002  # probability below which a leftover counts as structured
+MANY = 300  # samples from which causes are kept beside a structured leftover
+ACCOMPLICES = 4  # effects that one short log can hardly hold at once
+TIE = 7.0  # score within which another explanation counts as equally good
+STATED = 1.5  # times the stated noise: beyond, more than noise is left
+REPEATED = 1.6  # times the scatter of repeated poses
+ENOUGH_REPEATS = 30  # degrees of freedom from which repeats are a measure of the noise
+USUAL = 1.2e-4  # m, one coordinate: a worse repeatability than that is none
+INSTRUMENTS = 5.0  # times the instrument's sigma, for coarse instruments
+BENT = 10.8  # gain of a bent stiffness curve over a straight one that makes it one
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The verdict on one channel."""
+
+    accused: tuple[int, ...]  # positions in ``selection.terms``
+    structured: bool
+    p_value: float | None
+    depends_on: tuple[tuple[str, float], ...]  # quantity, held-out share of what is not accounted for
+    ties: dict[int, tuple[str, ...]]  # position -> effects that would do as well
+    withdrawn: tuple[tuple[int, str], ...]  # position, reason
+
+
+def judge(selection: Selection) -> Judgement:
+    """Return the judgement of a selection."""
+    space, found = selection.space, selection.found
+    smooth = [c for c in found.chosen if not space.candidates[c].named]
+    withdrawn: list[tuple[int, str]] = []
+    believed = [c for c in found.chosen if space.candidates[c].named]
+    straight = _not_bent(selection)
+    for position in straight:
+        withdrawn.append((position, "its curve cannot be told from a straight line"))
+        believed.remove(selection.term_index[position])
+    nuisance = selection.nuisance_basis
+    p_value = structure_p_value(space, nuisance, found.chosen)
+    effects = {space.candidates[c].family for c in believed}
+    structured = bool(smooth) or p_value < SURE or bool(straight) or _too_much_left(selection)
+    samples = int(selection.kept.sum())
+    if samples < MANY and len(effects) >= ACCOMPLICES:
+        structured = True
+    if structured and samples < MANY:
+        for c in believed:
+            withdrawn.append((selection.term_index.index(c), "structure is left beside it"))
+        believed = []
+    accused = tuple(selection.term_index.index(c) for c in believed)
+    depends = ()
+    if structured or not accused:
+        depends = tuple(dependence(space, nuisance, believed, selection.groups))
+    return Judgement(
+        accused, structured, p_value, depends, _ties(space, found, selection, accused),
+        tuple(withdrawn),
+    )  # fmt: skip
+
+
+def _too_much_left(selection: Selection) -> bool:
+    """Return whether more is left than noise can be: than repeats, or a repeatability, allow."""
+    observation, k = selection.observation, selection.observation.measured.shape[1]
+    if observation.sigma <= 0 or observation.channel != "position":
+        return False
+    left = selection.residual[selection.kept][:, : min(k, 3)]
+    variance = float(np.mean(left**2)) * left.size / max(left.size - selection.used, 1)
+    if observation.sigma_is_whole:
+        return variance > (STATED * observation.sigma) ** 2
+    pure, freedom = pure_error(left, observation.groups[selection.kept])
+    if freedom >= ENOUGH_REPEATS:
+        return variance > REPEATED**2 * max(pure, observation.sigma**2)
+    return variance > max(USUAL, INSTRUMENTS * observation.sigma) ** 2
+
+
+def pure_error(left: Array, groups: NDArray[np.int64]) -> tuple[float, int]:
+    """Return the variance of one coordinate among repeats of a pose, and its degrees of freedom.
+
+    Repeats under other loads count too: the leftover of a good model does not depend on them.
+    """
+    total, freedom = 0.0, 0
+    for group in np.unique(groups):
+        part = left[groups == group]
+        if len(part) > 1:
+            total += float(np.sum((part - part.mean(axis=0)) ** 2))
+            freedom += (len(part) - 1) * left.shape[1]
+    return total / max(freedom, 1), freedom
+
+
+def _not_bent(selection: Selection) -> list[int]:
+    """Return positions of stiffness curves that a straight line would fit as well."""
+    straight = []
+    for position, (term, covariance) in enumerate(
+        zip(selection.terms, selection.covariance, strict=True)
+    ):
+        if term.effect != "stiffness_nonlinearity":
+            continue
+        softening, deviation = term.values[1], float(np.sqrt(max(covariance[1, 1], 0)))
+        if softening <= 0 or softening < np.sqrt(BENT) * deviation:
+            straight.append(position)
+    return straight
+
+
+def _ties(
+    space: Space, found: Found, selection: Selection, accused: tuple[int, ...]
+) -> dict[int, tuple[str, ...]]:
+    told: dict[int, tuple[str, ...]] = {}
+    for position in accused:
+        c = selection.term_index[position]
+        own = space.candidates[c].family
+        names: list[str] = []
+        for _, other in rivals(space, found, c, TIE):
+            family = space.candidates[other].family
+            if space.candidates[other].named and family != own and family not in names:
+                names.append(family)
+        told[position] = tuple(names)
+    return told
+
+
+def without(selection: Selection, dropped: set[int]) -> Found:
+    """Return the fit of the chosen set less some candidates."""
+    return fit(selection.space, tuple(c for c in selection.found.chosen if c not in dropped))

@@ -1,0 +1,121 @@
+"""The leftover: whether it has structure that no accepted term accounts for, and what it follows.
+
+The test is a variance-component score test (Goeman's global test): the leftover against the sum of
+all columns that anything in the catalogue or any smooth function could make. Many small traces add
+up in it where each alone would drown in the number of hypotheses tried.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.search import Space
+
+Array = NDArray[np.float64]
+DRAWS = 4000
+FOLDS = 7
+MOST = 3000  # samples beyond which the test takes every so many
+
+
+def basis_of(columns: Array) -> Array:
+    """Return an orthonormal basis of columns (m, r), nearly dependent ones left out."""
+    if not columns.shape[1]:
+        return columns
+    unit = columns / (np.sqrt(np.einsum("ij,ij->j", columns, columns)) + 1e-300)
+    U, s, _ = np.linalg.svd(unit, full_matrices=False)
+    return np.asarray(U[:, s > 1e-6 * max(s[0], 1e-300)])
+
+
+def structure_p_value(
+    space: Space, nuisance: Array, chosen: Sequence[int], seed: int = 0
+) -> float:
+    """Return the probability that noise alone leaves as much structure as is left."""
+    fitted = basis_of(np.hstack([nuisance, space.columns(chosen)]))
+    r = space.y - fitted @ (fitted.T @ space.y)
+    spread = _families(space, fitted)
+    rng = np.random.default_rng(seed)
+    noise = rng.normal(size=(len(r), DRAWS))
+    noise -= fitted @ (fitted.T @ noise)
+    worst = []
+    for family in spread:
+        # sums of squares along the family's directions, as a share of everything left
+        seen = np.sum((family.T @ r) ** 2) / (r @ r)
+        drawn = np.sum((family.T @ noise) ** 2, axis=0) / np.sum(noise**2, axis=0)
+        mean, deviation = float(drawn.mean()), float(drawn.std()) + 1e-300
+        excess = np.concatenate([[(seen - mean) / deviation], (drawn - mean) / deviation])
+        worst.append(excess)
+    top = np.max(np.array(worst), axis=0)  # the most striking family, of data and of each draw
+    return float((1 + np.sum(top[1:] >= top[0])) / (1 + DRAWS))
+
+
+def _families(space: Space, fitted: Array) -> list[Array]:
+    """Return for every family of candidates its columns (m, K), cleaned and of equal size."""
+    groups: dict[str, list[int]] = {}
+    for c, candidate in enumerate(space.candidates):
+        key = candidate.family if candidate.named else f"{candidate.family} {candidate.target}"
+        groups.setdefault(key, []).append(c)
+    found = []
+    for members in groups.values():
+        columns = space.columns(members)
+        columns = columns - fitted @ (fitted.T @ columns)
+        size = np.sqrt(np.einsum("ij,ij->j", columns, columns))
+        whole = np.sqrt(np.einsum("ij,ij->j", space.columns(members), space.columns(members)))
+        alive = size > 1e-4 * whole
+        if alive.any():
+            found.append(columns[:, alive] / size[alive])
+    return found
+
+
+def dependence(
+    space: Space,
+    nuisance: Array,
+    chosen: Sequence[int],
+    groups: NDArray[np.int64],
+    seed: int = 0,
+) -> list[tuple[str, float]]:
+    """Return quantities and the share of the leftover that each predicts held out, best first.
+
+    ``groups`` (m,) says which rows of the sample space are held out together.
+    """
+    fitted = basis_of(np.hstack([nuisance, space.columns(chosen)]))
+    r = space.y - fitted @ (fitted.T @ space.y)
+    names = np.unique(groups)
+    fold_of = np.random.default_rng(seed).permutation(len(names)) % FOLDS
+    fold = fold_of[np.searchsorted(names, groups)]
+    best: dict[str, float] = {}
+    for c, candidate in enumerate(space.candidates):
+        if candidate.named:
+            continue
+        columns = space.X[:, space.start[c] : space.start[c + 1]]
+        clean = columns - fitted @ (fitted.T @ columns)
+        share = _held_out_share(clean, r, fold)
+        if share > best.get(candidate.quantity, -np.inf):
+            best[candidate.quantity] = share
+    return _one_of_a_kind(sorted(best.items(), key=lambda item: -item[1]))
+
+
+def _one_of_a_kind(ranked: list[tuple[str, float]]) -> list[tuple[str, float]]:
+    """Keep only the best joint temperature: they all rise together and crowd out the rest."""
+    told: list[tuple[str, float]] = []
+    for name, share in ranked:
+        warm = name.startswith("joint_temperatures_")
+        if warm and any(n.startswith("joint_temperatures_") for n, _ in told):
+            continue
+        told.append((name, share))
+    return told
+
+
+def _held_out_share(columns: Array, r: Array, fold: NDArray[np.int64]) -> float:
+    unit = columns / (np.sqrt(np.einsum("ij,ij->j", columns, columns)) + 1e-300)
+    G, g = unit.T @ unit, unit.T @ r
+    ridge = 1e-6 * np.eye(len(g))
+    left = 0.0
+    for k in range(FOLDS):
+        out = fold == k
+        U, u = unit[out], r[out]
+        x = np.linalg.solve(G - U.T @ U + ridge, g - U.T @ u)
+        left += float(np.sum((u - U @ x) ** 2))
+    return 1 - left / float(r @ r)

@@ -1,0 +1,270 @@
+"""The search: which set of candidates explains a gap best, at the price of having tried so many.
+
+All candidates compete in one whitened sample space out of which the nuisance (frames) has been
+projected. A set's score is -2 log likelihood plus a price per term (extended BIC, Chen and Chen
+2008: it grows with the number of parameters *and* with the number of hypotheses that were tried).
+Sets grow in a beam and are then improved by dropping and swapping.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.candidate import Candidate
+
+Array = NDArray[np.float64]
+BEAM = 6
+DEPTH = 16
+PATIENCE = 2  # depths without a better set before the beam stops
+RANK = 1e-10  # share of a block's own size below which a direction counts as already explained
+SMOOTH_PRICE = 12.0  # what an unnamed function pays beyond a named cause
+MARGIN = 4.0  # what every accusation pays: keeps clean logs clean
+ABSURD = 60.0  # times a parameter's usual size: beyond, a fit is no explanation
+LINES = 4  # periodic lines a joint may have
+
+
+@dataclass(frozen=True)
+class Space:
+    """The whitened sample space: y and the blocks of columns, nuisance projected out."""
+
+    y: Array  # (m,)
+    X: Array  # (m, K)
+    start: NDArray[np.int64]  # (C+1,) first column of each candidate
+    candidates: tuple[Candidate, ...]
+    price: Array  # (C,)
+    freedom: float  # m minus nuisance
+    floor: float  # variance of one coordinate that is known to be there
+
+    def columns(self, chosen: Sequence[int]) -> Array:
+        """Return the columns of a set of candidates (m, sum d)."""
+        parts = [self.X[:, self.start[c] : self.start[c + 1]] for c in chosen]
+        return np.hstack(parts) if parts else np.zeros((len(self.y), 0))
+
+    def misfit(self, rss: Array) -> Array:
+        """Return -2 log likelihood of residual sums of squares, variance profiled out."""
+        variance = np.maximum(rss / self.freedom, self.floor)
+        return np.asarray(self.freedom * np.log(variance) + rss / variance)
+
+
+@dataclass(frozen=True)
+class Found:
+    """One set of candidates with its joint least-squares fit."""
+
+    chosen: tuple[int, ...]
+    score: float
+    rss: float
+    values: tuple[Array, ...] = field(default=())  # per candidate (d,)
+    deviations: tuple[Array, ...] = field(default=())  # per candidate (d,), 1 sigma
+
+
+@dataclass
+class _State:
+    chosen: tuple[int, ...]
+    P: Array  # columns with the chosen ones projected out
+    r: Array
+    rss: float
+    score: float
+
+
+def prices(candidates: Sequence[Candidate], freedom: float) -> Array:
+    """Return what each candidate pays: d log m + 2 log(number of its like) + a margin."""
+    families = {c.family for c in candidates if c.named} or {""}
+    count: dict[str, int] = {}
+    for c in candidates:
+        count[c.family] = count.get(c.family, 0) + 1
+    paid = []
+    for c in candidates:
+        tried = count[c.family] * (len(families) if c.named else 1)
+        d = len(c.fixed) if c.family == "stiffness_nonlinearity" else len(c.parameters)
+        extra = MARGIN if c.named else SMOOTH_PRICE
+        paid.append(d * np.log(max(freedom, 2.0)) + 2 * np.log(tried) + extra)
+    return np.array(paid)
+
+
+def gains(space: Space, P: Array, r: Array) -> tuple[Array, Array]:
+    """Return how much of |r|^2 each candidate takes (C,), and its first value's sign (C,)."""
+    size = np.diff(space.start)
+    gain, sign = np.zeros(len(size)), np.ones(len(size))
+    g = P.T @ r
+    square = np.einsum("ij,ij->j", P, P)
+    whole = np.einsum("ij,ij->j", space.X, space.X)
+    for d in np.unique(size):
+        index = np.flatnonzero(size == d)
+        columns = space.start[index][:, None] + np.arange(d)
+        if d == 1:
+            c = columns[:, 0]
+            alive = square[c] > RANK * whole[c] + 1e-300
+            gain[index] = np.where(alive, g[c] ** 2 / np.where(alive, square[c], 1), 0)
+            sign[index] = np.sign(g[c])
+            continue
+        unit = 1 / np.sqrt(whole[columns] + 1e-300)
+        block = P[:, columns.ravel()].reshape(len(P), len(index), d)
+        G = np.einsum("mci,mcj->cij", block, block, optimize=True)
+        G *= unit[:, :, None] * unit[:, None, :]
+        values, vectors = np.linalg.eigh(G)
+        along = np.einsum("cji,cj->ci", vectors, g[columns] * unit)
+        alive = values > 1e-8
+        gain[index] = (np.where(alive, along**2 / np.where(alive, values, 1), 0)).sum(axis=1)
+    return gain, sign
+
+
+def fit(space: Space, chosen: Sequence[int]) -> Found:
+    """Return the joint fit of a set; its score is infinite where it breaks a bound or is absurd."""
+    if not chosen:
+        rss = float(space.y @ space.y)
+        return Found((), float(space.misfit(np.array(rss))), rss)
+    X = space.columns(chosen)
+    unit = 1 / np.sqrt(np.einsum("ij,ij->j", X, X) + 1e-300)
+    solution, _, rank, _ = np.linalg.lstsq(X * unit, space.y, rcond=1e-6)
+    rss = float(np.sum((space.y - (X * unit) @ solution) ** 2))
+    variance = max(rss / max(space.freedom - X.shape[1], 1.0), space.floor)
+    inverse = np.linalg.pinv((X * unit).T @ (X * unit), rcond=1e-12, hermitian=True)
+    values, deviation = solution * unit, np.sqrt(np.maximum(np.diag(inverse), 0) * variance) * unit
+    score = float(space.misfit(np.array(rss)) + space.price[list(chosen)].sum())
+    split = np.cumsum([len(space.candidates[c].parameters) for c in chosen])[:-1]
+    parts, spread = np.split(values, split), np.split(deviation, split)
+    for c, x, s in zip(chosen, parts, spread, strict=True):
+        if not _plausible(space.candidates[c], x, s):
+            score = np.inf
+    return Found(tuple(chosen), score, rss, tuple(parts), tuple(spread))
+
+
+def _plausible(candidate: Candidate, x: Array, s: Array) -> bool:
+    if not candidate.named:
+        return True
+    for parameter, value, deviation in zip(candidate.parameters, x, s, strict=True):
+        if value < parameter.lower - 2.5 * deviation or value > parameter.upper:
+            return False
+        if abs(value) - 3 * deviation > ABSURD * parameter.scale:
+            return False
+    return True
+
+
+def _clash(space: Space, chosen: Sequence[int], new: int) -> bool:
+    """Return whether a candidate stands instead of, not beside, one that is chosen."""
+    b = space.candidates[new]
+    lines = 0
+    for c in chosen:
+        a = space.candidates[c]
+        if not (a.named and b.named) or a.site.joint != b.site.joint:
+            continue
+        if a.family == b.family == "transmission_error":
+            lines += 1
+            if abs((a.site.order or 0) - (b.site.order or 0)) < 0.75 or lines >= LINES:
+                return True
+        elif a.family == b.family:
+            return True
+        elif {a.family, b.family} == {"axial_compliance", "stiffness_nonlinearity"}:
+            return True
+    return False
+
+
+def _grow(space: Space, state: _State, new: int, score: float) -> _State:
+    block = state.P[:, space.start[new] : space.start[new + 1]]
+    unit = np.sqrt(np.einsum("ij,ij->j", block, block)) + 1e-300
+    U, s, _ = np.linalg.svd(block / unit, full_matrices=False)
+    U = U[:, s > 1e-5]
+    P = state.P - U @ (U.T @ state.P)
+    r = state.r - U @ (U.T @ state.r)
+    return _State((*state.chosen, new), P, r, float(r @ r), score)
+
+
+def _children(space: Space, state: _State, width: int) -> list[tuple[float, int]]:
+    gain, sign = gains(space, state.P, state.r)
+    score = space.misfit(np.maximum(state.rss - gain, 1e-300)) + space.price
+    score += space.price[list(state.chosen)].sum()
+    found: list[tuple[float, int]] = []
+    for c in np.argsort(score):
+        candidate = space.candidates[c]
+        if c in state.chosen or _clash(space, state.chosen, int(c)):
+            continue
+        single = candidate.named and len(candidate.parameters) == 1
+        if single and candidate.parameters[0].lower == 0 and sign[c] < 0:
+            continue
+        found.append((float(score[c]), int(c)))
+        if len(found) >= width:
+            break
+    return found
+
+
+def beam_search(space: Space, allowed_depth: int = DEPTH, beam: int = BEAM) -> list[Found]:
+    """Return the best sets met, best first (the empty one among them)."""
+    rss = float(space.y @ space.y)
+    empty = _State((), space.X, space.y, rss, float(space.misfit(np.array(rss))))
+    states, best, waited = [empty], empty.score, 0
+    met: dict[frozenset[int], Found] = {frozenset(): Found((), empty.score, rss)}
+    for _ in range(allowed_depth):
+        children: dict[frozenset[int], tuple[float, int, int]] = {}
+        for s, state in enumerate(states):
+            for score, c in _children(space, state, 2 * beam):
+                key = frozenset((*state.chosen, c))
+                if key not in children or score < children[key][0]:
+                    children[key] = (score, s, c)
+        ranked = sorted(children.values())[: 2 * beam]
+        checked = []
+        for score, s, c in ranked:
+            found = fit(space, (*states[s].chosen, c))
+            met[frozenset(found.chosen)] = found
+            if np.isfinite(found.score):
+                checked.append((found.score, s, c))
+        checked.sort()
+        states = [_grow(space, states[s], c, score) for score, s, c in checked[:beam]]
+        if not states:
+            break
+        waited = 0 if states[0].score < best - 1e-9 else waited + 1
+        best = min(best, states[0].score)
+        if waited >= PATIENCE:
+            break
+    return sorted(met.values(), key=lambda f: f.score)
+
+
+def _projected(space: Space, chosen: Sequence[int]) -> _State:
+    rss = float(space.y @ space.y)
+    state = _State((), space.X, space.y, rss, 0.0)
+    for c in chosen:
+        state = _grow(space, state, c, 0.0)
+    return state
+
+
+def children(space: Space, chosen: Sequence[int], width: int) -> list[tuple[float, int]]:
+    """Return the best candidates to join a set: (score of the joint set, index), best first."""
+    return _children(space, _projected(space, chosen), width)
+
+
+def improve(space: Space, found: Found) -> Found:
+    """Return the set after dropping and swapping terms as long as that pays."""
+    for _ in range(8):
+        better = found
+        for c in found.chosen:
+            rest = tuple(o for o in found.chosen if o != c)
+            trial = fit(space, rest)
+            if trial.score < better.score:
+                better = trial
+            for _, other in _children(space, _projected(space, rest), 3):
+                if other != c:
+                    trial = fit(space, (*rest, other))
+                    if trial.score < better.score - 1e-6:
+                        better = trial
+        if better is found:
+            return found
+        found = better
+    return found
+
+
+def rivals(space: Space, found: Found, c: int, within: float) -> list[tuple[float, int]]:
+    """Return the candidates that could stand for ``c`` in a set: (score above the best, index)."""
+    rest = tuple(o for o in found.chosen if o != c)
+    told = []
+    for score, other in _children(space, _projected(space, rest), 40):
+        if score > found.score + within:
+            break
+        if other == c:
+            continue
+        trial = fit(space, (*rest, other))
+        if trial.score <= found.score + within:
+            told.append((trial.score - found.score, other))
+    return sorted(told)
