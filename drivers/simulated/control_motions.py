@@ -23,14 +23,12 @@ from drivers.simulated.motion import (
     Motion,
     MoveJoints,
     MoveLine,
-    Servo,
-    SpeedJoints,
-    SpeedTool,
     Stop,
 )
 from drivers.simulated.path_program import path_motion
 from drivers.simulated.plant_arm import BASE, Frame, place
 from drivers.simulated.rotations import Vector3
+from drivers.simulated.stream_motion import Servo, SpeedJoints, SpeedTool
 
 CONTACT_FORCE = 10.0  # N: a pull against the way that is taken for a touch
 JOG_ACCELERATION = 0.5  # m/s^2
