@@ -10,6 +10,7 @@ Chemistry 36 (1964) 1627.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,21 +60,14 @@ def differentiate(signal: Array, step: float, order: int, longest: float = LONGE
     halves = [h for h in HALF_WIDTHS if h <= widest]
     sigma = signal_noise(signal)
     filters = [_coefficients(h, order, step) for h in halves]
-    value, noise, chosen = np.empty((count, n)), np.zeros(n), np.zeros(n, dtype=int)
-    unsure = np.zeros((count, n), dtype=bool)
-    tried = [_filtered(signal, halves[0], order, step)]
+    tried = [_filtered(signal, h, order, step) for h in halves]
+    value, noise = np.empty((count, n)), np.zeros(n)
+    chosen, unsure = np.zeros(n, dtype=int), np.zeros((count, n), dtype=bool)
     for j in range(n):
-        k = 0
-        while k + 1 < len(halves):
-            if len(tried) < k + 2:
-                tried.append(_filtered(signal, halves[k + 1], order, step))
-            change = tried[k + 1][:, j] - tried[k][:, j]
-            if not _may_grow(change, sigma[j], filters[k], filters[k + 1]):
-                break
-            k += 1
+        k = _widest([d[:, j] for d in tried], float(sigma[j]), filters)
         value[:, j], chosen[j] = tried[k][:, j], halves[k]
         noise[j] = sigma[j] * np.linalg.norm(filters[k])
-        other = k - 1 if k else min(1, len(tried) - 1)
+        other = k - 1 if k else min(1, len(halves) - 1)
         change = np.abs(tried[other][:, j] - tried[k][:, j])
         typical = float(np.sqrt(np.mean(value[:, j] ** 2)))
         unsure[:, j] = _jumps(change, typical, sigma[j], filters[other], filters[k])
@@ -96,12 +90,23 @@ def _filtered(signal: Array, half: int, order: int, step: float) -> Array:
     )
 
 
-def _may_grow(change: Array, sigma: float, h: Array, wider: Array) -> bool:
-    """Return whether a wider window changes the derivative by no more than noise explains."""
-    squares = np.sort(change**2)[: int(SMOOTH_SHARE * len(change))]
-    explained = sigma**2 * _difference(h, wider)
-    allowed = BIAS_SHARE**2 * sigma**2 * (wider @ wider)
-    return bool(squares.mean() / TRIMMED <= 1.1 * explained + allowed)
+def _widest(tried: list[Array], sigma: float, filters: list[Array]) -> int:
+    """Return the number of the widest window before the motion itself is flattened.
+
+    A change from window to window is noise where white noise explains it, or where it still falls
+    steeply with the width (quantised angles are no white noise).
+    """
+    changes = []
+    for one, other in pairwise(tried):
+        squares = np.sort((other - one) ** 2)[: int(SMOOTH_SHARE * len(one))]
+        changes.append(float(squares.mean()) / TRIMMED)
+    for k, change in enumerate(changes):
+        explained = 1.1 * _difference(filters[k], filters[k + 1])
+        allowed = BIAS_SHARE**2 * float(filters[k + 1] @ filters[k + 1])
+        falls = k + 1 < len(changes) and changes[k + 1] < 0.5 * change
+        if change > sigma**2 * (explained + allowed) and not falls:
+            return k
+    return len(changes)
 
 
 def _jumps(

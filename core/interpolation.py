@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 if TYPE_CHECKING:
     from core.motion import Motion
 
 Array = NDArray[np.float64]
-FINE_STEP = 2e-3  # s: a lag's command is filled in to at least this rate
+FINE_STEP = 1e-3  # s: a lag's command is filled in to at least this rate
 
 
 def stretches(motion: Motion) -> list[slice]:
@@ -24,32 +25,18 @@ def stretches(motion: Motion) -> list[slice]:
 
 
 def interpolate(time: Array, value: Array, at: Array) -> Array:
-    """Return a signal (N,) at other times (M,) by local cubics through its samples.
-
-    Slopes are those of the parabola through three neighbours (Catmull-Rom on uneven steps), so a
-    corner spoils no more than its two neighbours. Beyond the ends the end values hold.
-    """
-    if len(time) < 3:
+    """Return a signal (N,) at other times (M,) by a cubic spline; beyond its ends they hold."""
+    if len(time) < 4:
         return np.interp(at, time, value)
-    step = np.diff(time)
-    secant = np.diff(value) / step
-    slope = np.empty_like(value)
-    slope[1:-1] = (step[1:] * secant[:-1] + step[:-1] * secant[1:]) / (step[1:] + step[:-1])
-    slope[0], slope[-1] = secant[0], secant[-1]
-    inside = np.clip(at, time[0], time[-1])
-    k = np.clip(np.searchsorted(time, inside, side="right") - 1, 0, len(time) - 2)
-    h = step[k]
-    s = (inside - time[k]) / h
-    rest = 1 - s
-    ends = value[k] * (1 + 2 * s) * rest**2 + value[k + 1] * s**2 * (3 - 2 * s)
-    return np.asarray(ends + h * (slope[k] * s * rest**2 - slope[k + 1] * s**2 * rest))
+    return np.asarray(CubicSpline(time, value)(np.clip(at, time[0], time[-1])))
 
 
 def lagged(time: Array, command: Array, constant: float, first: float) -> Array:
     """Return the response (N,) of a first-order lag to a command (N,): T dy/dt = u - y.
 
     ``constant`` is T in s, 0 or more; ``first`` the response at the first sample. Exact for a
-    command that runs as a ramp from sample to sample; where the log is coarse, cubics fill in.
+    command that runs as a ramp from sample to sample; where the log is coarser than 1 ms, a cubic
+    spline fills in.
     """
     if constant <= 0.0 or len(time) < 2:
         return command.copy()

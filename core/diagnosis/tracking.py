@@ -18,6 +18,7 @@ from core.motion import Motion, motion_of
 
 Array = NDArray[np.float64]
 SHORTEST_LEAD = 0.1  # s left out at the start of each stretch, whose past is unknown
+TEXT = 2e-7  # rad: smaller differences come from how the log was written
 LEADS = 4.0  # times the delay: what is left out where it is longer
 
 
@@ -61,14 +62,14 @@ def encoder_step(q: Array) -> float:
     """Return the step (rad) in which encoder angles (N, n) are told; 0 where they have none."""
     steps = []
     for angles in q.T:
-        change = np.abs(np.diff(angles))
-        change = change[change > 1e-10]
-        if len(change) < 20:
+        gaps = np.diff(np.unique(angles))
+        gaps = gaps[gaps > TEXT]
+        if len(gaps) < 20:
             continue
-        step = float(np.quantile(change, 0.02))
-        small = change[change < 20.5 * step] / step
-        whole = np.abs(small - np.round(small)) < 0.1
-        if len(small) >= 10 and whole.mean() > 0.8:
+        step = float(np.quantile(gaps, 0.05))
+        few = gaps[gaps < 20.5 * step] / step
+        whole = np.abs(few - np.round(few)) < 0.1
+        if len(few) >= 10 and whole.mean() > 0.9:
             steps.append(step)
     return float(np.median(steps)) if steps else 0.0
 

@@ -22,7 +22,7 @@ class Latency(JointEffect):
     delay at every joint that moved; told per joint, because one joint's drive can have it alone
     and a joint that stood still cannot tell. Differs from a lag in that corners stay sharp: only
     fast changes of the command separate the two, slow motion gives their sum.
-    Exact: the command is interpolated by local cubics (Catmull, Rom 1974) at t - latency. Rows
+    Exact: the command is interpolated by a cubic spline at t - latency. Rows
     right after the start of a recording, or after a gap, hold the first command.
     Source: CONTRACT; Astrom, Wittenmark, "Computer-Controlled Systems" (1997), ch. 2.
     """

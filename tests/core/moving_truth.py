@@ -34,8 +34,10 @@ class Plant:
         model = pin.buildModelFromXML(self.urdf)
         model.gravity.linear = np.array([0, 0, -9.80665])
         if link is not None:
-            I = model.inertias[link]
-            model.inertias[link] = pin.Inertia(I.mass * (1 + more), I.lever, I.inertia * (1 + more))
+            old = model.inertias[link]
+            model.inertias[link] = pin.Inertia(
+                old.mass * (1 + more), old.lever, old.inertia * (1 + more)
+            )
         model.inertias[model.njoints - 1] = pin.Inertia(payload, COG, np.zeros((3, 3)))
         return model
 
@@ -51,7 +53,6 @@ class Plant:
         n, hand = self.arm.n, model.njoints - 1
         mass = np.broadcast_to(payload, len(q))
         torque, wrench = np.empty((len(q), n)), np.empty((len(q), 6))
-        zero = np.zeros(1)
         for r in range(len(q)):
             model.inertias[hand] = pin.Inertia(float(mass[r]), COG, np.zeros((3, 3)))
             angles = np.append(q[r], 0)
@@ -75,13 +76,13 @@ def plant(folder: Path, n: int, seed: int) -> Plant:
         mass = 8.0 * 0.75**i
         size = 0.15 + 0.05 * rng.random(3)
         x, y, z = mass * size**2 * np.array([1, 1, 0.5])
-        cog = rng.uniform(-0.1, 0.1, 3) + [0, 0, 0.1]
+        cog = rng.uniform(-0.1, 0.1, 3) + np.array([0, 0, 0.1])
         links.append(
             f'<link name="l{i}"><inertial><origin xyz="{_text(cog)}" rpy="0.1 0.2 0.3"/>'
             f'<mass value="{mass:.17g}"/><inertia ixx="{x:.17g}" iyy="{y:.17g}" izz="{z:.17g}" '
             f'ixy="{0.1 * z:.17g}" ixz="0" iyz="{-0.05 * z:.17g}"/></inertial></link>'
         )
-        place = np.array([0, 0, 0.3]) + rng.uniform(-0.08, 0.08, 3)
+        place = rng.uniform(-0.08, 0.08, 3) + np.array([0, 0, 0.3])
         axis = ("0 0 1", "0 1 0")[(i + 1) % 2 if i > 1 else 0]
         joints.append(_joint(i, "revolute", f"l{i - 1}" if i > 1 else "base", f"l{i}", place, axis))
     links.append('<link name="flange"/>')
@@ -163,7 +164,7 @@ def fit(arm: Arm, observation, terms, rounds=8):
     for _ in range(rounds):
         left = ((observation.measured - observation.predict(terms)) * w).ravel()
         columns = []
-        for k, (term, scale) in enumerate(zip(terms, scales, strict=True)):
+        for k, scale in enumerate(scales):
             for p in range(len(scale)):
                 step = np.zeros(len(scale))
                 step[p] = 1e-2 * scale[p]

@@ -1,0 +1,135 @@
+"""Motion from logs: derivatives, rests, jumps, and timestamps as recorders leave them."""
+
+from __future__ import annotations
+
+import moving_truth as truth
+import numpy as np
+import pytest
+
+from core.derivatives import differentiate, signal_noise
+from core.errors import LogError
+from core.motion import motion_of, time_finding
+
+COURSE = truth.course(6, 1)
+ENCODER = 1.2e-5  # rad
+
+
+def recording(rate=500.0, seconds=10.0, **more):
+    t = np.arange(int(rate * seconds)) / rate
+    q = np.round(COURSE.at(t) / ENCODER) * ENCODER
+    return t, truth.log_of(6, timestamp=t, actual_q=q, **more)
+
+
+@pytest.mark.parametrize("rate", [500.0, 125.0, 25.0])
+def test_derivatives_of_encoder_angles_are_those_of_the_course(rate):
+    t, log = recording(rate, 20)
+    motion = motion_of(log)
+    good = motion.valid
+    assert good.mean() > 0.9
+    assert np.abs(motion.qd - COURSE.at(t, 1))[good].max() < 0.01
+    error = (motion.qdd - COURSE.at(t, 2))[good]
+    assert np.sqrt(np.mean(error**2)) < 0.02 * COURSE.at(t, 2).std()
+
+
+def test_measured_speeds_without_noise_make_accelerations_exact():
+    rate = 500.0
+    t = np.arange(5000) / rate
+    log = truth.log_of(6, timestamp=t, actual_q=COURSE.at(t), actual_qd=COURSE.at(t, 1))
+    motion = motion_of(log)
+    assert np.abs(motion.qdd - COURSE.at(t, 2))[motion.valid].max() < 1e-4
+
+
+def test_the_noise_of_a_smooth_signal_is_found():
+    t = np.arange(5000) / 500
+    noisy = COURSE.at(t) + np.random.default_rng(0).normal(0, 1e-4, (5000, 6))
+    assert np.allclose(signal_noise(noisy), 1e-4, rtol=0.1)
+
+
+def test_the_window_follows_the_noise_and_its_error_is_told():
+    t = np.arange(5000) / 500
+    quiet = differentiate(COURSE.at(t), 1 / 500, 2)
+    loud = differentiate(
+        COURSE.at(t) + np.random.default_rng(0).normal(0, 1e-4, (5000, 6)), 1 / 500, 2
+    )
+    assert loud.half_width > quiet.half_width
+    error = (loud.value - COURSE.at(t, 2))[100:-100]
+    assert np.all(error.std(axis=0) < 2 * loud.noise)
+
+
+def test_corners_of_a_trapezoidal_speed_are_left_out():
+    t = np.arange(6000) / 500
+    acceleration = np.select([(t % 3) < 0.3, (t % 3) < 1.2, (t % 3) < 1.5], [4.0, 0.0, -4.0], 0.0)
+    speed = np.concatenate([[0], np.cumsum(acceleration[:-1])]) / 500
+    angle = np.concatenate([[0], np.cumsum(speed[:-1] + acceleration[:-1] / 1000)]) / 500
+    q = np.round(np.tile(angle[:, None], 6) / ENCODER) * ENCODER
+    motion = motion_of(truth.log_of(6, timestamp=t, actual_q=q))
+    assert 0.4 < motion.valid.mean() < 0.99
+    error = np.abs(motion.qdd - acceleration[:, None])
+    assert error[~motion.valid].max() > 1.0
+    assert error[motion.valid].max() < 0.5
+
+
+def test_poses_at_rest_have_no_derivatives():
+    q = truth.poses(6, 30, 0)
+    for columns in ({}, {"timestamp": np.arange(30) * 30.0}, {"timestamp": np.arange(30) * 2e-3}):
+        motion = motion_of(truth.log_of(6, actual_q=q, **columns))
+        assert not motion.moving
+        assert not motion.qd.any()
+        assert not motion.qdd.any()
+
+
+def test_a_gap_in_time_ends_a_stretch():
+    t, log = recording()
+    kept = np.flatnonzero((t < 4) | (t > 6))
+    motion = motion_of(log.select(kept))
+    assert motion.stretch[-1] == 1
+    assert not motion.valid[[0, 1999, 2000, -1]].any()
+    assert np.abs(motion.qd - COURSE.at(t[kept], 1))[motion.valid].max() < 0.01
+
+
+def test_uneven_timestamps_are_honoured():
+    t = np.sort(np.arange(5000) / 500 + np.random.default_rng(0).uniform(-4e-4, 4e-4, 5000))
+    motion = motion_of(truth.log_of(6, timestamp=t, actual_q=COURSE.at(t)))
+    assert np.abs(motion.qd - COURSE.at(t, 1))[motion.valid].max() < 1e-3
+
+
+def test_cycles_recorded_twice_count_once_and_are_told():
+    _, log = recording()
+    twice = log.select(np.repeat(np.arange(len(log)), 2))
+    motion = motion_of(twice)
+    assert len(motion) == len(log)
+    assert np.array_equal(motion.rows, np.arange(0, 2 * len(log), 2))
+    assert "repeat the timestamp" in str(time_finding(twice))
+    assert time_finding(log) is None
+
+
+def test_rounded_timestamps_are_replaced_by_an_even_clock():
+    t, log = recording(25.0, 40)
+    rounded = truth.log_of(6, timestamp=np.round(t, 1), actual_q=log.columns["actual_q"])
+    motion = motion_of(rounded)
+    assert np.abs(motion.t - motion.t.mean() - (t - t.mean())).max() < 0.01
+    assert "rounded to 0.1 s" in str(time_finding(rounded))
+
+
+def test_other_repeats_name_their_row():
+    t, log = recording()
+    stuck = t.copy()
+    stuck[1000:3000] = stuck[1000]
+    with pytest.raises(LogError, match=r"row 1003, column timestamp: found 2 again"):
+        motion_of(truth.log_of(6, timestamp=stuck, actual_q=log.columns["actual_q"]))
+
+
+def test_time_that_runs_backwards_names_its_row():
+    t, log = recording()
+    t = t.copy()
+    t[700:] -= 1
+    with pytest.raises(LogError, match=r"row 702, column timestamp: .* expected rows in time"):
+        motion_of(truth.log_of(6, timestamp=t, actual_q=log.columns["actual_q"]))
+
+
+def test_direction_is_smooth_only_where_it_is_unsure():
+    _, log = recording()
+    motion = motion_of(log)
+    fast = np.abs(motion.qd) > motion.still
+    assert np.all(np.abs(motion.direction[fast] - np.sign(motion.qd[fast])) < 1e-3)
+    assert not motion.turning[fast].any()
