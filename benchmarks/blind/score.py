@@ -195,8 +195,24 @@ def _depends(label: Label, unexplained: dict[str, Any]) -> bool | None:
     told = [str(d["quantity"]) for d in unexplained.get("depends_on") or []][:3]
     true = label.depends_on
     if not true:
-        true = Hidden(label.kind, label.seed).columns_that_matter()
+        true = _plain_columns(label) or Hidden(label.kind, label.seed).columns_that_matter()
     return bool(set(told) & set(true)) if true else None
+
+
+def _plain_columns(label: Label) -> tuple[str, ...]:
+    """Return the columns of withheld effects that plainly go by one quantity; else nothing."""
+    out: list[str] = []
+    for cause in label.causes:
+        if cause.effect == "thermal_drift":
+            out += ["timestamp", *(f"joint_temperatures_{i}" for i in range(7))]
+        elif cause.effect in ("backlash", "transmission_error"):
+            column = "approach" if cause.effect == "backlash" else "actual_q"
+            out += [f"{column}_{j - 1}" for j in cause.joints]
+        elif cause.effect == "ft_drift":
+            out.append("timestamp")
+        elif cause.effect in ("coulomb_friction", "viscous_friction"):
+            out += [f"actual_qd_{j - 1}" for j in cause.joints]
+    return tuple(out)
 
 
 def _z_scores(label: Label, causes: list[dict[str, Any]]) -> dict[str, float]:
