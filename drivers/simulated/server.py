@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import gc
 import logging
 import select
@@ -18,6 +16,7 @@ from drivers.simulated.bench import BenchServer
 from drivers.simulated.connection import Connection, listen
 from drivers.simulated.controller import CYCLE, Controller
 from drivers.simulated.dashboard_server import DashboardServer
+from drivers.simulated.punctual import become_punctual
 from drivers.simulated.rtde_server import RtdeServer, RtdeSession
 from drivers.simulated.script_server import ScriptServer
 from drivers.simulated.settings import ServerSettings, make_controller
@@ -25,6 +24,7 @@ from drivers.simulated.settings import ServerSettings, make_controller
 log = logging.getLogger("drivers.simulated")
 
 LEAD = 0.0002  # s by which a cycle is computed before its packets are due, so that they are on time
+COLLECT_EVERY = 500  # cycles
 LATE = 0.1  # s: behind by more than this, the missed cycles are left out
 
 
@@ -83,10 +83,14 @@ class Server:
         """Serve until `stop()` is true; it is asked once per cycle."""
         controller, rtde = self.controller, self.rtde
         deadline = time.monotonic()
+        cycles = 0
         while not stop():
             self._serve_until(deadline + 0.5 * CYCLE)
             deadline += CYCLE
             controller.sensors.after_cycle(controller.clock)  # costly, so half a cycle off
+            cycles += 1
+            if cycles % COLLECT_EVERY == 0:
+                gc.collect(1)
             self._serve_until(deadline - LEAD)
             controller.cycle()
             self._serve_until(deadline)
@@ -150,19 +154,10 @@ def serve(settings: ServerSettings, stop: Callable[[], bool] | None = None) -> N
     taken. Must run in a process of its own: ur_rtde's constructors hold the interpreter lock.
     """
     server = Server(settings)
-    _sharpen_timers()
-    gc.collect()
-    gc.freeze()  # what exists now stays; a full collection would cost a cycle
+    become_punctual()
     sys.stdout.write(f"ready {settings.host}\n")
     sys.stdout.flush()
     try:
         server.run(stop or (lambda: False))
     finally:
         server.close()
-
-
-def _sharpen_timers() -> None:
-    """Let this thread's timeouts end on time: Linux otherwise rounds them up by 50 us."""
-    set_timer_slack = 29  # PR_SET_TIMERSLACK
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(set_timer_slack, 1000, 0, 0, 0)
