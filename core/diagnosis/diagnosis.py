@@ -1,0 +1,247 @@
+"""The diagnosis of a log: channel by channel, where the gap lies, what causes it, how far it shrinks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis import position, torque, tracking, wrench
+from core.diagnosis.cause import Cause, Considered, causes_of, considered_of
+from core.diagnosis.held_out import HeldOut
+from core.diagnosis.judgement import Judgement, judge, pure_error
+from core.diagnosis.location import Where, locate
+from core.diagnosis.observation import NotObservable, Observation
+from core.diagnosis.selection import Selection, select
+from core.diagnosis.separation import Measurement, next_measurements
+from core.diagnosis.suspicion import check_units, findings
+from core.effects import Term
+from core.errors import LogError
+from core.log import Log
+from core.metrology import Metrology
+from core.model import Model
+
+Array = NDArray[np.float64]
+Observe = Callable[[Model, Log, Metrology], Observation | NotObservable]
+
+CHANNELS: Mapping[str, Observe] = {
+    "position": position.observe,
+    "wrench": wrench.observe,
+    "tracking": tracking.observe,
+    "torque": torque.observe,
+}
+
+
+@dataclass(frozen=True)
+class ChannelDiagnosis:
+    """What was found in one channel; figures per coordinate, in the channel's unit."""
+
+    channel: str
+    unit: str
+    samples: int
+    gap_rms: float
+    gap_max: float
+    noise_floor_rms: float | None
+    remaining_rms: float
+    remaining_rms_held_out: float | None
+    where: Where
+    causes: tuple[Cause, ...]
+    considered: tuple[Considered, ...]
+    unexplained_rms: float
+    structured: bool
+    p_value: float | None
+    depends_on: tuple[tuple[str, float], ...]
+    verdict: str
+    selection: Selection = field(repr=False)
+    judgement: Judgement = field(repr=False)
+    gap: Array = field(repr=False)  # (N, k) measured - predicted, frame fitted
+    remaining: Array = field(repr=False)  # (N, k) with the causes in the model
+    held_out: Array | None = field(repr=False)  # (kept,) rms of each held-out sample
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found in a log."""
+
+    verdict: str
+    channels: tuple[ChannelDiagnosis, ...]
+    not_observable: tuple[NotObservable, ...]
+    next_measurements: tuple[Measurement, ...]
+    findings: tuple[str, ...]
+    model: Model = field(repr=False)  # with the causes in it
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """Return the terms of all causes."""
+        return tuple(t for c in self.channels for cause in c.causes for t in cause.terms)
+
+
+def diagnose(
+    model: Model,
+    log: Log,
+    metrology: Metrology | None = None,
+    *,
+    withhold: Iterable[str] = (),
+    progress: Callable[[str], None] | None = None,
+    observers: Mapping[str, Observe] = CHANNELS,
+) -> Diagnosis:
+    """Return the diagnosis of ``log`` against ``model``, in every channel that the log shows.
+
+    ``withhold`` names effects to take out of the catalogue. Raises LogError where the log cannot be
+    used at all (units, numbers, no channel to look at).
+    """
+    metrology = metrology or Metrology()
+    withhold = tuple(withhold)
+    check_units(model, log)
+    told = findings(log)
+    observed: list[ChannelDiagnosis] = []
+    hidden: list[NotObservable] = []
+    for observe in observers.values():
+        seen = observe(model, log, metrology)
+        if isinstance(seen, NotObservable):
+            hidden.append(seen)
+            continue
+        enough = _enough(seen)
+        if enough is not None:
+            told.append(enough)
+            hidden.append(NotObservable(seen.channel, ("more rows",)))
+            continue
+        observed.append(_channel(seen, model, withhold, progress))
+    if not observed:
+        needs = "; ".join(f"{h.channel}: {', '.join(h.needs)}" for h in hidden)
+        raise LogError(f"{log.path}: found no channel to diagnose, expected one of: {needs}")
+    for channel in observed:
+        told += _channel_findings(channel)
+    terms = _for_the_model(observed)
+    return Diagnosis(
+        _overall(observed), tuple(observed), tuple(hidden),
+        next_measurements(model, log, observed), tuple(told), with_found(model, terms),
+    )  # fmt: skip
+
+
+def with_found(model: Model, terms: Sequence[Term]) -> Model:
+    """Return the model with found terms added."""
+    return model.with_terms(terms)
+
+
+def _for_the_model(channels: Sequence[ChannelDiagnosis]) -> list[Term]:
+    """Return each cause once: what several channels show (a payload) by the most certain one."""
+    best: dict[tuple[str, object], tuple[float, Term]] = {}
+    for channel in channels:
+        for cause in channel.causes:
+            for term, deviation in zip(cause.terms, cause.relative_deviation, strict=True):
+                key = (term.effect, term.site)
+                if key not in best or deviation < best[key][0]:
+                    best[key] = (deviation, term)
+    return [term for _, term in best.values()]
+
+
+def _enough(seen: Observation) -> str | None:
+    """Return why there are too few samples, or None."""
+    N, k, p = seen.nuisance.shape
+    if N * k < p + 6 or len(np.unique(seen.groups)) < 4:
+        return f"{seen.channel}: {N} usable row(s) are too few for a diagnosis"
+    return None
+
+
+def _channel(
+    seen: Observation, model: Model, withhold: tuple[str, ...],
+    progress: Callable[[str], None] | None,
+) -> ChannelDiagnosis:  # fmt: skip
+    selection = select(seen, model, withhold, progress)
+    verdict = judge(selection)
+    held = HeldOut(selection)
+    chosen = [selection.term_index[p] for p in verdict.accused]
+    gap, remaining = gaps(selection, chosen)
+    k = 3 if seen.channel in ("position", "wrench") else gap.shape[1]
+    kept = selection.kept
+    causes = causes_of(selection, verdict, held, model.arm)
+    left = float(np.sqrt(np.mean(remaining[kept][:, :k] ** 2)))
+    held_rms = held.rms(chosen) if held.possible else None
+    structured = verdict.structured
+    floor = noise_floor(selection, structured)
+    some_gap = bool(causes) or structured
+    word = "no_gap" if not some_gap else "explained"
+    if structured:
+        word = "partly_explained" if causes else "unexplained"
+    return ChannelDiagnosis(
+        channel=seen.channel, unit=seen.unit, samples=len(gap),
+        gap_rms=float(np.sqrt(np.mean(gap[kept][:, :k] ** 2))),
+        gap_max=float(np.linalg.norm(gap[kept][:, :k], axis=1).max()),
+        noise_floor_rms=floor, remaining_rms=left, remaining_rms_held_out=held_rms,
+        where=locate(selection, gap[kept], chosen), causes=causes,
+        considered=considered_of(selection, verdict, held, model.arm, withhold),
+        unexplained_rms=_beyond(left, floor, structured), structured=structured,
+        p_value=verdict.p_value, depends_on=verdict.depends_on, verdict=word,
+        selection=selection, judgement=verdict, gap=gap, remaining=remaining,
+        held_out=np.sqrt(held.squares(chosen)) if held.possible else None,
+    )  # fmt: skip
+
+
+def gaps(selection: Selection, chosen: Sequence[int]) -> tuple[Array, Array]:
+    """Return the gap (N, k) without and with the chosen terms, the nuisance fitted each time."""
+    observation = selection.observation
+    at = {c: t for c, t in zip(selection.term_index, selection.terms, strict=True)}
+    found = []
+    for terms in ([], [at[c] for c in chosen]):
+        gap = observation.measured - observation.predict(terms)
+        if observation.nuisance.shape[2]:
+            W = selection.noise.whitener
+            kept = selection.kept
+            A = (W @ observation.nuisance)[kept].reshape(-1, observation.nuisance.shape[2])
+            b = (W @ gap[..., None])[kept].ravel()
+            gap = gap - observation.nuisance @ np.linalg.lstsq(A, b, rcond=1e-12)[0]
+        found.append(gap)
+    return found[0], found[1]
+
+
+def noise_floor(selection: Selection, structured: bool) -> float | None:
+    """Return 1 sigma of one coordinate: instrument and repeatability, as stated or estimated."""
+    observation = selection.observation
+    if observation.sigma_is_whole:
+        return observation.sigma
+    k = 3 if observation.channel in ("position", "wrench") else observation.measured.shape[1]
+    left = selection.residual[selection.kept][:, :k]
+    pure, freedom = pure_error(left, observation.groups[selection.kept])
+    if structured and freedom >= 30:
+        return float(np.sqrt(max(pure, observation.sigma**2)))
+    covariance = np.linalg.inv(selection.noise.whitener)
+    variance = np.einsum("nij,nij->ni", covariance, covariance)[:, :k]
+    return float(np.sqrt(np.mean(variance)))
+
+
+def _beyond(left: float, floor: float | None, structured: bool) -> float:
+    if not structured or floor is None:
+        return 0.0
+    return float(np.sqrt(max(left**2 - floor**2, 0.0)))
+
+
+def _overall(channels: Sequence[ChannelDiagnosis]) -> str:
+    words = {c.verdict for c in channels}
+    if words == {"no_gap"}:
+        return "no_gap"
+    if words <= {"no_gap", "explained"}:
+        return "explained"
+    if any(c.causes for c in channels):
+        return "partly_explained"
+    return "unexplained"
+
+
+def _channel_findings(channel: ChannelDiagnosis) -> list[str]:
+    told = []
+    wild = channel.selection.observation.rows[~channel.selection.kept]
+    if len(wild):
+        rows = ", ".join(str(int(r) + 2) for r in wild[:8])
+        told.append(
+            f"{channel.channel}: {len(wild)} wild reading(s) set aside (row {rows}"
+            f"{', ...' if len(wild) > 8 else ''} of the file)"
+        )
+    for position_, reason in channel.judgement.withdrawn:
+        term = channel.selection.terms[position_]
+        joint = f" of joint {term.site.joint}" if term.site.joint else ""
+        told.append(f"{channel.channel}: {term.effect}{joint} is not accused: {reason}")
+    for cause in channel.causes:
+        told += [f"{channel.channel}: {note}" for note in cause.notes]
+    return told
