@@ -7,6 +7,7 @@ first has derivatives. Which one it is follows from its timestamps and steps.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,10 +69,11 @@ class Motion:
 
     def pick(self, rows: Index | NDArray[np.bool_]) -> Motion:
         """Return the motion of some of the rows (derivatives stay those of the full rate)."""
+        index: Any = rows
         return replace(
             self, t=self.t[rows], q=self.q[rows], qd=self.qd[rows], qdd=self.qdd[rows],
             target_q=None if self.target_q is None else self.target_q[rows],
-            loads=self.loads[rows], rows=self.rows[rows], valid=self.valid[rows],
+            loads=self.loads[index], rows=self.rows[rows], valid=self.valid[rows],
             stretch=self.stretch[rows], pieces=None,
         )  # fmt: skip
 
@@ -97,7 +99,8 @@ def motion_of(log: Log) -> Motion:
     """
     q = log.require("actual_q", "target_q")
     time = log.require("timestamp") if log.has("timestamp") else None
-    rows, t = np.arange(len(q)), np.zeros(len(q)) if time is None else time
+    rows: Any = np.arange(len(q))
+    t = np.zeros(len(q)) if time is None else time
     moving = time is not None and is_moving(time, q, log.get("actual_qd"))
     if time is not None:
         _check_order(log, time)
@@ -153,7 +156,7 @@ def _check_order(log: Log, time: Array) -> None:
 def _clock(log: Log, time: Array) -> tuple[Index, Array, str | None]:
     """Return the rows of a recording that count, their times, and what was made of repeats."""
     repeats = np.flatnonzero(np.diff(time) <= 0) + 1
-    everything = np.arange(len(time))
+    everything: Index = np.arange(len(time))
     if not len(repeats):
         return everything, time, None
     first = f"the first is row {repeats[0] + log.first_row}"
@@ -165,7 +168,7 @@ def _clock(log: Log, time: Array) -> tuple[Index, Array, str | None]:
         kept = np.delete(everything, repeats)
         told = f"{len(repeats)} of {len(time)} rows repeat the timestamp before ({first})"
         return kept, time[kept], f"{told}; the moving channels leave them out"
-    even = np.polyval(np.polyfit(everything, time, 1), everything)
+    even: Array = np.asarray(np.polyval(np.polyfit(everything, time, 1), everything), dtype=float)
     grain = float(np.diff(time)[np.diff(time) > 0].min())
     if np.abs(time - even).max() <= grain:
         told = (
@@ -211,7 +214,7 @@ def _derivatives(
     speed = differentiate(on_grid, step, 1)
     for longest in WINDOWS:
         qdd, unsure, edge = _accelerations(on_grid, known, step, longest)
-        good = ~unsure.any(axis=1)
+        good: NDArray[np.bool_] = ~np.any(unsure, axis=1)
         if good.mean() >= FEWEST_SMOOTH:
             break
     else:

@@ -33,7 +33,7 @@ def conditions(motion: Motion) -> Index:
     if motion.moving:
         span = max(float(motion.t[-1] - motion.t[0]), 1e-9)
         number = (motion.t - motion.t[0]) / span * STRETCHES
-        return np.minimum(number.astype(np.int64), STRETCHES - 1)
+        return np.asarray(np.minimum(number.astype(np.int64), STRETCHES - 1))
     loads = motion.loads
     groups = pose_groups(motion.q)
     if groups.max() + 1 >= FEWEST_CONDITIONS:
