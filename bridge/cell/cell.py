@@ -1,0 +1,97 @@
+"""The cell: one file that says which arm stands there, what it carries and how it is reached."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydantic import ValidationError
+
+from bridge.cell.document import Document, read_document
+from bridge.cell.effects import compliance_terms, term_of
+from bridge.cell.message import message
+from bridge.cell.robot import build_arm
+from bridge.cell.schema import CellFile, Frame
+from core.arm import Arm
+from core.errors import ArmError, CellError
+from core.metrology import Metrology
+from core.model import Model
+from core.rotation import rpy_matrix, transform
+
+HEAVIEST = 2.0  # times the rated payload: beyond, the number is a mistake
+FINEST = 1.0e-9  # m: what a sigma of zero counts as
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell file that has been read and checked."""
+
+    path: Path
+    file: CellFile
+    document: Document
+    model: Model
+    metrology: Metrology
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def arm(self) -> Arm:
+        """Return the nominal arm."""
+        return self.model.arm
+
+
+def load_cell(path: Path | str) -> Cell:
+    """Return the cell of a YAML file.
+
+    Raises CellError (or ArmError) with one line that names file, line, key, what was found and
+    what was expected.
+    """
+    path = Path(path)
+    document = read_document(path)
+    try:
+        file = CellFile.model_validate(document.data)
+    except ValidationError as error:
+        raise CellError(message(document, CellFile, error)) from None
+    return cell_of(file, document)
+
+
+def cell_of(file: CellFile, document: Document) -> Cell:
+    """Return the cell of a file's keys; raises CellError where they do not fit each other."""
+    path = document.path
+    try:
+        arm = build_arm(file.robot, path.parent)
+        warnings = _check_payload(file, arm)
+        terms = compliance_terms(file.compliance, arm) + tuple(
+            term_of(entry, arm, f"effects entry {i + 1}") for i, entry in enumerate(file.effects)
+        )
+    except (ArmError, CellError) as error:
+        text = str(error)
+        raise type(error)(text if text.startswith(str(path)) else f"{path}: {text}") from None
+    model = Model(
+        arm=arm,
+        tool_in_flange=_transform(file.tool.tcp),
+        payload_mass=file.payload.mass,
+        payload_cog=np.array(file.payload.cog),
+        gravity=np.array(file.gravity),
+        reference_temperature=file.reference_temperature,
+        terms=terms,
+    )
+    entry = file.metrology
+    metrology = Metrology(entry.registered, max(entry.sigma, FINEST), entry.repeatability)
+    return Cell(path, file, document, model, metrology, tuple(f"{path}: {w}" for w in warnings))
+
+
+def _transform(frame: Frame) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    return transform(rpy_matrix(np.array(frame.rpy)), np.array(frame.xyz))
+
+
+def _check_payload(file: CellFile, arm: Arm) -> list[str]:
+    mass, rated = file.payload.mass, arm.payload
+    if mass > HEAVIEST * rated:
+        raise CellError(
+            f"payload.mass: found {mass:g} kg, out of range: expected 0 to {rated:g} kg, what "
+            f"{arm.name} is rated for"
+        )
+    if mass > rated:
+        return [f"payload.mass: {mass:g} kg is more than {arm.name} is rated for ({rated:g} kg)"]
+    return []

@@ -1,0 +1,107 @@
+"""Effects in a cell file and as terms of a model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from bridge.cell.message import nearest
+from bridge.cell.schema import Compliance, EffectEntry
+from core.arm import Arm
+from core.effects import Parameter, Site, Term, effect_named
+from core.errors import CellError, InputError
+
+VALUE = "value"  # the name in the file of a parameter that has none of its own
+FLEXIBILITIES = {"axial_compliance": "axial", "radial_compliance": "radial"}
+
+
+def term_of(entry: EffectEntry, arm: Arm, where: str) -> Term:
+    """Return the term of one entry of ``effects``; raises CellError beginning with ``where``."""
+    try:
+        effect = effect_named(entry.effect)
+    except InputError as error:
+        raise CellError(f"{where}.{error}") from None
+    sites = effect.sites(arm)
+    joints = [site.joint for site in sites]
+    if entry.joint not in joints:
+        allowed = "no joint" if joints == [None] else f"a joint of {joints[0]} to {joints[-1]}"
+        found = "none" if entry.joint is None else entry.joint
+        raise CellError(f"{where}.joint: found {found}, expected {allowed} for {entry.effect}")
+    if (entry.order is not None) != (entry.effect == "transmission_error"):
+        raise CellError(
+            f"{where}.order: found {'none' if entry.order is None else entry.order}, expected "
+            f"{'cycles per turn' if entry.order is None else 'none'} for {entry.effect}"
+        )
+    site = Site(entry.joint, entry.order)
+    parameters = effect.parameters(arm, site)
+    names = [name_of(parameter) for parameter in parameters]
+    for name in entry.parameters:
+        if name not in names:
+            raise CellError(
+                f"{where}.parameters.{name}: found an unknown parameter of {entry.effect}; "
+                f"{nearest(name, names)}"
+            )
+    values = [_value(entry, name, p, where) for name, p in zip(names, parameters, strict=True)]
+    return Term(entry.effect, site, tuple(values))
+
+
+def _value(entry: EffectEntry, name: str, parameter: Parameter, where: str) -> float:
+    if name not in entry.parameters:
+        raise CellError(f"{where}.parameters.{name}: found nothing, expected {parameter.unit}")
+    value = entry.parameters[name]
+    if not parameter.lower <= value <= parameter.upper:
+        raise CellError(
+            f"{where}.parameters.{name}: found {value:g}, expected {parameter.lower:g} to "
+            f"{parameter.upper:g} {parameter.unit}"
+        )
+    return value
+
+
+def name_of(parameter: Parameter) -> str:
+    """Return a parameter's name in the cell file."""
+    return parameter.name or VALUE
+
+
+def compliance_terms(compliance: Compliance, arm: Arm) -> tuple[Term, ...]:
+    """Return the terms of the compliance section; zeros are left out."""
+    terms = []
+    for effect, key in FLEXIBILITIES.items():
+        values = getattr(compliance, key)
+        if values is None:
+            continue
+        if len(values) != arm.n:
+            raise CellError(
+                f"compliance.{key}: found {len(values)} values, expected {arm.n}: "
+                f"the arm ({arm.name}) has {arm.n} joints"
+            )
+        terms += [Term(effect, Site(i + 1), (v,)) for i, v in enumerate(values) if v]
+    return tuple(terms)
+
+
+def compliance_entry(terms: Sequence[Term], n: int) -> dict[str, list[float]]:
+    """Return the compliance section of a model's terms: n values per key."""
+    entry = {key: np.zeros(n) for key in FLEXIBILITIES.values()}
+    for term in terms:
+        if term.effect in FLEXIBILITIES and term.site.joint is not None:
+            entry[FLEXIBILITIES[term.effect]][term.site.joint - 1] += term.values[0]
+    return {key: values.tolist() for key, values in entry.items()}
+
+
+def effect_entries(terms: Sequence[Term], arm: Arm) -> list[dict[str, Any]]:
+    """Return the ``effects`` list of a model's terms; flexibilities stand in their own section."""
+    entries = []
+    for term in terms:
+        if term.effect in FLEXIBILITIES:
+            continue
+        entry: dict[str, Any] = {"effect": term.effect}
+        if term.site.joint is not None:
+            entry["joint"] = term.site.joint
+        if term.site.order is not None:
+            entry["order"] = float(term.site.order)
+        parameters = effect_named(term.effect).parameters(arm, term.site)
+        names = [name_of(parameter) for parameter in parameters]
+        entry["parameters"] = dict(zip(names, map(float, term.values), strict=True))
+        entries.append(entry)
+    return entries

@@ -1,0 +1,154 @@
+"""One clear line out of what pydantic says about a cell file."""
+
+from __future__ import annotations
+
+import difflib
+import typing
+from collections.abc import Iterable
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from bridge.cell.document import Document, Keys
+
+_EXPECTED = {
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "int_type": "a whole number",
+    "int_parsing": "a whole number",
+    "int_from_float": "a whole number",
+    "finite_number": "a finite number",
+    "string_type": "a text",
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+    "list_type": "a list",
+    "dict_type": "keys with values",
+    "model_type": "keys with values",
+    "model_attributes_type": "keys with values",
+    "greater_than": "more than {gt}",
+    "greater_than_equal": "{ge} or more",
+    "less_than": "less than {lt}",
+    "less_than_equal": "{le} or less",
+    "too_short": "{min_length} values",
+    "too_long": "{max_length} values",
+    "literal_error": "{expected}",
+    "enum": "{expected}",
+}
+LONGEST = 60  # characters of a found value that are quoted
+
+
+def key_path(keys: Keys) -> str:
+    """Return a key path as people read it: ``robot.dh row 2.a``, list entries from 1."""
+    text = ""
+    for key in keys:
+        if isinstance(key, int):
+            text += f" entry {key + 1}"
+        else:
+            text += f"{'.' if text else ''}{key}"
+    return text
+
+
+def message(document: Document, schema: type[BaseModel], error: ValidationError) -> str:
+    """Return one line: file, line, key path, what was found, what was expected.
+
+    Unknown keys come first: a misspelt key is also a missing one.
+    """
+    details = sorted(error.errors(), key=lambda d: d["type"] != "extra_forbidden")
+    worst = details[0]
+    keys, model = _own_keys(schema, worst["loc"])
+    if worst["type"] == "extra_forbidden":
+        return _unknown_key(document, keys, model)
+    found, expected = _found(worst), _expected(worst, _description(schema, keys))
+    where = f"{document.path}, line {document.line(keys)}"
+    return f"{where}: {key_path(keys)}: found {found}, expected {expected}"
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return a hint that names the nearest known word, or all of them."""
+    names = list(known)
+    near = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.5)
+    return f"did you mean {near[0]!r}?" if near else f"known here: {', '.join(names)}"
+
+
+def _unknown_key(document: Document, keys: Keys, model: type[BaseModel] | None) -> str:
+    known = list(model.model_fields) if model else []
+    line = document.line(keys)
+    *parents, key = keys
+    inside = f" in {key_path(parents)}" if parents else ""
+    return (
+        f"{document.path}, line {line}: {key_path(keys)}: found an unknown key {str(key)!r}"
+        f"{inside}, expected one that is known; {nearest(str(key), known)}"
+    )
+
+
+def _models(annotation: Any) -> list[type[BaseModel]]:
+    """Return the pydantic models inside an annotation."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [m for part in typing.get_args(annotation) for m in _models(part)]
+
+
+def _own_keys(
+    schema: type[BaseModel], loc: tuple[str | int, ...]
+) -> tuple[list[str | int], type[BaseModel] | None]:
+    """Return the keys of the file in pydantic's location, and the model that holds the last one.
+
+    Pydantic puts the names of union members and validators between the keys.
+    """
+    keys: list[str | int] = []
+    models, holder = [schema], None
+    for part in loc:
+        if isinstance(part, int):
+            keys.append(part)
+            continue
+        owner = next((m for m in models if part in m.model_fields), None)
+        if owner is not None:
+            holder = owner
+            keys.append(part)
+            models = _models(owner.model_fields[part].annotation)
+        elif part == loc[-1] and models and not _is_union_label(part, models):
+            chosen = [m for m in models if m.__name__ in loc] or models
+            return [*keys, part], chosen[0]
+    return keys, holder
+
+
+def _is_union_label(part: str, models: list[type[BaseModel]]) -> bool:
+    names = {m.__name__ for m in models}
+    return part in names or part in ("str", "float", "int", "bool") or "[" in part
+
+
+def _description(schema: type[BaseModel], keys: Keys) -> str:
+    models, text = [schema], ""
+    for key in keys:
+        if isinstance(key, str):
+            owner = next((m for m in models if key in m.model_fields), None)
+            if owner is None:
+                return text
+            field = owner.model_fields[key]
+            text, models = field.description or "", _models(field.annotation)
+    return text
+
+
+def _found(error: ErrorDetails) -> str:
+    if error["type"] == "missing":
+        return "nothing"
+    value = error["input"]
+    if error["type"] in ("too_short", "too_long"):
+        return f"{len(value)}"
+    if value is None:
+        return "nothing"
+    text = " ".join(repr(value).split())
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+
+
+def _expected(error: ErrorDetails, description: str) -> str:
+    if error["type"] == "missing":
+        return description or "it here"
+    if error["type"] in ("value_error", "assertion_error"):
+        return str(error.get("ctx", {}).get("error", error["msg"]))
+    template = _EXPECTED.get(error["type"])
+    if template is None:
+        return str(error["msg"]).removeprefix("Input should be ")
+    text = template.format(**error.get("ctx", {}))
+    return f"{text} ({description})" if description else text

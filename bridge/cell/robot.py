@@ -1,0 +1,83 @@
+"""The arm of a cell: a built-in table, a URDF beside the cell, or DH rows."""
+
+from __future__ import annotations
+
+import configparser
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from bridge.cell.schema import Calibration, Robot
+from core.arm import Arm, arm_from_dh, builtin_arm
+from core.errors import ArmError, CellError
+from core.urdf import arm_from_urdf
+
+DELTAS = ("delta_theta", "delta_a", "delta_d", "delta_alpha")
+
+
+def build_arm(robot: Robot, folder: Path) -> Arm:
+    """Return the arm that the robot section names; paths are seen from ``folder``.
+
+    Raises CellError (or ArmError, naming the URDF) where the section or a file of it cannot be
+    used; messages begin with the key.
+    """
+    given = [kind for kind in ("model", "urdf", "dh") if getattr(robot, kind) is not None]
+    if len(given) != 1:
+        found = " and ".join(given) or "none of them"
+        raise CellError(f"robot: found {found}, expected one of model, urdf, dh")
+    for key, owner in (("tip", "urdf"), ("calibration", "model")):
+        if getattr(robot, key) is not None and given[0] != owner:
+            raise CellError(f"robot.{key}: found beside robot.{given[0]}, expected only beside "
+                            f"robot.{owner}")  # fmt: skip
+    if robot.model is not None:
+        return builtin_arm(robot.model, _calibration(robot.calibration, folder))
+    if robot.urdf is not None:
+        path = folder / robot.urdf
+        if not path.is_file():
+            raise CellError(f"robot.urdf: file not found: {path}, expected a URDF")
+        return arm_from_urdf(path, robot.tip)
+    return arm_from_dh([row.model_dump() for row in robot.dh or []])
+
+
+def _calibration(
+    given: Calibration | str | None, folder: Path
+) -> Mapping[str, Sequence[float]] | None:
+    if given is None:
+        return None
+    if isinstance(given, Calibration):
+        return {key: value for key in DELTAS if (value := getattr(given, key)) is not None}
+    return read_calibration(folder / given)
+
+
+def read_calibration(path: Path) -> dict[str, list[float]]:
+    """Return the deltas of a UR controller's ``calibration.conf`` (an INI file).
+
+    Raises ArmError where the file is missing, is no INI file or holds no deltas.
+    """
+    parser = configparser.ConfigParser(interpolation=None)
+    try:
+        parser.read_string(path.read_text(encoding="utf-8"), source=str(path))
+    except FileNotFoundError:
+        raise ArmError(
+            f"robot.calibration: file not found: {path}, expected a calibration.conf"
+        ) from None
+    except (OSError, UnicodeDecodeError, configparser.Error) as error:
+        what = " ".join(str(error).split())
+        raise ArmError(f"robot.calibration: {path} cannot be read: {what}") from None
+    deltas: dict[str, list[float]] = {}
+    for section in parser.sections():
+        for key in DELTAS:
+            if parser.has_option(section, key):
+                deltas[key] = _list(path, key, parser.get(section, key))
+    if not deltas:
+        raise ArmError(f"robot.calibration: {path}: found none of {', '.join(DELTAS)}")
+    return deltas
+
+
+def _list(path: Path, key: str, text: str) -> list[float]:
+    try:
+        return [float(value) for value in json.loads(text)]
+    except (ValueError, TypeError):
+        raise ArmError(
+            f"robot.calibration: {path}: {key}: found {text!r}, expected a list of numbers"
+        ) from None

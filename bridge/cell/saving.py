@@ -1,0 +1,142 @@
+"""Writing a cell with another model in it: the user's own text, with the model's keys replaced."""
+
+from __future__ import annotations
+
+import copy
+import os
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from bridge.cell.cell import Cell
+from bridge.cell.document import Document, number_text, parse
+from bridge.cell.effects import compliance_entry, effect_entries
+from bridge.output_file import write_text
+from core.errors import CellError
+from core.model import Model
+
+PATHS: tuple[tuple[str, ...], ...] = (("robot", "urdf"), ("robot", "calibration"))
+
+
+class _Dumper(yaml.SafeDumper):
+    """Block style outside, numbers that read back exactly."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        """Write every value where it stands."""
+        return True
+
+
+_Dumper.add_representer(
+    float, lambda d, value: d.represent_scalar("tag:yaml.org,2002:float", number_text(value))
+)
+
+
+def save_cell(cell: Cell, path: Path | str, model: Model | None = None) -> None:
+    """Write the cell, with the effects of ``model`` instead of its own, to ``path`` in one step.
+
+    Keys, order and comments of the user's file stay; relative paths are written so that they hold
+    from the new file's folder. Reading the new file gives the same model, number for number.
+    """
+    path = Path(path)
+    model = model or cell.model
+    text = cell_text(cell.document, path, model)
+    write_text(path, text)
+
+
+def cell_text(document: Document, path: Path, model: Model) -> str:
+    """Return the text of the cell file at ``path`` for ``model``."""
+    changes: dict[str, Any] = {"compliance": compliance_entry(model.terms, model.arm.n)}
+    entries = effect_entries(model.terms, model.arm)
+    if entries or "effects" in document.data:
+        changes["effects"] = entries
+    wanted = copy.deepcopy(document.data)
+    for keys in PATHS:
+        _rebase(wanted, keys, document.path.parent, path.parent)
+    edited = _edited(document, wanted, changes)
+    wanted.update(changes)
+    if edited is not None and _reads_as(edited, path, wanted):
+        return edited
+    return _dumped(wanted)
+
+
+def _rebase(data: dict[str, Any], keys: tuple[str, ...], old: Path, new: Path) -> None:
+    *parents, last = keys
+    section: Any = data
+    for key in parents:
+        section = section.get(key) if isinstance(section, dict) else None
+    if isinstance(section, dict) and isinstance(section.get(last), str):
+        given = Path(section[last])
+        if not given.is_absolute():
+            section[last] = os.path.relpath(old.resolve() / given, new.resolve())
+
+
+def _edited(document: Document, wanted: dict[str, Any], changes: dict[str, Any]) -> str | None:
+    """Return the user's text with values replaced, or None where its style forbids it."""
+    if document.root.flow_style:
+        return None
+    edits: list[tuple[int, int, str]] = []
+    for keys in PATHS:
+        node, value = document.node(keys), _value(wanted, keys)
+        if isinstance(node, yaml.ScalarNode) and isinstance(value, str) and value != node.value:
+            scalar = yaml.safe_dump(value, width=10**6).split("\n")[0]
+            edits.append((node.start_mark.index, node.end_mark.index, scalar))
+    appended = ""
+    for key, value in changes.items():
+        pair = next(((k, v) for k, v in document.root.value if k.value == key), None)
+        block = _block(key, value)
+        if pair is None:
+            appended += block
+        else:
+            edits.append((pair[0].start_mark.index, _end(pair[1]), block.rstrip("\n")))
+    text = document.text
+    for start, end, new in sorted(edits, reverse=True):
+        text = text[:start] + new + text[end:]
+    return text + ("" if text.endswith("\n") else "\n") + appended
+
+
+def _value(data: dict[str, Any], keys: tuple[str, ...]) -> Any:
+    value: Any = data
+    for key in keys:
+        value = value.get(key) if isinstance(value, dict) else None
+    return value
+
+
+def _end(node: yaml.Node) -> int:
+    """Return where a value ends; a block's own mark lies after the comments that follow it."""
+    if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
+        last = node.value[-1]
+        return _end(last[1] if isinstance(last, tuple) else last)
+    return int(node.end_mark.index)
+
+
+def _block(key: str, value: Any) -> str:
+    """Return a top-level key, one line per list or entry."""
+    if not value:
+        return f"{key}: []\n"
+    lines = [f"{key}:"]
+    if isinstance(value, dict):
+        lines += [f"  {name}: {_flow(item)}" for name, item in value.items()]
+    else:
+        lines += [f"  - {_flow(item)}" for item in value]
+    return "\n".join(lines) + "\n"
+
+
+def _flow(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{k}: {_flow(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(_flow(v) for v in value) + "]"
+    return number_text(value) if isinstance(value, float) else str(value)
+
+
+def _reads_as(text: str, path: Path, wanted: dict[str, Any]) -> bool:
+    try:
+        return parse(text, path).data == wanted
+    except CellError:
+        return False
+
+
+def _dumped(data: dict[str, Any]) -> str:
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True,
+                     default_flow_style=None, width=100)  # fmt: skip

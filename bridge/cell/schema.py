@@ -1,0 +1,130 @@
+"""The cell file's keys (CONTRACT, "The cell file"), and what may stand there."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[Number, Field(gt=0)]
+NotNegative = Annotated[Number, Field(ge=0)]
+Vector3 = Annotated[list[Number], Field(min_length=3, max_length=3)]
+
+
+class Section(BaseModel):
+    """One mapping of the file: unknown keys and lax conversions are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class DhRow(Section):
+    """One standard DH row."""
+
+    a: Number = Field(description="m")
+    alpha: Number = Field(description="rad")
+    d: Number = Field(description="m")
+    offset: Number = Field(default=0.0, description="rad")
+    mass: NotNegative = Field(default=0.0, description="kg")
+    cog: Vector3 = Field(default=[0.0, 0.0, 0.0], description="m, in the row's frame")
+
+
+class Calibration(Section):
+    """A UR arm's factory calibration: what is added to its DH rows."""
+
+    delta_theta: list[Number] | None = Field(default=None, description="rad per joint")
+    delta_a: list[Number] | None = Field(default=None, description="m per joint")
+    delta_d: list[Number] | None = Field(default=None, description="m per joint")
+    delta_alpha: list[Number] | None = Field(default=None, description="rad per joint")
+
+
+class Robot(Section):
+    """The arm: a built-in one, a URDF or DH rows."""
+
+    model: str | None = Field(default=None, description="a built-in arm")
+    urdf: str | None = Field(default=None, description="a file, seen from the cell's folder")
+    dh: list[DhRow] | None = Field(default=None, description="standard DH rows")
+    tip: str | None = Field(default=None, description="the URDF link that is the flange")
+    calibration: Calibration | str | None = Field(
+        default=None, description="UR's delta_* values, or its calibration.conf"
+    )
+
+
+class Frame(Section):
+    """A frame in another one."""
+
+    xyz: Vector3 = Field(default=[0.0, 0.0, 0.0], description="m")
+    rpy: Vector3 = Field(default=[0.0, 0.0, 0.0], description="rad, roll pitch yaw as in URDF")
+
+
+class Tool(Section):
+    """What is mounted on the flange."""
+
+    tcp: Frame = Field(default=Frame(), description="TCP in the flange frame")
+
+
+class Payload(Section):
+    """What the tool carries, the tool's own weight included."""
+
+    mass: NotNegative = Field(default=0.0, description="kg")
+    cog: Vector3 = Field(default=[0.0, 0.0, 0.0], description="m, in the flange frame")
+
+
+class Compliance(Section):
+    """Joint flexibilities, one value per joint."""
+
+    axial: list[NotNegative] | None = Field(default=None, description="rad/Nm about the axis")
+    radial: list[NotNegative] | None = Field(default=None, description="rad/Nm across the axis")
+
+
+class EffectEntry(Section):
+    """A further effect in the model, as ``--apply`` writes it."""
+
+    effect: str = Field(description="an effect of the catalogue")
+    joint: int | None = Field(default=None, strict=True, description="from 1")
+    order: Number | None = Field(default=None, description="cycles per turn of the joint")
+    parameters: dict[str, Number] = Field(default={}, description="name: value")
+
+
+class MetrologyEntry(Section):
+    """The instrument that measured the TCP."""
+
+    registered: bool = Field(default=False, strict=True, description="its frame is base")
+    sigma: NotNegative = Field(default=2.0e-5, description="m, 1 sigma of one coordinate")
+    repeatability: NotNegative | None = Field(default=None, description="m, of the arm, 1 sigma")
+
+
+class Simulation(Section):
+    """What ``simulate`` and the bench put behind the protocol: a plant drawn from the seed."""
+
+    seed: int = Field(default=0, ge=0, strict=True, description="of the plant and all noise")
+    host: str | None = Field(default=None, description="loopback address; default: link.host")
+    start_q: list[Number] | None = Field(default=None, description="rad, where the arm starts")
+    payload: Payload | None = Field(
+        default=None, description="what really hangs on the flange; default: payload"
+    )
+    compliance: Compliance | None = Field(
+        default=None, description="true flexibilities, rad/Nm; default: drawn from the seed"
+    )
+    tracker_noise: NotNegative | None = Field(default=None, description="m, 1 sigma")
+    rtde_port: int | None = Field(default=None, gt=0, lt=65536, strict=True)
+    dashboard_port: int | None = Field(default=None, gt=0, lt=65536, strict=True)
+    script_port: int | None = Field(default=None, gt=0, lt=65536, strict=True)
+    bench_port: int | None = Field(default=None, gt=0, lt=65536, strict=True)
+
+
+class CellFile(Section):
+    """The whole file."""
+
+    robot: Robot = Field(description="model, urdf or dh")
+    tool: Tool = Tool()
+    payload: Payload = Payload()
+    gravity: Vector3 = Field(default=[0.0, 0.0, -9.80665], description="m/s2, in base")
+    reference_temperature: Number = Field(default=25.0, description="°C")
+    compliance: Compliance = Compliance()
+    effects: list[EffectEntry] = []
+    metrology: MetrologyEntry = MetrologyEntry()
+    simulation: Simulation = Simulation()
+
+
+RobotKind = Literal["model", "urdf", "dh"]

@@ -1,0 +1,64 @@
+"""Output files: written beside their place, then renamed, so that none is ever half-written."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import InputError, RunError
+
+
+def require_writable(path: Path, *inputs: Path) -> Path:
+    """Return the path if a file can be written there; asked before the work is done.
+
+    Raises InputError where its folder is missing, it is a folder itself, or it is one of the
+    inputs.
+    """
+    if path.is_dir():
+        raise InputError(f"{path}: found a folder, expected a file to write")
+    folder = path.parent
+    if not folder.is_dir():
+        raise InputError(f"{path}: found no folder {folder}, expected an existing one")
+    for given in inputs:
+        if path.exists() and given.exists() and path.samefile(given):
+            raise InputError(f"{path}: found the output to be the input {given}, expected another")
+    if not os.access(folder, os.W_OK):
+        raise InputError(f"{path}: found a folder {folder} that cannot be written to")
+    return path
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[IO[str]]:
+    """Give a text file that takes the place of ``path`` when the block ends without an error."""
+    place = Path(os.path.realpath(path))
+    part = place.with_name(f".{place.name}.{os.getpid()}.part")
+    try:
+        with open(part, "w", encoding="utf-8", newline="\n") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, place)
+    except OSError as error:
+        raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink()
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file in one step."""
+    with replacing(path) as file:
+        file.write(text)
+
+
+def write_table(path: Path, columns: Sequence[str], table: NDArray[np.float64]) -> None:
+    """Write rows (N, k) under k column names as CSV; every number reads back exactly."""
+    with replacing(path) as file:
+        file.write(",".join(columns) + "\n")
+        np.savetxt(file, table, fmt="%.17g", delimiter=",")
