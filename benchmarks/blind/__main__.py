@@ -10,8 +10,9 @@ from rich.console import Console
 from rich.progress import track
 
 from benchmarks.blind import cases
+from benchmarks.blind.draws import POSITION_EFFECTS
 from benchmarks.blind.page import write_page
-from benchmarks.blind.report import print_report
+from benchmarks.blind.report import print_report, print_sensitivity
 from benchmarks.blind.run import (
     Command,
     Diagnose,
@@ -20,6 +21,7 @@ from benchmarks.blind.run import (
     has_pinocchio,
     jobs_of,
     run_blind,
+    run_sensitivity,
 )
 
 
@@ -35,10 +37,12 @@ from benchmarks.blind.run import (
               help="The diagnosis, as a program of its own.")  # fmt: skip
 @click.option("--in-process", "inside", default=None,
               help="module:function(log, cell, withhold) -> dict, instead.")  # fmt: skip
+@click.option("--sensitivity", "small", is_flag=True,
+              help="Also find the smallest effect found in 95 % of cases (slow).")  # fmt: skip
 @click.option("--list", "listing", is_flag=True, help="Show the kinds and stop.")
 def main(
     seeds: int, names: str | None, quick: bool, workers: int, first: int | None,
-    out: Path | None, command: str, inside: str | None, listing: bool,
+    out: Path | None, command: str, inside: str | None, small: bool, listing: bool,
 ) -> None:  # fmt: skip
     """Draw cases whose effect is withheld, have them diagnosed, and score the answers."""
     console = Console()
@@ -62,10 +66,15 @@ def main(
     order = {k: i for i, k in enumerate(chosen_kinds(wanted))}
     scores.sort(key=lambda s: (order.get(s.kind, 0), s.seed))
     print_report(scores, console)
+    found = []
+    if small:
+        effects = [k for k in chosen_kinds(wanted) if k in POSITION_EFFECTS]
+        found = run_sensitivity(effects, range(first, first + count), workers, how)
+        print_sensitivity(found, console)
     if out is not None:
         page = out / "blind.html"
         write_page(page, scores, "Gapbridge: the blind benchmark",
-                   f"{len(scores)} cases, first seed {first}.")  # fmt: skip
+                   f"{len(scores)} cases, first seed {first}.", found)  # fmt: skip
         console.print(f"written: {page}")
 
 

@@ -2,8 +2,9 @@
 
 Kinds of the position channel: ``none``; an effect (``backlash``); several (``backlash+payload``);
 ``pair``, ``triple`` (at random); ``withheld:EFFECT``; ``outside:NAME``; ``hard:EFFECT`` and
-``hard:none``; ``bad:NAME``. Other channels: ``wrench:``, ``tracking:``, ``torque:`` with an effect,
-several, ``none``, or one outside the catalogue.
+``hard:none``; ``bad:NAME``; ``size:EFFECT@RATIO`` (at one place, gap over floor). Other channels:
+``wrench:``, ``tracking:``, ``torque:`` with an effect, several, ``none``, or one outside the
+catalogue.
 """
 
 from __future__ import annotations
@@ -28,9 +29,12 @@ from benchmarks.blind.measuring import read_arm
 from benchmarks.blind.mechanics import Array
 from benchmarks.blind.outside import OUTSIDE
 from benchmarks.blind.special_cases import Strange
-from benchmarks.blind.static_cases import Drawn, causes_of, draw_static, write_static
+from benchmarks.blind.static_cases import Drawn, Wish, causes_of, draw_static, write_static
+from benchmarks.blind.wrench_cases import WrenchCell
 
 CHANNELS = tuple(EFFECTS)
+# the stiffening of a joint holds its linear part: never both
+ONE_OF = {"axial_compliance", "stiffness_nonlinearity"}
 
 
 @dataclass(frozen=True)
@@ -56,13 +60,14 @@ def effects_of(kind: str, rng: Generator) -> tuple[str, ...]:
         count = 2 if kind == "pair" else 3
         while True:
             chosen = tuple(str(e) for e in rng.choice(draws.POSITION_EFFECTS, count, replace=False))
-            # the stiffening of a joint holds its linear part: together only at other joints
-            if not {"axial_compliance", "stiffness_nonlinearity"} <= set(chosen):
+            if not set(chosen) >= ONE_OF:
                 return chosen
     effects = tuple(kind.split("+"))
     for effect in effects:
         if effect not in draws.POSITION_EFFECTS:
             raise ValueError(f"kind: found {effect!r}, expected an effect of the position channel")
+    if set(effects) >= ONE_OF:
+        raise ValueError(f"kind: found {kind!r}, expected one of {' and '.join(sorted(ONE_OF))}")
     return effects
 
 
@@ -79,7 +84,11 @@ def draw_case(kind: str, rng: Generator) -> Static | ChannelCase:
     elif group == "hard":
         drawn = special_cases.draw_hard(effects_of(rest, rng), rng)
     elif group == "":
-        drawn = draw_static(effects_of(rest, rng), rng)
+        drawn = draw_static(Wish(effects_of(rest, rng)), rng)
+    elif group == "size":
+        effect, _, ratio = rest.partition("@")
+        wish = Wish(effects_of(effect, rng), ratio=float(ratio), clear=False)
+        drawn = draw_static(wish, rng)
     else:
         raise ValueError(f"kind: found {kind!r}, expected one of those that --list shows")
     return Static(drawn, None, drawn.bench.whitened_gap(drawn.real), wild=group == "hard")
@@ -122,6 +131,8 @@ def make_case(kind: str, seed: int, folder: Path) -> Label:
 def _channel_label(kind: str, seed: int, case: ChannelCase) -> Label:
     causes = case.truth.causes(case.values)
     facts: dict[str, str | float | bool] = {"rows": len(case.gap) / len(case.truth.sigma)}
+    if isinstance(case.cell, WrenchCell):
+        facts["settling_drift"] = case.cell.saturating and "ft_drift" in kind
     return Label(
         kind=kind,
         seed=seed,
@@ -149,7 +160,7 @@ def group_of(kind: str) -> str:
         if kind in own:
             return group
     head = kind.partition(":")[0]
-    if head in ("withheld", "outside", "hard", "bad"):
+    if head in ("withheld", "outside", "hard", "bad", "size"):
         return head
     return "several" if "+" in kind else "known"
 

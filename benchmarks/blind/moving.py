@@ -31,10 +31,10 @@ class Motion:
         wave = (self.amplitude * self.rate**derivative * np.sin(angle)).sum(axis=2)
         return np.asarray(wave + (self.centre if derivative == 0 else 0.0))
 
-    def lagged(self, time: Array, delay: float, lag: Array) -> Array:
-        """Return q (N, n) behind a pure delay (s) and a first-order lag per joint (s), settled."""
+    def lagged(self, time: Array, delay: Array, lag: Array) -> Array:
+        """Return q (N, n) behind a pure delay and a first-order lag per joint (s), settled."""
         slow = self.rate * lag[:, None]
-        angle = self.rate * (time[:, None, None] - delay) + self.phase - np.arctan(slow)
+        angle = self.rate * (time[:, None, None] - delay[:, None]) + self.phase - np.arctan(slow)
         return np.asarray(
             (self.amplitude / np.hypot(1.0, slow) * np.sin(angle)).sum(axis=2) + self.centre
         )

@@ -58,17 +58,15 @@ def draw_tracking_cell(rng: Generator, seconds: float = 30.0) -> MovingCell:
     encoder = 2 * np.pi / 2 ** int(rng.integers(17, 21))
     shake = float(rng.uniform(5e-6, 3e-5))
     candidates: dict[Place, Candidate] = {
-        ("latency", None): Candidate(("latency",), np.array([8e-3]), 8),
-        **{
-            ("tracking_lag", j): Candidate((f"tracking_lag_{j}",), np.array([1e-2]), 8)
-            for j in range(1, kind.n + 1)
-        },
+        (effect, j): Candidate((f"{effect}_{j}",), np.array([usual]), 8)
+        for effect, usual in (("latency", 8e-3), ("tracking_lag", 1e-2))
+        for j in range(1, kind.n + 1)
     }
 
     def read(values: Values) -> Array:
-        delay = float(values.get(("latency", None), np.zeros(1))[0])
-        lag = np.array(
-            [values.get(("tracking_lag", j), np.zeros(1))[0] for j in range(1, kind.n + 1)]
+        delay, lag = (
+            np.array([values.get((effect, j), np.zeros(1))[0] for j in range(1, kind.n + 1)])
+            for effect in ("latency", "tracking_lag")
         )
         return motion.lagged(time, delay, lag)
 

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.blind.report import sensitivity_texts
 from benchmarks.blind.score import NOWHERE, CaseScore
+from benchmarks.blind.sensitivity import Sensitivity
 from benchmarks.blind.tally import NONE, by_kind, criteria, matrix, z_scores
 
 STYLE = """
@@ -26,7 +28,10 @@ svg { max-width: 100%; height: auto } p.note { color: #888; max-width: 70ch }
 """
 
 
-def write_page(path: Path, scores: Sequence[CaseScore], title: str, notes: str = "") -> None:
+def write_page(
+    path: Path, scores: Sequence[CaseScore], title: str, notes: str = "",
+    small: Sequence[Sensitivity] = (),
+) -> None:  # fmt: skip
     """Write the page."""
     parts = [
         f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{escape(title)}</title>"
@@ -43,6 +48,7 @@ def write_page(path: Path, scores: Sequence[CaseScore], title: str, notes: str =
         "<h2>Run times</h2>",
         _histogram([np.log10(s.seconds) for s in scores if s.seconds], -2, 2, 40,
                    "log10 of seconds a case"),
+        _sensitivity(small),
         "<h2>What went wrong</h2>", _wrong(scores),
         "</body></html>",
     ]  # fmt: skip
@@ -151,6 +157,14 @@ def _histogram(
         f"<svg viewBox='0 0 {width + 20} {height + foot}' role='img'>{bars}{curve}{ticks}"
         f"<text x='0' y='{height + 30}' font-size='12' fill='#888'>{escape(note)}</text></svg>"
     )
+
+
+def _sensitivity(small: Sequence[Sensitivity]) -> str:
+    if not small:
+        return ""
+    heads = ("effect", "smallest found in 95 %", "Cramér-Rao bound (3.6 sigma)", "share by size")
+    rows = [[_td(s.effect), *(_td(t) for t in sensitivity_texts(s))] for s in small]
+    return "<h2>Sensitivity: gap over noise floor</h2>" + _table(heads, rows)
 
 
 def _wrong(scores: Sequence[CaseScore]) -> str:

@@ -20,6 +20,7 @@ from benchmarks.blind.mechanics import Array
 Place = tuple[str, int | None]
 Values = dict[Place, Array]
 CLEAR = 150.0
+WHOLE_ARM = ("latency", "tracking_lag")
 
 
 @dataclass(frozen=True)
@@ -128,6 +129,11 @@ def draw_values(
     values: Values = {}
     for effect in effects:
         places = [p for p in truth.candidates if p[0] == effect]
+        if effect in WHOLE_ARM and rng.random() < 0.6:  # one cause delays all joints alike
+            ratio = float(np.exp(rng.uniform(*np.log(ratios))))
+            same = max(truth.size(p, truth.candidates[p].scale, ratio)[0] for p in places)
+            values |= {p: np.array([same]) for p in places}
+            continue
         count = min(int(rng.choice([1, 2, 3], p=[0.55, 0.3, 0.15])), len(places))
         for k in sorted(rng.permutation(len(places))[:count]):
             place = places[int(k)]

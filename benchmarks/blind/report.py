@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.blind.score import CaseScore
+from benchmarks.blind.sensitivity import Sensitivity
 from benchmarks.blind.tally import by_kind, criteria, matrix
 
 
@@ -22,6 +23,23 @@ def print_report(scores: Sequence[CaseScore], console: Console | None = None) ->
     if wrong:
         console.print(_wrong(wrong))
     console.print(_criteria(scores))
+
+
+def print_sensitivity(found: Sequence[Sensitivity], console: Console) -> None:
+    """Print how small each effect may be and still be found."""
+    table = Table(title="Smallest effect found in 95 % of cases: gap over noise floor")
+    for k, head in enumerate(("effect", "found", "Cramér-Rao (3.6 sigma)", "share by size")):
+        table.add_column(head, justify="left" if k in (0, 3) else "right")
+    for s in found:
+        table.add_row(s.effect, *sensitivity_texts(s))
+    console.print(table)
+
+
+def sensitivity_texts(s: Sensitivity) -> tuple[str, str, str]:
+    """Return smallest, bound and the shares as texts."""
+    smallest = "–" if s.smallest is None else f"{s.smallest:g}"
+    shares = "  ".join(f"{r:g}: {100 * share:.0f} %" for r, share in s.found.items())
+    return smallest, f"{s.bound:.2f}", shares
 
 
 def _percent(value: float | None) -> str:

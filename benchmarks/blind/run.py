@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import json
 import os
@@ -15,8 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.blind.cases import group_of, kinds, make_case
+from benchmarks.blind.cases import kinds, make_case
 from benchmarks.blind.score import CaseScore, failed, score
+from benchmarks.blind.sensitivity import Sensitivity, sensitivity
 
 Diagnose = Callable[[Path, Path, tuple[str, ...]], dict[str, Any]]
 CLEAN_FACTOR = 10  # clean cases of the position channel: this many times the seeds of the others
@@ -129,7 +131,7 @@ def run_blind(
     chosen = chosen_kinds(kinds)
     known = {k for own in _all_kinds().values() for k in own}
     for kind in chosen:
-        if kind not in known and "+" not in kind:
+        if kind not in known and "+" not in kind and not kind.startswith("size:"):
             raise ValueError(f"kind: found {kind!r}, expected a kind or group that --list shows")
     if not has_pinocchio():
         chosen = tuple(k for k in chosen if "torque:" not in k)
@@ -148,6 +150,21 @@ def run_blind(
             yield done.result()
 
 
+def run_sensitivity(
+    effects: Sequence[str], seeds: Sequence[int], workers: int, diagnose: Diagnose
+) -> list[Sensitivity]:
+    """Return how small each effect may be and still be found."""
+    run = functools.partial(_run_one, diagnose)
+    if workers <= 1:
+        return [sensitivity(e, seeds, run) for e in effects]
+    with ProcessPoolExecutor(workers, initializer=_one_thread) as pool:
+        return list(pool.map(functools.partial(sensitivity, seeds=seeds, run=run), effects))
+
+
+def _run_one(diagnose: Diagnose, kind: str, seed: int) -> CaseScore:
+    return run_job(Job(kind, seed), diagnose)
+
+
 def _all_kinds() -> dict[str, tuple[str, ...]]:
     return kinds()
 
@@ -160,6 +177,3 @@ def has_pinocchio() -> bool:
 def _one_thread() -> None:
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = "1"
-
-
-__all__ = ["Command", "Diagnose", "Job", "chosen_kinds", "group_of", "run_blind", "run_job"]

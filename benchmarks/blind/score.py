@@ -81,6 +81,7 @@ def score(label: Label, diagnosis: dict[str, Any], seconds: float | None = None)
     explained = group in ("clean", "known", "several") and verdict.outcome in ("right", "right_tie")
     held_out = own.get("remaining_rms_held_out") or own.get("remaining_rms")
     exact = verdict.outcome == "right" and _same_joints(label, claims)
+    exact = exact and not label.facts.get("settling_drift")
     return CaseScore(
         kind=label.kind,
         group=group,

@@ -13,7 +13,7 @@ from benchmarks.blind.measuring import read_arm, without
 from benchmarks.blind.mechanics import Array, Session
 from benchmarks.blind.outside import NEED_COMPLIANCE, OUTSIDE, Outside
 from benchmarks.blind.session import Plan
-from benchmarks.blind.static_cases import Drawn, draw_plan, draw_static
+from benchmarks.blind.static_cases import Drawn, Wish, draw_plan, draw_static
 from benchmarks.blind.twins import columns_of, singles
 
 HARD_SIGMA = 5e-5
@@ -86,7 +86,7 @@ def _unlike_known(bench: Bench, gap: Array) -> bool:
 def draw_hard(effects: tuple[str, ...], rng: Generator) -> Drawn:
     """Return a cell seen in 30 poses with 50 um of noise."""
     plan = replace(draw_plan(rng, poses=30), blocks=3)
-    return draw_static(effects, rng, plan, HARD_SIGMA, (5.5e-5, 7e-5))
+    return draw_static(Wish(effects, plan, HARD_SIGMA, (5.5e-5, 7e-5)), rng)
 
 
 def wild_readings(drawn: Drawn, rng: Generator, share: float = 0.03) -> tuple[Array, Array | None]:
@@ -104,17 +104,17 @@ def draw_bad(name: str, rng: Generator) -> Drawn:
     """Return badly excited data: something that the effect needs does not happen."""
     good = draw_plan(rng)
     if name == "no_reversals":
-        return draw_static(("backlash",), rng, replace(good, both_sides=False))
+        return draw_static(Wish(("backlash",), replace(good, both_sides=False)), rng)
     if name == "one_load":
         effect = str(rng.choice(["axial_compliance", "radial_compliance", "link_flexibility"]))
-        return draw_static((effect,), rng, replace(good, blocks=1, pulled=0.0))
+        return draw_static(Wish((effect,), replace(good, blocks=1, pulled=0.0)), rng)
     effect = str(rng.choice(["joint_offset", "axial_compliance", "backlash", "transmission_error"]))
     if name == "few_joints":
         # never the same arm twice in number of joints: all have joints 2 and 3
         moving = (1, int(rng.integers(2, 6)))
         joint = int(rng.choice(moving)) + 1
         plan = replace(good, moving=moving, approach_written=True)
-        return draw_static((effect,), rng, plan, joints={effect: [joint]})
+        return draw_static(Wish((effect,), plan, joints={effect: [joint]}), rng)
     if name == "tiny_range":
-        return draw_static((effect,), rng, Plan(poses=70, blocks=1, pulled=0.0, span=0.08))
+        return draw_static(Wish((effect,), Plan(poses=70, blocks=1, pulled=0.0, span=0.08)), rng)
     raise ValueError(f"kind: found bad:{name}, expected one of {', '.join(BAD)}")

@@ -45,51 +45,53 @@ def draw_plan(rng: Generator, poses: int = 70) -> Plan:
     )
 
 
-def draw_static(
-    effects: tuple[str, ...],
-    rng: Generator,
-    plan: Plan | None = None,
-    sigma: float = 2e-5,
-    target_floor: tuple[float, float] = (2.2e-5, 4.5e-5),
-    need_clear: bool = True,
-    arm: str | None = None,
-    joints: dict[str, list[int]] | None = None,
-) -> Drawn:
+@dataclass(frozen=True)
+class Wish:
+    """What a static case must be like; what is left open is drawn."""
+
+    effects: tuple[str, ...]
+    plan: Plan | None = None
+    sigma: float = 2e-5  # m, the tracker
+    floor: tuple[float, float] = (2.2e-5, 4.5e-5)  # m, tracker and repeatability
+    joints: dict[str, list[int]] | None = None  # of effects that sit at joints
+    ratio: float | None = None  # gap over floor of each part
+    clear: bool = True  # each part stands clear of the others
+
+
+def draw_static(wish: Wish, rng: Generator) -> Drawn:
     """Return a cell whose real arm has these effects, each clear of the others."""
-    soft = True if set(effects) & set(draws.NEEDS_COMPLIANCE) else None
+    soft = True if set(wish.effects) & set(draws.NEEDS_COMPLIANCE) else None
     for _ in range(200):
         bench = draw_bench(
-            rng, plan or draw_plan(rng), arm=arm, compliant=soft, sigma=sigma,
-            target_floor=target_floor,
+            rng, wish.plan or draw_plan(rng), compliant=soft, sigma=wish.sigma,
+            target_floor=wish.floor,
         )  # fmt: skip
         try:
-            bench, parts = _draw_parts(bench, effects, rng, joints or {})
+            bench, parts = _draw_parts(bench, wish, rng)
         except Redraw:
             continue
-        if parts and need_clear and not all_clear(bench, parts):
+        if parts and wish.clear and not all_clear(bench, parts):
             continue
         return Drawn(bench, tuple(parts), combined(bench, parts))
-    raise RuntimeError(f"no clear draw of {effects} in 200")
+    raise RuntimeError(f"no clear draw of {wish.effects} in 200")
 
 
-def _draw_parts(
-    bench: Bench, effects: tuple[str, ...], rng: Generator, joints: dict[str, list[int]]
-) -> tuple[Bench, list[Ingredient]]:
+def _places(effect: str, wish: Wish, bench: Bench, rng: Generator) -> list[int] | list[None]:
+    """Return the joints that an effect is put at."""
+    if effect not in draws.PER_JOINT:
+        return [None]
+    count = int(rng.choice([1, 2, 3], p=[0.55, 0.3, 0.15]))
+    most = 1 if wish.ratio is not None else 3 if len(wish.effects) == 1 else 2
+    chosen = [int(j) for j in rng.permutation(draws.sites(effect, bench.kind))]
+    return sorted((wish.joints or {}).get(effect, chosen[: min(count, most)]))
+
+
+def _draw_parts(bench: Bench, wish: Wish, rng: Generator) -> tuple[Bench, list[Ingredient]]:
     """Return the parts, sized. The nominal axial compliance of a stiffening joint is taken out."""
     parts: list[Ingredient] = []
-    for effect in effects:
+    for effect in wish.effects:
         low, high = draws.RATIO.get(effect, (3.0, 18.0))
-        where: list[int | None] = [None]
-        if effect in draws.PER_JOINT:
-            most = 3 if len(effects) == 1 else 2
-            free = draws.sites(effect, bench.kind)
-            if effect in ("stiffness_nonlinearity", "axial_compliance"):
-                taken = [p.joint for p in parts if p.effect.startswith(("stiff", "axial"))]
-                free = [j for j in free if j not in taken]
-            count = int(rng.choice([1, 2, 3], p=[0.55, 0.3, 0.15]))
-            chosen = rng.permutation(free)[: min(count, most)]
-            where = sorted(joints.get(effect, [int(j) for j in chosen]))  # type: ignore[assignment]
-        for joint in where:
+        for joint in _places(effect, wish, bench, rng):
             if effect == "stiffness_nonlinearity" and joint is not None:
                 bench = _stiff_about(bench, joint)
             for part in draws.draw(
@@ -97,7 +99,7 @@ def _draw_parts(
                 bench.instrument.sigma_turn is not None, rng,
             ):  # fmt: skip
                 ratio = float(np.exp(rng.uniform(np.log(low), np.log(high))))
-                parts.append(size(bench, part, ratio))
+                parts.append(size(bench, part, wish.ratio or ratio))
     return bench, parts
 
 

@@ -15,7 +15,7 @@ from benchmarks.blind.session import Plan
 
 EFFECTS = ("ft_bias", "ft_drift", "ft_gain", "ft_misalignment", "payload")
 OUTSIDE = ("ft_hose", "ft_step", "ft_overload")
-AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
+AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 
 
 @dataclass(frozen=True)

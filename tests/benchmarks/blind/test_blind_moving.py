@@ -69,12 +69,12 @@ def test_derivatives_of_a_motion_are_its_derivatives():
 def test_a_lag_is_what_integration_gives():
     kind = ARMS["cobot5"]
     motion = draw_motion(kind, np.random.default_rng(2))
-    lag, delay = np.linspace(0.01, 0.06, kind.n), 0.012
+    lag, delay = np.linspace(0.01, 0.06, kind.n), np.linspace(0.002, 0.02, kind.n)
     times = np.linspace(2.0, 4.0, 9)
 
     def follow(t, y):
-        return (motion.at(np.array([t - delay]))[0] - y) / lag
+        return (motion.at((t - delay)[None])[0] - y) / lag
 
-    start = motion.at(np.array([-delay]))[0]
+    start = motion.at(-delay[None])[0]
     run = solve_ivp(follow, (0, 4), start, t_eval=times, rtol=1e-9, atol=1e-11)
     assert motion.lagged(times, delay, lag) == pytest.approx(run.y.T, abs=1e-7)
