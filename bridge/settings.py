@@ -1,0 +1,88 @@
+"""Sections of the cell file that the daemon runs by: link, limits, setpoints, recording.
+
+Small pydantic models without a robot library behind them, so that a cell is read without one.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from drivers.ur_rtde.settings import UrRtdeSettings
+
+LinkSettings = UrRtdeSettings
+"""Section ``link``. With further drivers: a union of their settings, told apart by ``driver``."""
+
+_FROZEN = ConfigDict(extra="forbid", frozen=True)
+
+
+class LimitSettings(BaseModel):
+    """Section ``limits``: what no setpoint passes, whatever computed it."""
+
+    model_config = _FROZEN
+
+    offset: float = Field(0.010, gt=0.0, le=0.1, description="longest TCP offset, m")
+    offset_rotation: float = Field(0.02, gt=0.0, le=0.5, description="largest TCP rotation, rad")
+    offset_rate: float = Field(0.05, gt=0.0, le=1.0, description="change of the offset, m/s")
+    offset_rotation_rate: float = Field(
+        0.1, gt=0.0, le=5.0, description="change of the offset's rotation, rad/s"
+    )
+    joint_offset: float = Field(0.05, gt=0.0, le=0.5, description="correction of any joint, rad")
+    joint_velocity: float | None = Field(
+        None, gt=0.0, description="of any joint, rad/s; left out: the arm's own limits"
+    )
+    velocity_share: float = Field(
+        1.0, gt=0.0, le=1.0, description="share of the arm's own velocity limits that may be used"
+    )
+    joint_margin: float = Field(
+        0.0, ge=0.0, description="distance kept from the arm's joint limits, rad"
+    )
+    following: float = Field(
+        0.35, gt=0.0, le=2.0, description="farthest a command may be from the actual joint, rad"
+    )
+    ramp_time: float = Field(
+        0.5, gt=0.0, le=10.0, description="s in which offsets ramp in and out at least"
+    )
+
+
+class SetpointSettings(BaseModel):
+    """Section ``setpoints``: where nominal setpoints come from, and whether they are written."""
+
+    model_config = _FROZEN
+
+    source: Literal["target", "trajectory", "tcp"] = "target"
+    arm: bool = Field(False, description="true: `run` writes setpoints; false: it only observes")
+    file: Path | None = Field(None, description="trajectory: CSV of timestamp, target_q_i")
+    host: str = Field("127.0.0.1", description="tcp: address to listen on, loopback only")
+    port: int = Field(30310, ge=0, le=65535, description="tcp: port to listen on")
+    timeout: float = Field(
+        0.2, gt=0.0, le=5.0, description="tcp: s without a line after which the source is dry"
+    )
+    start_tolerance: float = Field(
+        0.02, gt=0.0, le=0.2, description="farthest the first setpoint may be from the arm, rad"
+    )
+    use_force: bool = Field(True, description="whether the measured TCP force bends the model")
+    force_filter: float = Field(
+        0.05, ge=0.0, le=5.0, description="time constant of the low-pass on the TCP force, s"
+    )
+
+    @field_validator("host")
+    @classmethod
+    def _loopback(cls, value: str) -> str:
+        """Refuse to listen where others could reach it: anyone who can write here moves the arm."""
+        if not (value == "localhost" or value.startswith("127.")):
+            raise ValueError("expected a loopback address (127.x.x.x)")
+        return value
+
+
+class RecordingSettings(BaseModel):
+    """Section ``recording``: where cycles are written to."""
+
+    model_config = _FROZEN
+
+    folder: Path | None = Field(
+        Path("recordings"), description="one CSV per run goes here; null: record nothing"
+    )
+    every: int = Field(1, ge=1, description="record every so manieth cycle")

@@ -1,0 +1,33 @@
+"""Drivers: what stands between a controller's wire and the loop, one folder per protocol."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, cast
+
+from core.errors import LinkError
+
+if TYPE_CHECKING:
+    from core.model import Model
+    from drivers.driver import Driver, DriverSettings
+
+DRIVERS: dict[str, str] = {
+    "ur_rtde": "drivers.ur_rtde.driver:UrRtdeDriver",
+}
+"""Driver name in a cell file -> ``module:Class``, imported when it is used."""
+
+
+def make_driver(settings: DriverSettings, model: Model) -> Driver:
+    """Return the driver that the settings name, not yet connected.
+
+    ``model`` tells it the arm and the tool. Raises LinkError where the driver's library is missing.
+    """
+    name = str(getattr(settings, "driver", ""))
+    if name not in DRIVERS:
+        raise LinkError(f"link.driver: found {name!r}, expected one of {', '.join(DRIVERS)}")
+    module, kind = DRIVERS[name].split(":")
+    try:
+        found = getattr(importlib.import_module(module), kind)
+    except ImportError as error:
+        raise LinkError(f"link.driver {name}: its library cannot be imported: {error}") from None
+    return cast("Driver", found(settings, model))

@@ -1,0 +1,98 @@
+"""What a driver is: four methods between a controller's wire and the loop.
+
+``connect``, ``read_state``, ``write_setpoint`` and ``close`` are what every driver must have. Three
+more have a sensible default: ``arm``, ``release`` and ``nominal_q``.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from types import TracebackType
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from core.setpoint import Setpoint
+from core.state import RobotState
+
+Vector = NDArray[np.float64]
+
+
+class DriverSettings(BaseModel):
+    """What every link says, whatever the driver."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    rate: float = Field(500.0, gt=0.0, le=1000.0, description="cycles per second asked for")
+    state_timeout: float = Field(
+        0.05, gt=0.0, le=1.0,
+        description="s without a new controller timestamp after which the state is stale",
+    )  # fmt: skip
+    connect_timeout: float = Field(
+        15.0, gt=0.0, description="s that connecting or arming may take before it counts as hung"
+    )
+
+
+class Driver(ABC):
+    """One link to one controller, for one thread.
+
+    Constructors never touch hardware, nor does garbage collection: only ``connect`` opens a link,
+    and only the side that reads. ``write_setpoint`` is the only call after which an arm moves.
+    """
+
+    moves_arm: ClassVar[bool] = True
+    """Whether setpoints are the arm's motion (True), or ride on a program of the robot's own."""
+
+    def __init__(self, rate: float, n: int) -> None:
+        self.rate = rate  # Hz: cycles per second that read_state is paced at
+        self.n = n  # joints
+
+    @abstractmethod
+    def connect(self) -> None:
+        """Open the link for reading. Moves nothing. Raises LinkError."""
+
+    @abstractmethod
+    def read_state(self) -> RobotState:
+        """Wait for the next sample of the controller and return it.
+
+        Blocks until a sample with a new controller timestamp is there. Raises StaleStateError where
+        none comes within the settings' timeout, InvalidStateError where it cannot be believed.
+        """
+
+    @abstractmethod
+    def write_setpoint(self, setpoint: Setpoint) -> None:
+        """Send one setpoint that came out of the limiter. Raises WriteError."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Leave the link: the arm stops where setpoints moved it. Never raises; may be repeated."""
+
+    def arm(self, state: RobotState) -> None:  # noqa: B027
+        """Make ready for writing; may take seconds and never moves the arm. Raises WriteError.
+
+        ``state`` is the sample last read; states read before are stale afterwards.
+        """
+
+    def release(self) -> None:  # noqa: B027
+        """Stop writing: the arm comes to rest and the controller is as before ``arm``.
+
+        May take a while. Raises WriteError where the link is gone.
+        """
+
+    def nominal_q(self, state: RobotState) -> Vector:
+        """Return the joints (n,) that the robot itself wants, without our correction, rad."""
+        return state.target_q
+
+    def __enter__(self) -> Self:
+        self.connect()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()

@@ -1,0 +1,1 @@
+"""Universal Robots arms over RTDE, with the ur_rtde library."""

@@ -1,0 +1,54 @@
+"""The link to a UR controller: what a cell file says under ``link``."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, field_validator
+
+from drivers.driver import DriverSettings
+
+
+class UrRtdeSettings(DriverSettings):
+    """How to reach a UR controller and how setpoints get there.
+
+    Two modes of writing: ``servoj`` streams joint setpoints through the library's own control
+    script, and moves the arm itself; ``offset`` leaves the motion to the robot's own program, which
+    holds ``gapbridge_offset.script``, and sends the Cartesian offset only.
+    """
+
+    driver: Literal["ur_rtde"] = "ur_rtde"
+    host: str = Field("127.0.0.2", description="the controller's IPv4 address or name")
+    mode: Literal["servoj", "offset"] = "servoj"
+    lookahead: float = Field(0.1, ge=0.03, le=0.2, description="servoj: lookahead time, s")
+    gain: float = Field(300.0, ge=100.0, le=2000.0, description="servoj: proportional gain")
+    watchdog: float = Field(
+        10.0, ge=1.0, le=100.0,
+        description="servoj: the robot stops where no setpoint comes at this rate, Hz",
+    )  # fmt: skip
+    stop_deceleration: float = Field(
+        2.0, gt=0.0, le=20.0, description="servoj: tool deceleration at the end, m/s^2"
+    )
+    following: float = Field(
+        0.5, gt=0.0, le=2.0,
+        description="servoj: s after which the controller's target must have come to a setpoint",
+    )  # fmt: skip
+    echo: float = Field(
+        0.1, gt=0.0, le=1.0,
+        description="offset: s after which the robot's program must have echoed an offset",
+    )  # fmt: skip
+    remote_control: bool = Field(
+        True, description="servoj: refuse where the robot is not in remote control"
+    )
+    torque_constants: tuple[float, ...] | None = Field(
+        None,
+        description="Nm/A of each joint motor current; without them there is no joint torque",
+    )
+
+    @field_validator("host")
+    @classmethod
+    def _plain_host(cls, value: str) -> str:
+        """Refuse what ur_rtde cannot reach: ports and IPv6 addresses are not possible with it."""
+        if not value or ":" in value or value.strip() != value:
+            raise ValueError("expected an IPv4 address or host name without a port")
+        return value
