@@ -49,7 +49,9 @@ def load_cell(path: Path | str) -> Cell:
     path = Path(path)
     document = read_document(path)
     try:
-        file = CellFile.model_validate(document.data)
+        # a key with nothing behind it counts as left out
+        given = {key: value for key, value in document.data.items() if value is not None}
+        file = CellFile.model_validate(given)
     except ValidationError as error:
         raise CellError(message(document, CellFile, error)) from None
     return cell_of(file, document)
@@ -61,6 +63,8 @@ def cell_of(file: CellFile, document: Document) -> Cell:
     try:
         arm = build_arm(file.robot, path.parent)
         warnings = _check_payload(file, arm)
+        if file.robot.tip is not None and file.robot.urdf is None:
+            warnings.append("robot.tip: means nothing without robot.urdf")
         terms = compliance_terms(file.compliance, arm) + tuple(
             term_of(entry, arm, f"effects entry {i + 1}") for i, entry in enumerate(file.effects)
         )

@@ -26,10 +26,10 @@ _EXPECTED = {
     "dict_type": "keys with values",
     "model_type": "keys with values",
     "model_attributes_type": "keys with values",
-    "greater_than": "more than {gt}",
-    "greater_than_equal": "{ge} or more",
-    "less_than": "less than {lt}",
-    "less_than_equal": "{le} or less",
+    "greater_than": "more than {gt:g}",
+    "greater_than_equal": "{ge:g} or more",
+    "less_than": "less than {lt:g}",
+    "less_than_equal": "{le:g} or less",
     "too_short": "{min_length} values",
     "too_long": "{max_length} values",
     "literal_error": "{expected}",
@@ -56,6 +56,8 @@ def message(document: Document, schema: type[BaseModel], error: ValidationError)
     """
     details = sorted(error.errors(), key=lambda d: d["type"] != "extra_forbidden")
     worst = details[0]
+    if worst["type"] == "invalid_key":
+        return f"{document.path}: found a key {worst['input']!r}, expected a word"
     keys, model = _own_keys(schema, worst["loc"])
     if worst["type"] == "extra_forbidden":
         return _unknown_key(document, keys, model)
@@ -135,7 +137,7 @@ def _found(error: ErrorDetails) -> str:
         return "nothing"
     value = error["input"]
     if error["type"] in ("too_short", "too_long"):
-        return f"{len(value)}"
+        return f"{len(value)} values"
     if value is None:
         return "nothing"
     text = " ".join(repr(value).split())
@@ -146,7 +148,7 @@ def _expected(error: ErrorDetails, description: str) -> str:
     if error["type"] == "missing":
         return description or "it here"
     if error["type"] in ("value_error", "assertion_error"):
-        return str(error.get("ctx", {}).get("error", error["msg"]))
+        return str(error.get("ctx", {}).get("error", error["msg"])).removeprefix("expected ")
     template = _EXPECTED.get(error["type"])
     if template is None:
         return str(error["msg"]).removeprefix("Input should be ")

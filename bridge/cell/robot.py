@@ -22,13 +22,15 @@ def build_arm(robot: Robot, folder: Path) -> Arm:
     used; messages begin with the key.
     """
     given = [kind for kind in ("model", "urdf", "dh") if getattr(robot, kind) is not None]
+    if len(given) > 1 and not robot.dh:
+        given = [kind for kind in given if kind != "dh"]  # an empty list left standing
     if len(given) != 1:
         found = " and ".join(given) or "none of them"
         raise CellError(f"robot: found {found}, expected one of model, urdf, dh")
-    for key, owner in (("tip", "urdf"), ("calibration", "model")):
-        if getattr(robot, key) is not None and given[0] != owner:
-            raise CellError(f"robot.{key}: found beside robot.{given[0]}, expected only beside "
-                            f"robot.{owner}")  # fmt: skip
+    if robot.calibration is not None and robot.model is None:
+        raise CellError(
+            f"robot.calibration: found beside robot.{given[0]}, expected only beside robot.model"
+        )
     if robot.model is not None:
         return builtin_arm(robot.model, _calibration(robot.calibration, folder))
     if robot.urdf is not None:

@@ -16,7 +16,12 @@ from bridge.output_file import write_text
 from core.errors import CellError
 from core.model import Model
 
-PATHS: tuple[tuple[str, ...], ...] = (("robot", "urdf"), ("robot", "calibration"))
+PATHS: tuple[tuple[str, ...], ...] = (
+    ("robot", "urdf"),
+    ("robot", "calibration"),
+    ("setpoints", "file"),
+    ("recording", "folder"),
+)
 
 
 class _Dumper(yaml.SafeDumper):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
+
+from bridge.settings import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0)]
@@ -124,7 +126,8 @@ class CellFile(Section):
     compliance: Compliance = Compliance()
     effects: list[EffectEntry] = []
     metrology: MetrologyEntry = MetrologyEntry()
+    link: LinkSettings | None = Field(default=None, description="driver, host, ...")
+    limits: LimitSettings = LimitSettings()
+    setpoints: SetpointSettings = SetpointSettings()
+    recording: RecordingSettings = RecordingSettings()
     simulation: Simulation = Simulation()
-
-
-RobotKind = Literal["model", "urdf", "dh"]

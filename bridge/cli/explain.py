@@ -1,0 +1,47 @@
+"""``gapbridge explain``."""
+
+from __future__ import annotations
+
+import inspect
+
+import click
+
+from core.arm import builtin_arm
+from core.effects import CATALOGUE, CHANNELS, Effect, effect_named
+
+
+@click.command()
+@click.argument("effect", required=False)
+def explain(effect: str | None) -> None:
+    """Explain an effect of the catalogue: where it comes from, what shows it.
+
+    Without EFFECT, lists them all.
+
+    Example: gapbridge explain backlash
+    """
+    if effect is None:
+        width = max(map(len, CATALOGUE))
+        for name, member in CATALOGUE.items():
+            first = (inspect.getdoc(member) or "").partition("\n")[0]
+            click.echo(f"{name:<{width}}  {first}")
+        return
+    click.echo(explanation(effect_named(effect)))
+
+
+def explanation(effect: Effect) -> str:
+    """Return what a person should know of an effect: its docstring, needs and parameters."""
+    arm = builtin_arm("ur10e")
+    sites = effect.sites(arm)
+    channels = ", ".join(f"{name} ({CHANNELS[name]})" for name in effect.channels)
+    lines = [effect.identifier, "", inspect.getdoc(effect) or "", "", f"shows in: {channels}"]
+    if effect.motion:
+        lines.append(f"needs motion: {effect.motion}")
+    if effect.needs:
+        lines.append(f"needs columns: {', '.join(effect.needs)}")
+    lines.append("sits at: " + ("one joint each" if sites[0].joint else "the whole arm"))
+    lines.append("parameters in a cell file:")
+    lines += [
+        f"  {parameter.name or 'value'} ({parameter.unit or 'no unit'})"
+        for parameter in effect.parameters(arm, sites[0])
+    ]
+    return "\n".join(lines)

@@ -1,0 +1,117 @@
+"""The entry point: commands loaded on use, one line for every failure, three exit codes."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import os
+import sys
+import tempfile
+import traceback
+from importlib.metadata import PackageNotFoundError, version
+from typing import NoReturn
+
+import click
+
+from bridge.cli.table import COMMANDS
+from core.errors import GapbridgeError
+
+SUCCESS, FAILURE, UNUSABLE = 0, 1, 2
+
+
+class CommandTable(click.Group):
+    """A group whose commands are imported when they are called, so that help is quick."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names in the order of the table."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Return a command, imported now."""
+        if cmd_name not in COMMANDS:
+            return None
+        module, name = COMMANDS[cmd_name][0].split(":")
+        command = getattr(importlib.import_module(module), name)
+        assert isinstance(command, click.Command)
+        return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Return the command that is meant; an unknown one is told with the nearest known."""
+        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
+            near = difflib.get_close_matches(args[0], COMMANDS, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(COMMANDS)}"
+            raise click.UsageError(f"found an unknown command {args[0]!r}; {hint}", ctx)
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the table, without importing any command."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
+
+
+def _version() -> str:
+    try:
+        return version("gapbridge")
+    except PackageNotFoundError:
+        return "not installed"
+
+
+@click.group(cls=CommandTable, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(_version(), prog_name="gapbridge")
+def gapbridge() -> None:
+    """Predict how an arm bends, correct its setpoints, find out why it misses.
+
+    Exits 0 on success, 2 on unusable input, 1 on a failure at run time.
+
+    Example: gapbridge demo
+    """
+
+
+def main(arguments: list[str] | None = None) -> NoReturn:
+    """Run the command line and leave with its exit code; never shows a traceback."""
+    sys.exit(_run(sys.argv[1:] if arguments is None else arguments))
+
+
+def _run(arguments: list[str]) -> int:
+    try:
+        result = gapbridge.main(args=arguments, prog_name="gapbridge", standalone_mode=False)
+        sys.stdout.flush()
+    except click.exceptions.Exit as leaving:
+        return leaving.exit_code
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message(), err=True)
+        return UNUSABLE
+    except click.UsageError as error:
+        command = error.ctx.command_path if error.ctx else "gapbridge"
+        return _fail(f"{error.format_message()} (see {command} --help)", UNUSABLE)
+    except click.ClickException as error:
+        return _fail(error.format_message(), UNUSABLE)
+    except (KeyboardInterrupt, click.Abort):
+        return _fail("interrupted", FAILURE)
+    except GapbridgeError as error:
+        return _fail(str(error), error.exit_code)
+    except BrokenPipeError:
+        # whoever read our output has left; a closed stdout must not complain at exit either
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILURE
+    except Exception as error:
+        return _crash(error)
+    return int(result) if isinstance(result, int) else SUCCESS
+
+
+def _fail(text: str, code: int) -> int:
+    sys.stderr.write(f"error: {' '.join(text.split())}\n")
+    return code
+
+
+def _crash(error: Exception) -> int:
+    """Tell an unforeseen failure in one line; its traceback goes to a file."""
+    with tempfile.NamedTemporaryFile(
+        "w", prefix="gapbridge-crash-", suffix=".txt", delete=False, encoding="utf-8"
+    ) as file:
+        file.write(" ".join(sys.argv) + "\n\n")
+        traceback.print_exception(error, file=file)
+    what = " ".join(str(error).split()) or "no message"
+    return _fail(f"{type(error).__name__}: {what} (details: {file.name})", FAILURE)

@@ -1,0 +1,40 @@
+"""``gapbridge predict``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import numpy as np
+
+from bridge.cli.options import cell_option, csv_option, log_argument, open_cell, open_log
+from bridge.output_file import require_writable, write_table
+from core.errors import InputError, LogError
+
+
+@click.command()
+@log_argument
+@cell_option
+@csv_option
+def predict(log: Path, cell: Path, out: Path) -> None:
+    """Predict the TCP pose of every row of a log.
+
+    Joints come from actual_q (where there is none, from target_q), loads from the payload,
+    payload_cog, actual_TCP_force, joint_temperatures and approach columns. Writes
+    predicted_position_0..2 (m) and predicted_rotation_0..2 (rotation vector, rad), in base.
+
+    Example: gapbridge predict log.csv --cell cell.yaml --out predicted.csv
+    """
+    given = open_cell(cell)
+    rows = open_log(log, given)
+    require_writable(out, log, cell)
+    q = rows.require("actual_q", "target_q")
+    try:
+        poses = given.model.predict(q, rows.loads())
+    except LogError:
+        raise
+    except InputError as error:
+        raise InputError(f"{log}: data {error}") from None
+    names = [f"predicted_{kind}_{i}" for kind in ("position", "rotation") for i in range(3)]
+    write_table(out, names, np.hstack([poses.position, poses.rotation_vector]))
+    click.echo(f"{out}: {len(q)} predicted poses")

@@ -1,0 +1,36 @@
+"""``gapbridge simulate``."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+import click
+
+from bridge.cell.simulation import server_settings
+from bridge.cli.options import cell_argument, open_cell
+from drivers.simulated.server import serve
+
+
+@click.command()
+@cell_argument
+@click.option("--host", help="Loopback address to serve at, instead of the cell's.")
+@click.option("--seed", type=click.IntRange(min=0), help="Seed of the hidden plant.")
+def simulate(cell: Path, host: str | None, seed: int | None) -> None:
+    """Serve the simulated controller of a cell over its real protocol until stopped.
+
+    The arm behind it bends by hidden flexibilities that are drawn from the seed. A bench port
+    (30100) stands for the people and the laser tracker around the cell: `measure`, `payload`,
+    `wrench`, `help`. Ends on SIGINT and SIGTERM.
+
+    Example: gapbridge simulate config/ur10e_simulated.yaml
+    """
+    settings = server_settings(open_cell(cell), host, seed)
+    stopped: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda n, _: stopped.append(n))
+    click.echo(
+        f"{settings.arm.name} at {settings.host}: RTDE {settings.rtde_port}, dashboard "
+        f"{settings.dashboard_port}, scripts {settings.script_port}, bench {settings.bench_port}"
+    )
+    serve(settings, lambda: bool(stopped))

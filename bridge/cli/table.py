@@ -1,0 +1,16 @@
+"""The table of commands: name, where it lives, its one line. A new command is one line here."""
+
+from __future__ import annotations
+
+COMMANDS: dict[str, tuple[str, str]] = {
+    "demo": ("bridge.cli.demo:demo", "Do the whole job on a simulated cell, no hardware."),
+    "simulate": ("bridge.cli.simulate:simulate", "Serve the simulated controller of a cell."),
+    "run": ("bridge.cli.run:run", "Run the on-cell daemon."),
+    "fit": ("bridge.cli.fit:fit", "Identify the compliance of a cell from a log."),
+    "predict": ("bridge.cli.predict:predict", "Predict the TCP pose of every row of a log."),
+    "compensate": (
+        "bridge.cli.compensate:compensate",
+        "Correct the setpoint of every row of a log.",
+    ),
+    "explain": ("bridge.cli.explain:explain", "Explain an effect of the catalogue."),
+}
