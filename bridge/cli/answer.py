@@ -1,0 +1,110 @@
+"""The diagnosis in plain sentences, as the command prints it."""
+
+from __future__ import annotations
+
+from core.diagnosis.cause import Cause
+from core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
+from core.diagnosis.separation import Measurement
+from core.effects import Reported
+
+VERDICTS = {
+    "no_gap": "no gap: nothing stands above the noise",
+    "explained": "explained: causes were found, what is left has no structure",
+    "partly_explained": "partly explained: causes were found, but structure is left over",
+    "unexplained": "unexplained: there is a gap that no effect of the catalogue accounts for",
+}
+SMALL = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}  # gaps are told in units that people read
+SHOWN = 6  # next measurements
+
+
+def answer(diagnosis: Diagnosis) -> str:
+    """Return the whole answer, lines joined; joints count from 1."""
+    lines = [f"verdict: {VERDICTS[diagnosis.verdict]}"]
+    for channel in diagnosis.channels:
+        lines += ["", *_channel(channel)]
+    if diagnosis.not_observable:
+        lines.append("")
+    for hidden in diagnosis.not_observable:
+        lines.append(f"{hidden.channel}: not observable here; needs {', '.join(hidden.needs)}")
+    if diagnosis.findings:
+        lines += ["", *(f"note: {finding}" for finding in diagnosis.findings)]
+    if diagnosis.next_measurements:
+        lines += ["", "worth measuring next:"]
+        lines += [f"  {_measurement(m)}" for m in diagnosis.next_measurements[:SHOWN]]
+        more = len(diagnosis.next_measurements) - SHOWN
+        lines += [f"  ... and {more} more in the JSON"] if more > 0 else []
+    return "\n".join(lines)
+
+
+def size(value: float | None, unit: str) -> str:
+    """Return a gap as text, m as mm and rad as mrad."""
+    if value is None:
+        return "unknown"
+    name, factor = SMALL.get(unit, (unit, 1.0))
+    return f"{value * factor:.4g} {name}"
+
+
+def _channel(channel: ChannelDiagnosis) -> list[str]:
+    unit = channel.unit
+    lines = [
+        f"{channel.channel}: {VERDICTS[channel.verdict]}",
+        f"  gap {size(channel.gap_rms, unit)} rms per coordinate, at most "
+        f"{size(channel.gap_max, unit)}, over {channel.samples} samples; noise "
+        f"{size(channel.noise_floor_rms, unit)}",
+    ]
+    for cause in channel.causes:
+        lines += [f"  {line}" for line in _cause(cause, unit)]
+    if channel.causes:
+        lines.append(
+            f"  remaining {size(channel.remaining_rms, unit)}, on held-out samples "
+            f"{size(channel.remaining_rms_held_out, unit)}"
+        )
+    if channel.structured:
+        depends = ", ".join(f"{name} ({share:.0%})" for name, share in channel.depends_on[:4])
+        lines.append(
+            f"  unexplained: {size(channel.unexplained_rms, unit)} with structure"
+            + (f"; it depends on {depends}" if depends else "")
+        )
+    return lines
+
+
+def _cause(cause: Cause, unit: str) -> list[str]:
+    where = ""
+    if cause.joints:
+        plural = "s" if len(cause.joints) > 1 else ""
+        where = f" of joint{plural} {', '.join(str(j) for j in cause.joints)}"
+    lines = [f"cause: {cause.effect}{where} (probability {cause.probability:.3g}){_shrink(cause)}"]
+    if cause.shrink is not None:
+        lines.append(
+            f"  held-out gap {size(cause.shrink.gap_without, unit)} without it, "
+            f"{size(cause.shrink.gap_with, unit)} with it"
+        )
+    lines += [f"  {_parameter(parameter)}" for parameter in cause.parameters]
+    if cause.indistinguishable_from:
+        lines.append(
+            f"  these data cannot tell it from {', '.join(cause.indistinguishable_from)}"
+        )
+    return lines
+
+
+def _shrink(cause: Cause) -> str:
+    if cause.shrink is None:
+        return ""
+    low, high = cause.shrink.interval
+    return f": shrinks the gap by {cause.shrink.shrink:.1%} ({low:.1%} to {high:.1%})"
+
+
+def _parameter(parameter: Reported) -> str:
+    spread = "" if parameter.std is None else f" ± {parameter.std:.2g}"
+    return f"{parameter.name} = {parameter.value:.5g}{spread} {parameter.unit}".rstrip()
+
+
+def _measurement(m: Measurement) -> str:
+    q = ", ".join(f"{v:.3f}" for v in m.q)
+    purpose = f"separates {' from '.join(m.separates)}" if len(m.separates) > 1 else (
+        f"would show {m.separates[0]}"
+    )  # fmt: skip
+    came = ""
+    if m.approach:
+        came = f", last motions {' '.join(f'{a:+d}' for a in m.approach)}"
+    return f"q = [{q}] rad with {m.payload:.3g} kg{came}: {purpose}"

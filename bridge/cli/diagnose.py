@@ -1,0 +1,132 @@
+"""``gapbridge diagnose``."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from bridge.cell import Cell, save_cell
+from bridge.cli.answer import answer
+from bridge.cli.options import cell_option, log_argument, open_cell, open_log
+from bridge.cli.progress import status
+from bridge.output_file import require_writable, write_text
+from core.diagnosis.diagnosis import Diagnosis
+from core.diagnosis.diagnosis import diagnose as diagnose_log
+from core.diagnosis.document import document
+from core.effects import effect_named
+from core.errors import InputError, LogError
+from core.log import Log
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+REPORT = "bridge.report"
+
+
+@click.command()
+@log_argument
+@cell_option
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR",
+              help="Folder for diagnosis.json and report.html; made where it is missing.")
+@click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
+              help="Write the diagnosis as JSON.")
+@click.option("--apply", "new_cell", type=click.Path(path_type=Path), metavar="NEW_CELL",
+              help="Write the cell with the found effects added.")
+@click.option("--withhold", multiple=True, metavar="EFFECT",
+              help="Take an effect out of the catalogue; may be given several times.")
+@click.option("--sim", type=click.Path(path_type=Path), metavar="SIM_LOG",
+              help="Take the prediction, row by row, from a log of your own simulator.")
+def diagnose(  # fmt: skip
+    log: Path, cell: Path, out: Path | None, json_file: Path | None, new_cell: Path | None,
+    withhold: tuple[str, ...], sim: Path | None,
+) -> None:
+    """Diagnose the sim-to-real gap of a log: where it lies, what causes it, how far it shrinks.
+
+    Says what it found in plain sentences. An effect is named only where it shrinks the gap on poses
+    that its fit did not see; what the catalogue does not explain is said, with what it depends on.
+
+    Example: gapbridge diagnose log.csv --cell cell.yaml --out out/diagnosis --apply better.yaml
+    """
+    given = open_cell(cell)
+    rows = open_log(log, given)
+    _check_effects(withhold)
+    simulated = None if sim is None else _simulated(sim, given, rows)
+    inputs = [log, cell] + ([sim] if sim else [])
+    for file in (json_file, new_cell):
+        if file is not None:
+            require_writable(file, *inputs)
+    if out is not None:
+        _folder(out)
+    with status("diagnosing") as tell:
+        found = _diagnose(given, rows, withhold, simulated, tell)
+    text = json.dumps(document(found), indent=1, allow_nan=False) + "\n"
+    if json_file is not None:
+        write_text(json_file, text)
+    if new_cell is not None:
+        save_cell(given, new_cell, found.model)
+    written = [] if out is None else _write_folder(out, text, found, given, rows)
+    click.echo(answer(found))
+    for file in (*written, json_file, new_cell):
+        if file is not None:
+            click.echo(f"{file}: written")
+
+
+def _diagnose(
+    cell: Cell, log: Log, withhold: tuple[str, ...], simulated: Log | None,
+    tell: Callable[[str], None],
+) -> Diagnosis:  # fmt: skip
+    extra = {} if simulated is None else {"simulated": simulated}
+    try:
+        return diagnose_log(
+            cell.model, log, cell.metrology, withhold=withhold, progress=tell, **extra
+        )
+    except InputError as error:
+        text = str(error)
+        raise type(error)(text if text.startswith(log.path) else f"{log.path}: {text}") from None
+
+
+def _check_effects(names: tuple[str, ...]) -> None:
+    for name in names:
+        try:
+            effect_named(name)
+        except InputError as error:
+            raise InputError(f"--withhold: {error}") from None
+
+
+def _simulated(path: Path, cell: Cell, log: Log) -> Log:
+    """Return the simulator's log; raises LogError where its rows are not those of the log."""
+    simulated = open_log(path, cell)
+    if len(simulated) != len(log):
+        raise LogError(
+            f"{path}: found {len(simulated)} rows, expected {len(log)}: one per row of {log.path}"
+        )
+    return simulated
+
+
+def _folder(path: Path) -> None:
+    """Make the folder of the results; its parent must exist."""
+    if path.exists() and not path.is_dir():
+        raise InputError(f"{path}: found a file, expected a folder for --out")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: found no folder {path.parent}, expected an existing one")
+    try:
+        path.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: folder cannot be made: {error.strerror}") from None
+
+
+def _write_folder(
+    folder: Path, text: str, found: Diagnosis, cell: Cell, log: Log
+) -> list[Path]:
+    """Write diagnosis.json, and the page where this installation draws pages."""
+    written = [folder / "diagnosis.json"]
+    write_text(written[0], text)
+    if importlib.util.find_spec(REPORT) is not None:
+        importlib.import_module(REPORT).write_report(found, cell, log, folder)
+        written.append(folder / "report.html")
+    return written

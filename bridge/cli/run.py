@@ -1,0 +1,34 @@
+"""``gapbridge run``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from bridge.cli.optional import member
+from bridge.cli.options import cell_argument, open_cell
+from core.errors import InputError
+
+
+@click.command()
+@cell_argument
+@click.option("--observe", is_flag=True, help="Compute and record, but write nothing.")
+@click.option("--arm", is_flag=True, help="Write setpoints, whatever the cell says.")
+@click.option("--duration", type=click.FloatRange(min=0, min_open=True), metavar="S",
+              help="End after so many seconds; else on SIGINT or SIGTERM.")
+def run(cell: Path, observe: bool, arm: bool, duration: float | None) -> None:  # fmt: skip
+    """Run the on-cell daemon: read the arm's state, predict how it bends, correct its setpoints.
+
+    Setpoints are written where the cell has `setpoints.arm: true`, or with --arm.
+
+    Example: gapbridge run config/ur10e_simulated.yaml --observe --duration 60
+    """
+    if observe and arm:
+        raise InputError("--observe: found beside --arm, expected one of them")
+    given = open_cell(cell)
+    result = member("bridge.daemon", "run_cell", "run")(
+        given, observe=observe, arm=arm, duration=duration
+    )
+    if isinstance(result, int) and not isinstance(result, bool) and result:
+        raise click.exceptions.Exit(result)
