@@ -12,14 +12,15 @@ from bridge.cell.document import Document, read_document
 from bridge.cell.effects import compliance_terms, term_of
 from bridge.cell.message import message
 from bridge.cell.robot import build_arm
-from bridge.cell.schema import CellFile, Frame
+from bridge.cell.schema import CellFile, Frame, Simulation
+from bridge.settings import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
 from core.arm import Arm
 from core.errors import ArmError, CellError
 from core.metrology import Metrology
 from core.model import Model
 from core.rotation import rpy_matrix, transform
 
-HEAVIEST = 2.0  # times the rated payload: beyond, the number is a mistake
+HEAVIEST = 1.5  # times the rated payload: beyond, the number is a mistake
 FINEST = 1.0e-9  # m: what a sigma of zero counts as
 
 
@@ -38,6 +39,37 @@ class Cell:
     def arm(self) -> Arm:
         """Return the nominal arm."""
         return self.model.arm
+
+    @property
+    def link(self) -> LinkSettings | None:
+        """Return section ``link``; None where the cell has none."""
+        return self.file.link
+
+    @property
+    def limits(self) -> LimitSettings:
+        """Return section ``limits``."""
+        return self.file.limits
+
+    @property
+    def setpoints(self) -> SetpointSettings:
+        """Return section ``setpoints``, its file seen from here instead of the cell's folder."""
+        given = self.file.setpoints
+        if given.file is None:
+            return given
+        return given.model_copy(update={"file": self.path.parent / given.file})
+
+    @property
+    def recording(self) -> RecordingSettings:
+        """Return section ``recording``, its folder seen from here instead of the cell's folder."""
+        given = self.file.recording
+        if given.folder is None:
+            return given
+        return given.model_copy(update={"folder": self.path.parent / given.folder})
+
+    @property
+    def simulation(self) -> Simulation:
+        """Return section ``simulation``."""
+        return self.file.simulation
 
 
 def load_cell(path: Path | str) -> Cell:

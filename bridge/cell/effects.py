@@ -86,15 +86,25 @@ def compliance_entry(terms: Sequence[Term], n: int) -> dict[str, list[float]]:
     for term in terms:
         if term.effect in FLEXIBILITIES and term.site.joint is not None:
             entry[FLEXIBILITIES[term.effect]][term.site.joint - 1] += term.values[0]
-    return {key: values.tolist() for key, values in entry.items()}
+    # what is below zero is no flexibility: it stands among the effects
+    return {key: np.maximum(values, 0.0).tolist() for key, values in entry.items()}
+
+
+def _negative_terms(terms: Sequence[Term]) -> list[Term]:
+    """Return what a joint's flexibilities of one kind add up to, where that is below zero."""
+    totals: dict[tuple[str, Site], float] = {}
+    for term in terms:
+        if term.effect in FLEXIBILITIES:
+            key = (term.effect, term.site)
+            totals[key] = totals.get(key, 0.0) + term.values[0]
+    return [Term(effect, site, (v,)) for (effect, site), v in totals.items() if v < 0]
 
 
 def effect_entries(terms: Sequence[Term], arm: Arm) -> list[dict[str, Any]]:
     """Return the ``effects`` list of a model's terms; flexibilities stand in their own section."""
     entries = []
-    for term in terms:
-        if term.effect in FLEXIBILITIES:
-            continue
+    further = [term for term in terms if term.effect not in FLEXIBILITIES]
+    for term in (*_negative_terms(terms), *further):
         entry: dict[str, Any] = {"effect": term.effect}
         if term.site.joint is not None:
             entry["joint"] = term.site.joint

@@ -6,7 +6,7 @@ import importlib
 import importlib.util
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -41,7 +41,7 @@ REPORT = "bridge.report"
               help="Take an effect out of the catalogue; may be given several times.")
 @click.option("--sim", type=click.Path(path_type=Path), metavar="SIM_LOG",
               help="Take the prediction, row by row, from a log of your own simulator.")
-def diagnose(  # fmt: skip
+def diagnose(
     log: Path, cell: Path, out: Path | None, json_file: Path | None, new_cell: Path | None,
     withhold: tuple[str, ...], sim: Path | None,
 ) -> None:
@@ -80,7 +80,7 @@ def _diagnose(
     cell: Cell, log: Log, withhold: tuple[str, ...], simulated: Log | None,
     tell: Callable[[str], None],
 ) -> Diagnosis:  # fmt: skip
-    extra = {} if simulated is None else {"simulated": simulated}
+    extra: dict[str, Any] = {} if simulated is None else {"simulated": simulated}
     try:
         return diagnose_log(
             cell.model, log, cell.metrology, withhold=withhold, progress=tell, **extra

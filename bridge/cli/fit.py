@@ -15,6 +15,9 @@ from bridge.cli.progress import progress
 from bridge.output_file import require_writable
 from core.errors import ExcitationError
 from core.identification import Identification, identify_compliance
+from core.model import Array
+
+CRUMB = 1e-15  # rad/Nm: turns no joint by anything
 
 
 @click.command()
@@ -41,9 +44,15 @@ def fit(log: Path, cell: Path, out: Path) -> None:
             found = identify_compliance(given.model, rows, given.metrology)
     except ExcitationError as error:
         raise ExcitationError(f"{log}: {error}") from None
-    save_cell(given, out, found.model)
+    model = given.model.with_compliance(_rounded(found.axial), _rounded(found.radial))
+    save_cell(given, out, model)
     tell(found)
     click.echo(f"{out}: written")
+
+
+def _rounded(flexibility: Array) -> list[float]:
+    """Return flexibilities (rad/Nm) without the crumbs that a bound of zero leaves behind."""
+    return [float(v) if abs(v) > CRUMB else 0.0 for v in flexibility]
 
 
 def tell(found: Identification) -> None:
