@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from types import TracebackType
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,12 +42,10 @@ class Driver(ABC):
     and only the side that reads. ``write_setpoint`` is the only call after which an arm moves.
     """
 
-    moves_arm: ClassVar[bool] = True
-    """Whether setpoints are the arm's motion (True), or ride on a program of the robot's own."""
-
-    def __init__(self, rate: float, n: int) -> None:
+    def __init__(self, rate: float, n: int, moves_arm: bool = True) -> None:
         self.rate = rate  # Hz: cycles per second that read_state is paced at
         self.n = n  # joints
+        self.moves_arm = moves_arm  # setpoints are the arm's motion; False: they ride on its own
 
     @abstractmethod
     def connect(self) -> None:

@@ -1,0 +1,267 @@
+"""Writing: Setpoint -> wire, by servoJ or as an offset in RTDE input registers.
+
+Knows nothing of reading. Neither way confirms anything: the library's True means that a call was
+made. What counts is what the controller says afterwards, in its samples: the target joints that
+follow a setpoint, the sequence number that comes back.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any, Protocol
+
+import numpy as np
+
+from core.errors import WriteError
+from core.setpoint import Setpoint
+from core.state import RobotState
+from drivers.ur_rtde import registers
+from drivers.ur_rtde.registers import Program
+from drivers.ur_rtde.settings import UrRtdeSettings
+
+ROBOT_RUNNING, PLAYING = 7, 2
+SAFE = (1, 2)  # safety_mode: normal, reduced
+NO_REMOTE_CHECK = 0x80  # FLAG_DISABLE_REMOTE_CONTROL_CHECK
+KICK = 0.02  # s between kicks of the watchdog
+FOLLOWING = 0.02  # rad: how near the controller's target must come to a setpoint
+DECIMATION, KEPT = 5, 64  # setpoints between two remembered ones; how many are remembered
+
+
+class Writer(Protocol):
+    """The writing half of a link."""
+
+    def arm(self, state: RobotState) -> None:
+        """Make ready; moves nothing. Raises WriteError."""
+
+    def write(self, setpoint: Setpoint, state: RobotState) -> None:
+        """Send one setpoint; ``state`` is the sample last read. Raises WriteError."""
+
+    def release(self) -> None:
+        """End the stream so that the arm comes to rest. Raises WriteError."""
+
+    def abandon(self) -> None:
+        """Let go of a link that may be dead, without touching it."""
+
+
+_ABANDONED: list[Any] = []
+"""Library objects of dead links: destroying them hangs, aborts or crashes the process, so they are
+kept until its end, which must be ``os._exit``."""
+
+
+def check_ready(host: str, state: RobotState) -> None:
+    """Refuse a robot that cannot move. Raises WriteError."""
+    if state.robot_mode != ROBOT_RUNNING:
+        raise WriteError(
+            f"{host}: robot_mode: found {state.robot_mode}, expected {ROBOT_RUNNING} (running)"
+        )
+    if state.safety_mode not in SAFE:
+        raise WriteError(
+            f"{host}: safety_mode: found {state.safety_mode}, expected 1 (normal) or 2 (reduced)"
+        )
+
+
+class ServoWriter:
+    """Joint setpoints by servoJ, through the control script that the library uploads."""
+
+    def __init__(self, settings: UrRtdeSettings) -> None:
+        self._settings = settings
+        self._control: Any = None
+        self._period = 1.0 / settings.rate
+        self._kicked = 0.0
+        self._sent = np.zeros((KEPT, 6))
+        self._sent_at = np.zeros(KEPT)
+        self._count = 0
+
+    def arm(self, state: RobotState) -> None:
+        """Upload the control script and start the robot's watchdog. Raises WriteError."""
+        host = self._settings.host
+        check_ready(host, state)
+        if state.runtime_state == PLAYING:
+            raise WriteError(
+                f"{host}: found a program running on the controller, expected none: link.mode "
+                "'servoj' would end it; stop it, or use link.mode 'offset'"
+            )
+        if self._control is None:
+            self._control = self._open()
+        elif not self._control.isProgramRunning():
+            self._control.reuploadScript()
+            self._wait_running()
+        if not self._control.setWatchdog(self._settings.watchdog):
+            raise WriteError(f"{host}: the controller refused the watchdog")
+        self._count, self._kicked = 0, 0.0
+
+    def _open(self) -> Any:
+        from rtde_control import RTDEControlInterface
+
+        settings = self._settings
+        flags = RTDEControlInterface.FLAG_UPLOAD_SCRIPT
+        if not settings.remote_control:
+            flags |= NO_REMOTE_CHECK
+        try:
+            return RTDEControlInterface(settings.host, settings.rate, flags)
+        except Exception as error:
+            words = str(error).strip().splitlines() or [type(error).__name__]
+            raise WriteError(f"{settings.host}: {words[0].strip()}") from None
+
+    def _wait_running(self) -> None:
+        """Wait until an uploaded script runs: the library returns before it does."""
+        until = time.monotonic() + 2.0
+        while not self._control.isProgramRunning():
+            if time.monotonic() > until:
+                raise WriteError(f"{self._settings.host}: the control script does not start")
+            time.sleep(0.01)
+        time.sleep(0.05)
+
+    def write(self, setpoint: Setpoint, state: RobotState) -> None:
+        """Send one setpoint. Raises WriteError where the robot does not obey."""
+        control, settings = self._control, self._settings
+        if control is None:
+            raise WriteError(f"{settings.host}: found no control script, expected arm() first")
+        if not control.isConnected() or not control.isProgramRunning():
+            raise WriteError(
+                f"{settings.host}: the control script has ended (watchdog, a stop, or a person)"
+            )
+        self._check_following(setpoint, state)
+        now = time.monotonic()
+        if now - self._kicked > KICK:
+            # before servoJ, which writes the same register: the command must be what stays in it
+            control.kickWatchdog()
+            self._kicked = now
+        if not control.servoJ(
+            setpoint.q.tolist(), 0.0, 0.0, self._period, settings.lookahead, settings.gain
+        ):
+            raise WriteError(f"{settings.host}: the controller refused servoJ")
+
+    def _check_following(self, setpoint: Setpoint, state: RobotState) -> None:
+        """Compare the controller's target with the setpoints of the last moments.
+
+        servoJ goes on returning True when nothing arrives any more; a target that is outside the
+        range of what was sent lately is the only sign of it.
+        """
+        count, self._count = self._count, self._count + 1
+        if count % DECIMATION:
+            return
+        now = time.monotonic()
+        slot = count // DECIMATION % KEPT
+        oldest = self._sent_at[slot] if count >= DECIMATION * KEPT else self._sent_at[0]
+        self._sent[slot], self._sent_at[slot] = setpoint.q, now
+        if count == 0 or now - oldest < self._settings.following:
+            return
+        recent = self._sent[self._sent_at >= now - self._settings.following]
+        low, high = recent.min(axis=0) - FOLLOWING, recent.max(axis=0) + FOLLOWING
+        if (state.target_q < low).any() or (state.target_q > high).any():
+            joint = int(np.argmax(np.abs(state.target_q - setpoint.q)))
+            raise WriteError(
+                f"{self._settings.host}: setpoints do not arrive: joint {joint + 1} has a target "
+                f"of {state.target_q[joint]:.4f} rad, and {setpoint.q[joint]:.4f} rad was sent"
+            )
+
+    def release(self) -> None:
+        """Brake the arm and end the control script. Raises WriteError where that failed."""
+        control = self._control
+        if control is None:
+            return
+        if not control.isProgramRunning():
+            return
+        stopped = control.servoStop(self._settings.stop_deceleration)
+        control.stopScript()
+        if not stopped:
+            raise WriteError(f"{self._settings.host}: the controller refused servoStop")
+
+    def abandon(self) -> None:
+        """Let go of the control object, whose end is not safe on a dead link."""
+        if self._control is not None:
+            _ABANDONED.append(self._control)
+            self._control = None
+
+
+class OffsetWriter:
+    """Offsets in RTDE input registers, applied by the robot's own program.
+
+    One call sends one register, so an offset arrives in nine packets; the sequence number goes
+    last, and the checksum tells the program whether they belong together.
+    """
+
+    def __init__(self, settings: UrRtdeSettings) -> None:
+        self._settings = settings
+        self._io: Any = None
+        self._sequence = 0
+        self._awaited = 0  # a sequence number that has not come back yet
+        self._awaited_since = 0.0
+        self.echo = 0
+        self.program = 0
+
+    def arm(self, state: RobotState) -> None:
+        """Open the registers. Raises WriteError where the robot's program is not there."""
+        host = self._settings.host
+        check_ready(host, state)
+        if self.program == Program.ABSENT or state.runtime_state != PLAYING:
+            raise WriteError(
+                f"{host}: output_int_register_{registers.PROGRAM}: found {self.program} with "
+                f"runtime_state {state.runtime_state}, expected a running robot program that holds "
+                "gapbridge_offset.script"
+            )
+        if self._io is None:
+            try:
+                from rtde_io import RTDEIOInterface
+
+                self._io = RTDEIOInterface(host)
+            except Exception as error:
+                words = str(error).strip().splitlines() or [type(error).__name__]
+                raise WriteError(f"{host}: {words[0].strip()}") from None
+        # a number that the program cannot take for the one it has seen last
+        self._sequence = (self.echo + registers.LAST_SEQUENCE // 4) % registers.LAST_SEQUENCE
+        self._awaited = 0
+
+    def write(self, setpoint: Setpoint, state: RobotState) -> None:
+        """Send one offset. Raises WriteError where the program stopped taking them."""
+        if self._io is None:
+            raise WriteError(f"{self._settings.host}: found no registers, expected arm() first")
+        self._check_echo()
+        self._sequence = registers.next_sequence(self._sequence)
+        if not self._awaited:
+            self._awaited, self._awaited_since = self._sequence, time.monotonic()
+        self._send(registers.counts(setpoint.offset_in_base.tolist()))
+
+    def _send(self, units: list[int]) -> None:
+        io, sequence = self._io, self._sequence
+        fine = True
+        try:
+            for register, count in zip(registers.OFFSET_DOUBLES, units[:5], strict=True):
+                fine &= io.setInputDoubleRegister(register, count * registers.UNIT)
+            fine &= io.setInputIntRegister(registers.OFFSET_RZ, units[5])
+            fine &= io.setInputIntRegister(registers.CHECKSUM, registers.checksum(units, sequence))
+            fine &= io.setInputIntRegister(registers.HEARTBEAT, sequence)
+            fine &= io.setInputIntRegister(registers.SEQUENCE, sequence)
+        except Exception as error:
+            raise WriteError(f"{self._settings.host}: registers: {error}") from None
+        if not fine:
+            raise WriteError(f"{self._settings.host}: the library refused a register")
+
+    def _check_echo(self) -> None:
+        """Raise WriteError where an offset sent has not been taken in time."""
+        if not self._awaited:
+            return
+        if registers.reached(self.echo, self._awaited):
+            self._awaited = 0
+            return
+        late = time.monotonic() - self._awaited_since
+        if late > self._settings.echo:
+            reason = Program(self.program).name if self.program in (0, 1, 2, 3) else self.program
+            raise WriteError(
+                f"{self._settings.host}: offsets do not arrive: number {self._awaited} was sent "
+                f"{late:.3f} s ago, {self.echo} came back last, the robot's program says {reason}"
+            )
+
+    def release(self) -> None:
+        """Leave a zero offset behind; without a heartbeat the program keeps to zero by itself."""
+        if self._io is None:
+            return
+        self._sequence = registers.next_sequence(self._sequence)
+        self._send([0] * 6)
+
+    def abandon(self) -> None:
+        """Let go of the library's object, whose destruction on a dead link aborts the process."""
+        if self._io is not None:
+            _ABANDONED.append(self._io)
+            self._io = None

@@ -1,0 +1,105 @@
+"""The UR driver: reading and writing halves put together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import LinkError, WriteError
+from core.model import Model
+from core.setpoint import Setpoint
+from core.state import RobotState
+from drivers.driver import Driver
+from drivers.ur_rtde.command import OffsetWriter, ServoWriter, Writer
+from drivers.ur_rtde.nominal import Nominal
+from drivers.ur_rtde.settings import UrRtdeSettings
+from drivers.ur_rtde.state import StateReader
+
+Vector = NDArray[np.float64]
+OFFSET_SCRIPT = Path(__file__).with_name("gapbridge_offset.script")
+TCP_APART = 0.03  # m: farther apart, the controller's TCP is not the cell's (calibration: a few mm)
+
+
+class UrRtdeDriver(Driver):
+    """One UR arm over RTDE. ``settings.mode`` says how setpoints get there.
+
+    To be used in a process that may be killed: the library can hang, abort or crash it when the
+    link breaks. After a LinkError the object is finished; a new process makes a new one.
+    """
+
+    def __init__(self, settings: UrRtdeSettings, model: Model) -> None:
+        super().__init__(settings.rate, 6, moves_arm=settings.mode == "servoj")
+        if model.arm.n != 6:
+            raise LinkError(f"link: found an arm of {model.arm.n} joints, a UR has 6")
+        self.settings = settings
+        self.reader = StateReader(settings)
+        self._nominal = Nominal(model)
+        self._writer: Writer = (
+            ServoWriter(settings) if settings.mode == "servoj" else OffsetWriter(settings)
+        )
+        self._state: RobotState | None = None
+
+    def connect(self) -> None:
+        """Open the receiving side only: no program is touched, no input claimed."""
+        self.reader.open()
+
+    def read_state(self) -> RobotState:
+        """Return the next sample; see Driver.read_state."""
+        self._state = self.reader.read()
+        if isinstance(self._writer, OffsetWriter):
+            self._writer.echo, self._writer.program = self.reader.echo, self.reader.program
+        return self._state
+
+    def nominal_q(self, state: RobotState) -> Vector:
+        """Return what the robot itself wants (6,), rad.
+
+        Offset mode: ``target_q`` without the offset that the robot's program says it applied in
+        that cycle (see nominal.py); holds for the sample last read. servoj mode: ``target_q``.
+        """
+        if self.moves_arm:
+            return state.target_q
+        return self._nominal.without(state.target_q, self.reader.applied)
+
+    def arm(self, state: RobotState) -> None:
+        """Make ready for writing: upload the control script, or claim the registers."""
+        if not self.moves_arm:
+            self._check_tcp(state)
+        self._writer.arm(state)
+
+    def _check_tcp(self, state: RobotState) -> None:
+        """Refuse where the controller's TCP is another than the cell's: offsets act there."""
+        said = self.reader.tcp_pose()
+        if said is None:
+            return
+        position, _ = self._nominal.tcp(state.actual_q)
+        apart = float(np.linalg.norm(said[:3] - position))
+        if apart > TCP_APART:
+            raise WriteError(
+                f"{self.settings.host}: the controller's TCP is {1e3 * apart:.1f} mm from the "
+                "cell's: set the same TCP in both (tool.tcp in the cell file)"
+            )
+
+    def write_setpoint(self, setpoint: Setpoint) -> None:
+        """Send one setpoint; needs ``arm`` before."""
+        state = self._state
+        if state is None:
+            raise WriteError(f"{self.settings.host}: found no state, expected read_state() first")
+        self._writer.write(setpoint, state)
+
+    def release(self) -> None:
+        """Stop writing: servoStop and end of the script, or an offset of zero."""
+        if self.reader.age > self.settings.state_timeout:
+            raise WriteError(f"{self.settings.host}: the link is silent; the robot's watchdog acts")
+        self._writer.release()
+
+    def close(self) -> None:
+        """Release where the link lives, let go where it does not, and disconnect."""
+        try:
+            self.release()
+        except LinkError:
+            pass
+        finally:
+            self._writer.abandon()
+            self.reader.close()

@@ -1,0 +1,59 @@
+"""The RTDE registers of the offset mode: what is sent, what the robot's program answers.
+
+=========================  ====================================================================
+input_double_register_18   offset x, m; 19 y, 20 z, 21 rotation vector x (rad), 22 y; base axes
+input_int_register_18      rotation vector z in 1e-9 rad
+input_int_register_19      sequence number, written last: it makes the offset valid
+input_int_register_20      checksum
+input_int_register_21      heartbeat: any change
+output_int_register_12     sequence number of the last offset that the program accepted
+output_int_register_13     0 no program, 1 running, 2 watchdog expired, 3 wrong checksum
+output_double_register_12  offset applied in this cycle: 12 to 17, x, y, z, rotation vector
+=========================  ====================================================================
+
+The library reaches no other registers: 18 to 22 on the way in, 12 to 19 on the way out, five of
+each kind in and eight out, which is why one of the six numbers travels as an integer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntEnum
+
+OFFSET_DOUBLES = (18, 19, 20, 21, 22)
+OFFSET_RZ, SEQUENCE, CHECKSUM, HEARTBEAT = 18, 19, 20, 21
+ECHO, PROGRAM = 12, 13
+APPLIED = (12, 13, 14, 15, 16, 17)
+
+UNIT = 1e-9  # m and rad: grain of what is sent
+LAST_SEQUENCE = 1_000_000  # 31 times it fits a 32 bit integer
+MODULUS = 2**31
+
+
+class Program(IntEnum):
+    """What the robot's program says of itself."""
+
+    ABSENT = 0
+    RUNNING = 1
+    EXPIRED = 2
+    REJECTED = 3
+
+
+def counts(offset_in_base: Sequence[float]) -> list[int]:
+    """Return an offset (6,) in m and rad as whole numbers of UNIT."""
+    return [round(v / UNIT) for v in offset_in_base]
+
+
+def checksum(units: Sequence[int], sequence: int) -> int:
+    """Return the checksum of an offset in UNIT: their sum plus 31 sequence, modulo 2^31."""
+    return (sum(units) + 31 * sequence) % MODULUS
+
+
+def next_sequence(sequence: int) -> int:
+    """Return the number after ``sequence``: 1 to LAST_SEQUENCE, round and round."""
+    return sequence % LAST_SEQUENCE + 1
+
+
+def reached(echo: int, sequence: int) -> bool:
+    """Return whether an echoed number is ``sequence`` or one after it."""
+    return (echo - sequence) % LAST_SEQUENCE < LAST_SEQUENCE // 2
