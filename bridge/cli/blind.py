@@ -22,7 +22,9 @@ BENCHMARK = "benchmarks.blind.__main__"
 )
 @click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
 def blind(arguments: tuple[str, ...]) -> None:
-    """Run the blind benchmark: data whose effect is withheld from the diagnosis, scored.
+    """Run the blind benchmark of the diagnosis.
+
+    Data are drawn whose effect is withheld from the diagnosis, and its answers are scored.
 
     Example: gapbridge blind --quick --out out/blind
     """

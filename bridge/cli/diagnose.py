@@ -45,10 +45,11 @@ def diagnose(
     log: Path, cell: Path, out: Path | None, json_file: Path | None, new_cell: Path | None,
     withhold: tuple[str, ...], sim: Path | None,
 ) -> None:
-    """Diagnose the sim-to-real gap of a log: where it lies, what causes it, how far it shrinks.
+    """Diagnose the sim-to-real gap of a log.
 
-    Says what it found in plain sentences. An effect is named only where it shrinks the gap on poses
-    that its fit did not see; what the catalogue does not explain is said, with what it depends on.
+    Says in plain sentences where it lies, what causes it and how far it shrinks. An effect is named
+    only where it shrinks the gap on poses that its fit did not see; what the catalogue does not
+    explain is said, with what it depends on.
 
     Example: gapbridge diagnose log.csv --cell cell.yaml --out out/diagnosis --apply better.yaml
     """

@@ -9,6 +9,7 @@ import numpy as np
 
 from bridge.cell import Cell, load_cell
 from bridge.cell.cell import HEAVIEST
+from core.diagnosis.suspicion import check_units
 from core.errors import LogError
 from core.log import Log, read_log
 
@@ -31,8 +32,16 @@ def open_cell(path: Path) -> Cell:
 
 
 def open_log(path: Path, cell: Cell) -> Log:
-    """Return a log for a cell's arm; raises LogError where a payload is out of range."""
+    """Return a log for a cell's arm.
+
+    Raises LogError where a payload is out of range, angles look like degrees or positions like
+    millimetres.
+    """
     log = read_log(path, cell.arm.n)
+    for name in ("actual_q", "target_q"):
+        if np.isinf(log.columns.get(name, np.zeros(0))).any():
+            log.require(name)  # names the cell
+    check_units(cell.model, log)
     mass, rated = log.get("payload"), cell.arm.payload
     if mass is not None and (mass > HEAVIEST * rated).any():
         row = int(np.argmax(mass > HEAVIEST * rated))

@@ -12,7 +12,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "bridge.cli.compensate:compensate",
         "Correct the setpoint of every row of a log.",
     ),
-    "diagnose": ("bridge.cli.diagnose:diagnose", "Find out why an arm misses its prediction."),
+    "diagnose": ("bridge.cli.diagnose:diagnose", "Diagnose the sim-to-real gap of a log."),
     "blind": ("bridge.cli.blind:blind", "Run the blind benchmark of the diagnosis."),
     "explain": ("bridge.cli.explain:explain", "Explain an effect of the catalogue."),
 }

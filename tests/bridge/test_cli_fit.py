@@ -1,0 +1,72 @@
+"""Cells that commands write and commands read: fit and predict, to the last digit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from cli_runs import (
+    AXIAL,
+    CELL,
+    RADIAL,
+    bent_model,
+    cell_in,
+    columns_of,
+    gapbridge,
+    log_in,
+    measured,
+    names,
+    poses_and_loads,
+    table_of,
+)
+
+from bridge.cell import load_cell, save_cell
+
+
+def bent_cell(folder: Path) -> Path:
+    save_cell(load_cell(cell_in(folder)), folder / "bent.yaml", bent_model())
+    return folder / "bent.yaml"
+
+
+def test_predict_writes_the_poses_of_the_bent_arm_to_the_last_digit(tmp_path: Path) -> None:
+    q, loads = poses_and_loads(7)
+    log = log_in(tmp_path, columns_of(q, loads))
+    answer = gapbridge("predict", log, "--cell", bent_cell(tmp_path), "--out", tmp_path / "p.csv")
+    assert (answer.code, answer.err) == (0, "")
+    header, table = table_of(tmp_path / "p.csv")
+    assert header == [*names("predicted_position", 3), *names("predicted_rotation", 3)]
+    poses = bent_model().predict(q, loads)
+    np.testing.assert_array_equal(table[:, :3], poses.position)
+    np.testing.assert_array_equal(table[:, 3:], poses.rotation_vector)
+
+
+def test_a_fitted_cell_predicts_what_was_measured(tmp_path: Path) -> None:
+    q, loads = poses_and_loads(40)
+    columns = columns_of(q, loads)
+    log = log_in(tmp_path, columns | measured(bent_model(), q, loads))
+    new = tmp_path / "new.yaml"
+    answer = gapbridge("fit", log, "--cell", cell_in(tmp_path), "--out", new)
+    assert answer.code == 0, answer.err
+    assert new.read_text(encoding="utf-8").startswith(CELL)  # comment, keys and order stay
+    axial, radial = load_cell(new).model.compliance()
+    # the TCP sits on the last axis: its own turn moves no point
+    np.testing.assert_allclose(axial[1:5], AXIAL[1:5], rtol=1e-4)
+    np.testing.assert_allclose(radial[:5], RADIAL[:5], rtol=1e-4)
+    other_q, other_loads = poses_and_loads(15, seed=5)
+    fresh = log_in(tmp_path, columns_of(other_q, other_loads), "fresh.csv")
+    assert gapbridge("predict", fresh, "--cell", new, "--out", tmp_path / "p.csv").code == 0
+    _, table = table_of(tmp_path / "p.csv")
+    truth = bent_model().predict(other_q, other_loads).position
+    rigid = bent_model().rigid_pose(other_q).position
+    assert np.abs(table[:, :3] - truth).max() < 1e-4 * np.abs(rigid - truth).max()
+
+
+def test_what_a_fit_of_a_rigid_arm_leaves_can_be_read_again(tmp_path: Path) -> None:
+    q, loads = poses_and_loads(30)
+    rigid = bent_model().without_terms()
+    log = log_in(tmp_path, columns_of(q, loads) | measured(rigid, q, loads, noise=2e-5))
+    new = tmp_path / "new.yaml"
+    assert gapbridge("fit", log, "--cell", cell_in(tmp_path), "--out", new).code == 0
+    axial, radial = load_cell(new).model.compliance()
+    assert min(*axial, *radial) >= 0
+    assert max(axial[1:3]) < 5e-7
