@@ -1,0 +1,54 @@
+"""Data quality: findings, wild readings, rows used, and what could not be seen."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bridge.report.fragment import bullets, heading, paragraph, table
+from bridge.report.material import Material, own_coordinates, per_sample
+from bridge.report.words import CHANNELS, told
+from core.diagnosis.diagnosis import ChannelDiagnosis
+
+WILD = 20  # wild readings listed a channel
+
+
+def section(material: Material) -> str:
+    """Return rows used, findings, wild readings, channels that the log does not show."""
+    diagnosis = material.diagnosis
+    rows = [
+        [CHANNELS[c.channel], str(len(material.log)), str(c.samples),
+         str(int((~c.selection.kept).sum())),
+         str(len(np.unique(c.selection.observation.groups)))]
+        for c in diagnosis.channels
+    ]  # fmt: skip
+    parts = [
+        table(("channel", "rows in the log", "samples used", "wild, set aside",
+               "different poses or stretches of time"), rows),
+    ]  # fmt: skip
+    parts.append(heading("Findings"))
+    parts.append(bullets(diagnosis.findings) or paragraph("Nothing odd was found in the log."))
+    parts += [_wild(c, material.log.first_row) for c in diagnosis.channels]
+    if diagnosis.not_observable:
+        parts.append(heading("What this log cannot show"))
+        parts.append(table(
+            ("channel", "columns it would need"),
+            [[CHANNELS.get(h.channel, h.channel), ", ".join(h.needs)]
+             for h in diagnosis.not_observable],
+        ))  # fmt: skip
+    return "".join(parts)
+
+
+def _wild(channel: ChannelDiagnosis, first_row: int) -> str:
+    wild = np.flatnonzero(~channel.selection.kept)
+    if not len(wild):
+        return ""
+    size = per_sample(channel.remaining, own_coordinates(channel))
+    worst = wild[np.argsort(-size[wild])][:WILD]
+    rows = [
+        [str(int(channel.selection.observation.rows[i]) + first_row), told(float(size[i]),
+         channel.unit)] for i in worst
+    ]  # fmt: skip
+    more = f" The {WILD} largest of {len(wild)}:" if len(wild) > WILD else ""
+    return heading(f"Wild readings: {CHANNELS[channel.channel]}") + paragraph(
+        f"They fit nothing around them and were set aside before any effect was judged.{more}"
+    ) + table(("line of the file", "distance from the model"), rows)  # fmt: skip

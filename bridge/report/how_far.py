@@ -1,0 +1,123 @@
+"""How far: the gap before and after, on measurements that the fit did not see."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bridge.report.fragment import AFTER, BEFORE, Figure, bar, figure_block, paragraph, table
+from bridge.report.fragment import EXPLAINED, FLOOR, LEFT
+from bridge.report.material import Array, Material, held_out_pair, shares, thinned
+from bridge.report.words import CHANNELS, effect_words, percent, told, unit_of
+from core.diagnosis.diagnosis import ChannelDiagnosis
+
+BINS = 40
+
+
+def section(material: Material) -> str:
+    """Return the shares, and before and after for every channel."""
+    parts = [_shares(material.diagnosis.channels)]
+    for channel in material.diagnosis.channels:
+        if len(material.diagnosis.channels) > 1:
+            parts.append(f"<h3>{CHANNELS[channel.channel]}</h3>")
+        parts.append(_channel(channel))
+    return "".join(parts)
+
+
+def _shares(channels: tuple[ChannelDiagnosis, ...]) -> str:
+    rows = []
+    for c in channels:
+        part = shares(c)
+        rows.append([
+            CHANNELS[c.channel], told(c.gap_rms, c.unit), told(c.remaining_rms_held_out, c.unit),
+            told(c.noise_floor_rms, c.unit),
+            bar(part.explained, percent(part.explained), EXPLAINED),
+            bar(part.noise, percent(part.noise), FLOOR),
+            bar(part.unexplained, percent(part.unexplained), LEFT),
+        ])  # fmt: skip
+    heads = ("channel", "before", "after, held out", "noise", "explained", "noise share",
+             "unexplained")  # fmt: skip
+    return table(heads, rows)
+
+
+def _channel(channel: ChannelDiagnosis) -> str:
+    pair = held_out_pair(channel)
+    parts = []
+    if channel.causes:
+        parts.append(_causes(channel))
+    if pair is None:
+        parts.append(paragraph("There are too few different poses to hold any out."))
+        return "".join(parts)
+    before, after = pair
+    if not channel.causes:
+        parts.append(paragraph("No cause was put into the model, so before and after are the same.",
+                               "note"))  # fmt: skip
+    parts += [figure_block(_histogram(channel, before, after)),
+              figure_block(_by_sample(channel, before, after))]  # fmt: skip
+    better = float(np.mean(after < before)) if channel.causes else None
+    if better is not None:
+        parts.append(paragraph(f"{percent(better)} of the held-out samples came closer."))
+    return "".join(parts)
+
+
+def _causes(channel: ChannelDiagnosis) -> str:
+    rows = []
+    for cause in channel.causes:
+        s = cause.shrink
+        if s is None:
+            continue
+        low, high = s.interval
+        rows.append([
+            effect_words(cause.effect), told(s.gap_without, channel.unit),
+            told(s.gap_with, channel.unit),
+            bar(s.shrink, f"{percent(s.shrink)} ({percent(low)} to {percent(high)})", EXPLAINED),
+        ])  # fmt: skip
+    heads = ("cause, all others kept in", "gap without it", "gap with it", "shrinks by (95 %)")
+    return table(heads, rows) if rows else ""
+
+
+def _histogram(channel: ChannelDiagnosis, before: Array, after: Array) -> Figure:
+    name, factor = unit_of(channel.unit)
+    most = float(max(before.max(), after.max())) * factor
+    edges = np.linspace(0, max(most, 1e-12), BINS + 1)
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    given = [("before", before, BEFORE)] + ([("after", after, AFTER)] if channel.causes else [])
+    traces = [
+        {"type": "bar", "x": middle, "y": np.histogram(values * factor, edges)[0], "name": label,
+         "marker": {"color": colour}, "opacity": 0.7, "width": float(edges[1])}
+        for label, values, colour in given
+    ]  # fmt: skip
+    layout = {
+        "barmode": "overlay", "xaxis": {"title": {"text": f"gap per coordinate ({name})"}},
+        "yaxis": {"title": {"text": "samples"}}, **_floor_line(channel, vertical=True),
+    }  # fmt: skip
+    return Figure(traces, layout, "How many samples have which gap, held out. Dotted: the noise.",
+                  height=300)  # fmt: skip
+
+
+def _by_sample(channel: ChannelDiagnosis, before: Array, after: Array) -> Figure:
+    name, factor = unit_of(channel.unit)
+    rows = channel.selection.observation.rows[channel.selection.kept] + 1
+    keep = thinned(before)
+    given = [("before", before, BEFORE)] + ([("after", after, AFTER)] if channel.causes else [])
+    traces = [
+        {"type": "scatter", "mode": "markers", "x": rows[keep], "y": values[keep] * factor,
+         "name": label, "marker": {"color": colour, "size": 5, "opacity": 0.75}}
+        for label, values, colour in given
+    ]  # fmt: skip
+    layout = {
+        "xaxis": {"title": {"text": "row of the log"}},
+        "yaxis": {"title": {"text": f"gap per coordinate ({name})"}, "rangemode": "tozero"},
+        **_floor_line(channel, vertical=False),
+    }
+    thin = f" {len(keep)} of {len(before)} samples are drawn." if len(keep) < len(before) else ""
+    return Figure(traces, layout, f"Every sample, held out. Dotted: the noise.{thin}", height=320)
+
+
+def _floor_line(channel: ChannelDiagnosis, *, vertical: bool) -> dict[str, object]:
+    if channel.noise_floor_rms is None:
+        return {}
+    at = channel.noise_floor_rms * unit_of(channel.unit)[1]
+    line = {"type": "line", "line": {"dash": "dot", "width": 1.5, "color": "#444"}}
+    if vertical:
+        return {"shapes": [line | {"x0": at, "x1": at, "y0": 0, "y1": 1, "yref": "paper"}]}
+    return {"shapes": [line | {"y0": at, "y1": at, "x0": 0, "x1": 1, "xref": "paper"}]}

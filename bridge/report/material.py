@@ -1,0 +1,92 @@
+"""The material of a report: the diagnosis, the log and the model it is about."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
+from core.diagnosis.held_out import HeldOut
+from core.log import Log
+from core.model import Model
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+SHOWN = 1500  # points a figure draws at most; wild readings and extremes are not thinned away
+
+
+@dataclass(frozen=True)
+class Material:
+    """All that a section may speak about."""
+
+    diagnosis: Diagnosis
+    cell_name: str
+    log: Log
+    model: Model  # as it was before the diagnosis
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Of a gap's energy: what is explained, noise, and unexplained; they add up to one."""
+
+    explained: float
+    noise: float
+    unexplained: float
+
+
+def own_coordinates(channel: ChannelDiagnosis) -> int:
+    """Return how many coordinates the channel's figures speak about (rotations, torques apart)."""
+    k = int(channel.gap.shape[1])
+    return min(k, 3) if channel.channel in ("position", "wrench") else k
+
+
+def shares(channel: ChannelDiagnosis) -> Shares:
+    """Return the shares of a channel's gap; held out where held-out figures can be had."""
+    total = max(channel.gap_rms**2, 1e-300)
+    left = channel.remaining_rms_held_out if channel.causes else channel.gap_rms
+    left = channel.remaining_rms if left is None else left
+    rest = min(left**2 / total, 1.0)
+    if not channel.structured:
+        return Shares(1 - rest, rest, 0.0)
+    floor = channel.noise_floor_rms or 0.0
+    noise = min(floor**2 / total, rest)
+    return Shares(1 - rest, noise, rest - noise)
+
+
+def per_sample(gap: Array, count: int) -> Array:
+    """Return the length (N,) of the first ``count`` coordinates of a gap."""
+    return np.asarray(np.linalg.norm(gap[:, :count], axis=1))
+
+
+def held_out_pair(channel: ChannelDiagnosis) -> tuple[Array, Array] | None:
+    """Return the rms per coordinate of each kept sample, held out: without and with the causes.
+
+    None where samples cannot be held out.
+    """
+    if channel.held_out is None:
+        return None
+    held = HeldOut(channel.selection)
+    if not held.possible:
+        return None
+    return np.sqrt(held.squares(())), channel.held_out
+
+
+def thinned(score: Array, most: int = SHOWN) -> Index:
+    """Return indices of at most ``most`` samples: evenly spread, and the largest scores."""
+    n = len(score)
+    if n <= most:
+        return np.arange(n)
+    even = np.linspace(0, n - 1, most - most // 10).astype(np.int64)
+    top = np.argsort(-score)[: most // 10]
+    return np.unique(np.concatenate([even, top]))
+
+
+def chosen_channel(diagnosis: Diagnosis) -> ChannelDiagnosis:
+    """Return the channel to speak of first: the one with the largest gap over its noise."""
+    def excess(channel: ChannelDiagnosis) -> float:
+        return channel.gap_rms / max(channel.noise_floor_rms or channel.gap_rms, 1e-300)
+
+    gaps = [c for c in diagnosis.channels if c.verdict != "no_gap"]
+    return max(gaps or list(diagnosis.channels), key=excess)

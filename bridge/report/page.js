@@ -1,0 +1,21 @@
+"use strict";
+// Draws every figure of the page from the data that stands inside it.
+document.querySelectorAll(".plot").forEach(function (place) {
+  const given = JSON.parse(place.querySelector("script").textContent);
+  const config = { responsive: true, displaylogo: false, displayModeBar: false };
+  place.textContent = "";
+  const drawn = Plotly.newPlot(place, given.data, given.layout, config);
+  drawn.then(function () { place.dataset.drawn = "yes"; });
+  place.parentElement.querySelectorAll("select").forEach(function (menu) {
+    menu.addEventListener("change", function () {
+      const axis = menu.dataset.axis;
+      const choice = given.choices[axis][Number(menu.value)];
+      const layout = {};
+      layout[axis + "axis.title.text"] = choice.title;
+      layout[axis + "axis.autorange"] = true;
+      const data = {};
+      data[axis] = choice.values;
+      Plotly.update(place, data, layout);
+    });
+  });
+});
