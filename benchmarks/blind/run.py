@@ -7,11 +7,14 @@ import importlib.util
 import json
 import os
 import shlex
+import signal
 import subprocess
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +24,7 @@ from benchmarks.blind.score import CaseScore, failed, score
 from benchmarks.blind.sensitivity import Sensitivity, sensitivity
 
 Diagnose = Callable[[Path, Path, tuple[str, ...]], dict[str, Any]]
+LIMIT = 120.0  # s, of one diagnosis; longer is a failed case
 CLEAN_FACTOR = 10  # clean cases of the position channel: this many times the seeds of the others
 
 
@@ -33,7 +37,7 @@ class Command:
     """A diagnosis by a program of its own: ``COMMAND LOG --cell CELL --json FILE``."""
 
     words: tuple[str, ...] = ("gapbridge", "diagnose")
-    timeout: float = 300.0
+    timeout: float = LIMIT
 
     @classmethod
     def parse(cls, text: str) -> Command:
@@ -95,6 +99,25 @@ def jobs_of(chosen: Sequence[str], seeds: int, first_seed: int) -> list[Job]:
     return jobs
 
 
+@contextmanager
+def _at_most(seconds: float) -> Iterator[None]:
+    """Raise DiagnosisError in what runs longer; no limit where signals are not to be had."""
+    if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "SIGALRM"):
+        yield
+        return
+
+    def stop(number: int, frame: object) -> None:
+        raise DiagnosisError(f"no answer in {seconds:g} s")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
 def run_job(job: Job, diagnose: Diagnose, keep: Path | None = None) -> CaseScore:
     """Run one case. Its folder's name tells nothing, and its label never leaves this process."""
     with tempfile.TemporaryDirectory(prefix="case-") as scratch:
@@ -102,7 +125,8 @@ def run_job(job: Job, diagnose: Diagnose, keep: Path | None = None) -> CaseScore
         label = make_case(job.kind, job.seed, folder)
         start = time.perf_counter()
         try:
-            answer = diagnose(folder / "log.csv", folder / "cell.yaml", label.withhold)
+            with _at_most(LIMIT):
+                answer = diagnose(folder / "log.csv", folder / "cell.yaml", label.withhold)
         except Exception as error:
             said = f"{type(error).__name__}: {error}"
             return failed(label, said, time.perf_counter() - start)

@@ -78,6 +78,8 @@ def score(label: Label, diagnosis: dict[str, Any], seconds: float | None = None)
         verdict = Verdict("right" if clean else "wrong", tuple(c.effect for c in claims))
     else:
         verdict = _known(label, claims, causes)
+        if verdict.outcome == "abstained" and structured and label.facts.get("settling_drift"):
+            verdict = Verdict("right_tie")  # a drift that settles may be owned up to as another
     explained = group in ("clean", "known", "several") and verdict.outcome in ("right", "right_tie")
     held_out = own.get("remaining_rms_held_out") or own.get("remaining_rms")
     exact = verdict.outcome == "right" and _same_joints(label, claims)

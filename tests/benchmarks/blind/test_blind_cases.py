@@ -168,3 +168,27 @@ def test_diagnoses_are_kept_where_asked(tmp_path):
     run_job(Job("none", 1), blame_nobody, tmp_path)
     kept = json.loads((tmp_path / "none-1.json").read_text(encoding="utf-8"))
     assert kept["channels"][0]["causes"] == []
+
+
+def test_a_diagnosis_that_never_ends_is_cut_off(monkeypatch):
+    import time
+
+    from benchmarks.blind import run
+
+    monkeypatch.setattr(run, "LIMIT", 0.1)
+    got = run_job(Job("none", 1), lambda log, cell, withhold: time.sleep(20))
+    assert (got.outcome, got.message) == ("failed", "DiagnosisError: no answer in 0.1 s")
+
+
+def test_an_effect_of_wanted_size_has_that_size(tmp_path):
+    label = make_case("size:axial_compliance@0.8", 3, tmp_path)
+    assert label.gap_rms / label.floor_rms == pytest.approx(0.8, rel=1e-3)
+    assert len(label.causes[0].joints) == 1
+
+
+def test_the_cramer_rao_bound_of_an_offset_is_that_of_its_only_number():
+    from benchmarks.blind.sensitivity import SURE, cramer_rao
+
+    # one number, 70 poses of 3 coordinates: its deviation is gap / (floor sqrt(210)), where
+    # rotations are not measured too
+    assert 0.5 * SURE / np.sqrt(210) < cramer_rao("joint_offset", range(8)) < 1.02 * SURE / 210**0.5

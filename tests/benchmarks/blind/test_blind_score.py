@@ -154,3 +154,13 @@ def test_other_channels_are_scored_alike(case, kind):
     if kind == "tracking:latency":
         blamed = score(label, answer(label, [cause("tracking_lag", [1], ties=["latency"])]))
         assert blamed.outcome == "wrong"
+
+
+def test_a_delay_of_the_whole_arm_may_be_told_joint_by_joint_or_of_the_arm(tmp_path):
+    for seed in range(10):
+        label = make_case("tracking:latency", seed, tmp_path)
+        if len(label.causes[0].joints) >= 6:
+            break
+    whole = score(label, answer(label, [cause("latency")]))
+    assert (whole.outcome, whole.joints_right) == ("right", True)
+    assert score(label, answer(label, true_causes(label))).joints_right is True
