@@ -65,13 +65,13 @@ def diagnose(
         _folder(out)
     with status("diagnosing") as tell:
         found = _diagnose(given, rows, withhold, simulated, tell)
+    click.echo(answer(found))
     text = json.dumps(document(found), indent=1, allow_nan=False) + "\n"
     if json_file is not None:
         write_text(json_file, text)
     if new_cell is not None:
         save_cell(given, new_cell, found.model)
     written = [] if out is None else _write_folder(out, text, found, given, rows)
-    click.echo(answer(found))
     for file in (*written, json_file, new_cell):
         if file is not None:
             click.echo(f"{file}: written")
