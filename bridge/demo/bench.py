@@ -1,0 +1,104 @@
+"""The people and the laser tracker around the simulated cell: its bench port, and the pendant."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.demo.poses import Load
+from core.errors import LinkError
+from drivers.simulated.settings import ServerSettings
+
+Array = NDArray[np.float64]
+READINGS_PERIOD = 0.01  # s between two readings of the tracker
+
+
+class Bench:
+    """One connection to the bench port, for one thread."""
+
+    def __init__(self, settings: ServerSettings) -> None:
+        self._settings = settings
+        self._socket = socket.create_connection((settings.host, settings.bench_port), timeout=10)
+        self._lines = self._socket.makefile("r")
+
+    def ask(self, line: str) -> str:
+        """Return the bench's answer; raises LinkError where it refuses."""
+        try:
+            self._socket.sendall(line.encode() + b"\n")
+            answer = self._lines.readline().strip()
+        except OSError as error:
+            raise LinkError(f"bench of {self._settings.host}: {error}") from error
+        if not answer or answer.startswith("error"):
+            raise LinkError(
+                f"bench of {self._settings.host}: {line}: found {answer or 'nothing'!r}"
+            )
+        return answer
+
+    def measure(self) -> Array:
+        """Return one reading (7,): controller time (s), position (m), rotation vector (rad)."""
+        return np.array([float(v) for v in self.ask("measure").split(",")])
+
+    def hang(self, load: Load) -> None:
+        """Hang a load on the flange, let go of the tool or pull at it, and tell the controller."""
+        numbers = " ".join(f"{v:.9g}" for v in (load.mass, *load.cog))
+        self.ask(f"payload {numbers}")
+        self.ask("wrench " + " ".join(f"{v:.9g}" for v in load.wrench))
+        cog = ",".join(f"{v:.9g}" for v in load.cog)
+        self._pendant(f"def hang():\n  set_payload({load.mass:.9g}, [{cog}])\nend\n")
+
+    def _pendant(self, program: str) -> None:
+        """Run a short program, as a person at the pendant would."""
+        address = (self._settings.host, self._settings.script_port)
+        with socket.create_connection(address, timeout=10) as script:
+            script.sendall(program.encode())
+            time.sleep(0.1)
+
+    def close(self) -> None:
+        """Leave the bench."""
+        self._lines.close()
+        self._socket.close()
+
+
+class Tracker(threading.Thread):
+    """Reads the tracker a hundred times a second while the ``with`` block lasts."""
+
+    def __init__(self, settings: ServerSettings) -> None:
+        super().__init__(name="tracker", daemon=True)
+        self._bench = Bench(settings)
+        self._ending = threading.Event()
+        self._readings: list[Array] = []
+        self._error: LinkError | None = None
+
+    def run(self) -> None:
+        """Collect readings until the block ends."""
+        try:
+            while not self._ending.wait(READINGS_PERIOD):
+                self._readings.append(self._bench.measure())
+        except LinkError as error:
+            self._error = error
+
+    def readings(self) -> Array:
+        """Return all readings (N, 7); raises LinkError where the tracker failed."""
+        if self._error is not None:
+            raise self._error
+        return np.array(self._readings).reshape(-1, 7)
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._ending.set()
+        self.join(5)
+        self._bench.close()

@@ -1,0 +1,122 @@
+"""Which poses the demo measures: those that tell most about the joints, and others to check on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.compensation import LEVER
+from core.loads import Loads
+from core.model import Model
+
+Array = NDArray[np.float64]
+
+# around elbow-up poses with the tool pointing down, rad
+LOWER = np.array([-0.5, -2.1, 0.8, -2.6, -2.1, -0.7])
+UPPER = np.array([0.5, -0.9, 2.1, -0.9, -1.0, 0.7])
+CANDIDATES = 400
+LOWEST = 0.15  # m: nothing of the arm comes closer to the table
+NEAREST = 0.35  # m: the tool stays at least this far from the base's axis
+FAR = 0.6  # m: test poses reach out as far as this, where arms bend
+REGULAR = 0.05  # smallest singular value of the Jacobian (rotations times the lever)
+
+
+@dataclass(frozen=True)
+class Load:
+    """What a person hangs on the flange, and what pulls at the tool."""
+
+    name: str
+    mass: float  # kg
+    cog: tuple[float, float, float] = (0.0, 0.0, 0.06)  # m, flange frame
+    wrench: tuple[float, ...] = (0.0,) * 6  # N, Nm, at the TCP, base axes
+
+    def rows(self, count: int) -> Loads:
+        """Return this load for ``count`` rows."""
+        return Loads(
+            payload_mass=np.full(count, self.mass),
+            payload_cog=np.tile(self.cog, (count, 1)),
+            wrench=np.tile(self.wrench, (count, 1)),
+        )
+
+
+CALIBRATION_LOADS = (
+    Load("nothing", 0.0),
+    Load("10 kg", 10.0),
+    Load("4 kg and a pull", 4.0, wrench=(25.0, 30.0, -10.0, 0.0, 0.0, 0.0)),
+)
+TEST_LOADS = (
+    Load("12 kg", 12.0, (0.01, 0.0, 0.08)),
+    Load("8 kg and a pull", 8.0, wrench=(-20.0, 25.0, -50.0, 0.0, 0.0, 0.0)),
+)
+
+
+def candidates(model: Model, seed: int) -> Array:
+    """Return free, regular poses (N, 6) drawn from the seed."""
+    q = np.random.default_rng((seed, 11)).uniform(LOWER, UPPER, (CANDIDATES, len(LOWER)))
+    position = model.rigid_pose(q).position
+    jacobian = model.without_terms().linear_form(q).jacobian.copy()
+    jacobian[:, 3:] *= LEVER
+    smallest = np.linalg.svd(jacobian, compute_uv=False)[:, -1]
+    free = (position[:, 2] > LOWEST) & (np.hypot(position[:, 0], position[:, 1]) > NEAREST)
+    return q[free & (smallest > REGULAR)]
+
+
+def telling(model: Model, q: Array, load: Load, count: int, known: Array) -> Array:
+    """Return the indices of ``count`` poses that add most to what is known (D-optimal, greedy).
+
+    ``known`` (2n, 2n) is the information so far, in units of one measured position; it is updated
+    in place.
+    """
+    rigid = model.without_terms()
+    form = rigid.linear_form(q, load.rows(len(q))).regressor[:, :3] * 1e-5 / 2e-5
+    parts = np.einsum("rki,rkj->rij", form, form)
+    chosen: list[int] = []
+    for _ in range(count):
+        gain = np.linalg.slogdet(known + parts)[1]
+        gain[chosen] = -np.inf
+        best = int(np.argmax(gain))
+        chosen.append(best)
+        known += parts[best]
+    return np.array(chosen)
+
+
+def tour(q: Array, start: Array) -> Array:
+    """Return an order in which to visit the poses (N, 6): from the start, always the nearest."""
+    left, order, here = set(range(len(q))), [], start
+    while left:
+        nearest = min(left, key=lambda i: float(np.abs(q[i] - here).max()))
+        order.append(nearest)
+        left.remove(nearest)
+        here = q[nearest]
+    return np.array(order)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Poses of the whole demo, each list in the order of its visits."""
+
+    calibration: tuple[Array, ...]  # per calibration load (N, 6)
+    test: tuple[Array, ...]  # per test load (M, 6), none of them in the calibration
+
+
+def plan(model: Model, home: Array, seed: int, calibrate: int = 10, test: int = 5) -> Plan:
+    """Return telling poses per calibration load and random ones per test load (so many each)."""
+    free = candidates(model, seed)
+    n = model.arm.n
+    known = np.eye(2 * n) * 1e-2
+    used: set[int] = set()
+    calibration = []
+    for load in CALIBRATION_LOADS:
+        chosen = telling(model, free, load, calibrate, known)
+        used |= set(chosen.tolist())
+        calibration.append(free[chosen][tour(free[chosen], home)])
+    position = model.rigid_pose(free).position
+    far = np.flatnonzero(np.hypot(position[:, 0], position[:, 1]) > FAR)
+    rest = free[[i for i in far if i not in used]]
+    tests = []
+    for k in range(len(TEST_LOADS)):
+        chosen_poses = rest[k * test : (k + 1) * test]
+        tests.append(chosen_poses[tour(chosen_poses, home)])
+    return Plan(tuple(calibration), tuple(tests))

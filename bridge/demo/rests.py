@@ -1,0 +1,124 @@
+"""What was measured while the arm stood still: the recording and the tracker, joined by time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.output_file import write_table
+from core.errors import RunError
+from core.rotation import rotation_matrix, rotation_vector
+
+Array = NDArray[np.float64]
+STILL = 0.003  # rad/s: slower than this, the arm stands
+SETTLING = 0.3  # s from standing still until readings count
+FEWEST = 8  # readings of the tracker at one rest
+NEAR = 0.05  # rad between a visited pose and the one that was meant
+
+
+@dataclass(frozen=True)
+class Rests:
+    """M rests of the arm, one row each, in the order of the visits."""
+
+    timestamp: Array  # (M,) s, controller clock
+    nominal_q: Array  # (M, n) rad, the pose that was meant
+    actual_q: Array  # (M, n) rad
+    payload: Array  # (M,) kg, declared in the controller
+    payload_cog: Array  # (M, 3) m
+    force: Array  # (M, 6) N, Nm: actual_TCP_force
+    position: Array  # (M, 3) m, measured
+    rotation: Array  # (M, 3) rad, measured, rotation vector
+
+    def __len__(self) -> int:
+        return len(self.timestamp)
+
+
+def rests(recording: Mapping[str, Array], readings: Array, visited: Array) -> Rests:
+    """Return the rests at the ``visited`` poses (M, n), in their order.
+
+    ``recording`` holds columns by RTDE name, ``readings`` (K, 7) is the tracker's. Raises RunError
+    where a visit is missing or the tracker saw too little of it.
+    """
+    spans = _spans(recording)
+    rows: list[tuple[Array, ...]] = []
+    for number, pose in enumerate(visited):
+        span = _next_span(recording, spans, pose)
+        if span is None:
+            raise RunError(f"visit {number + 1} of {len(visited)}: the arm never rested there")
+        rows.append(_rest(recording, readings, span, pose, number))
+    return Rests(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def _spans(recording: Mapping[str, Array]) -> list[slice]:
+    """Return the stretches in which the arm stood still for longer than it takes to settle."""
+    t = recording["timestamp"]
+    still = np.abs(recording["actual_qd"]).max(axis=1) < STILL
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
+    pairs = zip(edges[::2], edges[1::2] - 1, strict=True)
+    return [slice(a, b + 1) for a, b in pairs if t[b] - t[a] > SETTLING + 0.05]
+
+
+def _next_span(recording: Mapping[str, Array], spans: list[slice], pose: Array) -> slice | None:
+    """Take the first span at a pose out of the list, with those before it."""
+    while spans:
+        span = spans.pop(0)
+        if np.abs(recording["actual_q"][span.stop - 1] - pose).max() < NEAR:
+            return span
+    return None
+
+
+def _rest(
+    recording: Mapping[str, Array], readings: Array, span: slice, pose: Array, number: int
+) -> tuple[Array, ...]:
+    t = recording["timestamp"][span]
+    begin, end = t[0] + SETTLING, t[-1] - 0.01
+    seen = readings[(readings[:, 0] >= begin) & (readings[:, 0] <= end)]
+    if len(seen) < FEWEST:
+        raise RunError(
+            f"visit {number + 1}: found {len(seen)} readings of the tracker, expected {FEWEST}"
+        )
+    during = np.arange(span.start, span.stop)[t >= begin]
+    return (
+        np.array(begin),
+        pose,
+        recording["actual_q"][during].mean(axis=0),
+        recording["payload"][during].mean(),
+        recording["payload_cog"][during].mean(axis=0),
+        recording["actual_TCP_force"][during].mean(axis=0),
+        seen[:, 1:4].mean(axis=0),
+        _mean_rotation(seen[:, 4:7]),
+    )
+
+
+def _mean_rotation(vectors: Array) -> Array:
+    """Return the mean of close rotations (N, 3): of their matrices, as near pi vectors flip."""
+    U, _, Vt = np.linalg.svd(rotation_matrix(vectors).mean(axis=0))
+    return rotation_vector(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+
+
+def joined(parts: list[Rests]) -> Rests:
+    """Return several runs' rests as one."""
+    fields = Rests.__dataclass_fields__
+    return Rests(*(np.concatenate([getattr(part, name) for part in parts]) for name in fields))
+
+
+def write_log(path: Path, rests: Rests) -> None:
+    """Write rests as a log in the contract's columns."""
+    columns = {
+        "timestamp": rests.timestamp,
+        "target_q": rests.nominal_q,
+        "actual_q": rests.actual_q,
+        "payload": rests.payload,
+        "payload_cog": rests.payload_cog,
+        "actual_TCP_force": rests.force,
+        "measured_position": rests.position,
+        "measured_rotation": rests.rotation,
+    }
+    names: list[str] = []
+    for name, values in columns.items():
+        names += [name] if values.ndim == 1 else [f"{name}_{i}" for i in range(values.shape[1])]
+    write_table(path, names, np.hstack([v.reshape(len(v), -1) for v in columns.values()]))

@@ -1,0 +1,113 @@
+"""What the demo has shown, as numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.demo.rests import Rests
+from core.identification import Identification
+from core.model import Model
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LoopFigures:
+    """How the daemon's loop kept time."""
+
+    rate: float  # Hz
+    missed: int  # cycles of the controller that were not seen
+    cycles: int
+    p99: float  # us, period
+
+
+@dataclass(frozen=True)
+class Result:
+    """The whole demo."""
+
+    link: str
+    seed: int
+    identification: Identification
+    model: Model  # calibrated
+    without: Rests  # test visits, effect-free setpoints
+    compensated: Rests  # the same visits, corrected setpoints
+    loads: tuple[str, ...]  # name of the load of each visit
+    setpoints_written: int
+    loop: LoopFigures
+    duration: float  # s
+
+    @property
+    def error_without(self) -> Array:
+        """Return the distance (M,) (m) of the TCP from where it was wanted, uncompensated."""
+        return tcp_error(self.model, self.without)
+
+    @property
+    def error_with(self) -> Array:
+        """Return the same with compensation."""
+        return tcp_error(self.model, self.compensated)
+
+    @property
+    def repeatability(self) -> float:
+        """Return how far (m, rms) the arm comes back from where it was: measured on revisits."""
+        return repeatability([self.without, self.compensated], self.loads)
+
+    def summary(self) -> dict[str, Any]:
+        """Return what summary.json holds."""
+        return {
+            "link": self.link,
+            "seed": self.seed,
+            "samples": self.identification.samples,
+            "tcp_error_mm": {
+                "without": millimetres(self.error_without),
+                "with": millimetres(self.error_with),
+            },
+            "repeatability_mm": self.repeatability * 1e3,
+            "setpoints_written": self.setpoints_written,
+            "loop": {
+                "rate_hz": self.loop.rate,
+                "missed": self.loop.missed,
+                "cycles": self.loop.cycles,
+                "p99_us": self.loop.p99,
+            },
+            "duration_s": self.duration,
+        }
+
+
+def tcp_error(model: Model, rests: Rests) -> Array:
+    """Return the distance (M,) (m) of the measured TCP from the rigid arm's at the meant pose."""
+    wanted = model.rigid_pose(rests.nominal_q).position
+    return np.asarray(np.linalg.norm(rests.position - wanted, axis=1))
+
+
+def repeatability(runs: list[Rests], labels: tuple[str, ...]) -> float:
+    """Return the rms distance (m) of visits from the mean of all visits to the same pose.
+
+    Within each run, pose and load; corrected for the degree of freedom that each mean takes.
+    """
+    square, freedom = 0.0, 0
+    for rests in runs:
+        keys = [(label, *q) for label, q in zip(labels, rests.nominal_q.tolist(), strict=True)]
+        for key in set(keys):
+            rows = rests.position[[i for i, k in enumerate(keys) if k == key]]
+            square += float(np.sum((rows - rows.mean(axis=0)) ** 2))
+            freedom += len(rows) - 1
+    return float(np.sqrt(square / freedom)) if freedom else float("nan")
+
+
+def millimetres(error: Array) -> dict[str, float]:
+    """Return rms and largest of distances (m) in mm."""
+    return {"rms": float(np.sqrt(np.mean(error**2))) * 1e3, "max": float(error.max()) * 1e3}
+
+
+def visits_of_poses(result: Result) -> list[list[int]]:
+    """Return the rows of each pose and load, in the order of their first visit."""
+    found: dict[tuple[object, ...], list[int]] = {}
+    for i, (load, q) in enumerate(
+        zip(result.loads, np.round(result.without.nominal_q, 9).tolist(), strict=True)
+    ):
+        found.setdefault((load, *q), []).append(i)
+    return list(found.values())
