@@ -8,7 +8,7 @@ channel's whole prediction, by central differences, at the model found so far.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +16,15 @@ from numpy.typing import NDArray
 from core.arm import Arm
 from core.diagnosis.observation import Observation
 from core.effects import CATALOGUE, Effect, Parameter, Site, Term
+from core.errors import InputError
 
 Array = NDArray[np.float64]
 STEP = 1e-2  # of a parameter's usual scale, for central differences
 WHOLE_ORDERS = 128  # cycles a turn that are looked through one by one
 CYCLES = 1.5  # of a periodic line over the joint's range, at least
 HALF_ORDERS = 40  # up to here also the halves
-SOFTENING = (0.1, 0.5, 2.0, 6.0, 20.0, 60.0, 200.0, 800.0)  # (typical moment / M0)^2 that a bent stiffness curve starts from
+# (typical moment / M0)^2 that a bent stiffness curve starts from
+SOFTENING = tuple(float(v) for v in np.geomspace(0.1, 3000, 13))
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,7 @@ class Candidate:
     site: Site
     parameters: tuple[Parameter, ...]
     fixed: tuple[float | None, ...]  # per parameter of the effect: None = fitted
+    curve: float | None = None  # softening of a bent stiffness curve: columns straight, and bent
     quantity: str = ""  # what a smooth candidate depends on
     target: str = ""  # and what it moves
 
@@ -43,6 +46,8 @@ class Candidate:
 
     def term(self, x: Array) -> Term:
         """Return the term with fitted values ``x`` (d,)."""
+        if self.curve is not None:
+            return Term(self.family, self.site, (float(np.sum(x)), self.curve))
         free = iter(float(v) for v in x)
         values = tuple(next(free) if f is None else f for f in self.fixed)
         return Term(self.family, self.site, values)
@@ -80,19 +85,22 @@ def _at(
     if effect.identifier == "transmission_error":
         orders = sorted(
             set(np.arange(1, WHOLE_ORDERS + 1).astype(float))
-            | set(np.arange(1, 2 * HALF_ORDERS + 1) / 2)
+            | set(np.arange(2, 2 * HALF_ORDERS + 1) / 2)
             | {t.site.order for t in inside if t.site.order is not None}
         )
-        # a period has to be seen more than once: slower waves are no period but a shape
-        least = max(1.0, CYCLES / max(turns[site.joint - 1], 1e-6)) if site.joint else 1.0
+        # one cycle a turn is a usual period; of others, more than one has to be seen
+        least = CYCLES / max(turns[site.joint - 1], 1e-6) if site.joint else 1.0
         return [
             Candidate(effect.identifier, Site(site.joint, float(o)), parameters, free)
             for o in orders
-            if o >= least
+            if o >= min(least, 3.0) or o in (1.0, 2.0)
         ]
     if effect.identifier == "stiffness_nonlinearity" and not inside:
         return [
-            Candidate(effect.identifier, site, parameters[:1], (None, s * parameters[1].scale))
+            Candidate(
+                effect.identifier, site, (replace(parameters[0], lower=-np.inf),) * 2, free,
+                curve=s * parameters[1].scale,
+            )
             for s in SOFTENING
         ]
     if effect.identifier == "tool_frame" and not with_rotation:
@@ -111,15 +119,32 @@ def named_columns(
         phase = candidate.site.order * observation.quantities[joint_quantity(observation, i)]
         return np.stack([J[:, :, i] * np.sin(phase)[:, None], J[:, :, i] * np.cos(phase)[:, None]],
                         axis=-1)  # fmt: skip
+    if candidate.curve is not None:
+        return _bent_columns(observation, candidate)
     columns = []
     for k, parameter in enumerate(candidate.parameters):
         h = STEP * parameter.scale
         step = np.zeros(len(candidate.parameters))
         step[k] = h
-        ahead = observation.predict([*base, candidate.term(step)])
-        behind = observation.predict([*base, candidate.term(-step)])
+        try:
+            ahead = observation.predict([*base, candidate.term(step)])
+            behind = observation.predict([*base, candidate.term(-step)])
+        except InputError:  # the arm would buckle: no candidate beside this base
+            ahead = behind = observation.measured
         columns.append((ahead - behind) / (2 * h))
     return np.stack(columns, axis=-1)
+
+
+def _bent_columns(observation: Observation, candidate: Candidate) -> Array:
+    """Return the straight and the bent part of a stiffness curve (N, k, 2).
+
+    Both: a joint that the model holds as compliant already only bends its own line.
+    """
+    i, moment = (candidate.site.joint or 1) - 1, observation.axial_moment
+    assert moment is not None and candidate.curve is not None
+    straight = observation.axial_columns()[:, :, i]
+    bent = 1 / np.sqrt(1 + candidate.curve * moment[:, i] ** 2)
+    return np.stack([straight, straight * bent[:, None]], axis=-1)
 
 
 def joint_quantity(observation: Observation, i: int) -> str:

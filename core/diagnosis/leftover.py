@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from core.diagnosis.search import Space
 
 Array = NDArray[np.float64]
-DRAWS = 4000
+DRAWS = 1500
 FOLDS = 7
 MOST = 3000  # samples beyond which the test takes every so many
 
@@ -87,7 +87,7 @@ def dependence(
     fold = fold_of[np.searchsorted(names, groups)]
     best: dict[str, float] = {}
     for c, candidate in enumerate(space.candidates):
-        if candidate.named:
+        if candidate.named or not candidate.quantity:
             continue
         columns = space.X[:, space.start[c] : space.start[c + 1]]
         clean = columns - fitted @ (fitted.T @ columns)

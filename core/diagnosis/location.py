@@ -46,7 +46,7 @@ def locate(selection: Selection, gap: Array, accused: Sequence[int]) -> Where:
                 shares[joint] = shares.get(joint, 0.0) + float(part @ space.y) / total
     else:
         for c, candidate in enumerate(space.candidates):
-            if not candidate.named and candidate.target.startswith("joint_"):
+            if candidate.quantity and candidate.target.startswith("joint_"):
                 joint = int(candidate.target.removeprefix("joint_"))
                 basis = basis_of(space.X[:, space.start[c] : space.start[c + 1]])
                 share = float(np.sum((basis.T @ space.y) ** 2)) / total

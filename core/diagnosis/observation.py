@@ -44,6 +44,13 @@ class Observation:
     rows: NDArray[np.int64]  # (N,) row of each sample in the log
     axes: tuple[str, ...]  # name of each coordinate
     joint_columns: Array | None = None  # (N, k, n) d prediction / d joint angle, where it has one
+    unnamed: tuple[tuple[str, Array], ...] = ()  # target, columns (N, k, d) of further rivals
     tool_axes: Array | None = None  # (N, 3, 3) axes of the TCP in base, as columns
+    axial_moment: Array | None = None  # (N, n) Nm about each joint's axis, where it is known
     order_in_time: bool = False  # True: neighbours in time are correlated (a moving log)
     rebase: Callable[[Array], Observation] | None = None  # the same with the nuisance moved (p,)
+
+    def axial_columns(self) -> Array:
+        """Return d prediction / d axial compliance (N, k, n), to first order."""
+        assert self.joint_columns is not None and self.axial_moment is not None
+        return self.joint_columns * self.axial_moment[:, None, :]

@@ -17,13 +17,16 @@ from numpy.typing import NDArray
 from core.diagnosis.candidate import Candidate
 
 Array = NDArray[np.float64]
+MERGED = 9  # terms up to which every pair is tried against one
 BEAM = 6
 DEPTH = 16
 PATIENCE = 2  # depths without a better set before the beam stops
 RANK = 1e-10  # share of a block's own size below which a direction counts as already explained
-SMOOTH_PRICE = 12.0  # what an unnamed function pays beyond a named cause
+USUAL_ORDERS = (1.0, 2.0, 3.0, 4.0)  # eccentricity and its kin
+SMOOTH_PRICE = 18.0  # what an unnamed function pays beyond a named cause
 MARGIN = 4.0  # what every accusation pays: keeps clean logs clean
 ABSURD = 60.0  # times a parameter's usual size: beyond, a fit is no explanation
+SMOOTH_TERMS = 2  # more unnamed functions than that tell nothing more
 LINES = 4  # periodic lines a joint may have
 
 
@@ -75,14 +78,21 @@ def prices(candidates: Sequence[Candidate], freedom: float) -> Array:
     families = {c.family for c in candidates if c.named} or {""}
     count: dict[str, int] = {}
     for c in candidates:
-        count[c.family] = count.get(c.family, 0) + 1
+        count[_kind(c)] = count.get(_kind(c), 0) + 1
     paid = []
     for c in candidates:
-        tried = count[c.family] * (len(families) if c.named else 1)
-        d = len(c.fixed) if c.family == "stiffness_nonlinearity" else len(c.parameters)
+        tried = count[_kind(c)] * (len(families) if c.named else 1)
+        d = len(c.parameters)
         extra = MARGIN if c.named else SMOOTH_PRICE
         paid.append(d * np.log(max(freedom, 2.0)) + 2 * np.log(tried) + extra)
     return np.array(paid)
+
+
+def _kind(candidate: Candidate) -> str:
+    """Return among how many of its like a candidate was tried: usual lines are few."""
+    if candidate.family == "transmission_error" and (candidate.site.order or 0) in USUAL_ORDERS:
+        return "usual lines"
+    return candidate.family
 
 
 def gains(space: Space, P: Array, r: Array) -> tuple[Array, Array]:
@@ -148,6 +158,8 @@ def _clash(space: Space, chosen: Sequence[int], new: int) -> bool:
     """Return whether a candidate stands instead of, not beside, one that is chosen."""
     b = space.candidates[new]
     lines = 0
+    if not b.named and sum(not space.candidates[c].named for c in chosen) >= SMOOTH_TERMS:
+        return True
     for c in chosen:
         a = space.candidates[c]
         if not (a.named and b.named) or a.site.joint != b.site.joint:
@@ -173,14 +185,18 @@ def _grow(space: Space, state: _State, new: int, score: float) -> _State:
     return _State((*state.chosen, new), P, r, float(r @ r), score)
 
 
-def _children(space: Space, state: _State, width: int) -> list[tuple[float, int]]:
+def _children(
+    space: Space, state: _State, width: int, named_only: bool = False
+) -> list[tuple[float, int]]:
     gain, sign = gains(space, state.P, state.r)
     score = space.misfit(np.maximum(state.rss - gain, 1e-300)) + space.price
     score += space.price[list(state.chosen)].sum()
     found: list[tuple[float, int]] = []
     for c in np.argsort(score):
         candidate = space.candidates[c]
-        if c in state.chosen or _clash(space, state.chosen, int(c)):
+        if c in state.chosen or (named_only and not candidate.named):
+            continue
+        if _clash(space, state.chosen, int(c)):
             continue
         single = candidate.named and len(candidate.parameters) == 1
         if single and candidate.parameters[0].lower == 0 and sign[c] < 0:
@@ -191,7 +207,24 @@ def _children(space: Space, state: _State, width: int) -> list[tuple[float, int]
     return found
 
 
-def beam_search(space: Space, allowed_depth: int = DEPTH, beam: int = BEAM) -> list[Found]:
+def search(space: Space, depth: int = DEPTH) -> Found:
+    """Return the best set: named causes alone, unless an unnamed function beside them pays.
+
+    The catalogue is searched by itself first, so that a smooth function, which imitates several
+    causes at once, does not stand in their way.
+    """
+    named = improve(space, beam_search(space, depth, named_only=True)[0], named_only=True)
+    joined = [fit(space, (*named.chosen, c)) for _, c in children(space, named.chosen, 4)]
+    if not any(j.score < named.score for j in joined):
+        return named
+    whole = improve(space, unpack(space, beam_search(space, depth)[0]))
+    grown = improve(space, min(joined, key=lambda f: f.score))
+    return min([named, whole, grown], key=lambda f: f.score)
+
+
+def beam_search(
+    space: Space, allowed_depth: int = DEPTH, beam: int = BEAM, named_only: bool = False
+) -> list[Found]:
     """Return the best sets met, best first (the empty one among them)."""
     rss = float(space.y @ space.y)
     empty = _State((), space.X, space.y, rss, float(space.misfit(np.array(rss))))
@@ -200,7 +233,7 @@ def beam_search(space: Space, allowed_depth: int = DEPTH, beam: int = BEAM) -> l
     for _ in range(allowed_depth):
         children: dict[frozenset[int], tuple[float, int, int]] = {}
         for s, state in enumerate(states):
-            for score, c in _children(space, state, 2 * beam):
+            for score, c in _children(space, state, 2 * beam, named_only):
                 key = frozenset((*state.chosen, c))
                 if key not in children or score < children[key][0]:
                     children[key] = (score, s, c)
@@ -235,24 +268,39 @@ def children(space: Space, chosen: Sequence[int], width: int) -> list[tuple[floa
     return _children(space, _projected(space, chosen), width)
 
 
-def improve(space: Space, found: Found) -> Found:
+def improve(space: Space, found: Found, named_only: bool = False) -> Found:
     """Return the set after dropping and swapping terms as long as that pays."""
-    for _ in range(8):
+    for _ in range(4):
         better = found
         for c in found.chosen:
             rest = tuple(o for o in found.chosen if o != c)
             trial = fit(space, rest)
             if trial.score < better.score:
                 better = trial
-            for _, other in _children(space, _projected(space, rest), 3):
+            for _, other in _children(space, _projected(space, rest), 3, named_only):
                 if other != c:
                     trial = fit(space, (*rest, other))
                     if trial.score < better.score - 1e-6:
                         better = trial
+        if better is found and 2 < len(found.chosen) <= MERGED:
+            better = _merged(space, found, named_only)
         if better is found:
             return found
         found = better
     return found
+
+
+def _merged(space: Space, found: Found, named_only: bool) -> Found:
+    """Return the set with two terms replaced by one, where that pays: two that imitate a third."""
+    better = found
+    for i, one in enumerate(found.chosen):
+        for other in found.chosen[i + 1 :]:
+            rest = tuple(c for c in found.chosen if c not in (one, other))
+            for _, new in _children(space, _projected(space, rest), 2, named_only):
+                trial = fit(space, (*rest, new))
+                if trial.score < better.score - 1e-6:
+                    better = trial
+    return better
 
 
 def rivals(space: Space, found: Found, c: int, within: float) -> list[tuple[float, int]]:
@@ -268,3 +316,40 @@ def rivals(space: Space, found: Found, c: int, within: float) -> list[tuple[floa
         if trial.score <= found.score + within:
             told.append((trial.score - found.score, other))
     return sorted(told)
+
+
+def unpack(space: Space, found: Found) -> Found:
+    """Return the set with smooth functions of a joint's own angle told as periodic lines.
+
+    A few lines together look smooth, and each alone is dearer than one smooth function.
+    """
+    for c in found.chosen:
+        candidate = space.candidates[c]
+        joint = candidate.target.removeprefix("joint_")
+        if candidate.named or not joint.isdigit():
+            continue
+        if candidate.quantity.rpartition("_")[2] != str(int(joint) - 1):
+            continue
+        rest = tuple(o for o in found.chosen if o != c)
+        found = min([found, *_lines(space, rest, int(joint))], key=lambda f: f.score)
+    return found
+
+
+def _lines(space: Space, rest: tuple[int, ...], joint: int) -> list[Found]:
+    """Return the best sets of up to three lines of a joint beside ``rest``."""
+    own = [k for k, candidate in enumerate(space.candidates)
+           if candidate.family == "transmission_error" and candidate.site.joint == joint]  # fmt: skip
+    grown: list[Found] = []
+    sets = [rest]
+    for _ in range(3):
+        step: list[Found] = []
+        for chosen in sets:
+            state = _projected(space, chosen)
+            gain, _ = gains(space, state.P, state.r)
+            for k in sorted(own, key=lambda k: -gain[k])[:6]:
+                if not _clash(space, chosen, k):
+                    step.append(fit(space, (*chosen, k)))
+        step.sort(key=lambda f: f.score)
+        grown += step
+        sets = [f.chosen for f in step[:5]]
+    return grown

@@ -22,7 +22,7 @@ from core.diagnosis.candidate import (
 from core.diagnosis.noise import Noise, estimate_noise
 from core.diagnosis.observation import Observation
 from core.diagnosis.smooth import smooth_candidates
-from core.diagnosis.search import Found, Space, beam_search, children, fit, improve, prices
+from core.diagnosis.search import Found, Space, children, fit, prices, search
 from core.effects import CATALOGUE, Term
 from core.errors import InputError
 from core.model import Model
@@ -115,8 +115,7 @@ def select(
             _look_for_wild(work, columns)
         space, raw, nuisance, target = _space(work, columns, base, smooth)
         depth = min(40, 8 + len(space.y) // 200)
-        best = beam_search(space, depth)[0]
-        best = improve(space, best)
+        best = search(space, depth)
         if turn > 0 and not work.kept.all():
             space, raw, nuisance, target, best = _with_wild_explained(
                 work, columns, base, smooth, (space, raw, nuisance, target, best)
@@ -127,7 +126,7 @@ def select(
         except InputError:  # absurd values: the arm would buckle
             best = fit(space, ())
             terms, index, covariance, residual = _refit(work, space, best)
-        same = terms_alike(terms, base) and turn > 1
+        same = terms_alike(terms, base) and turn > 0
         found = best
         free = 1 - sum(len(v) for v in best.values) / space.freedom
         changed = _look_again(work, residual, free)
@@ -235,9 +234,9 @@ def _refit(
         sizes = [len(v) for v in x]
         cuts = np.cumsum([*sizes, extra.shape[1]])
         parts = np.split(step, cuts)
-        moved = 0.0
+        moved, share = 0.0, _share(work, freed, index, x, parts, A, b)
         for k in range(len(x)):
-            x[k] = _within(freed[index[k]], x[k] + parts[k])
+            x[k] = _within(freed[index[k]], x[k] + share * parts[k])
             scale = np.array([p.scale for p in freed[index[k]].parameters])
             moved = max(moved, float(np.abs(parts[k] / scale).max()))
         if observation.rebase is not None:
@@ -261,12 +260,40 @@ def _refit(
     return terms, index, tuple(covariance), gap
 
 
+def _share(
+    work: _Work, freed: dict[int, Candidate], index: tuple[int, ...], x: list[Array],
+    parts: list[Array], A: Array, b: Array,
+) -> float:  # fmt: skip
+    """Return the share of a Gauss-Newton step to go: less than all where a curve would overshoot."""
+    if not any(freed[c].family == "stiffness_nonlinearity" for c in index):
+        return 1.0
+    linear = A[:, sum(len(v) for v in x) :]  # smooth terms and nuisance, refitted for each trial
+    Q = np.linalg.qr(linear)[0] if linear.shape[1] else linear
+
+    def left(share: float) -> float:
+        terms = [freed[c].term(_within(freed[c], v + share * part))
+                 for c, v, part in zip(index, x, parts, strict=False)]  # fmt: skip
+        try:
+            gap = work.observation.measured - work.observation.predict(terms)
+        except InputError:
+            return float("inf")
+        r = _flat(gap[..., None], work)[:, 0]
+        r = r - Q @ (Q.T @ r)
+        return float(r @ r)
+
+    now = left(0.0)
+    for share in (1.0, 0.5, 0.25, 0.1, 0.03):
+        if left(share) <= now:
+            return share
+    return 0.0
+
+
 def _freed(arm: Arm, candidate: Candidate) -> Candidate:
     """Return the candidate with what its columns held fixed (a softening) fitted too."""
     if candidate.family != "stiffness_nonlinearity":
         return candidate
     parameters = CATALOGUE[candidate.family].parameters(arm, candidate.site)
-    return replace(candidate, parameters=parameters, fixed=(None,) * len(parameters))
+    return replace(candidate, parameters=parameters, fixed=(None,) * len(parameters), curve=None)
 
 
 def _slope(work: _Work, candidate: Candidate, x: Array, others: tuple[Term, ...]) -> Array:

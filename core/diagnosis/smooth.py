@@ -38,6 +38,8 @@ def smooth_candidates(observation: Observation, arm: Arm) -> list[Pair]:
                 found += _bumps(name, target, z, directions)
         if name == "timestamp":
             found += _steps(name, z, targets)
+    for target, columns in observation.unnamed:
+        found.append((_candidate("", target, columns.shape[-1]), columns))
     return found
 
 
@@ -76,7 +78,7 @@ def _spread(quantity: str, target: str, directions: Array, shape: Array) -> Pair
 
 def _candidate(quantity: str, target: str, size: int) -> Candidate:
     scale = (Parameter("", "", 1e-3),) * size
-    return Candidate("smooth", Site(), scale, (None,) * size, quantity, target)
+    return Candidate("smooth", Site(), scale, (None,) * size, quantity=quantity, target=target)
 
 
 def _bumps(name: str, target: str, z: Array, directions: Array) -> list[Pair]:
