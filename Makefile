@@ -1,0 +1,49 @@
+# Everything runs in .venv, which is made here: Python 3.11 or newer and make are all it takes.
+# `make PYTHON=python3.12 test` takes another interpreter.
+
+PYTHON ?= python3
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+
+.PHONY: help demo test check coverage clean
+
+help:
+	@echo "make demo      the whole job on a simulated cell; results in out/demo"
+	@echo "make test      all tests"
+	@echo "make check     format, lint, types, import contracts, all tests"
+	@echo "make coverage  all tests, and which lines of core and drivers they reach"
+	@echo "make clean     remove .venv and everything that was made"
+
+demo: .venv/.main
+	$(BIN)/gapbridge demo
+
+test: .venv/.test
+	$(BIN)/python -m pytest
+
+check: .venv/.test
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/python -m pytest
+
+coverage: .venv/.test
+	$(BIN)/python -m pytest --cov --cov-report=term-missing:skip-covered
+
+.venv/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+		|| { echo "$(PYTHON) is older than 3.11; try make PYTHON=python3.12"; exit 1; }
+	$(PYTHON) -m venv .venv
+
+# one stamp per set of dependencies: a later make finds nothing to do
+.venv/.main: pyproject.toml | .venv/bin/python
+	$(PIP) install --quiet --editable .
+	@touch $@
+
+.venv/.test: pyproject.toml | .venv/bin/python
+	$(PIP) install --quiet --editable '.[test]'
+	@touch $@ .venv/.main
+
+clean:
+	rm -rf .venv out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
