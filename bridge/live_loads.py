@@ -1,0 +1,72 @@
+"""What acts on the arm now, for the model: from one state after the other."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.loads import Loads
+from core.state import RobotState
+
+Vector = NDArray[np.float64]
+MOVED = 1e-5  # rad: a joint that has come this far has moved, in that direction
+
+
+class LiveLoads:
+    """Keeps one row of loads up to date: filtered force, payload, temperature, last motion.
+
+    The controller's declared payload stands instead of the model's own, because its TCP force has
+    that payload taken off.
+    """
+
+    def __init__(self, n: int, use_force: bool, time_constant: float) -> None:
+        self._use_force = use_force
+        self._constant = time_constant
+        self._wrench = np.zeros((1, 6))
+        self._mass = np.zeros(1)
+        self._cog = np.zeros((1, 3))
+        self._temperature = np.zeros((1, n))
+        self._approach = np.zeros((1, n))
+        self._turned_at: Vector | None = None
+        self._last = -math.inf  # s, controller clock
+
+    def update(self, state: RobotState) -> Loads:
+        """Return the loads (one row) of this state; the arrays are this object's own."""
+        self._filter_force(state)
+        self._follow_motion(state.actual_q)
+        has_payload = state.payload is not None and state.payload_cog is not None
+        if has_payload:
+            self._mass[0] = state.payload
+            self._cog[0] = state.payload_cog
+        if state.joint_temperatures is not None:
+            self._temperature[0] = state.joint_temperatures
+        return Loads(
+            payload_mass=self._mass if has_payload else None,
+            payload_cog=self._cog if has_payload else None,
+            wrench=self._wrench if self._use_force else None,
+            temperature=None if state.joint_temperatures is None else self._temperature,
+            approach=self._approach,
+        )
+
+    def _filter_force(self, state: RobotState) -> None:
+        """Low-pass the force: its noise must not shake the arm. A long gap begins anew."""
+        gap = state.timestamp - self._last
+        self._last = state.timestamp
+        if self._constant <= 0.0 or not 0.0 < gap < 10.0 * self._constant:
+            self._wrench[0] = state.actual_TCP_force
+            return
+        share = 1.0 - math.exp(-gap / self._constant)
+        self._wrench[0] += share * (state.actual_TCP_force - self._wrench[0])
+
+    def _follow_motion(self, q: Vector) -> None:
+        before = self._turned_at
+        if before is None:
+            self._turned_at = q.copy()
+            return
+        way = q - before
+        moved = np.abs(way) > MOVED
+        if moved.any():
+            self._approach[0, moved] = np.sign(way[moved])
+            before[moved] = q[moved]

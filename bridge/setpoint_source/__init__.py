@@ -1,0 +1,29 @@
+"""Where nominal setpoints come from; an explicit table of sources."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+if TYPE_CHECKING:
+    from bridge.setpoint_source.source import Source
+    from bridge.settings import SetpointSettings
+
+SOURCES: dict[str, str] = {
+    "target": "bridge.setpoint_source.target:TargetSource",
+    "trajectory": "bridge.setpoint_source.trajectory:TrajectorySource",
+    "tcp": "bridge.setpoint_source.tcp:TcpSource",
+}
+"""Name in a cell file (setpoints.source) -> ``module:Class``, imported when it is used."""
+
+
+def make_source(settings: SetpointSettings, n: int, moves_arm: bool, folder: Path) -> Source:
+    """Return the source that the settings name, not yet open.
+
+    ``n``: joints; ``moves_arm``: whether setpoints are the arm's only motion; ``folder``: where
+    relative paths start. Raises InputError where it cannot be used.
+    """
+    module, kind = SOURCES[settings.source].split(":")
+    found = getattr(importlib.import_module(module), kind)
+    return cast("Source", found(settings, n, moves_arm, folder))

@@ -1,0 +1,55 @@
+"""What a source of nominal setpoints is."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.settings import SetpointSettings
+from core.errors import RunError
+
+Vector = NDArray[np.float64]
+
+
+class SourceDryError(RunError):
+    """A source has no setpoint where it should have one: the arm must hold."""
+
+
+class Source(ABC):
+    """Nominal joint setpoints, one per cycle, at the controller's clock. For one thread.
+
+    Constructors read what they need and open nothing. ``sample`` never blocks.
+    """
+
+    def __init__(self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path) -> None:
+        self.settings = settings
+        self.n = n
+
+    def open(self) -> None:  # noqa: B027
+        """Open what the source listens on. Raises RunError."""
+
+    @abstractmethod
+    def first(self, own_q: Vector) -> Vector | None:
+        """Return where the source would start (n,), rad; None where it has nothing yet.
+
+        ``own_q`` is what the robot itself wants now, (n,) rad. The caller checks that the start is
+        near the arm: starting never jumps.
+        """
+
+    def begin(self, timestamp: float, own_q: Vector) -> None:  # noqa: B027
+        """Start the motion at controller time ``timestamp`` (s)."""
+
+    @abstractmethod
+    def sample(self, timestamp: float, own_q: Vector) -> Vector:
+        """Return the setpoint (n,) rad at controller time ``timestamp``. Raises SourceDryError."""
+
+    @property
+    def ended(self) -> bool:
+        """Return whether the source has come to its end, and stays there."""
+        return False
+
+    def close(self) -> None:  # noqa: B027
+        """Close what ``open`` has opened; may be repeated."""

@@ -1,0 +1,38 @@
+"""Setpoints of the robot's own: what its program, or its standing still, wants."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.setpoint_source.source import Source
+from bridge.settings import SetpointSettings
+
+Vector = NDArray[np.float64]
+
+
+class TargetSource(Source):
+    """The arm's own ``target_q``.
+
+    Where setpoints are the arm's only motion there is none of its own, and its target is what was
+    written last: then it is where the arm stood when writing began.
+    """
+
+    def __init__(self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path) -> None:
+        super().__init__(settings, n, moves_arm, folder)
+        self._stands = moves_arm
+        self._start: Vector | None = None
+
+    def first(self, own_q: Vector) -> Vector | None:
+        """Return the robot's own target."""
+        return own_q
+
+    def begin(self, timestamp: float, own_q: Vector) -> None:
+        """Remember where the arm stands."""
+        self._start = own_q.copy() if self._stands else None
+
+    def sample(self, timestamp: float, own_q: Vector) -> Vector:
+        """Return the robot's own target, or where the arm stood."""
+        return own_q if self._start is None else self._start

@@ -1,0 +1,68 @@
+"""Setpoints from a file: CSV with columns timestamp, target_q_0, target_q_1, ..."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.setpoint_source.source import Source
+from bridge.settings import SetpointSettings
+from core.errors import LogError
+from core.log import read_log
+
+Vector = NDArray[np.float64]
+
+
+class TrajectorySource(Source):
+    """A recorded or planned motion, replayed at the controller's clock.
+
+    Between two rows joints move linearly; after the last row the arm stays there, which is no
+    fault. Raises LogError where the file is not a trajectory of n joints.
+    """
+
+    def __init__(self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path) -> None:
+        super().__init__(settings, n, moves_arm, folder)
+        path = folder / (settings.file or "")
+        log = read_log(path, n)
+        self._q = np.ascontiguousarray(log.require("target_q"))
+        time = log.require("timestamp")
+        behind = np.flatnonzero(np.diff(time) <= 0.0)
+        if len(behind):
+            row = int(behind[0]) + log.first_row + 1
+            raise LogError(
+                f"{path}: row {row}, column timestamp: found {time[behind[0] + 1]:g} after "
+                f"{time[behind[0]]:g}, expected rows in time order"
+            )
+        self._time = time - time[0]
+        self._begun: float | None = None
+        self._row = 0
+        self._ended = False
+
+    def first(self, own_q: Vector) -> Vector | None:
+        """Return the first row."""
+        return self._q[0]
+
+    def begin(self, timestamp: float, own_q: Vector) -> None:
+        """Start the clock: the first row is due at ``timestamp``."""
+        self._begun, self._row, self._ended = timestamp, 0, False
+
+    def sample(self, timestamp: float, own_q: Vector) -> Vector:
+        """Return the joints at this moment."""
+        time, q, row = self._time, self._q, self._row
+        at = timestamp - (timestamp if self._begun is None else self._begun)
+        if at >= time[-1]:
+            self._ended = True
+            return q[-1]
+        while time[row + 1] <= at:
+            row += 1
+        self._row = row
+        share = (at - time[row]) / (time[row + 1] - time[row])
+        found: Vector = q[row] + share * (q[row + 1] - q[row])
+        return found
+
+    @property
+    def ended(self) -> bool:
+        """Return whether the last row has been reached."""
+        return self._ended
