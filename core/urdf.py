@@ -36,7 +36,7 @@ def arm_from_urdf(path: Path | str, tip: str | None = None) -> Arm:
     """
     path = Path(path)
     robot = _parse(path)
-    joints = {j.find("child").get("link"): j for j in robot.findall("joint")}  # type: ignore[union-attr]
+    joints = {_child(j): j for j in robot.findall("joint")}
     links = {str(link.get("name")): link for link in robot.findall("link")}
     tip = tip or _only_leaf(path, links, joints)
     if tip not in links:
@@ -57,9 +57,14 @@ def _parse(path: Path) -> ElementTree.Element:
         raise ArmError(f"{path}: found broken XML ({error}), expected a URDF") from None
     if root.tag != "robot":
         raise ArmError(f"{path}: found a <{root.tag}> file, expected a URDF <robot>")
+    links = {str(link.get("name")) for link in root.findall("link")}
     for joint in root.findall("joint"):
+        label = f"{path}: joint {joint.get('name')!r}"
         if joint.find("child") is None or joint.find("parent") is None:
-            raise ArmError(f"{path}: joint {joint.get('name')!r}: found no parent or child link")
+            raise ArmError(f"{label}: found no parent or child link")
+        for link in (_parent(joint), _child(joint)):
+            if link not in links:
+                raise ArmError(f"{label}: found link {link!r}, expected one that the file has")
     return root
 
 
@@ -70,9 +75,8 @@ def _only_leaf(
     leaves = [name for name in links if name not in parents]
     if len(leaves) == 1:
         return leaves[0]
-    moving = [leaf for leaf in leaves if any(j.get("type") in TURNING for j in _chain(leaf, joints))]
-    depth = {leaf: sum(j.get("type") in TURNING for j in _chain(leaf, joints)) for leaf in moving}
-    deepest = [leaf for leaf in moving if depth[leaf] == max(depth.values())]
+    depth = {leaf: sum(j.get("type") in TURNING for j in _chain(leaf, joints)) for leaf in leaves}
+    deepest = [leaf for leaf in leaves if depth[leaf] == max(depth.values())]
     if len(deepest) == 1:
         return deepest[0]
     raise ArmError(
@@ -110,7 +114,7 @@ def _assemble(
         kind, label = joint.get("type"), f"{path}: joint {joint.get('name')!r}"
         step = fixed[-1] @ _origin(joint, label)
         if kind in TURNING:
-            align = _align_z(_vector(joint.find("axis"), "xyz", "1 0 0", label))
+            align = _align_z(_axis(joint, label))
             fixed[-1] = step @ align
             moving.append(joint)
             fixed.append(align.T)  # align is a pure rotation
@@ -123,11 +127,11 @@ def _assemble(
         _add_branches(path, _child(joint), fixed[-1], bodies[-1], joints, links, on_chain)
     if not moving:
         raise ArmError(f"{path}: found no revolute joint on the way to the tip")
-    return _arm(name, np.array(fixed), bodies[1:], moving)
+    return _arm(path, name, np.array(fixed), bodies[1:], moving)
 
 
 def _arm(
-    name: str, fixed: Array, bodies: list[_Body], moving: list[ElementTree.Element]
+    path: Path, name: str, fixed: Array, bodies: list[_Body], moving: list[ElementTree.Element]
 ) -> Arm:
     mass = np.array([b.mass for b in bodies])
     cog = np.array([b.first / b.mass if b.mass > 0 else np.zeros(3) for b in bodies])
@@ -135,13 +139,14 @@ def _arm(
     columns: dict[str, list[float]] = {"lower": [], "upper": [], "velocity": [], "effort": []}
     for joint in moving:
         limit = joint.find("limit")
+        label = f"{path}: joint {joint.get('name')!r}: limit"
         free = joint.get("type") == "continuous"
         for key, default in (("lower", -np.inf), ("upper", np.inf)):
-            given = None if limit is None or free else limit.get(key)
-            columns[key].append(default if given is None else float(given))
+            told = limit is not None and not free and limit.get(key) is not None
+            columns[key].append(_vector(limit, key, "0", label)[0] if told else default)
         for key in ("velocity", "effort"):
-            given = None if limit is None else limit.get(key)
-            columns[key].append(np.inf if given is None or float(given) <= 0 else float(given))
+            value = _vector(limit, key, "0", label)[0]
+            columns[key].append(value if value > 0 else np.inf)
     limits = JointLimits(**{key: np.array(values) for key, values in columns.items()})
     names = tuple(str(j.get("name")) for j in moving)
     return Arm(name, fixed, mass, cog, inertia, limits, joint_names=names)
@@ -175,20 +180,27 @@ def _add_link(path: Path, link: ElementTree.Element, frame: Array, body: _Body) 
     mass = _vector(element, "value", "0", label)[0]
     pose = frame @ _origin(inertial, label)
     tensor = inertial.find("inertia")
-    I = np.zeros((3, 3))
+    about_centre = np.zeros((3, 3))
     if tensor is not None:
         for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
             key = "i" + "xyz"[i] + "xyz"[j]
-            I[i, j] = I[j, i] = _vector(tensor, key, "0", label)[0]
+            about_centre[i, j] = about_centre[j, i] = _vector(tensor, key, "0", label)[0]
     R, c = pose[:3, :3], pose[:3, 3]
     body.mass += mass
     body.first = body.first + mass * c
-    body.second = body.second + R @ I @ R.T + mass * _point(c)
+    body.second = body.second + R @ about_centre @ R.T + mass * _point(c)
 
 
 def _point(c: Array) -> Array:
     """Return the inertia (3, 3) of a unit point mass at c about the origin."""
     return np.asarray(c @ c * np.eye(3) - np.outer(c, c))
+
+
+def _axis(joint: ElementTree.Element, label: str) -> Array:
+    axis = _vector(joint.find("axis"), "xyz", "1 0 0", label)
+    if not axis.any():
+        raise ArmError(f"{label}: axis xyz: found '0 0 0', expected a direction")
+    return axis
 
 
 def _origin(element: ElementTree.Element, label: str) -> Array:
