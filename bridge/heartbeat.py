@@ -1,194 +1,140 @@
-"""Memory shared by the loop's process and its parent: heartbeat, commands, cycles.
+"""What the daemon and its loop process share: heartbeat, commands, events, statistics, rows.
 
-One writer for each word, 8 bytes each, and no locks: whichever side dies, stands still or is
-killed, the other goes on. Cycles go through a ring; each row begins with its own number, so that a
-reader knows a row that is not whole, or was overwritten.
+One block of anonymous memory that the daemon makes and the loop's process inherits. It outlives the
+loop's process, however that ends. Each field has one writer, so there are no locks: rows and events
+are published by a counter that is raised after they are complete.
 """
 
 from __future__ import annotations
 
+import json
 import mmap
 import os
+import sys
 import tempfile
 import time
 from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-WORDS = 64
-ROWS = 8192  # cycles kept: 16 s at 500 Hz
-_BEATS, _PHASE, _STATE, _COMMAND, _WRITTEN, _ENDED, _SEEN = range(7)
-_BEAT_TIME = 32
+ROWS = 8192  # 16 s at 500 Hz: how long the daemon may be held up before rows are lost
+EVENTS, EVENT_BYTES = 64, 512
+BINS, BIN = 20_000, 5e-6  # s: histograms reach to 100 ms, the last bin holds what is beyond
 
-
-class Phase(IntEnum):
-    """What the loop's process is at; each may take a different time without a heartbeat."""
-
-    STARTING = 0  # imports, compilation
-    CONNECTING = 1  # constructors of the robot's library, which can hang for ever
-    RUNNING = 2
-    ARMING = 3
-    ENDING = 4
-
-
-class Command(IntEnum):
-    """What the parent asks for."""
-
-    NONE = 0
-    ARM = 1
-    DISARM = 2
-    STOP = 3
+_HEADER = np.dtype(
+    [
+        ("beat", "f8"),  # s, monotonic: last sign of life of the loop
+        ("allowed", "f8"),  # s it may take to the next one
+        ("state", "i8"),  # of State
+        ("rows", "i8"),  # written so far
+        ("events", "i8"),  # written so far
+        ("cycles", "i8"),  # distinct controller timestamps
+        ("missed", "i8"),  # controller cycles between them that were never seen
+        ("span", "f8"),  # s of the controller's clock that cycles and missed are counted over
+        ("written", "i8"),  # setpoints
+        ("invalid", "i8"),  # samples that could not be believed
+        ("torn", "i8"),  # samples that were read again
+        ("unsolved", "i8"),  # cycles without a correction: no pose could be reached
+        ("ended", "i8"),  # 1: the source has come to its end
+        ("stop", "i8"),  # 1: ramp out and end (written by the daemon)
+        ("clamps", "i8", (5,)),
+    ]
+)
 
 
 @dataclass(frozen=True)
-class Columns:
-    """Where each field of a cycle stands in its row."""
+class Event:
+    """One change of state."""
 
-    n: int
-
-    @property
-    def slices(self) -> dict[str, slice]:
-        """Return name -> columns of a row; lengths: 1, n, 3 or 6."""
-        n, found, at = self.n, {}, 0
-        for name, size in (
-            ("number", 1), ("timestamp", 1), ("state", 1), ("written", 1), ("missed", 1),
-            ("age", 1), ("duration", 1), ("clamped", 1), ("residual", 1),
-            ("target_q", n), ("actual_q", n), ("actual_qd", n), ("actual_current_as_torque", n),
-            ("joint_temperatures", n), ("payload", 1), ("payload_cog", 3),
-            ("actual_TCP_force", 6), ("ft_raw_wrench", 6),
-            ("nominal_q", n), ("corrected_q", n), ("offset", 6),
-        ):  # fmt: skip
-            found[name] = slice(at, at + size)
-            at += size
-        return found
-
-    @property
-    def width(self) -> int:
-        """Return the numbers in a row."""
-        return self.slices["offset"].stop
+    before: str
+    after: str
+    cause: str
+    detail: str
+    time: float  # s, monotonic
 
 
-class Page:
-    """The shared memory, seen from either side; ``fd`` is handed to the child."""
+class SharedBlock:
+    """The block, seen from either side. ``file`` may be inherited by a child process."""
 
-    def __init__(self, n: int, fd: int | None = None) -> None:
-        self.columns = Columns(n)
-        width = self.columns.width
-        size = 8 * (WORDS + ROWS * width)
-        self.fd = _anonymous(size) if fd is None else fd
-        self._map = mmap.mmap(self.fd, size)
-        self._words = np.frombuffer(self._map, np.int64, WORDS)
-        self._times = np.frombuffer(self._map, np.float64, WORDS)
-        self._rows = np.frombuffer(self._map, np.float64, ROWS * width, 8 * WORDS)
-        self._rows = self._rows.reshape(ROWS, width)
-        self._read = 0
-        self.lost = 0  # rows overwritten before they were read
+    def __init__(self, width: int, file: int | None = None) -> None:
+        size = _HEADER.itemsize + EVENTS * EVENT_BYTES + 8 * (2 * BINS + ROWS * width)
+        self._owned = file is None
+        self.file = _anonymous_file(size) if file is None else file
+        self._map = mmap.mmap(self.file, size)
+        head = np.frombuffer(self._map, _HEADER, 1)
+        self.fields = head[0]
+        at = _HEADER.itemsize
+        self._events = np.frombuffer(self._map, f"S{EVENT_BYTES}", EVENTS, at)
+        at += EVENTS * EVENT_BYTES
+        counts = np.frombuffer(self._map, np.int64, 2 * BINS, at).reshape(2, BINS)
+        self.ages, self.works = counts  # histograms over BIN
+        at += 16 * BINS
+        self.ring: NDArray[np.float64] = np.frombuffer(
+            self._map, np.float64, ROWS * width, at
+        ).reshape(ROWS, width)
+        self._taken = 0
+        self._told = 0
+        self.dropped = 0  # rows overwritten before they were drained
 
-    # -- the loop's side --------------------------------------------------------------------------
-
-    def beat(self) -> None:
-        """Tell that the loop is alive."""
-        self._times[_BEAT_TIME] = time.monotonic()
-        self._words[_BEATS] += 1
-
-    def enter(self, phase: Phase) -> None:
-        """Tell what comes next."""
-        self.beat()
-        self._words[_PHASE] = phase
-
-    def tell_state(self, state: int) -> None:
-        """Tell the supervisor's state."""
-        self._words[_STATE] = state
-
-    def tell_ended(self) -> None:
-        """Tell that the source has come to its end."""
-        self._words[_ENDED] = 1
-
-    def tell_seen(self) -> None:
-        """Tell that a state has been read: the link works."""
-        self._words[_SEEN] = 1
-
-    def next_row(self) -> Array:
-        """Return the row of the next cycle, to be filled from column 1 on."""
-        row: Array = self._rows[self._words[_WRITTEN] % ROWS]
-        row[0] = -1.0
-        return row
-
-    def publish(self) -> None:
-        """Hand the filled row over."""
-        written = int(self._words[_WRITTEN])
-        self._rows[written % ROWS, 0] = written
-        self._words[_WRITTEN] = written + 1
-
-    def take_command(self) -> Command:
-        """Return what the parent asks for, once; STOP stays."""
-        command = Command(int(self._words[_COMMAND]))
-        if command in (Command.ARM, Command.DISARM):
-            self._words[_COMMAND] = Command.NONE
-        return command
-
-    # -- the parent's side ------------------------------------------------------------------------
-
-    def ask(self, command: Command) -> None:
-        """Ask the loop for something; STOP is never taken back."""
-        if self._words[_COMMAND] != Command.STOP:
-            self._words[_COMMAND] = command
+    def beat(self, allowed: float) -> None:
+        """Say that the loop lives, and that the next sign comes within ``allowed`` s."""
+        self.fields["allowed"] = allowed
+        self.fields["beat"] = time.monotonic()
 
     @property
-    def phase(self) -> Phase:
-        """Return what the loop's process is at."""
-        return Phase(int(self._words[_PHASE]))
+    def hangs(self) -> bool:
+        """Return whether the loop's sign of life is overdue."""
+        late = time.monotonic() - float(self.fields["beat"])
+        return late > float(self.fields["allowed"])
 
-    @property
-    def state(self) -> int:
-        """Return the supervisor's state."""
-        return int(self._words[_STATE])
+    def tell(self, event: Event) -> None:
+        """Publish an event (loop's side)."""
+        words = [event.before, event.after, event.cause, event.detail[:300], event.time]
+        text = json.dumps(words).encode()
+        if len(text) >= EVENT_BYTES:
+            text = json.dumps([*words[:3], event.detail[:60], event.time]).encode()
+        self._events[int(self.fields["events"]) % EVENTS] = text
+        self.fields["events"] += 1
 
-    @property
-    def ended(self) -> bool:
-        """Return whether the source has come to its end."""
-        return bool(self._words[_ENDED])
+    def heard(self) -> list[Event]:
+        """Return the events since the last call (daemon's side)."""
+        last = int(self.fields["events"])
+        first = max(self._told, last - EVENTS)
+        self._told = last
+        return [Event(*json.loads(bytes(self._events[i % EVENTS]))) for i in range(first, last)]
 
-    @property
-    def seen(self) -> bool:
-        """Return whether a state has been read."""
-        return bool(self._words[_SEEN])
+    def drain(self) -> NDArray[np.float64]:
+        """Return a copy of the rows since the last call (daemon's side)."""
+        last = int(self.fields["rows"])
+        first = max(self._taken, last - ROWS + 64)  # a margin: the loop goes on writing
+        self.dropped += first - self._taken
+        self._taken = last
+        if first == last:
+            return self.ring[:0].copy()
+        return np.take(self.ring, np.arange(first, last) % ROWS, axis=0)
 
-    @property
-    def silence(self) -> float:
-        """Return s since the last heartbeat; 0 before the first."""
-        beat = float(self._times[_BEAT_TIME])
-        return time.monotonic() - beat if beat else 0.0
-
-    def drain(self) -> Array:
-        """Return a copy of the rows (k, width) that came since the last call."""
-        written = int(self._words[_WRITTEN])
-        first = max(self._read, written - ROWS + ROWS // 8)  # the oldest may be under the pen
-        self.lost += first - self._read
-        index = np.arange(first, written)
-        rows = self._rows[index % ROWS]
-        whole = rows[:, 0] == index
-        self.lost += int((~whole).sum())
-        self._read = written
-        return rows[whole]
+    def quantile(self, counts: NDArray[np.int64], share: float) -> float:
+        """Return the quantile of a histogram, s; NaN of an empty one."""
+        total = int(counts.sum())
+        if not total:
+            return float("nan")
+        index = int(np.searchsorted(np.cumsum(counts), share * total))
+        return (min(index, BINS - 1) + 1) * BIN
 
     def close(self) -> None:
-        """Let go of the memory."""
-        self._words = self._times = np.empty(0)  # type: ignore[assignment]
-        self._rows = np.empty((0, 0))
-        self._map.close()
-        os.close(self.fd)
+        """Give the memory back; may be repeated."""
+        if self._owned and self.file >= 0:
+            os.close(self.file)
+            self.file = -1
 
 
-def _anonymous(size: int) -> int:
-    """Return the descriptor of zeroed memory that no name leads to."""
-    if hasattr(os, "memfd_create"):
-        fd = os.memfd_create("gapbridge", os.MFD_CLOEXEC)
+def _anonymous_file(size: int) -> int:
+    """Return the descriptor of a file without a name; in memory where the system has such."""
+    if sys.platform == "linux":
+        file = os.memfd_create("gapbridge")
     else:
-        with tempfile.TemporaryFile() as file:
-            fd = os.dup(file.fileno())
-    os.ftruncate(fd, size)
-    return fd
+        with tempfile.TemporaryFile() as found:
+            file = os.dup(found.fileno())
+    os.ftruncate(file, size)
+    return file
