@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,8 +22,6 @@ from core.log import Log
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-REPORT = "bridge.report"
 
 
 @click.command()
@@ -124,10 +120,10 @@ def _folder(path: Path) -> None:
 def _write_folder(
     folder: Path, text: str, found: Diagnosis, cell: Cell, log: Log
 ) -> list[Path]:
-    """Write diagnosis.json, and the page where this installation draws pages."""
+    """Write diagnosis.json and report.html; returns their paths."""
+    from bridge.report import write_report  # plotly takes its time, and only --out needs it
+
     written = [folder / "diagnosis.json"]
     write_text(written[0], text)
-    if importlib.util.find_spec(REPORT) is not None:
-        importlib.import_module(REPORT).write_report(found, cell, log, folder)
-        written.append(folder / "report.html")
+    written.append(write_report(found, str(cell.path), log, cell.model, folder))
     return written

@@ -44,6 +44,7 @@ def test_what_is_found_is_told_written_and_predicts(tmp_path: Path) -> None:
     assert (answer.code, answer.err) == (0, "")
     told = json.loads(file.read_text(encoding="utf-8"))
     assert told == json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
+    assert "axial_compliance" in (folder / "report.html").read_text(encoding="utf-8")
     assert told["schema"] == "gapbridge.diagnosis/1"
     (cause,) = told["channels"][0]["causes"]
     assert (cause["effect"], cause["joints"]) == ("axial_compliance", [2])
