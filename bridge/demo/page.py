@@ -95,10 +95,10 @@ def _flexibilities(result: Result) -> str:
     found = result.identification
     joints = [f"joint {i + 1}" for i in range(len(found.axial))]
     traces = [
-        go.Bar(x=joints, y=value * 1e6, name=name, error_y={"array": 2 * std * 1e6})
-        for name, value, std in (
-            ("axial", found.axial, found.std_axial),
-            ("radial", found.radial, found.std_radial),
+        go.Bar(x=joints, y=value * 1e6, name=name, error_y={"array": 2e6 * np.where(shown, std, 0)})
+        for name, value, std, shown in (
+            ("axial", found.axial, found.std_axial, found.identifiable[: len(joints)]),
+            ("radial", found.radial, found.std_radial, found.identifiable[len(joints) :]),
         )
     ]
     return _chart(traces, "flexibility, 1e-6 rad/Nm (bars: 2 sigma)", "", barmode="group")

@@ -46,6 +46,10 @@ def _text(x: float, y: float, text: str, size: int = 13, colour: str = INK, more
     return f"<text {place} {more}>{escape(text)}</text>"
 
 
+def _bold(x: float, y: float, text: str, colour: str = INK, size: int = 13) -> str:
+    return _text(x, y, text, size, colour, 'font-weight="600"')
+
+
 def _arm(result: Result) -> str:
     """Draw the arm at the test visit with the largest error, seen from its side."""
     visit = int(np.argmax(result.error_without))
@@ -53,8 +57,8 @@ def _arm(result: Result) -> str:
     load = next(known for known in TEST_LOADS if known.name == result.loads[visit])
     rigid = skeleton(result.model.without_terms(), q, load)
     bent = rigid + MAGNIFIED * (skeleton(result.model, q, load) - rigid)
-    c, s = np.cos(q[0]), np.sin(q[0])
-    side = np.array([[c, 0.0], [s, 0.0], [0.0, 1.0]])  # along the arm, up
+    ahead = rigid[-1, :2] / np.linalg.norm(rigid[-1, :2])
+    side = np.array([[ahead[0], 0.0], [ahead[1], 0.0], [0.0, 1.0]])  # towards the tool, up
     drawn = [points @ side for points in (rigid, bent)]
     both = np.vstack(drawn)
     low, high = both.min(axis=0), both.max(axis=0)
@@ -64,7 +68,7 @@ def _arm(result: Result) -> str:
     def at(point: Array) -> tuple[float, float]:
         return 225 + (point[0] - middle[0]) * scale, 225 - (point[1] - middle[1]) * scale
 
-    parts = [_text(30, 34, "One test pose, seen from the side", 16, more='font-weight="600"')]
+    parts = [_bold(30, 34, "One test pose, seen from the side", size=16)]
     for points, colour, width in ((drawn[0], FAINT, 9), (drawn[1], RED, 4)):
         places = [at(point) for point in points]
         line = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
@@ -72,9 +76,10 @@ def _arm(result: Result) -> str:
         parts.append(f'<polyline points="{line}" fill="none" stroke-linejoin="round" {stroke}/>')
         stroke = f'r="{width / 2 + 1:.1f}" fill="#ffffff" stroke="{colour}" stroke-width="2"'
         parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" {stroke}/>' for x, y in places]
-    parts.append(_text(30, 388, "where it was wanted", 13, FAINT, 'font-weight="600"'))
-    parts.append(_text(190, 388, f"how it hangs, bending drawn {MAGNIFIED} times larger", 13, RED,
-                       'font-weight="600"'))  # fmt: skip
+    x, y = at(rigid[0] @ side)
+    parts.append(f'<rect x="{x - 32:.1f}" y="{y:.1f}" width="64" height="8" fill="{INK}"/>')
+    parts.append(_bold(30, 388, "where it was wanted", "#6b7785"))
+    parts.append(_bold(30, 406, f"how it hangs, bending drawn {MAGNIFIED} times larger", RED))
     return "\n".join(parts)
 
 
@@ -85,8 +90,7 @@ def _bars(result: Result) -> str:
     before, after = result.error_without * 1e3, result.error_with * 1e3
     longest = float(before.max())
     step = min(300 / len(poses), 34)
-    parts = [_text(490, 34, "Distance of the TCP from where it was wanted, mm", 16,
-                   more='font-weight="600"')]  # fmt: skip
+    parts = [_bold(490, 34, "Distance of the TCP from where it was wanted, mm", size=16)]
     for number, rows in enumerate(poses):
         y = top + number * step
         parts.append(_text(490, y + step * 0.55, f"pose {number + 1}", 12, FAINT))
@@ -100,11 +104,9 @@ def _bars(result: Result) -> str:
             parts.append(_text(left + length + 5, y_bar + height - 1, f"{value:.2f}", 10, colour))
     figures = result.summary()
     errors = figures["tcp_error_mm"]
-    for k, (words, colour) in enumerate((
-        (f"without: {errors['without']['rms']:.2f} mm rms", RED),
-        (f"with compensation: {errors['with']['rms']:.3f} mm rms", GREEN),
-        (f"repeatability: {figures['repeatability_mm']:.3f} mm", FAINT),
-    )):  # fmt: skip
-        x = (490, 622, 812)[k]
-        parts.append(_text(x, 388, words, 13, colour, 'font-weight="600"'))
+    without, with_it = errors["without"]["rms"], errors["with"]["rms"]
+    repeats = figures["repeatability_mm"]
+    parts.append(_bold(490, 388, f"without compensation {without:.2f} mm rms", RED))
+    parts.append(_bold(490, 406, f"with compensation {with_it:.3f} mm rms", GREEN))
+    parts.append(_bold(752, 388, f"the arm repeats to {repeats:.3f} mm", "#6b7785"))
     return "\n".join(parts)
