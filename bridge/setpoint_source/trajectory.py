@@ -26,7 +26,7 @@ class TrajectorySource(Source):
         super().__init__(settings, n, moves_arm, folder)
         path = folder / (settings.file or "")
         log = read_log(path, n)
-        self._q = np.ascontiguousarray(log.require("target_q"))
+        self._q: Vector = np.ascontiguousarray(log.require("target_q"))
         time = log.require("timestamp")
         behind = np.flatnonzero(np.diff(time) <= 0.0)
         if len(behind):
@@ -42,7 +42,8 @@ class TrajectorySource(Source):
 
     def first(self, own_q: Vector) -> Vector | None:
         """Return the first row."""
-        return self._q[0]
+        first: Vector = self._q[0]
+        return first
 
     def begin(self, timestamp: float, own_q: Vector) -> None:
         """Start the clock: the first row is due at ``timestamp``."""
@@ -54,7 +55,8 @@ class TrajectorySource(Source):
         at = timestamp - (timestamp if self._begun is None else self._begun)
         if at >= time[-1]:
             self._ended = True
-            return q[-1]
+            last: Vector = q[-1]
+            return last
         while time[row + 1] <= at:
             row += 1
         self._row = row

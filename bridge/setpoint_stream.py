@@ -1,0 +1,106 @@
+"""From a nominal setpoint to what may be written: correct, ramp, limit."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.nominal_stream import NominalStream
+from bridge.settings import LimitSettings
+from core.arm import Arm
+from core.compensation import Compensator, Correction
+from core.limits import LONGEST_GAP, Limiter, Limits
+from core.loads import Loads
+from core.model import Model
+from core.setpoint import Setpoint
+from core.state import RobotState
+
+Vector = NDArray[np.float64]
+SOLVED = 1e-5  # m: corrections that miss the wanted pose by more are not used
+USUAL_VELOCITY = np.pi  # rad/s: of joints whose limit is not known
+_NOTHING = np.zeros(6)
+
+
+def limits_of(settings: LimitSettings, arm: Arm, rate: float) -> Limits:
+    """Return the limits of a cell for its arm."""
+    own = np.where(np.isfinite(arm.limits.velocity), arm.limits.velocity, USUAL_VELOCITY)
+    velocity = settings.velocity_share * own
+    if settings.joint_velocity is not None:
+        velocity = np.minimum(velocity, settings.joint_velocity)
+    return Limits(
+        lower=arm.limits.lower + settings.joint_margin,
+        upper=arm.limits.upper - settings.joint_margin,
+        velocity=velocity,
+        offset=settings.offset,
+        offset_rotation=settings.offset_rotation,
+        offset_rate=settings.offset_rate,
+        offset_rotation_rate=settings.offset_rotation_rate,
+        joint_offset=settings.joint_offset,
+        following=settings.following,
+        cycle=1.0 / rate,
+    )
+
+
+class SetpointStream:
+    """One stream of setpoints between ``start`` and coming to rest."""
+
+    def __init__(self, model: Model, settings: LimitSettings, rate: float) -> None:
+        limits = limits_of(settings, model.arm, rate)
+        self.limiter = Limiter(limits, model.arm.n)
+        self._compensator = Compensator(model)
+        self._nominal = NominalStream(limits.velocity)
+        self._ramp_time = settings.ramp_time
+        self._longest_gap = LONGEST_GAP / rate
+        self._ramp = 0.0
+        self._last = 0.0  # s, controller time of the last setpoint
+        self.unsolved = 0  # setpoints without a correction that meets the wanted pose
+        self.residual = 0.0  # m, of the last correction
+        self.clamped = 0  # bits of the last setpoint
+
+    def correct(self, nominal_q: Vector, loads: Loads) -> Correction:
+        """Return the correction alone, neither ramped nor limited."""
+        correction = self._compensator.correct(nominal_q, loads)
+        self.residual = float(correction.residual)
+        return correction
+
+    def start(self, own_q: Vector, timestamp: float) -> None:
+        """Begin at rest at ``own_q`` (n,) with no offset. Raises LimitError."""
+        self.limiter.start(own_q)
+        self._nominal.start(own_q)
+        self._ramp = 0.0
+        # as if a setpoint had been there one cycle ago
+        self._last = timestamp - self.limiter.limits.cycle
+
+    def advance(
+        self, state: RobotState, source_q: Vector | None, loads: Loads, goal: float
+    ) -> Setpoint:
+        """Return the next setpoint; ``source_q`` None: the motion brakes.
+
+        ``goal`` is where the ramp goes: 1 in, 0 out. The setpoint's arrays hold until the next
+        call. Raises LimitError: then nothing has changed and nothing may leave.
+        """
+        gap = state.timestamp - self._last
+        usable = min(max(gap, 0.0), self._longest_gap)
+        stream = self._nominal
+        nominal = stream.brake(usable) if source_q is None else source_q
+        step = usable / self._ramp_time
+        ramp = min(max(goal, self._ramp - step), self._ramp + step)
+        correction = self.correct(nominal, loads)
+        corrected, offset = correction.q, correction.offset_in_base
+        if not self.residual < SOLVED:
+            self.unsolved += 1
+            corrected, offset = nominal, _NOTHING
+        limited = self.limiter.limit(nominal, corrected, offset, ramp, state.actual_q, gap)
+        if source_q is not None:
+            stream.follow(source_q, gap)
+        self._ramp, self._last, self.clamped = ramp, state.timestamp, limited.clamped
+        return Setpoint(limited.q, nominal, limited.offset_in_base, state.timestamp, state.received)
+
+    @property
+    def rests(self) -> bool:
+        """Return whether no offset is left and the motion has come to rest."""
+        return self._ramp == 0.0 and self._nominal.rests and not self.limiter.offset_in_base.any()
+
+    def end(self) -> None:
+        """End the stream; nothing leaves until the next ``start``."""
+        self.limiter.reset()
