@@ -10,17 +10,22 @@ import numpy as np
 
 from core.arm import builtin_arm
 from core.compensation import correct
+from core.limits import Limiter, Limits
 from core.model import Model
 
 
 def warm_up() -> None:
     """Call each compiled function once."""
     n = 6
-    model = Model(builtin_arm("ur10e")).with_compliance(np.full(n, 1e-6), np.full(n, 1e-6))
+    model = Model(builtin_arm("ur10e")).with_compliance([1e-6] * n, [1e-6] * n)
     q = np.array([[0.0, -1.5, 1.8, -1.87, -1.57, 0.0]])
     model.predict(q)
     model.linear_form(q)
-    correct(model, q)
+    corrected = correct(model, q)
+    limits = Limits(np.full(n, -7.0), np.full(n, 7.0), np.full(n, 3.0))
+    limiter = Limiter(limits, n)
+    limiter.start(q[0])
+    limiter.limit(q[0], corrected.q[0], corrected.offset_in_base[0], 1.0, q[0], 0.002)
 
 
 if __name__ == "__main__":
