@@ -1,0 +1,123 @@
+"""The loop's process: ``python -m bridge.loop_main``, started by the daemon and by nobody else.
+
+It holds the loop and one driver, and is expendable: the robot's library can abort it, crash it or
+hang it. Settings come as one line of JSON on stdin; cycles go out through shared memory, events as
+lines of JSON through a pipe. It always ends by ``os._exit``, because destroying the library's
+objects is not safe.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import gc
+import importlib
+import json
+import os
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from bridge.daemon_settings import DaemonSettings
+from bridge.loop import Exit, Loop
+from bridge.realtime import become_realtime
+from bridge.setpoint_source import make_source
+from bridge.setpoint_stream import SetpointStream
+from bridge.shared_page import Page, Phase
+from core.errors import GapbridgeError, InputError
+from core.loads import Loads
+from core.model import Model
+from drivers import make_driver
+
+_PR_SET_PDEATHSIG = 1
+
+
+def main() -> None:
+    """Run the loop; never returns."""
+    order = json.loads(sys.stdin.readline())
+    os.set_blocking(order["events"], False)
+    tell = _teller(order["events"])
+    code: int = Exit.CRASH
+    try:
+        code = _run(order, tell)
+    except InputError as error:
+        tell({"failure": str(error), "input": True})
+        code = Exit.INPUT
+    except GapbridgeError as error:
+        tell({"failure": str(error)})
+        code = Exit.LINK
+    except BaseException as error:
+        traceback.print_exc()
+        tell({"failure": f"the loop failed: {type(error).__name__}: {error}"})
+    sys.stderr.flush()
+    os._exit(code)
+
+
+def _run(order: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Exit:
+    settings = DaemonSettings.model_validate(order["settings"])
+    page = Page(order["n"], order["page"])
+    page.enter(Phase.STARTING)
+    model = _read_model(settings)
+    driver = make_driver(settings.link, model)
+    source = make_source(settings.setpoints, model.arm.n, driver.moves_arm, settings.cell.parent)
+    loop = Loop(settings, model, driver, source, page, tell)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: setattr(loop, "stop_requested", True))
+    _end_with_parent(order["parent"])
+    _compile(settings, model)
+    if order["may_write"]:
+        source.open()
+    tell({"granted": become_realtime()})
+    return loop.run(order["arm"], order["may_write"])
+
+
+def _teller(events: int) -> Callable[[dict[str, Any]], None]:
+    """Return a function that tells the daemon of an event and never blocks."""
+
+    def tell(event: dict[str, Any]) -> None:
+        line = json.dumps({"time": time.time(), **event}) + "\n"
+        with contextlib.suppress(OSError):
+            os.write(events, line.encode())
+
+    return tell
+
+
+def _read_model(settings: DaemonSettings) -> Model:
+    module, function = settings.model_source.split(":")
+    found = getattr(importlib.import_module(module), function)(settings.cell).model
+    if not isinstance(found, Model):
+        raise InputError(f"{settings.model_source}: found {type(found).__name__}, expected a Model")
+    return found
+
+
+def _compile(settings: DaemonSettings, model: Model) -> None:
+    """Have everything compiled, or loaded, before the first cycle: it may take seconds."""
+    arm = model.arm
+    stream = SetpointStream(model, settings.limits, settings.link.rate)
+    q = np.clip(np.zeros(arm.n), arm.limits.lower, arm.limits.upper)
+    loads = Loads(
+        np.zeros(1), np.zeros((1, 3)), np.zeros((1, 6)), np.full((1, arm.n), 25.0),
+        np.zeros((1, arm.n)),
+    )  # fmt: skip
+    correction = stream.correct(q, loads)
+    with contextlib.suppress(GapbridgeError):
+        stream.limiter.start(q)
+        stream.limiter.limit(q, correction.q, correction.offset_in_base, 0.0, q, 0.002)
+    gc.collect()
+
+
+def _end_with_parent(parent: int) -> None:
+    """Have the kernel send SIGTERM when the daemon dies, so that the arm is not left to itself."""
+    if sys.platform.startswith("linux"):
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+    if os.getppid() != parent:
+        os._exit(Exit.DONE)
+
+
+if __name__ == "__main__":
+    main()
