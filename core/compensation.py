@@ -1,8 +1,9 @@
 """The correction: the setpoint whose predicted real pose is the wanted one.
 
 Solved in joint space by Newton's method on the exact prediction with the Jacobian of the bent arm,
-damped near singularities (Levenberg; Nakamura, Hanafusa 1986). Works for fewer, six and more joints; with
-more, the joint offset is the smallest one.
+damped near singularities (Levenberg; Nakamura, Hanafusa 1986), where the offset stays within
+LARGEST_OFFSET. Works for fewer, six and more joints; with more, the joint offset is the smallest
+one.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ Array = NDArray[np.float64]
 TOLERANCE = 1e-9  # m, and rad times the tool's lever: where the pose counts as reached
 MAX_STEPS = 12
 LEVER = 0.5  # m: weighs a rotation against a shift
-LARGEST_STEP = 0.05  # rad: joint step (norm) beyond which a Newton step is damped
+LARGEST_OFFSET = 0.1  # rad: joint offset (norm) beyond which the correction is damped
 
 
 @dataclass(frozen=True)
@@ -37,31 +38,32 @@ class Correction:
 
 
 @njit(**JIT)
-def _damped_step(J, error, dq):  # type: ignore[no-untyped-def]
-    """Write the least-squares step J+ error, damped just enough to stay within LARGEST_STEP.
+def _smallest_offset(J, wanted, offset):  # type: ignore[no-untyped-def]
+    """Write the least-squares solution of J offset = wanted, damped to LARGEST_OFFSET.
 
-    Rows of J and error are weighted by the lever already. Undamped wherever the plain step is
-    short, so that the wanted pose is met exactly right up to a singularity.
+    Rows of J and wanted are weighted by the lever already. Of many solutions (more than six
+    joints, singular poses) the shortest one. Undamped wherever that is short enough, so that the
+    wanted pose is met exactly right up to a singularity.
     """
     n = J.shape[1]
     wide = n > 6
     # the smaller, regular one of J J^T and J^T J; s holds the squared singular values
     G = J @ J.T if wide else J.T @ J
     s, V = np.linalg.eigh(G)
-    y = V.T @ error if wide else V.T @ (J.T @ error)
+    y = V.T @ wanted if wide else V.T @ (J.T @ wanted)
     damping = 1e-14 * max(s[-1], 1e-12)
     for _ in range(60):
         square = 0.0
         for i in range(s.shape[0]):
             part = y[i] / (max(s[i], 0.0) + damping)
             square += part * part * (max(s[i], 0.0) if wide else 1.0)
-        if square <= LARGEST_STEP * LARGEST_STEP:
+        if square <= LARGEST_OFFSET * LARGEST_OFFSET:
             break
         damping *= 3.0
     for i in range(s.shape[0]):
         y[i] /= max(s[i], 0.0) + damping
-    step = V @ y
-    dq[:] = J.T @ step if wide else step
+    solution = V @ y
+    offset[:] = J.T @ solution if wide else solution
 
 
 @njit(**JIT)
@@ -86,20 +88,34 @@ def _pose_error(shape, position, rotation, lever, error):  # type: ignore[no-unt
 
 
 @njit(**JIT)
-def newton_step(chain, rows, r, shape, position, rotation, lever, dq):  # type: ignore[no-untyped-def]
-    """Write the joint step of row r towards the wanted pose; returns the present distance (m).
+def next_offset(chain, rows, r, shape, position, rotation, lever, offset):  # type: ignore[no-untyped-def]
+    """Write the next joint offset of row r, given the one that its q holds; returns the distance.
 
-    Returns -1 where the arm has no equilibrium.
+    The distance (m) is that of the present shape from the wanted pose; -1 where the arm has no
+    equilibrium or a number is not finite. The whole offset is solved for anew, not a step on top:
+    what turns joints without moving the tool cannot pile up from setpoint to setpoint.
     """
     n = chain.mass.shape[0]
     if kernel.equilibrium(chain, rows, r, shape) < 0:
         return -1.0
     error, J = np.empty(6), np.empty((6, n))
     distance = _pose_error(shape, position, rotation, lever, error)
+    if not np.isfinite(distance):
+        return -1.0
     kernel.jacobian(shape, J)
     J[3:] *= lever
-    _damped_step(J, error, dq)
+    _smallest_offset(J, error + J @ offset, offset)
     return distance
+
+
+@njit(**JIT)
+def newton_step(chain, rows, r, shape, position, rotation, lever, dq):  # type: ignore[no-untyped-def]
+    """Write the joint step of row r towards the wanted pose; returns the present distance.
+
+    ``next_offset`` for joints that hold no offset yet.
+    """
+    dq[:] = 0.0
+    return next_offset(chain, rows, r, shape, position, rotation, lever, dq)
 
 
 class Compensator:
@@ -123,29 +139,23 @@ class Compensator:
         solved comes back with the distance left in ``residual`` (inf: no equilibrium).
         """
         row = np.array(nominal_q, dtype=float, order="C")[None]
-        rigid_rows = self._plain(row)
-        position, rotation = self._rigid_pose(rigid_rows)
-        shape, dq = self._shape, np.empty(row.shape[1])
-        q, steps, distance = row + self._offset, 0, np.inf
-        best_q, best = q, np.inf
+        position, rotation = self._rigid_pose(self._plain(row))
+        shape, offset = self._shape, self._offset.copy()
+        best_q, best, steps = row, np.inf, 0
         for steps in range(1, MAX_STEPS + 1):  # noqa: B007
+            q = row + offset
             rows = self.model.rows(q, loads)
-            distance = kernel_step(self._chain, rows, shape, position, rotation, dq)
+            distance = _next_offset(self._chain, rows, shape, position, rotation, offset)
             if distance < 0:
-                shape.bend[:] = 0.0
-                shape.tip[:] = 0.0
                 break
             if distance < best:
                 best_q, best = q, distance
             if distance < TOLERANCE:
                 break
-            q = q + dq
-        self._offset = (best_q - row)[0] if best < 1e-3 else np.zeros(row.shape[1])
+        self._offset = (best_q - row)[0] if best < np.inf else np.zeros(row.shape[1])
         pose = self._rigid_pose(self._plain(best_q))
-        offset = np.concatenate(
-            [pose[0] - position, rotation_vector(pose[1] @ rotation.T)]
-        )
-        return Correction(best_q[0], offset, np.float64(best), np.int64(steps))
+        moved = np.concatenate([pose[0] - position, rotation_vector(pose[1] @ rotation.T)])
+        return Correction(best_q[0], moved, np.float64(best), np.int64(steps))
 
     def _plain(self, q: Array) -> Rows:
         n = q.shape[1]
@@ -153,15 +163,16 @@ class Compensator:
 
     def _rigid_pose(self, rows: Rows) -> tuple[Array, Array]:
         shape = self._rigid_shape
+        shape.bend[:] = 0.0  # nothing bends; and no row may spoil the next
         kernel.equilibrium(self._rigid, rows, 0, shape)
         return shape.tcp_position.copy(), shape.tcp_rotation.copy()
 
 
-def kernel_step(
-    chain: Chain, rows: Rows, shape: Shape, position: Array, rotation: Array, dq: Array
+def _next_offset(
+    chain: Chain, rows: Rows, shape: Shape, position: Array, rotation: Array, offset: Array
 ) -> float:
-    """Return the distance of row 0 from the wanted pose and write the joint step towards it."""
-    return float(newton_step(chain, rows, 0, shape, position, rotation, LEVER, dq))
+    """Return the distance of row 0 from the wanted pose and write the next joint offset."""
+    return float(next_offset(chain, rows, 0, shape, position, rotation, LEVER, offset))
 
 
 def correct(model: Model, nominal_q: Array, loads: Loads | None = None) -> Correction:

@@ -239,15 +239,19 @@ def _flex(chain, rows, r, shape, i, total):  # type: ignore[no-untyped-def]
 def equilibrium(chain, rows, r, shape):  # type: ignore[no-untyped-def]
     """Solve the deflected shape of row r to equilibrium; returns the iterations it took.
 
-    Starts from the bending that ``shape`` holds (zeros: cold). Returns -1 where it does not settle:
-    a load under which the arm would buckle.
+    Starts from the bending that ``shape`` holds (zeros: cold). Returns -1 where it does not settle
+    (a load under which the arm would buckle) or a number is not finite.
     """
     A, B = np.empty((3, 3)), np.empty((3, 3))
     tilt, total = np.zeros(3), np.empty(6)
     for step in range(MAX_ITERATIONS):
         _place(chain, rows, r, shape, tilt, A, B)
-        if _load(chain, rows, r, shape, tilt, total) < TOLERANCE:
+        change = _load(chain, rows, r, shape, tilt, total)
+        # a change that is not a number would pass for none
+        if change < TOLERANCE and np.isfinite(total.sum()):
             return step + 1
+    shape.bend[:, :] = 0.0  # what cannot be solved must not spoil the next row
+    shape.tip[:, :] = 0.0
     return -1
 
 
@@ -261,11 +265,8 @@ def predict_rows(chain, rows, position, rotation):  # type: ignore[no-untyped-de
     )  # fmt: skip
     bad = -1
     for r in range(rows.q.shape[0]):
-        if equilibrium(chain, rows, r, shape) < 0:
-            shape.bend[:, :] = 0.0
-            shape.tip[:, :] = 0.0
-            if bad < 0:
-                bad = r
+        if equilibrium(chain, rows, r, shape) < 0 and bad < 0:
+            bad = r
         position[r] = shape.tcp_position
         rotation[r] = shape.tcp_rotation
     return bad

@@ -129,10 +129,7 @@ class Model:
         chain, rows = self.chain(), self.rows(np.atleast_2d(q), loads)
         count = len(rows.q)
         position, rotation = np.empty((count, 3)), np.empty((count, 3, 3))
-        bad = kernel.predict_rows(chain, rows, position, rotation)
-        if bad >= 0:
-            raise InputError(f"row {bad + 1}: the arm finds no equilibrium under its load; expected "
-                             "smaller flexibilities or loads")
+        _require_equilibrium(kernel.predict_rows(chain, rows, position, rotation))
         return Poses(position, rotation)
 
     def rigid_pose(self, q: Array) -> Poses:
@@ -143,12 +140,20 @@ class Model:
         """Return the linear form (paper eqs. 18, 33, 35) at the model's present shape.
 
         For a model without compliance this is the paper's A(q, F), to be multiplied with the 2n
-        flexibilities.
+        flexibilities. Raises InputError where a row has no equilibrium.
         """
         chain, rows = self.chain(), self.rows(np.atleast_2d(q), loads)
         count, n = rows.q.shape
         form = LinearForm(
             np.zeros((count, 6, 2 * n)), np.zeros((count, 6, n)), np.zeros((count, n, 3))
         )
-        kernel.regressor_rows(chain, rows, form.regressor, form.jacobian, form.moment)
+        _require_equilibrium(
+            kernel.regressor_rows(chain, rows, form.regressor, form.jacobian, form.moment)
+        )
         return form
+
+
+def _require_equilibrium(bad: int) -> None:
+    if bad >= 0:
+        raise InputError(f"row {bad + 1}: the arm finds no equilibrium under its load; expected "
+                         "smaller flexibilities or loads")
