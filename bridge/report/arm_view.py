@@ -15,6 +15,7 @@ from core.rotation import rotation_matrix
 ARROWS = 250
 DRAWN = 4  # poses in which the arm is drawn
 LENGTH = 0.12  # of the arm's reach: how long a large error's arrow is drawn
+HEAD = 0.35  # of an arrow's length
 ARM = "#5b6770"
 
 
@@ -42,10 +43,13 @@ def arm_figure(channel: ChannelDiagnosis, material: Material) -> Figure:
     tip = selection.observation.measured[selection.kept][:, :3] - gap  # where the model puts it
     keep = thinned(per_sample(gap, 3), ARROWS)
     factor = _factor(gap, material.model)
+    most = HEAD * LENGTH * _reach(material.model) / 2
     traces = [_arm(material.model, q[i], first=k == 0) for k, i in enumerate(_apart(tip, DRAWN))]
-    given = [("error before", gap, BEFORE)] + ([("error after", after, AFTER)] if channel.causes else [])
+    given = [("error before", gap, BEFORE)] + (
+        [("error after", after, AFTER)] if channel.causes else []
+    )
     for name, error, colour in given:
-        traces += _arrows(name, tip[keep], error[keep] * factor, colour)
+        traces += _arrows(name, tip[keep], error[keep] * factor, colour, most)
     layout = {"margin": {"l": 0, "r": 0, "t": 8, "b": 0}, "scene": _scene(), "hovermode": False}
     drawn = f" {len(keep)} of {len(gap)} samples are drawn." if len(keep) < len(gap) else ""
     return Figure(
@@ -55,10 +59,13 @@ def arm_figure(channel: ChannelDiagnosis, material: Material) -> Figure:
     )  # fmt: skip
 
 
+def _reach(model: Model) -> float:
+    return max(float(np.linalg.norm(model.arm.link_in_link[:, :3, 3], axis=1).sum()), 0.1)
+
+
 def _factor(gap: Array, model: Model) -> float:
-    reach = float(np.linalg.norm(model.arm.link_in_link[:, :3, 3], axis=1).sum())
     large = float(np.quantile(per_sample(gap, 3), 0.95))
-    rough = LENGTH * max(reach, 0.1) / max(large, 1e-9)
+    rough = LENGTH * _reach(model) / max(large, 1e-9)
     size = 10 ** np.floor(np.log10(max(rough, 1.0)))
     return float(max(np.floor(rough / size) * size, 1.0))
 
@@ -83,19 +90,23 @@ def _arm(model: Model, q: Array, *, first: bool) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _arrows(name: str, start: Array, vector: Array, colour: str) -> list[dict[str, Any]]:
+def _arrows(
+    name: str, start: Array, vector: Array, colour: str, most: float
+) -> list[dict[str, Any]]:
+    """Return shafts and heads; ``most`` is the longest head, m."""
     gap = np.full(len(start), np.nan)
     end = start + vector
     lines = [np.column_stack([start[:, i], end[:, i], gap]).ravel() for i in range(3)]
     shaft = {
         "type": "scatter3d", "mode": "lines", "x": lines[0], "y": lines[1], "z": lines[2],
-        "name": name, "legendgroup": name, "line": {"color": colour, "width": 4},
+        "name": name, "legendgroup": name, "line": {"color": colour, "width": 5},
     }  # fmt: skip
-    long = np.linalg.norm(vector, axis=1)
+    long = np.linalg.norm(vector, axis=1, keepdims=True)
+    vector = vector * np.minimum(HEAD, most / np.maximum(long, 1e-300))
     head = {
         "type": "cone", "x": end[:, 0], "y": end[:, 1], "z": end[:, 2], "u": vector[:, 0],
-        "v": vector[:, 1], "w": vector[:, 2], "anchor": "tip", "sizemode": "scaled",
-        "sizeref": 0.4 if float(long.max(initial=0.0)) > 0 else 1, "showscale": False,
+        "v": vector[:, 1], "w": vector[:, 2], "anchor": "tip", "sizemode": "raw",
+        "sizeref": 2, "showscale": False,
         "colorscale": [[0, colour], [1, colour]], "name": name, "legendgroup": name,
         "showlegend": False, "hoverinfo": "skip",
     }  # fmt: skip
@@ -108,5 +119,5 @@ def _scene() -> dict[str, Any]:
         "aspectmode": "data", "dragmode": "turntable",
         "xaxis": axis | {"title": {"text": "x"}}, "yaxis": axis | {"title": {"text": "y"}},
         "zaxis": axis | {"title": {"text": "z"}},
-        "camera": {"eye": {"x": 1.4, "y": 1.2, "z": 0.7}},
+        "camera": {"eye": {"x": 1.55, "y": 1.3, "z": 0.7}, "center": {"x": 0, "y": 0, "z": -0.12}},
     }  # fmt: skip

@@ -10,8 +10,10 @@ from html import escape
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 BEFORE, AFTER, FLOOR = "#d9822b", "#1f77b4", "#9aa5b1"
+GRID, ZERO = "#e8ecf0", "#c9d1d8"
 EXPLAINED, LEFT = "#2f9e62", "#c43d3d"
 FONT = {"family": "system-ui, -apple-system, Segoe UI, Roboto, sans-serif", "size": 13}
 
@@ -32,7 +34,7 @@ class Choice:
 
     label: str
     title: str  # of the axis
-    values: Sequence[Sequence[float]]  # per trace
+    values: Sequence[NDArray[np.float64]]  # per trace
 
 
 @dataclass(frozen=True)
@@ -71,17 +73,28 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[Cell]]) -> str:
     """Return a table that scrolls sideways where the screen is narrow."""
     head = "".join(f"<th>{escape(h)}</th>" for h in heads)
     body = "".join(
-        "<tr>" + "".join(f"<td>{html_of(c)}</td>" for c in cells) + "</tr>" for cells in rows
+        "<tr>"
+        # the label stands beside the cell where a phone shows each row as a card
+        + "".join(
+            f'<td data-label="{escape(h)}"><div>{html_of(c)}</div></td>'
+            for h, c in zip(heads, cells, strict=True)
+        )
+        + "</tr>"
+        for cells in rows
     )
-    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    kind = ' class="cards"' if len(heads) > 3 else ""
+    return (
+        f'<div class="wide"><table{kind}><thead><tr>{head}</tr></thead>'
+        f"<tbody>{body}</tbody></table></div>"
+    )
 
 
 def bar(share: float | None, text: str, colour: str = AFTER) -> Raw:
     """Return a small bar for a share of 0 to 1, with its figure beside it."""
     width = 0.0 if share is None or not math.isfinite(share) else min(max(share, 0.0), 1.0)
     return Raw(
-        f'<span class="bar"><i style="width:{width * 100:.0f}%;background:{colour}"></i></span>'
-        f'<span class="figure">{escape(text)}</span>'
+        f'<span class="share"><span class="bar"><i style="width:{width * 100:.0f}%;'
+        f'background:{colour}"></i></span>{escape(text)}</span>'
     )
 
 
@@ -92,12 +105,14 @@ def badge(text: str, kind: str) -> Raw:
 
 def figure_block(figure: Figure) -> str:
     """Return a figure with its caption and the menus of its axes."""
-    layout = {
+    layout: dict[str, Any] = {
         "font": FONT, "margin": {"l": 60, "r": 16, "t": 16, "b": 48}, "autosize": True,
         "height": figure.height, "paper_bgcolor": "rgba(0,0,0,0)", "hovermode": "closest",
         "plot_bgcolor": "rgba(0,0,0,0)", "legend": {"orientation": "h", "y": 1.02, "x": 0,
         "yanchor": "bottom"}, **figure.layout,
     }  # fmt: skip
+    for axis in ("xaxis", "yaxis"):
+        layout[axis] = {"gridcolor": GRID, "zerolinecolor": ZERO, **layout.get(axis, {})}
     choices = {
         axis: [{"label": c.label, "title": c.title, "values": c.values} for c in given]
         for axis, given in figure.choices.items()

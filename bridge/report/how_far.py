@@ -4,8 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from bridge.report.fragment import AFTER, BEFORE, Figure, bar, figure_block, paragraph, table
-from bridge.report.fragment import EXPLAINED, FLOOR, LEFT
+from bridge.report.fragment import (
+    AFTER,
+    BEFORE,
+    EXPLAINED,
+    FLOOR,
+    LEFT,
+    Cell,
+    Figure,
+    bar,
+    figure_block,
+    paragraph,
+    table,
+)
 from bridge.report.material import Array, Material, held_out_pair, shares, thinned
 from bridge.report.words import CHANNELS, effect_words, percent, told, unit_of
 from core.diagnosis.diagnosis import ChannelDiagnosis
@@ -24,11 +35,12 @@ def section(material: Material) -> str:
 
 
 def _shares(channels: tuple[ChannelDiagnosis, ...]) -> str:
-    rows = []
+    rows: list[list[Cell]] = []
     for c in channels:
         part = shares(c)
         rows.append([
-            CHANNELS[c.channel], told(c.gap_rms, c.unit), told(c.remaining_rms_held_out, c.unit),
+            CHANNELS[c.channel], told(c.gap_rms, c.unit),
+            told(c.remaining_rms_held_out, c.unit) if c.causes else "–",
             told(c.noise_floor_rms, c.unit),
             bar(part.explained, percent(part.explained), EXPLAINED),
             bar(part.noise, percent(part.noise), FLOOR),
@@ -60,7 +72,7 @@ def _channel(channel: ChannelDiagnosis) -> str:
 
 
 def _causes(channel: ChannelDiagnosis) -> str:
-    rows = []
+    rows: list[list[Cell]] = []
     for cause in channel.causes:
         s = cause.shrink
         if s is None:

@@ -45,14 +45,19 @@ def own_coordinates(channel: ChannelDiagnosis) -> int:
 def shares(channel: ChannelDiagnosis) -> Shares:
     """Return the shares of a channel's gap; held out where held-out figures can be had."""
     total = max(channel.gap_rms**2, 1e-300)
-    left = channel.remaining_rms_held_out if channel.causes else channel.gap_rms
-    left = channel.remaining_rms if left is None else left
+    left = after(channel) if channel.causes else channel.gap_rms
     rest = min(left**2 / total, 1.0)
     if not channel.structured:
         return Shares(1 - rest, rest, 0.0)
     floor = channel.noise_floor_rms or 0.0
     noise = min(floor**2 / total, rest)
     return Shares(1 - rest, noise, rest - noise)
+
+
+def after(channel: ChannelDiagnosis) -> float:
+    """Return the gap with the causes in the model, held out where that can be had."""
+    held = channel.remaining_rms_held_out
+    return channel.remaining_rms if held is None else held
 
 
 def per_sample(gap: Array, count: int) -> Array:
@@ -85,6 +90,7 @@ def thinned(score: Array, most: int = SHOWN) -> Index:
 
 def chosen_channel(diagnosis: Diagnosis) -> ChannelDiagnosis:
     """Return the channel to speak of first: the one with the largest gap over its noise."""
+
     def excess(channel: ChannelDiagnosis) -> float:
         return channel.gap_rms / max(channel.noise_floor_rms or channel.gap_rms, 1e-300)
 

@@ -5,6 +5,13 @@ document.querySelectorAll(".plot").forEach(function (place) {
   const config = { responsive: true, displaylogo: false, displayModeBar: false };
   place.textContent = "";
   const drawn = Plotly.newPlot(place, given.data, given.layout, config);
+  // paper is narrower than most screens: draw for it, and for the screen again afterwards
+  window.addEventListener("beforeprint", function () {
+    Plotly.relayout(place, { width: 680 });
+  });
+  window.addEventListener("afterprint", function () {
+    Plotly.relayout(place, { width: null, autosize: true });
+  });
   drawn.then(function () { place.dataset.drawn = "yes"; });
   place.parentElement.querySelectorAll("select").forEach(function (menu) {
     menu.addEventListener("change", function () {

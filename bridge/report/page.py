@@ -48,12 +48,16 @@ def page(material: Material) -> str:
         # an empty icon keeps browsers from asking for one
         '<link rel="icon" href="data:,">'
         f"<style>{_own('style.css')}</style></head><body>"
-        f"<header><h1>Why {name} differs from its model</h1>"
-        f"<p>Arm {escape(material.model.arm.name)}, {material.model.arm.n} joints · log "
+        f"<header><h1>{name}: the robot against its model</h1>"
+        f"<p>{_arm_words(material.model.arm.name)}, {material.model.arm.n} joints · log "
         f"{escape(log)}, {len(material.log)} rows · Gapbridge</p><nav>{links}</nav></header>"
         f"<main>{body}</main>"
         f"<script>{get_plotlyjs()}</script><script>{_own('page.js')}</script></body></html>\n"
     )
+
+
+def _arm_words(name: str) -> str:
+    return "Arm of DH rows" if name == "dh" else f"Arm {escape(name)}"
 
 
 def _own(name: str) -> str:

@@ -18,7 +18,9 @@ SHOWN = 12
 def section(material: Material) -> str:
     """Return the parameters, the ties and the next measurements."""
     causes = [c for channel in material.diagnosis.channels for c in channel.causes]
-    return "".join([_parameters(causes), _ties(causes), _next(material.diagnosis.next_measurements)])
+    return "".join(
+        [_parameters(causes), _ties(causes), _next(material.diagnosis.next_measurements)]
+    )
 
 
 def _parameters(causes: list[Cause]) -> str:
@@ -31,7 +33,10 @@ def _parameters(causes: list[Cause]) -> str:
         for p in cause.parameters:
             rows.append([first, Raw(f"<code>{html_of(p.name)}</code>"), *_value(p)])
             first = ""
-    note = "Each is what the real arm has more than the model; the interval holds it in 19 of 20 cases."
+    note = (
+        "Each is what the real arm has more than the model; the interval holds it in 19 of 20 "
+        "cases."
+    )
     return table(("cause", "parameter", "value", "95 % interval", "unit"), rows) + paragraph(
         note, "note"
     )
@@ -72,12 +77,14 @@ def _ties(causes: list[Cause]) -> str:
 def _next(measurements: tuple[Measurement, ...]) -> str:
     head = heading("What to measure next")
     if not measurements:
-        return head + paragraph("Nothing is open that another pose would settle.")
+        return head + paragraph(
+            "No question is open that another pose under another load would settle."
+        )
     approach = any(m.approach for m in measurements)
     rows = []
     for i, m in enumerate(measurements[:SHOWN], start=1):
-        q = "  ".join(number(v, 4) if abs(v) >= 0.05 else "0" for v in np.rad2deg(m.q).round(1))
-        row: list[Cell] = [str(i), Raw(f'<span class="joints">{q}</span>'), number(m.payload),
+        q = ", ".join(f"{v + 0.0:.1f}".replace("-", "−") for v in np.rad2deg(m.q).round(1))
+        row: list[Cell] = [str(i), q, number(m.payload),
                            _purpose(m), f"{number(m.expected_gain, 2)} × noise"]  # fmt: skip
         if approach:
             signs = " ".join({1: "+", -1: "−"}.get(a, "0") for a in m.approach or ())

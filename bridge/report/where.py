@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from bridge.report.arm_view import arm_figure
 from bridge.report.fragment import (
-    AFTER, BEFORE, Choice, Figure, bar, figure_block, heading, paragraph, table,
+    AFTER,
+    BEFORE,
+    Cell,
+    Choice,
+    Figure,
+    bar,
+    figure_block,
+    heading,
+    paragraph,
+    table,
 )  # fmt: skip
-from bridge.report.material import Array, Material, own_coordinates, per_sample, thinned
+from bridge.report.material import Array, Index, Material, own_coordinates, per_sample, thinned
 from bridge.report.words import CHANNELS, percent, quantity_unit, quantity_words, unit_of
 from core.diagnosis.diagnosis import ChannelDiagnosis
 
@@ -35,7 +46,9 @@ def _channel(channel: ChannelDiagnosis) -> str:
 
 
 def _joints(channel: ChannelDiagnosis) -> str:
-    rows = [[f"joint {j}", bar(s, percent(s))] for j, s in channel.where.joints if s >= 0.005]
+    rows: list[list[Cell]] = [
+        [f"joint {j}", bar(s, percent(s))] for j, s in channel.where.joints if s >= 0.005
+    ]
     if not rows:
         return paragraph("No single joint stands out.", "note")
     title = "share of the gap" if channel.causes else "gap this joint alone could make"
@@ -44,16 +57,22 @@ def _joints(channel: ChannelDiagnosis) -> str:
 
 def _axes(channel: ChannelDiagnosis) -> str:
     names = channel.selection.observation.axes
-    rows = [[names[i], bar(s, percent(s))] for i, s in enumerate(channel.where.axes)]
-    frame = {"position": "axis of base", "wrench": "axis of the flange"}.get(channel.channel, "axis")
+    rows: list[list[Cell]] = [
+        [names[i], bar(s, percent(s))] for i, s in enumerate(channel.where.axes)
+    ]
+    frame = {"position": "axis of base", "wrench": "axis of the flange"}.get(
+        channel.channel, "axis"
+    )
     return table((frame, "share of the gap"), rows)
 
 
 def _depends(channel: ChannelDiagnosis) -> str:
-    rows = [[quantity_words(n), bar(s, percent(s))] for n, s in channel.where.depends_on if s > STATED]
+    rows: list[list[Cell]] = [
+        [quantity_words(n), bar(s, percent(s))] for n, s in channel.where.depends_on if s > STATED
+    ]
     if not rows:
         return paragraph("The gap follows no single quantity of the log.", "note")
-    return table(("the gap follows", "share it predicts"), rows)
+    return table(("the gap follows", "predicts of it"), rows)
 
 
 def _quantities(channel: ChannelDiagnosis) -> list[str]:
@@ -73,7 +92,7 @@ def _against(channel: ChannelDiagnosis) -> Figure:
     count = own_coordinates(channel)
     keep = thinned(per_sample(gap, count))
     given = [("before", gap, BEFORE)] + ([("after", after, AFTER)] if channel.causes else [])
-    traces = [
+    traces: list[dict[str, Any]] = [
         {"type": "scattergl" if len(keep) > 3000 else "scatter", "mode": "markers", "name": label,
          "marker": {"color": colour, "size": 5, "opacity": 0.7}}
         for label, _, colour in given
@@ -92,20 +111,20 @@ def _against(channel: ChannelDiagnosis) -> Figure:
     )  # fmt: skip
 
 
-def _x_choices(channel: ChannelDiagnosis, keep: Array, traces: int) -> list[Choice]:
+def _x_choices(channel: ChannelDiagnosis, keep: Index, traces: int) -> list[Choice]:
     observation, kept = channel.selection.observation, channel.selection.kept
     spread = np.random.default_rng(0).uniform(-0.08, 0.08, len(keep))
     choices = []
     for name in _quantities(channel):
         unit, factor = quantity_unit(name)
-        values = observation.quantities[name][kept][keep] * factor
+        values: Array = observation.quantities[name][kept][keep] * factor
         if name.startswith("approach"):
             values = values + spread  # so that points at -1 and +1 do not hide each other
         words = quantity_words(name)
         title = f"{words} ({unit})" if unit else words
         choices.append(Choice(words, title, [values] * traces))
     if not choices:
-        rows = observation.rows[kept][keep] + 1.0
+        rows: Array = np.asarray(observation.rows[kept][keep] + 1, dtype=np.float64)
         choices.append(Choice("row of the log", "row of the log", [rows] * traces))
     return choices
 

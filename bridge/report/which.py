@@ -8,7 +8,7 @@ from bridge.report.words import CHANNELS, effect_words, joints_words, likelihood
 from core.diagnosis.cause import Cause, Considered
 from core.diagnosis.diagnosis import ChannelDiagnosis
 
-HEADS = ("effect", "verdict", "shrinks the gap alone by", "probability", "why")
+HEADS = ("effect", "verdict", "shrinks alone", "probability", "why")
 
 
 def section(material: Material) -> str:
@@ -62,11 +62,15 @@ def _lost(considered: Considered, channel: ChannelDiagnosis, tied: bool) -> list
                 f"this log does not show it; it needs {need}"]  # fmt: skip
     word = badge("tied", "doubtful") if tied else badge("no", "quiet")
     why = considered.reason
-    if why.startswith("does not pay"):
+    withdrawn = not why.startswith("does not pay")
+    if not withdrawn:
         why = (
             "explains too little more, beside the causes found, for the numbers it adds"
             if channel.causes else "explains too little for the numbers it adds"
         )  # fmt: skip
+    elif not tied:
+        word = badge("withdrawn", "doubtful")
+        why = f"looked like a cause, but is not accused: {why}"
     if tied:
         why = "would explain these data as well as the cause named above"
     alone: Cell = "–"

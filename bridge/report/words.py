@@ -62,7 +62,7 @@ _COLUMNS = {
     "target_q": "commanded angle of joint",
     "actual_qd": "speed of joint",
     "joint_temperatures": "temperature of joint",
-    "approach": "direction of the last motion of joint",
+    "approach": "last motion of joint",
 }
 _VECTORS = {
     "payload_cog": "centre of gravity of the load",
@@ -138,11 +138,13 @@ def percent(share: float | None) -> str:
     """Return a share as percent."""
     if share is None or not math.isfinite(share):
         return "unknown"
-    return f"{share * 100:.0f} %".replace("-", "−")
+    return f"{round(share * 100)} %".replace("-", "−")
 
 
 def likelihood(probability: float) -> str:
     """Return a probability as percent, without claiming certainty."""
+    if not math.isfinite(probability):
+        return "unknown"
     if probability > 0.999:
         return "over 99.9 %"
     if probability < 0.001:
