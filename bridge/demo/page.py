@@ -126,7 +126,7 @@ def _figures(result: Result) -> str:
         ("setpoints written", f"{figures['setpoints_written']}"),
         ("rate of the loop", f"{loop.rate:.1f} Hz"),
         ("cycles missed", f"{loop.missed} of {loop.cycles}"),
-        ("period, 99th percentile", f"{loop.p99:.0f} us"),
+        ("age of the state behind a setpoint, p99", f"{loop.p99:.0f} us"),
         ("whole demo", f"{result.duration:.0f} s"),
     )
     rows = "".join(f"<tr><td>{escape(k)}</td><td>{escape(v)}</td></tr>" for k, v in lines)

@@ -22,7 +22,7 @@ class LoopFigures:
     rate: float  # Hz
     missed: int  # cycles of the controller that were not seen
     cycles: int
-    p99: float  # us, period
+    p99: float  # us, age of the state behind a setpoint, in the worst run
 
 
 @dataclass(frozen=True)

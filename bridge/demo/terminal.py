@@ -46,5 +46,5 @@ def show(result: Result, console: Console | None = None) -> None:
     console.print(
         f"fitted on {figures['samples']} measured poses; {figures['setpoints_written']} setpoints "
         f"written at {loop['rate_hz']:.1f} Hz, {loop['missed']} of {loop['cycles']} cycles missed, "
-        f"period p99 {loop['p99_us']:.0f} us"
+        f"state behind a setpoint {loop['p99_us']:.0f} us old (p99)"
     )

@@ -1,0 +1,170 @@
+"""The whole job, step by step: measure, fit, compensate, check, report."""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from bridge.cell import Cell, load_cell, save_cell
+from bridge.cell.simulation import server_settings
+from bridge.cli.answer import answer
+from bridge.demo.page import page
+from bridge.demo.picture import picture
+from bridge.demo.poses import CALIBRATION_LOADS, TEST_LOADS, Load, Plan, plan
+from bridge.demo.rests import Rests, joined, write_log
+from bridge.demo.result import Result
+from bridge.demo.session import Session
+from bridge.demo.terminal import show
+from bridge.output_file import write_text
+from bridge.warm_up import warm_up
+from core.diagnosis.diagnosis import diagnose
+from core.errors import InputError, RunError
+from core.identification import identify_compliance
+from core.log import read_log
+from drivers.simulated.process import SimulatedController
+from drivers.simulated.settings import (
+    BENCH_PORT,
+    DASHBOARD_PORT,
+    RTDE_PORT,
+    SCRIPT_PORT,
+    ServerSettings,
+)
+
+Array = NDArray[np.float64]
+LINKS = ("ur_rtde",)
+PORTS = (RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, BENCH_PORT)
+LAST_HOST = 60  # 127.0.0.2 to this are tried
+
+
+@dataclass
+class _Visits:
+    """Test visits so far."""
+
+    without: list[Rests] = field(default_factory=list)
+    compensated: list[Rests] = field(default_factory=list)
+    loads: list[str] = field(default_factory=list)
+
+
+def run_demo(seed: int, out: Path, link: str = "ur_rtde", console: Console | None = None) -> Result:
+    """Do the whole job on a simulated cell, write its results into ``out`` and print them.
+
+    Writes summary.json, report.html, picture.svg, calibration.csv, and the cells before and after
+    the fit. Raises InputError for an unknown link, RunError where the job fails.
+    """
+    if link not in LINKS:
+        raise InputError(f"--link: found {link!r}, expected one of {', '.join(LINKS)}")
+    console = console or Console()
+    begun = time.monotonic()
+    out.mkdir(parents=True, exist_ok=True)
+    cell = _write_cell(out, link)
+    settings = server_settings(cell, seed=seed)
+    warm_up()
+    console.print(f"simulated {settings.arm.name} at {settings.host}, its flexibilities hidden")
+    with SimulatedController(settings):
+        result = _job(cell, settings, seed, out, console, begun)
+    _write(result[0], result[1], out)
+    show(result[0], console)
+    console.print(f"results in {out}: report.html, summary.json", highlight=False)
+    _require_success(result[0])
+    return result[0]
+
+
+def _job(
+    cell: Cell, settings: ServerSettings, seed: int, out: Path, console: Console, begun: float
+) -> tuple[Result, str]:
+    home = np.array(settings.start_q)
+    session = Session(settings, home, out)
+    planned = plan(cell.model, home, seed)
+    log = _calibrate(cell, session, planned, out, console)
+    rows = read_log(log, cell.arm.n)
+    found = identify_compliance(cell.model, rows, cell.metrology)
+    save_cell(cell, out / "calibrated.yaml", found.model)
+    calibrated = load_cell(out / "calibrated.yaml")
+    console.print(
+        f"fitted on {found.samples} poses: gap {found.gap_rms * 1e3:.3f} mm per coordinate before, "
+        f"{found.remaining_rms * 1e3:.3f} mm after"
+    )
+    seen = _Visits()
+    for load, poses in zip(TEST_LOADS, planned.test, strict=True):
+        _check(cell, calibrated, session, load, np.vstack([poses, poses]), seen, console)
+    console.print("diagnosing the calibration log")
+    diagnosis = answer(diagnose(cell.model, rows, cell.metrology))
+    result = Result(
+        link=cell.file.link.driver if cell.file.link else "", seed=seed, identification=found, model=calibrated.model,
+        without=joined(seen.without), compensated=joined(seen.compensated),
+        loads=tuple(seen.loads), setpoints_written=session.written, loop=session.figures(),
+        duration=time.monotonic() - begun,
+    )  # fmt: skip
+    return result, diagnosis
+
+
+def _calibrate(cell: Cell, session: Session, planned: Plan, out: Path, console: Console) -> Path:
+    """Measure poses under each calibration load; returns the log."""
+    parts = []
+    for load, poses in zip(CALIBRATION_LOADS, planned.calibration, strict=True):
+        console.print(f"measuring {len(poses)} poses with {load.name}")
+        parts.append(session.visit(cell, load, poses))
+    write_log(out / "calibration.csv", joined(parts))
+    return out / "calibration.csv"
+
+
+def _check(
+    cell: Cell, calibrated: Cell, session: Session, load: Load, poses: Array, seen: _Visits,
+    console: Console,
+) -> None:  # fmt: skip
+    """Visit test poses without and with compensation, under one load."""
+    console.print(f"checking {len(poses)} visits with {load.name}, without compensation")
+    seen.without.append(session.visit(cell, load, poses))
+    console.print(f"checking {len(poses)} visits with {load.name}, with compensation")
+    seen.compensated.append(session.visit(calibrated, load, poses))
+    seen.loads += [load.name] * len(poses)
+
+
+def _write_cell(out: Path, link: str) -> Cell:
+    text = resources.files("bridge.demo").joinpath("cell.yaml").read_text(encoding="utf-8")
+    path = out / "cell.yaml"
+    write_text(path, text.replace("LINK", link).replace("HOST", free_address()))
+    return load_cell(path)
+
+
+def free_address() -> str:
+    """Return a loopback address on which none of a controller's ports is taken."""
+    for last in range(2, LAST_HOST + 1):
+        host = f"127.0.0.{last}"
+        if all(_is_free(host, port) for port in PORTS):
+            return host
+    raise RunError(f"found every address from 127.0.0.2 to 127.0.0.{LAST_HOST} taken")
+
+
+def _is_free(host: str, port: int) -> bool:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError:
+            return False
+    return True
+
+
+def _write(result: Result, diagnosis: str, out: Path) -> None:
+    write_text(out / "summary.json", json.dumps(result.summary(), indent=1) + "\n")
+    write_text(out / "picture.svg", picture(result))
+    write_text(out / "report.html", page(result, diagnosis))
+
+
+def _require_success(result: Result) -> None:
+    """Raise RunError where compensation did not help: nobody should take that for a success."""
+    before, after = result.error_without, result.error_with
+    if np.sqrt(np.mean(after**2)) > 0.2 * np.sqrt(np.mean(before**2)):
+        raise RunError(
+            f"compensation left {np.sqrt(np.mean(after**2)) * 1e3:.3f} mm of "
+            f"{np.sqrt(np.mean(before**2)) * 1e3:.3f} mm, expected a fifth at most"
+        )
