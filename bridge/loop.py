@@ -153,8 +153,8 @@ class Loop:
         self._page.tell_seen()
         self._check_robot(state)
         loads = self._loads.update(state)
-        if self._supervisor.state == State.ARMED:
-            self._start(state, own)
+        if self._supervisor.state == State.ARMED and self._start(state, own):
+            return  # the state is old by now
         written = self._write(state, own, loads) if self._supervisor.state.writes else None
         self._record(state, missed, own, loads, written)
 
@@ -197,13 +197,16 @@ class Loop:
         elif self._supervisor.state == State.FAULT:
             self._supervisor.take(Cause.RECOVERED)
 
-    def _start(self, state: RobotState, own: Vector) -> None:
-        """Begin writing once the source has a first setpoint and the driver is ready."""
+    def _start(self, state: RobotState, own: Vector) -> bool:
+        """Begin writing once the source has a first setpoint and the driver is ready.
+
+        Returns whether it took so long that a fresh state is needed.
+        """
         first = self._source.first(own)
         if first is None:
             if self._ready_to_write:
                 self._refuse_start("the source fell silent before the first setpoint")
-            return
+            return False
         away = np.abs(first - own)
         tolerance = self._settings.setpoints.start_tolerance
         if not (away <= tolerance).all():
@@ -212,24 +215,29 @@ class Loop:
                 f"joint {joint + 1}: found the first setpoint {away[joint]:.4f} rad from the arm, "
                 f"expected at most {tolerance:g} (setpoints.start_tolerance)"
             )
-            return
+            return False
         try:
             if not self._ready_to_write:
-                # takes a moment: the next cycle, with a fresh state, goes on
-                self._page.enter(Phase.ARMING)
-                self._has_written = True
-                self._driver.arm(state)
-                self._ready_to_write = True
-                return
+                self._arm_driver(state)
+                return True
             self._stream.start(own, state.timestamp)
         except (WriteError, LimitError) as error:
             self._refuse_start(str(error))
-            return
+            return True
+        self._source.begin(state.timestamp, own)
+        self._supervisor.take(Cause.WRITING)
+        return False
+
+    def _arm_driver(self, state: RobotState) -> None:
+        """Make the driver ready, which takes a moment: a fresh state is needed after it."""
+        self._page.enter(Phase.ARMING)
+        self._has_written = True
+        try:
+            self._driver.arm(state)
+            self._ready_to_write = True
         finally:
             self._page.enter(Phase.RUNNING)
             self._clock.skip()
-        self._source.begin(state.timestamp, own)
-        self._supervisor.take(Cause.WRITING)
 
     def _refuse_start(self, detail: str) -> None:
         self._release()

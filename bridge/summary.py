@@ -14,7 +14,6 @@ from core.limits import CLAMPS
 
 Array = NDArray[np.float64]
 UNIT = 1e-6  # s: bin of a histogram
-LONGEST_GAP = 1.0  # s: a longer one is a break, and no part of the rate
 BINS = 50_000  # to 50 ms; what is beyond counts as the last
 
 
@@ -126,7 +125,8 @@ class Tally:
         self.late += int((age > 1.0 / self.rate).sum())
         self.written += int(written.sum())
         gaps = np.diff(rows[:, s["timestamp"].start], prepend=self.last_timestamp)
-        gaps = gaps[(gaps > 0.0) & (gaps < LONGEST_GAP)]
+        # a gap without cycles missed is a break: the loop armed, or was started anew
+        gaps = gaps[np.abs(gaps - (missed + 1.0) / self.rate) < 0.5 / self.rate]
         self.last_timestamp = float(rows[-1, s["timestamp"].start])
         self.steps += len(gaps)
         self.span += float(gaps.sum())
