@@ -89,11 +89,20 @@ def arm_from_dh(
         mass[i] = _number(row, "mass", where, 0.0)
         if mass[i] < 0:
             raise ArmError(f"{where}: mass: found {mass[i]:g}, expected 0 or more kg")
-        in_row = np.asarray(row.get("cog") if row.get("cog") is not None else np.zeros(3), float)
-        if in_row.shape != (3,) or not np.isfinite(in_row).all():
-            raise ArmError(f"{where}: cog: found {row.get('cog')}, expected three numbers (m)")
+        in_row = _centre(row, where)
         cog[i] = links[i + 1][:3, :3] @ in_row + links[i + 1][:3, 3]
     return Arm(name, links, mass, cog, np.zeros((n, 3, 3)), limits or JointLimits.none(n))
+
+
+def _centre(row: Mapping[str, Any], where: str) -> Array:
+    given = row.get("cog")
+    try:
+        centre = np.zeros(3) if given is None else np.array(given, dtype=float)
+    except (TypeError, ValueError):
+        centre = np.full(3, np.nan)
+    if centre.shape != (3,) or not np.isfinite(centre).all():
+        raise ArmError(f"{where}: cog: found {given}, expected three numbers (m)")
+    return centre
 
 
 def _number(row: Mapping[str, Any], key: str, where: str, default: float | None = None) -> float:

@@ -225,6 +225,11 @@ def _read_parquet(path: Path) -> tuple[list[str], Array]:
         names = list(parquet.read_schema(path).names)
         wanted = [names[i] for i in _wanted(names)]
         frame = parquet.read_table(path, columns=wanted)
+        for name in wanted:
+            kind = frame.schema.field(name).type
+            if not (pyarrow.types.is_floating(kind) or pyarrow.types.is_integer(kind)):
+                what = "text" if pyarrow.types.is_string(kind) else str(kind)
+                raise LogError(f"{path}: column {name}: found {what}, expected numbers")
         table = [
             frame[name].cast(pyarrow.float64()).to_numpy(zero_copy_only=False) for name in wanted
         ]
