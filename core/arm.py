@@ -160,6 +160,7 @@ def builtin_arm(name: str, calibration: Mapping[str, Sequence[float]] | None = N
             )
         for row, value in zip(rows, values, strict=True):
             row[key] = row.get(key, 0.0) + float(value)
-    columns = {key: np.array([float(r[key]) for r in table["limits"]]) for key in table["limits"][0]}
+    limits = table["limits"]
+    columns = {key: np.array([float(row[key]) for row in limits]) for key in limits[0]}
     arm = arm_from_dh(rows, name, JointLimits(**columns))
     return replace(arm, payload=float(table["payload"]))

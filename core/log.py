@@ -41,7 +41,7 @@ _INDEXED = re.compile(r"(.+)_(\d+)$")
 
 @dataclass(frozen=True)
 class Log:
-    """One log: ``columns`` holds (N,) or (N, k) arrays by contract name; NaN where a cell is empty."""
+    """One log: ``columns`` holds (N,) or (N, k) arrays by contract name; NaN: an empty cell."""
 
     path: str
     columns: Mapping[str, Array]
@@ -227,7 +227,8 @@ def _read_parquet(path: Path) -> tuple[list[str], Array]:
         frame = parquet.read_table(path, columns=wanted)
         for name in wanted:
             kind = frame.schema.field(name).type
-            if not (pyarrow.types.is_floating(kind) or pyarrow.types.is_integer(kind)):
+            types = pyarrow.types
+            if not (types.is_floating(kind) or types.is_integer(kind) or types.is_decimal(kind)):
                 what = "text" if pyarrow.types.is_string(kind) else str(kind)
                 raise LogError(f"{path}: column {name}: found {what}, expected numbers")
         table = [
@@ -275,4 +276,5 @@ def _nearest(names: Sequence[str]) -> str:
         near = difflib.get_close_matches(stem, COLUMNS, n=1, cutoff=0.6)
         if near:
             return f"; found {name!r}, did you mean {near[0]!r}?"
-    return f" ({', '.join(names[:6])}{', ...' if len(names) > 6 else ''}), expected RTDE field names"
+    more = ", ..." if len(names) > 6 else ""
+    return f" ({', '.join(names[:6])}{more}), expected RTDE field names"
