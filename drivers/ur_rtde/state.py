@@ -108,7 +108,12 @@ class StateReader:
 
     @property
     def age(self) -> float:
-        """Return for how long the controller's clock has stood still, s."""
+        """Return for how long the controller's clock has stood still, s; 0 where it has moved.
+
+        A sample that has come but was not read yet counts: who was busy is not cut off.
+        """
+        if self._receive is not None and self._receive.getTimestamp() != self._last:
+            return 0.0
         return time.monotonic() - self._changed
 
     def read(self) -> RobotState:

@@ -1,0 +1,33 @@
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Iterator
+
+import pytest
+from driver_runs import Bench, cell_settings, offset_program
+
+from drivers.simulated.process import SimulatedController
+from drivers.simulated.settings import SCRIPT_PORT
+
+
+@pytest.fixture
+def controller() -> Iterator[SimulatedController]:
+    with SimulatedController(cell_settings(), log_level="INFO") as running:
+        yield running
+
+
+@pytest.fixture
+def bench(controller: SimulatedController) -> Iterator[Bench]:
+    found = Bench(controller.host)
+    yield found
+    found.close()
+
+
+@pytest.fixture
+def offset_robot(controller: SimulatedController) -> SimulatedController:
+    """A robot whose own program, with ours in it, runs."""
+    with socket.create_connection((controller.host, SCRIPT_PORT), timeout=5) as pendant:
+        pendant.sendall(offset_program().encode())
+        time.sleep(0.3)
+    return controller

@@ -1,0 +1,68 @@
+"""The driver in a process of its own: its library can hang, abort or crash the one it is in."""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+from pathlib import Path
+from typing import Any
+
+SIMULATED = str(Path(__file__).resolve().parents[1] / "simulated")
+sys.path.insert(0, SIMULATED)
+
+from simulated_cell import Bench, cell_settings, run_client  # noqa: E402
+
+from drivers.ur_rtde.driver import OFFSET_SCRIPT  # noqa: E402
+
+__all__ = ["Bench", "cell_settings", "run_driver"]
+
+PREAMBLE = """
+import sys
+sys.path.insert(0, {simulated!r})
+import numpy as np
+from simulated_cell import Bench
+from core.arm import builtin_arm
+from core.errors import *
+from core.model import Model
+from core.setpoint import Setpoint
+from drivers import make_driver
+from drivers.ur_rtde.settings import UrRtdeSettings
+
+model = Model(builtin_arm("ur10e"))
+driver = make_driver(UrRtdeSettings(host=host, **{link!r}), model)
+bench = Bench(host)
+
+def setpoint(state, q, nominal_q, offset=np.zeros(6)):
+    return Setpoint(q, nominal_q, offset, state.timestamp, state.received)
+
+def error_of(action, *arguments):
+    try:
+        action(*arguments)
+    except GapbridgeError as error:
+        return type(error).__name__ + ": " + str(error)
+    return ""
+
+def until_error(seconds):
+    begun = time.monotonic()
+    while time.monotonic() - begun < seconds:
+        found = error_of(driver.read_state)
+        if found:
+            return found, time.monotonic() - begun
+    return "", seconds
+
+def read_for(cycles):
+    for _ in range(cycles):
+        state = driver.read_state()
+    return state
+"""
+
+
+def run_driver(host: str, body: str, timeout: float = 60.0, **link: Any) -> dict[str, Any]:
+    """Run ``body`` with a driver, a bench and a few words; returns what it puts into ``out``."""
+    preamble = PREAMBLE.format(simulated=SIMULATED, link=link)
+    return run_client(host, preamble + textwrap.dedent(body), timeout)
+
+
+def offset_program() -> str:
+    """Return the program that users load onto their robot."""
+    return OFFSET_SCRIPT.read_text(encoding="utf-8")

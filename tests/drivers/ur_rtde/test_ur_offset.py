@@ -1,0 +1,205 @@
+"""Offset mode: the shipped program on the robot, offsets through registers, nominal joints back."""
+
+from __future__ import annotations
+
+from textwrap import dedent
+
+import pytest
+from driver_runs import Bench, offset_program, run_driver
+
+from drivers.simulated.process import SimulatedController
+from drivers.ur_rtde import registers
+
+OFFSET = [1.0e-3, -5.0e-4, 2.0e-3, 1.0e-3, -4.0e-4, -2.0e-3]
+ARMED = """
+driver.connect()
+state = read_for(20)
+driver.arm(state)
+nominal = driver.nominal_q(state).copy()
+def stream(cycles, offset):
+    for _ in range(cycles):
+        state = driver.read_state()
+        driver.write_setpoint(setpoint(state, state.target_q, nominal, np.array(offset)))
+    return state
+"""
+
+
+def run(host: str, body: str, **link: object) -> dict[str, object]:
+    return run_driver(host, ARMED + dedent(body), mode="offset", **link)
+
+
+def test_an_offset_moves_the_tcp_and_is_taken_out_of_the_nominal_joints(
+    offset_robot: SimulatedController, bench: Bench
+) -> None:
+    before = bench.truth()["rigid_tcp"]
+    out = run(
+        offset_robot.host,
+        f"""
+        state = stream(150, {OFFSET})
+        out["applied"] = driver.reader.applied.tolist()
+        out["echo"] = driver.reader.echo - driver._writer._sequence
+        out["program"] = driver.reader.program
+        out["nominal"] = (driver.nominal_q(state) - nominal).tolist()
+        out["moved"] = float(np.abs(state.target_q - nominal).max())
+        out["truth"] = bench.truth()["rigid_tcp"]
+        driver.release()
+        state = read_for(150)
+        out["released"] = driver.reader.applied.tolist()
+        out["back"] = (state.target_q - nominal).tolist()
+        """,
+    )
+    assert out["applied"] == pytest.approx(OFFSET, abs=1e-9)
+    assert -4 <= out["echo"] <= 0  # type: ignore[operator]
+    assert out["program"] == registers.Program.RUNNING
+    assert out["nominal"] == pytest.approx([0] * 6, abs=1e-8)
+    assert out["moved"] > 5e-4  # type: ignore[operator]
+    moved = [a - b for a, b in zip(out["truth"][:3], before[:3], strict=True)]  # type: ignore[index]
+    assert moved == pytest.approx(OFFSET[:3], abs=1e-5)
+    assert out["released"] == pytest.approx([0] * 6, abs=1e-12)
+    assert out["back"] == pytest.approx([0] * 6, abs=1e-9)
+
+
+def test_the_nominal_joints_are_the_robots_own_while_it_moves(
+    offset_robot: SimulatedController,
+) -> None:
+    out = run(
+        offset_robot.host,
+        f"""
+        stream(100, {OFFSET})
+        goal = nominal + [0.2, 0.1, -0.1, 0.05, 0.1, -0.2]
+        bench.do("move " + " ".join(map(str, goal)))
+        seen = []
+        for _ in range(700):
+            state = driver.read_state()
+            seen.append(driver.nominal_q(state).copy())
+            driver.write_setpoint(setpoint(state, state.target_q, nominal, np.array({OFFSET})))
+        way = (np.array(seen) - nominal) / (goal - nominal)
+        out["end"] = (seen[-1] - goal).tolist()
+        # a straight joint move: all joints are the same share of their way
+        out["spread"] = float(np.ptp(way, axis=1).max())
+        """,
+    )
+    assert out["end"] == pytest.approx([0] * 6, abs=1e-7)
+    assert out["spread"] < 1e-5  # type: ignore[operator]
+
+
+def test_without_a_heartbeat_the_robots_program_goes_to_zero_and_on(
+    offset_robot: SimulatedController,
+) -> None:
+    out = run(
+        offset_robot.host,
+        f"""
+        stream(100, {OFFSET})
+        for _ in range(250):
+            state = driver.read_state()
+        out["program"] = driver.reader.program
+        out["applied"] = driver.reader.applied.tolist()
+        out["runtime"] = state.runtime_state
+        """,
+    )
+    assert out["program"] == registers.Program.EXPIRED
+    assert out["applied"] == [0] * 6
+    assert out["runtime"] == 2
+
+
+def test_a_wrong_checksum_moves_nothing_and_is_told(offset_robot: SimulatedController) -> None:
+    out = run(
+        offset_robot.host,
+        f"""
+        from drivers.ur_rtde import registers
+        right, registers.checksum = registers.checksum, lambda *a: right(*a) + 1
+        error, count = "", 0
+        while not error and count < 400:
+            state, count = driver.read_state(), count + 1
+            error = error_of(
+                driver.write_setpoint, setpoint(state, state.target_q, nominal, np.array({OFFSET}))
+            )
+        out["error"] = error
+        out["applied"] = driver.reader.applied.tolist()
+        """,
+    )
+    assert "offsets do not arrive" in str(out["error"])
+    assert "REJECTED" in str(out["error"])
+    assert out["applied"] == [0] * 6
+
+
+def test_a_stopped_program_is_noticed(offset_robot: SimulatedController) -> None:
+    out = run(
+        offset_robot.host,
+        """
+        import socket
+        stream(50, [1e-3, 0, 0, 0, 0, 0])
+        with socket.create_connection((host, 29999)) as dashboard:
+            dashboard.recv(100)
+            dashboard.sendall(b"stop\\n")
+            dashboard.recv(100)
+        error, count = "", 0
+        while not error and count < 400:
+            state, count = driver.read_state(), count + 1
+            error = error_of(
+                driver.write_setpoint, setpoint(state, state.target_q, nominal, np.zeros(6))
+            )
+        out["error"] = error
+        """,
+    )
+    assert str(out["error"]).startswith("WriteError: ")
+
+
+def test_arming_needs_the_robots_program(controller: SimulatedController) -> None:
+    out = run_driver(
+        controller.host,
+        """
+        driver.connect()
+        out["error"] = error_of(driver.arm, read_for(20))
+        """,
+        mode="offset",
+    )
+    assert "gapbridge_offset.script" in out["error"]
+
+
+def test_another_tcp_in_the_controller_is_refused(offset_robot: SimulatedController) -> None:
+    out = run_driver(
+        offset_robot.host,
+        """
+        tool = np.eye(4)
+        tool[2, 3] = 0.18
+        other = make_driver(
+            UrRtdeSettings(host=host, mode="offset"), Model(builtin_arm("ur10e"), tool)
+        )
+        other.connect()
+        out["error"] = error_of(other.arm, other.read_state())
+        """,
+    )
+    assert "180.0 mm from the cell's" in out["error"]
+
+
+def test_the_checksum_is_what_both_sides_compute() -> None:
+    from drivers.simulated.offset_program import checksum
+
+    for sequence in (1, 77, registers.LAST_SEQUENCE):
+        units = registers.counts(OFFSET)
+        assert registers.checksum(units, sequence) == checksum(OFFSET, sequence)
+    assert registers.checksum([-5, 0, 0, 0, 0, 0], 0) == 2**31 - 5
+
+
+def test_sequence_numbers_go_round() -> None:
+    assert registers.next_sequence(registers.LAST_SEQUENCE) == 1
+    assert registers.next_sequence(1) == 2
+    assert registers.reached(5, 5)
+    assert registers.reached(3, registers.LAST_SEQUENCE - 2)
+    assert not registers.reached(4, 5)
+
+
+def test_the_shipped_program_is_whole() -> None:
+    text = offset_program()
+    code = [line.split("#")[0].split() for line in text.splitlines()]
+    words = [line[0].rstrip(":") for line in code if line]
+    opened = sum(word in ("def", "if", "while", "thread") for word in words)
+    assert opened == words.count("end")
+    for number in (18, 19, 20, 21):
+        assert str(number) in text
+    for name in ("path_offset_enable", "path_offset_set(", "path_offset_disable", "sync()"):
+        assert name in text
+    # one cycle's steps: those of the simulator, and no more than the limiter's rates need
+    assert "gb_shift_step = 0.0001" in text
+    assert "gb_turn_step = 0.0002" in text

@@ -1,0 +1,232 @@
+"""Reading: what the driver says of the plant, and what it refuses to believe."""
+
+from __future__ import annotations
+
+import pytest
+from driver_runs import run_driver
+
+from drivers.simulated.process import SimulatedController
+
+
+def test_a_state_is_the_plants(controller: SimulatedController) -> None:
+    out = run_driver(
+        controller.host,
+        """
+        with driver:
+            states = [driver.read_state() for _ in range(200)]
+            free = np.mean([s.actual_TCP_force for s in states], axis=0)
+            bench.do("wrench 30 -20 10 1 2 -3")
+            read_for(50)
+            pulled = np.mean([driver.read_state().actual_TCP_force for _ in range(200)], axis=0)
+            out["pull"] = (pulled - free).tolist()
+            s = states[-1]
+            out["q"] = s.actual_q.tolist()
+            out["target"] = s.target_q.tolist()
+            out["sizes"] = [len(s.actual_qd), len(s.ft_raw_wrench), len(s.joint_temperatures)]
+            out["temperature"] = s.joint_temperatures.tolist()
+            out["declared"] = [s.payload, *s.payload_cog]
+            out["modes"] = [s.robot_mode, s.safety_mode, s.runtime_state, s.safety_status_bits]
+            out["gaps"] = np.diff([s.timestamp for s in states]).tolist()
+            out["torque"] = s.actual_current_as_torque is None
+            out["scaling"] = s.speed_scaling
+            out["tcp"] = driver.reader.tcp_pose().tolist()
+            out["age"] = min(
+                -driver.read_state().received + time.monotonic() for _ in range(50)
+            )
+            from core.rotation import rotation_vector
+            pose = model.rigid_pose(s.actual_q[None])
+            out["model"] = [*pose.position[0], *rotation_vector(pose.rotation[0])]
+        """,
+    )
+    start = controller.settings.start_q
+    assert out["q"] == pytest.approx(start, abs=2e-4)
+    assert out["target"] == pytest.approx(start, abs=1e-9)
+    assert out["pull"][:3] == pytest.approx([30, -20, 10], abs=0.3)
+    assert out["pull"][3:] == pytest.approx([1, 2, -3], abs=0.3)
+    assert out["sizes"] == [6, 6, 6]
+    assert all(15 < t < 60 for t in out["temperature"])
+    assert out["declared"] == [0.0, 0.0, 0.0, 0.0]
+    assert out["modes"] == [7, 1, 1, 1]
+    assert min(out["gaps"]) > 0
+    assert sum(g < 0.0021 for g in out["gaps"]) > 150
+    assert out["torque"]
+    assert out["scaling"] == pytest.approx(1.0)
+    assert out["tcp"][:3] == pytest.approx(out["model"][:3], abs=2e-3)
+    assert 0 <= out["age"] < 0.01
+
+
+def test_reading_claims_and_writes_nothing(controller: SimulatedController) -> None:
+    out = run_driver(
+        controller.host,
+        """
+        driver.connect()
+        first = driver.read_state()
+        import rtde_control
+        control = rtde_control.RTDEControlInterface(host)  # would be refused were an input claimed
+        out["control"] = control.isConnected()
+        out["runtime"] = first.runtime_state
+        """,
+    )
+    assert out == {"control": True, "runtime": 1}
+
+
+def test_a_frozen_clock_is_stale_in_time_although_packets_flow(
+    controller: SimulatedController,
+) -> None:
+    out = run_driver(
+        controller.host,
+        """
+        driver.connect()
+        read_for(50)
+        bench.do("freeze")
+        out["error"], out["after"] = until_error(2.0)
+        out["connected"] = driver.reader._receive.isConnected()
+        bench.do("thaw")
+        time.sleep(0.05)
+        out["again"] = driver.read_state().timestamp > 0
+        """,
+        state_timeout=0.05,
+    )
+    assert out["error"].startswith("StaleStateError: ")
+    assert 0.04 < out["after"] < 0.5
+    assert out["connected"]  # which is why nobody asks it
+    assert out["again"]
+
+
+def test_a_stalled_and_a_dropped_link_are_stale(controller: SimulatedController) -> None:
+    out = run_driver(
+        controller.host,
+        """
+        driver.connect()
+        read_for(20)
+        bench.do("stall 0.4")
+        out["stalled"], out["after"] = until_error(2.0)
+        time.sleep(0.5)
+        read_for(20)
+        bench.do("drop")
+        out["dropped"], _ = until_error(2.0)
+        """,
+    )
+    assert out["stalled"].startswith("StaleStateError: ")
+    assert out["after"] < 0.3
+    assert out["dropped"].startswith("StaleStateError: ")
+
+
+def test_a_controller_that_is_not_there_is_one_line() -> None:
+    out = _nobody()
+    assert out["error"].startswith("LinkError: 127.250.250.250: ")
+    assert "\n" not in out["error"]
+    assert "expected connect() first" in out["unread"]
+
+
+def _nobody() -> dict[str, str]:
+    from simulated_cell import run_client
+
+    return run_client(
+        "127.250.250.250",
+        """
+        from core.arm import builtin_arm
+        from core.errors import LinkError
+        from core.model import Model
+        from drivers import make_driver
+        from drivers.ur_rtde.settings import UrRtdeSettings
+        driver = make_driver(UrRtdeSettings(host=host), Model(builtin_arm("ur10e")))
+        for name, action in (("error", driver.connect), ("unread", driver.read_state)):
+            try:
+                action()
+            except LinkError as error:
+                out[name] = "LinkError: " + str(error)
+        driver.close()
+        driver.close()
+        """,
+    )
+
+
+def test_a_sample_that_is_torn_by_a_packet_is_read_again(controller: SimulatedController) -> None:
+    out = run_driver(
+        controller.host,
+        """
+        driver.connect()
+        read_for(20)
+        reader = driver.reader
+        quick, delays = reader._getters[0], [0.0025]
+        def slow():
+            values = quick()
+            time.sleep(delays.pop() if delays else 0.0)
+            return values
+        reader._getters[0] = slow
+        before = reader.torn
+        state = driver.read_state()
+        out["torn"] = reader.torn - before
+        out["fresh"] = state.timestamp == reader._last
+        delays[:] = [0.0025] * 10
+        out["hopeless"] = error_of(driver.read_state)
+        delays.clear()
+        reader._getters[0] = quick
+        out["again"] = error_of(driver.read_state)
+        """,
+    )
+    assert out["torn"] >= 1
+    assert out["fresh"]
+    assert out["hopeless"].startswith("InvalidStateError: ")
+    assert out["again"] == ""
+
+
+def test_states_that_cannot_be_are_refused_and_the_next_is_read(
+    controller: SimulatedController,
+) -> None:
+    wrong = {
+        "[0.0, -1.5, math.nan, -1.87, -1.57, 0.0]": "actual_q_2: found nan",
+        "[0.0, -1.5, 1.8, math.inf, -1.57, 0.0]": "actual_q_3: found inf",
+        "[0.0, -1.5, 1.8]": "actual_q: found 3 numbers, expected 6",
+        "[]": "actual_q: found 0 numbers, expected 6",
+        "[0.0, -1.5, 1.8, 900.0, -1.57, 0.0]": "actual_q_3: found 900",
+        "[0.0, -1.5, 1.8, -1.87, -1.57, 0.5]": "actual_q_5: found a step of 0.5",
+    }
+    out = run_driver(
+        controller.host,
+        f"""
+        driver.connect()
+        read_for(20)
+        real = driver.reader._getters[0]
+        assert driver.reader._fields[0][0] == "actual_q"
+        for values in {list(wrong)!r}:
+            driver.reader._getters[0] = lambda: eval(values)
+            out[values] = error_of(driver.read_state)
+            driver.reader._getters[0] = real
+            read_for(3)
+        """,
+    )
+    for values, words in wrong.items():
+        assert out[values].startswith("InvalidStateError: ")
+        assert words in out[values]
+
+
+def test_a_restarted_controller_is_noticed_by_its_clock(controller: SimulatedController) -> None:
+    out = run_driver(
+        controller.host,
+        """
+        driver.connect()
+        read_for(20)
+        driver.reader._last += 1000.0
+        out["error"] = error_of(driver.read_state)
+        """,
+    )
+    assert "clock went back" in out["error"]
+
+
+def test_torques_need_the_motors_constants(controller: SimulatedController) -> None:
+    out = run_driver(
+        controller.host,
+        """
+        driver.connect()
+        s = driver.read_state()
+        out["torque"] = s.actual_current_as_torque.tolist()
+        out["current"] = driver.reader._receive.getActualCurrent()
+        """,
+        torque_constants=(10.0, 11.0, 12.0, 13.0, 14.0, 15.0),
+    )
+    assert len(out["torque"]) == 6
+    for torque, current, constant in zip(out["torque"], out["current"], range(10, 16), strict=True):
+        assert torque == pytest.approx(current * constant, abs=0.1 + 0.5 * abs(torque))
+    assert any(abs(t) > 1e-3 for t in out["torque"])
