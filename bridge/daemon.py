@@ -10,6 +10,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -115,6 +116,11 @@ class Daemon:
         """Return the process id of the loop, None between two of them."""
         loop = self._loop
         return None if loop is None else loop.pid
+
+    @property
+    def recording(self) -> Path | None:
+        """Return the file that cycles go to."""
+        return self._recorder.path
 
     def stop(self) -> None:
         """Ramp out and end."""

@@ -31,6 +31,7 @@ from core.errors import (
 )
 from core.loads import Loads
 from core.model import Model
+from core.setpoint import Setpoint
 from core.state import RobotState
 from drivers.driver import Driver
 
@@ -39,6 +40,7 @@ INVALID_IN_A_ROW = 3  # states that cannot be believed, after which they count a
 SILENCE = 0.2  # s without a state: a fault
 LOST = 3.0  # s without a state: the link is lost
 LOST_AFTER_WRITING = 0.5  # s: the library's writing half does not survive a break
+SETTLED, LONGEST_SETTLING = 2e-6, 0.3  # rad, s
 ROBOT_RUNNING, SAFE = 7, (1, 2)  # robot_mode; safety_mode normal, reduced
 
 Tell = Callable[[dict[str, Any]], None]
@@ -76,6 +78,7 @@ class Loop:
         self._ready_to_write = False  # the driver is armed
         self._has_written = False  # the library's writing half exists in this process
         self._invalid = 0
+        self._settling = 0.0  # s, monotonic: since when the last setpoint stands
         self._heard = 0.0  # s, monotonic, of the last believable state
         self._stop_by: float | None = None  # s, monotonic
         self._exit: Exit | None = None
@@ -110,7 +113,8 @@ class Loop:
             if wanted and may_write and self._page.seen and self._stop_by is None:
                 wanted = False
                 self._supervisor.take(Cause.ARM)
-            self._cycle()
+            if self._exit is None:
+                self._cycle()
         self._page.enter(Phase.ENDING)
         self._source.close()
         return self._exit
@@ -130,6 +134,7 @@ class Loop:
             self._supervisor.take(Cause.STOP)
         if not self._supervisor.state.writes or time.monotonic() > self._stop_by:
             self._release()
+            self._supervisor.take(Cause.RAMPED_OUT, "not at rest in time")
             self._exit = Exit.DONE
 
     def _lose(self, detail: str) -> None:
@@ -243,7 +248,7 @@ class Loop:
         self._release()
         self._supervisor.take(Cause.START_REFUSED, detail)
 
-    def _write(self, state: RobotState, own: Vector, loads: Loads) -> Any:
+    def _write(self, state: RobotState, own: Vector, loads: Loads) -> Setpoint | None:
         """Send one setpoint; returns it, or None where none has left."""
         source_q = self._next(state, own)
         holding = self._supervisor.state == State.HOLDING
@@ -260,10 +265,27 @@ class Loop:
             self._ready_to_write = False
             self._lose(str(error))
             return None
-        if holding and self._stream.rests:
+        if holding and self._at_rest(setpoint, state):
             self._release()
             self._supervisor.take(Cause.RAMPED_OUT)
         return setpoint
+
+    def _at_rest(self, setpoint: Setpoint, state: RobotState) -> bool:
+        """Return whether the offset is out, and the arm, where it is ours, stands.
+
+        The controller's target follows late: who lets go at once leaves the arm short of it.
+        """
+        if not self._driver.moves_arm:
+            return self._stream.is_bare
+        if not self._stream.rests:
+            return False
+        now = time.monotonic()
+        self._settling = self._settling or now
+        near = bool((np.abs(state.target_q - setpoint.q) < SETTLED).all())
+        if near or now - self._settling > LONGEST_SETTLING:
+            self._settling = 0.0
+            return True
+        return False
 
     def _next(self, state: RobotState, own: Vector) -> Vector | None:
         """Return the source's setpoint; None: the motion must brake."""
@@ -294,7 +316,7 @@ class Loop:
         self._clock.skip()
 
     def _record(
-        self, state: RobotState, missed: int, own: Vector, loads: Loads, setpoint: Any
+        self, state: RobotState, missed: int, own: Vector, loads: Loads, setpoint: Setpoint | None
     ) -> None:
         page, stream = self._page, self._stream
         if setpoint is None:

@@ -97,9 +97,14 @@ class SetpointStream:
         return Setpoint(limited.q, nominal, limited.offset_in_base, state.timestamp, state.received)
 
     @property
+    def is_bare(self) -> bool:
+        """Return whether no offset is left."""
+        return self._ramp == 0.0 and not self.limiter.offset_in_base.any()
+
+    @property
     def rests(self) -> bool:
         """Return whether no offset is left and the motion has come to rest."""
-        return self._ramp == 0.0 and self._nominal.rests and not self.limiter.offset_in_base.any()
+        return self.is_bare and self._nominal.rests
 
     def end(self) -> None:
         """End the stream; nothing leaves until the next ``start``."""

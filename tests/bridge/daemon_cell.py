@@ -1,0 +1,204 @@
+"""A simulated cell that the daemon runs on: its controller, its bench, its cell file."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import socket
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.cell import load_cell
+from bridge.daemon import Daemon, settings_of
+from bridge.summary import RunSummary
+from bridge.supervisor import State
+from drivers.simulated.process import SimulatedController
+from drivers.simulated.settings import BENCH_PORT, ServerSettings, simulated_cell
+from drivers.ur_rtde.driver import OFFSET_SCRIPT
+
+Array = NDArray[np.float64]
+TCP = (0.0, 0.0, 0.18, 0.0, 0.0, 0.0)
+PAYLOAD, COG = 5.0, (0.0, 0.0, 0.06)
+_hosts = itertools.count(2)
+
+
+def own_address() -> str:
+    """Return a loopback address that no other test uses."""
+    pid = os.getpid()
+    return f"127.{1 + (pid >> 8) % 250}.{pid % 256}.{next(_hosts) + 100}"
+
+
+def plant(**changed: Any) -> ServerSettings:
+    given: dict[str, Any] = {"tcp": TCP, "payload_mass": PAYLOAD, "payload_cog": COG}
+    return simulated_cell("ur10e", own_address(), 11, **{**given, **changed})
+
+
+def wait_for(what: Callable[[], bool], limit: float, words: str) -> float:
+    """Wait until ``what`` holds; returns how long it took, s."""
+    begun = time.monotonic()
+    while not what():
+        waited = time.monotonic() - begun
+        assert waited < limit, f"{words}: not within {limit:g} s"
+        time.sleep(0.01)
+    return time.monotonic() - begun
+
+
+class Robot:
+    """A simulated controller with its bench, and a cell file that knows its true compliance."""
+
+    def __init__(self, folder: Path, settings: ServerSettings | None = None) -> None:
+        self.settings = settings or plant()
+        self.host = self.settings.host
+        self.folder = folder
+        self.controller = SimulatedController(self.settings, log_level="INFO")
+
+    def __enter__(self) -> Self:
+        self.controller.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.controller.stop()
+
+    def bench(self, line: str) -> str:
+        with socket.create_connection((self.host, BENCH_PORT), timeout=5) as link:
+            link.sendall(line.encode() + b"\n")
+            return link.makefile("r").readline().strip()
+
+    def truth(self) -> dict[str, Any]:
+        found: dict[str, Any] = json.loads(self.bench("truth"))
+        return found
+
+    def tcp(self, readings: int = 20) -> Array:
+        """Return the true TCP's position (3,) as the tracker sees it, m."""
+        rows = [self.bench("measure").split(",") for _ in range(readings)]
+        return np.array(rows, dtype=float).mean(axis=0)[1:4]
+
+    def start_offset_program(self) -> socket.socket:
+        """Start the program of the offset mode; it runs until the socket is closed."""
+        upload = socket.create_connection((self.host, self.settings.script_port), timeout=5)
+        upload.sendall(OFFSET_SCRIPT.read_bytes())
+        time.sleep(0.2)
+        return upload
+
+    def cell(self, link: str = "", **sections: str) -> Path:
+        """Write the cell file; ``link`` adds to its link, the others are whole sections."""
+        axial, radial = list(self.settings.plant.axial), list(self.settings.plant.radial)
+        text = textwrap.dedent(f"""\
+            robot: {{model: ur10e}}
+            tool: {{tcp: {{xyz: [0, 0, 0.18], rpy: [0, 0, 0]}}}}
+            payload: {{mass: {PAYLOAD}, cog: [0, 0, 0.06]}}
+            compliance: {{axial: {axial}, radial: {radial}}}
+            link: {{driver: ur_rtde, host: {self.host}{link}}}
+            recording: {{folder: recordings}}
+            """)
+        for name, body in sections.items():
+            text += f"{name}: {body}\n"
+        path = self.folder / "cell.yaml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+
+class Run:
+    """A daemon in a thread of the test; its loop is a process as always."""
+
+    def __init__(self, cell: Path, arm: bool = False, observe: bool = False,
+                 duration: float | None = None) -> None:  # fmt: skip
+        self.said: list[str] = []
+        settings = settings_of(load_cell(cell))
+        self.daemon = Daemon(settings, may_write=not observe, say=self.said.append)
+        self.summary: RunSummary | None = None
+        self.error: Exception | None = None
+        self._thread = threading.Thread(target=self._run, args=(arm, duration))
+
+    def _run(self, arm: bool, duration: float | None) -> None:
+        try:
+            self.summary = self.daemon.run(arm, duration)
+        except Exception as error:
+            self.error = error
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.daemon.stop()
+        self._thread.join(20)
+        assert not self._thread.is_alive()
+
+    def wait(self, state: State, limit: float = 30.0) -> float:
+        """Wait until the loop is in a state; returns how long it took, s."""
+
+        def there() -> bool:
+            assert self.error is None, self.error
+            return self.daemon.state == state
+
+        return wait_for(there, limit, f"{state.name} ({self.said})")
+
+    def end(self) -> RunSummary:
+        """Stop the run and return how it went."""
+        self.daemon.stop()
+        return self.join()
+
+    def join(self, limit: float = 30.0) -> RunSummary:
+        """Wait for the run's own end."""
+        self._thread.join(limit)
+        assert not self._thread.is_alive(), self.said
+        assert self.error is None, self.error
+        assert self.summary is not None
+        return self.summary
+
+    def cycles(self) -> dict[str, Any]:
+        """Return the recorded columns: arrays, and the states as words."""
+        return read_recording(self.daemon)
+
+
+def read_recording(daemon: Daemon) -> dict[str, Any]:
+    path = daemon.recording
+    assert path is not None
+    return read_cycles(path)
+
+
+def read_cycles(path: Path) -> dict[str, Any]:
+    """Return the whole lines of a recording by column."""
+    header, *lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    names = header.strip().split(",")
+    rows = [line.strip().split(",") for line in lines if line.endswith("\n")]
+    columns = {name: [row[i] for row in rows] for i, name in enumerate(names)}
+    states = columns.pop("state")
+    return {**{k: np.array(v, dtype=float) for k, v in columns.items()}, "state": states}
+
+
+def offsets(cycles: dict[str, Any]) -> Array:
+    """Return the TCP offsets (N, 6) of cycles that were written; zero where nothing was."""
+    found = np.stack([cycles[f"offset_{i}"] for i in range(6)], axis=1)
+    return np.where(cycles["written"][:, None] > 0, found, 0.0)
+
+
+def gapbridge(*arguments: object, folder: Path) -> subprocess.Popen[str]:
+    """Start the command line in a process of its own."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    return subprocess.Popen(
+        [sys.executable, "-m", "bridge.cli", *map(str, arguments)],
+        cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
