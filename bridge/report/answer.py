@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bridge.report.answer_picture import picture
 from bridge.report.fragment import badge, figure_block, html_of, paragraph
-from bridge.report.material import Material, after, chosen_channel
+from bridge.report.material import Material, after, chosen_channel, unexplained
 from bridge.report.words import (
     CHANNELS,
     VERDICTS,
@@ -66,7 +66,9 @@ def _size(channel: ChannelDiagnosis) -> str:
     }[channel.channel]  # fmt: skip
     per = "joint" if channel.channel in ("tracking", "torque") else "axis"
     floor = channel.noise_floor_rms
-    noise = "" if floor is None else f"; measurement noise makes {told(floor, unit)} of it"
+    # where structure is left over, part of it has gone into the estimate of the noise
+    most = "at most " if channel.structured else ""
+    noise = "" if floor is None else f"; measurement noise makes {most}{told(floor, unit)} of it"
     if floor is not None and floor >= channel.gap_rms:
         noise = f", no more than the measurement noise of {told(floor, unit)}"
     elif channel.verdict == "no_gap":
@@ -105,9 +107,7 @@ def _left(channel: ChannelDiagnosis) -> str:
     if channel.structured:
         names = [quantity_words(name) for name, share in channel.depends_on[:3] if share > 0.01]
         on = f" It depends on {listed(names)}." if names else ""
-        return (
-            f"{told(channel.unexplained_rms, channel.unit)} stays unexplained, more than noise.{on}"
-        )
+        return f"{told(unexplained(channel), channel.unit)} stays unexplained, more than noise.{on}"
     if channel.verdict == "no_gap":
         return "Nothing needs to be changed on account of this log."
     return "What remains looks like measurement noise, with no structure left in it."

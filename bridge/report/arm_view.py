@@ -50,7 +50,12 @@ def arm_figure(channel: ChannelDiagnosis, material: Material) -> Figure:
     )
     for name, error, colour in given:
         traces += _arrows(name, tip[keep], error[keep] * factor, colour, most)
-    layout = {"margin": {"l": 0, "r": 0, "t": 8, "b": 0}, "scene": _scene(), "hovermode": False}
+    layout = {
+        "margin": {"l": 0, "r": 0, "t": 8, "b": 0},
+        "scene": _scene(),
+        "legend": {"orientation": "h", "x": 0, "y": 1, "yanchor": "top"},
+        "hovermode": False,
+    }
     drawn = f" {len(keep)} of {len(gap)} samples are drawn." if len(keep) < len(gap) else ""
     return Figure(
         traces, layout, f"The arm at a few of its poses; arrows show where the tool really was, "
@@ -119,5 +124,5 @@ def _scene() -> dict[str, Any]:
         "aspectmode": "data", "dragmode": "turntable",
         "xaxis": axis | {"title": {"text": "x"}}, "yaxis": axis | {"title": {"text": "y"}},
         "zaxis": axis | {"title": {"text": "z"}},
-        "camera": {"eye": {"x": 1.55, "y": 1.3, "z": 0.7}, "center": {"x": 0, "y": 0, "z": -0.12}},
+        "camera": {"eye": {"x": 1.35, "y": 1.15, "z": 0.6}, "center": {"x": 0, "y": 0, "z": -0.12}},
     }  # fmt: skip

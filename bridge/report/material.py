@@ -51,7 +51,17 @@ def shares(channel: ChannelDiagnosis) -> Shares:
         return Shares(1 - rest, rest, 0.0)
     floor = channel.noise_floor_rms or 0.0
     noise = min(floor**2 / total, rest)
-    return Shares(1 - rest, noise, rest - noise)
+    # what a quantity predicts of samples that it did not see is no noise, whatever the floor says
+    foreseen = rest * max((share for _, share in channel.depends_on), default=0.0)
+    beyond = min(max(rest - noise, foreseen), rest)
+    return Shares(1 - rest, rest - beyond, beyond)
+
+
+def unexplained(channel: ChannelDiagnosis) -> float:
+    """Return the rms of what is left and no noise, in the channel's unit."""
+    return max(
+        channel.unexplained_rms, channel.gap_rms * float(np.sqrt(shares(channel).unexplained))
+    )
 
 
 def after(channel: ChannelDiagnosis) -> float:

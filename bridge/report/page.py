@@ -33,7 +33,7 @@ def write_report(
 
 def page(material: Material) -> str:
     """Return the whole page."""
-    name = escape(material.cell_name)
+    name = escape(_cell_words(material.cell_name))
     links = "".join(f'<a href="#{key}">{escape(s.title)}</a>' for key, s in SECTIONS.items())
     body = "".join(
         f'<section id="{key}"><h2>{escape(s.title)}</h2>'
@@ -54,6 +54,11 @@ def page(material: Material) -> str:
         f"<main>{body}</main>"
         f"<script>{get_plotlyjs()}</script><script>{_own('page.js')}</script></body></html>\n"
     )
+
+
+def _cell_words(name: str) -> str:
+    """Return a cell's name; of a path to a cell file, the file's own."""
+    return Path(name).stem if name.endswith((".yaml", ".yml")) else name
 
 
 def _arm_words(name: str) -> str:

@@ -1,6 +1,7 @@
 """The report: one file for every verdict, plain words, nothing in it that could run."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from report_cases import CASES, diagnosed
 
 from bridge.report import SECTIONS, write_report
 from bridge.report.arm_view import joint_origins
-from bridge.report.material import SHOWN, shares, thinned
+from bridge.report.material import SHOWN, shares, thinned, unexplained
 from bridge.report.parameters import _decimals
 from bridge.report.words import (
     EFFECTS,
@@ -87,6 +88,19 @@ def test_shares_add_up_to_one(case):
         part = shares(channel)
         assert part.explained + part.noise + part.unexplained == pytest.approx(1.0)
         assert min(part.explained, part.noise, part.unexplained) >= 0
+
+
+def test_what_a_quantity_foretells_is_not_called_noise():
+    channel = diagnosed("partly explained").diagnosis.channels[0]
+    blind = replace(channel, noise_floor_rms=channel.gap_rms, unexplained_rms=0.0)
+    assert shares(blind).unexplained > 0
+    assert unexplained(blind) > 0
+
+
+def test_a_path_to_a_cell_is_told_by_its_file(tmp_path):
+    c = diagnosed("no gap")
+    text = write_report(c.diagnosis, "a/b/line4.yaml", c.log, c.model, tmp_path).read_text("utf-8")
+    assert "<h1>line4: " in text
 
 
 def test_the_drawn_arm_ends_at_the_rigid_tcp():
