@@ -17,6 +17,8 @@ from drivers.simulated.settings import ServerSettings
 
 Array = NDArray[np.float64]
 READINGS_PERIOD = 0.01  # s between two readings of the tracker
+LONGEST_MOVE = 20.0  # s
+STANDING = 2e-4  # m between two looks, half a second apart
 
 
 class Bench:
@@ -51,6 +53,22 @@ class Bench:
         self.ask("wrench " + " ".join(f"{v:.9g}" for v in load.wrench))
         cog = ",".join(f"{v:.9g}" for v in load.cog)
         self._pendant(f"def hang():\n  set_payload({load.mass:.9g}, [{cog}])\nend\n")
+
+    def go(self, q: Array) -> None:
+        """Move the arm to ``q`` (6,) from the pendant, and wait until it stands there.
+
+        Raises LinkError where it does not come to rest in time.
+        """
+        numbers = ",".join(f"{v:.9g}" for v in q)
+        self._pendant(f"def go():\n  movej([{numbers}], a=1.0, v=0.7)\nend\n")
+        latest, before = time.monotonic() + LONGEST_MOVE, self.measure()
+        while time.monotonic() < latest:
+            time.sleep(0.5)
+            now = self.measure()
+            if np.linalg.norm(now[1:4] - before[1:4]) < STANDING:
+                return
+            before = now
+        raise LinkError(f"the arm did not come to rest within {LONGEST_MOVE:g} s")
 
     def _pendant(self, program: str) -> None:
         """Run a short program, as a person at the pendant would."""

@@ -81,7 +81,7 @@ def _job(
     cell: Cell, settings: ServerSettings, seed: int, out: Path, console: Console, begun: float
 ) -> tuple[Result, str]:
     home = np.array(settings.start_q)
-    session = Session(settings, home, out)
+    session = Session(settings, home, out, console.print)
     planned = plan(cell.model, home, seed)
     log = _calibrate(cell, session, planned, out, console)
     rows = read_log(log, cell.arm.n)
@@ -92,13 +92,14 @@ def _job(
         f"fitted on {found.samples} poses: gap {found.gap_rms * 1e3:.3f} mm per coordinate before, "
         f"{found.remaining_rms * 1e3:.3f} mm after"
     )
+    link = cell.link.driver if cell.link else ""
     seen = _Visits()
     for load, poses in zip(TEST_LOADS, planned.test, strict=True):
         _check(cell, calibrated, session, load, np.vstack([poses, poses]), seen, console)
     console.print("diagnosing the calibration log")
     diagnosis = answer(diagnose(cell.model, rows, cell.metrology))
     result = Result(
-        link=cell.file.link.driver if cell.file.link else "", seed=seed, identification=found, model=calibrated.model,
+        link=link, seed=seed, identification=found, model=calibrated.model,
         without=joined(seen.without), compensated=joined(seen.compensated),
         loads=tuple(seen.loads), setpoints_written=session.written, loop=session.figures(),
         duration=time.monotonic() - begun,

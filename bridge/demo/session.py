@@ -2,57 +2,83 @@
 
 from __future__ import annotations
 
+import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bridge.cell import Cell
-from bridge.daemon import run_daemon, settings_of
+from bridge.daemon import Daemon, settings_of
 from bridge.demo.bench import Bench, Tracker
 from bridge.demo.poses import Load
 from bridge.demo.rests import Rests, rests
 from bridge.demo.result import LoopFigures
 from bridge.demo.trajectory import visits, write_trajectory
 from bridge.summary import RunSummary
-from core.errors import RunError
+from bridge.supervisor import State
+from core.errors import LinkError, RunError
 from core.log import read_log
 from drivers.simulated.settings import ServerSettings
 
 Array = NDArray[np.float64]
+ATTEMPTS = 3
+MARGIN = 60.0  # s to connect, arm and end, on top of the trajectory
 
 
 class Session:
     """Runs of the daemon on one simulated cell, one after the other."""
 
-    def __init__(self, settings: ServerSettings, home: Array, folder: Path) -> None:
+    def __init__(
+        self, settings: ServerSettings, home: Array, folder: Path, tell: Callable[[str], None]
+    ) -> None:
         self._settings = settings
         self._home = home
         self._folder = folder
+        self._tell = tell
         self._runs: list[RunSummary] = []
 
     def visit(self, cell: Cell, load: Load, poses: Array) -> Rests:
         """Visit poses (M, n) with a load on the arm; returns what was measured at each.
 
         The daemon writes setpoints corrected by the cell's model: a cell without compliance is
-        one without compensation. Raises RunError where the run fails.
+        one without compensation. A run that breaks off is told and repeated from home. Raises
+        RunError where that does not help.
         """
-        write_trajectory(self._folder / "trajectory.csv", visits(self._home, poses))
-        self._hang(load)
-        with Tracker(self._settings) as tracker:
-            summary = run_daemon(settings_of(cell), arm=True)
-        self._runs.append(summary)
-        if summary.faults or summary.recording is None:
-            raise RunError(f"the daemon: {'; '.join(summary.faults) or 'recorded nothing'}")
-        recording = read_log(summary.recording, cell.arm.n)
-        return rests(recording.columns, tracker.readings(), poses)
-
-    def _hang(self, load: Load) -> None:
+        longest = write_trajectory(self._folder / "trajectory.csv", visits(self._home, poses))
         bench = Bench(self._settings)
         try:
             bench.hang(load)
+            for attempt in range(ATTEMPTS):
+                if attempt:
+                    bench.go(self._home)
+                try:
+                    return self._run(cell, poses, longest)
+                except (RunError, LinkError) as error:
+                    if attempt == ATTEMPTS - 1:
+                        raise
+                    self._tell(f"  the run broke off ({error}); once more")
+            raise AssertionError("unreachable")
         finally:
             bench.close()
+
+    def _run(self, cell: Cell, poses: Array, longest: float) -> Rests:
+        daemon = Daemon(settings_of(cell), may_write=True)
+        over = threading.Event()
+        watch = threading.Thread(target=_watch, args=(daemon, over, longest + MARGIN), daemon=True)
+        watch.start()
+        try:
+            with Tracker(self._settings) as tracker:
+                summary = daemon.run(arm=True)
+        finally:
+            over.set()
+        self._runs.append(summary)
+        if summary.faults or summary.recording is None:
+            raise RunError(summary.faults[0] if summary.faults else "nothing was recorded")
+        recording = read_log(summary.recording, cell.arm.n)
+        return rests(recording.columns, tracker.readings(), poses)
 
     @property
     def written(self) -> int:
@@ -69,3 +95,13 @@ class Session:
             cycles=cycles + missed,
             p99=max((r.age_ms["p99"] for r in self._runs), default=0.0) * 1e3,
         )
+
+
+def _watch(daemon: Daemon, over: threading.Event, longest: float) -> None:
+    """Stop a run that no longer writes: the daemon goes on observing after a fault."""
+    began, latest = False, time.monotonic() + longest
+    while not over.wait(0.1):
+        state = daemon.state
+        began |= state == State.COMPENSATING
+        if (began and not state.writes) or time.monotonic() > latest:
+            daemon.stop()
