@@ -53,6 +53,8 @@ class SetpointStream:
         self._longest_gap = LONGEST_GAP / rate
         self._ramp = 0.0
         self._last = 0.0  # s, controller time of the last setpoint
+        self._start_gap: Vector | None = None  # rad: where the arm stood minus the first setpoint
+        self._since_start = 0.0  # s
         self.unsolved = 0  # setpoints without a correction that meets the wanted pose
         self.residual = 0.0  # m, of the last correction
         self.clamped = 0  # bits of the last setpoint
@@ -68,6 +70,7 @@ class SetpointStream:
         self.limiter.start(own_q)
         self._nominal.start(own_q)
         self._ramp = 0.0
+        self._start_gap, self._since_start = None, 0.0
         # as if a setpoint had been there one cycle ago
         self._last = timestamp - self.limiter.limits.cycle
 
@@ -82,6 +85,8 @@ class SetpointStream:
         gap = state.timestamp - self._last
         usable = min(max(gap, 0.0), self._longest_gap)
         stream = self._nominal
+        if source_q is not None:
+            source_q = self._without_start_gap(source_q, usable)
         nominal = stream.brake(usable) if source_q is None else source_q
         step = usable / self._ramp_time
         ramp = min(max(goal, self._ramp - step), self._ramp + step)
@@ -100,6 +105,17 @@ class SetpointStream:
     def is_bare(self) -> bool:
         """Return whether no offset is left."""
         return self._ramp == 0.0 and not self.limiter.offset_in_base.any()
+
+    def _without_start_gap(self, source_q: Vector, gap: float) -> Vector:
+        """Return the source's setpoint, led over to from where the arm stood: no first jump."""
+        if self._start_gap is None:
+            self._start_gap = self._nominal.q - source_q
+        self._since_start += gap
+        share = self._since_start / self._ramp_time
+        if share >= 1.0:
+            return source_q
+        left = 1.0 - share * share * (3.0 - 2.0 * share)
+        return source_q + left * self._start_gap
 
     @property
     def rests(self) -> bool:
