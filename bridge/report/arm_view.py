@@ -14,7 +14,7 @@ from core.rotation import rotation_matrix
 
 ARROWS = 250
 DRAWN = 4  # poses in which the arm is drawn
-LENGTH = 0.12  # of the arm's reach: how long a large error's arrow is drawn
+LENGTH = 0.18  # of the arm's reach: how long a large error's arrow is drawn
 HEAD = 0.35  # of an arrow's length
 ARM = "#5b6770"
 
