@@ -1,0 +1,1 @@
+"""The command line, the cell, the daemon: everything that stands around core and drivers."""

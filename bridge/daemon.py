@@ -6,6 +6,7 @@ died (observing, never writing), records every cycle, and says at the end how it
 
 from __future__ import annotations
 
+import gc
 import signal
 import threading
 import time
@@ -19,7 +20,7 @@ from pydantic import ValidationError
 
 from bridge.cell import Cell, load_cell
 from bridge.daemon_settings import DaemonSettings
-from bridge.loop import Exit
+from bridge.loop import LONGEST_STOP, Exit
 from bridge.loop_process import LoopProcess
 from bridge.recorder import Recorder
 from bridge.shared_page import Command
@@ -29,7 +30,7 @@ from core.errors import CellError, InputError, LinkError
 
 TICK = 0.02  # s between two looks at the loop
 HEALTHY = 10.0  # s after which a restart counts as the first again
-STOP_MARGIN = 1.0  # s on top of the ramp: then a loop that does not end is ended
+STOP_MARGIN = 0.4  # s on top of the loop's own time: then it is ended by force
 
 Say = Callable[[str], None]
 
@@ -52,20 +53,21 @@ def settings_of(cell: Cell) -> DaemonSettings:
 
 
 def run_cell(
-    cell: Cell, observe: bool = False, arm: bool = False, duration: float | None = None
+    cell: Cell | Path, observe: bool = False, arm: bool = False, duration: float | None = None
 ) -> int:
     """Run a cell's daemon until it is stopped, its trajectory ends or ``duration`` s are over.
 
     Prints what happens and a summary; returns the exit code. Raises InputError for a cell that
     cannot be run, LinkError where the robot cannot be reached.
     """
-    settings = settings_of(cell)
+    settings = settings_of(cell if isinstance(cell, Cell) else load_cell(cell))
     summary = run_daemon(
         settings, observe=observe, arm=arm or settings.setpoints.arm, duration=duration,
         say=click.echo,
     )  # fmt: skip
     for line in summary.lines():
         click.echo(line)
+    gc.freeze()  # else Python's last collection, of all compiled code, delays the end by 0.5 s
     return summary.exit_code
 
 
@@ -173,7 +175,7 @@ class Daemon:
                 if over or (loop.page.ended and duration is None):
                     self._stopping.set()
                 if self._stopping.is_set() and stop_by is None:
-                    stop_by = time.monotonic() + self._longest_stop()
+                    stop_by = time.monotonic() + LONGEST_STOP + STOP_MARGIN
                     loop.ask_to_stop()
                 if loop.hangs or (stop_by is not None and time.monotonic() > stop_by):
                     self._fault(f"the loop stood still for {loop.page.silence:.2f} s and was ended")
@@ -185,10 +187,6 @@ class Daemon:
         finally:
             self._loop = None
             loop.close()
-
-    def _longest_stop(self) -> float:
-        limits = self._settings.limits
-        return limits.ramp_time + limits.offset / limits.offset_rate + STOP_MARGIN
 
     def _take(self, loop: LoopProcess) -> None:
         """Take cycles and events over from the loop."""

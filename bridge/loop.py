@@ -21,14 +21,9 @@ from bridge.live_loads import LiveLoads
 from bridge.setpoint_source.source import Source, SourceDryError
 from bridge.setpoint_stream import SetpointStream
 from bridge.shared_page import Command, Page, Phase
+from bridge.state_watch import StateWatch
 from bridge.supervisor import Cause, State, Supervisor
-from core.errors import (
-    InvalidStateError,
-    LimitError,
-    LinkError,
-    StaleStateError,
-    WriteError,
-)
+from core.errors import InvalidStateError, LimitError, LinkError, WriteError
 from core.loads import Loads
 from core.model import Model
 from core.setpoint import Setpoint
@@ -36,12 +31,11 @@ from core.state import RobotState
 from drivers.driver import Driver
 
 Vector = NDArray[np.float64]
-INVALID_IN_A_ROW = 3  # states that cannot be believed, after which they count as silence
-SILENCE = 0.2  # s without a state: a fault
-LOST = 3.0  # s without a state: the link is lost
-LOST_AFTER_WRITING = 0.5  # s: the library's writing half does not survive a break
 SETTLED, LONGEST_SETTLING = 2e-6, 0.3  # rad, s
 ROBOT_RUNNING, SAFE = 7, (1, 2)  # robot_mode; safety_mode normal, reduced
+
+LONGEST_STOP = 1.0  # s from a request to stop to letting go, at rest or not
+HASTY_RAMP = 0.5  # s: what a stop takes for the ramp at most
 
 Tell = Callable[[dict[str, Any]], None]
 
@@ -75,11 +69,9 @@ class Loop:
         )
         self._clock = ControllerClock(driver.rate)
         self._supervisor = Supervisor(self._changed)
+        self._watch = StateWatch(driver, self._supervisor, tell, self._lose)
         self._ready_to_write = False  # the driver is armed
-        self._has_written = False  # the library's writing half exists in this process
-        self._invalid = 0
         self._settling = 0.0  # s, monotonic: since when the last setpoint stands
-        self._heard = 0.0  # s, monotonic, of the last believable state
         self._stop_by: float | None = None  # s, monotonic
         self._exit: Exit | None = None
         self.stop_requested = False  # set by signal handlers
@@ -97,7 +89,7 @@ class Loop:
         except LinkError as error:
             self._tell({"failure": str(error)})
             return Exit.LINK
-        self._heard = time.monotonic()
+        self._watch.believe()
         self._supervisor.take(Cause.CONNECTED)
         self._page.enter(Phase.RUNNING)
         wanted = arm
@@ -127,10 +119,9 @@ class Loop:
 
     def _stop(self) -> None:
         """Ramp out, then end; a deadline makes sure of the end."""
-        limits = self._settings.limits
         if self._stop_by is None:
-            needed = limits.ramp_time + limits.offset / limits.offset_rate
-            self._stop_by = time.monotonic() + needed + 0.3
+            self._stop_by = time.monotonic() + LONGEST_STOP
+            self._stream.hasten(HASTY_RAMP)
             self._supervisor.take(Cause.STOP)
         if not self._supervisor.state.writes or time.monotonic() > self._stop_by:
             self._release()
@@ -145,15 +136,15 @@ class Loop:
     # -- one cycle --------------------------------------------------------------------------------
 
     def _cycle(self) -> None:
-        state = self._read()
+        state = self._watch.next()
         if state is None:
             return
         try:
             own = self._driver.nominal_q(state)
         except InvalidStateError as error:
-            self._doubt(str(error))
+            self._watch.doubt(str(error))
             return
-        self._heard, self._invalid = time.monotonic(), 0
+        self._watch.believe()
         missed = self._clock.take(state)
         self._page.tell_seen()
         self._check_robot(state)
@@ -162,34 +153,6 @@ class Loop:
             return  # the state is old by now
         written = self._write(state, own, loads) if self._supervisor.state.writes else None
         self._record(state, missed, own, loads, written)
-
-    def _read(self) -> RobotState | None:
-        try:
-            return self._driver.read_state()
-        except StaleStateError as error:
-            self._supervisor.take(Cause.STALE, str(error))
-            self._fall_silent(str(error))
-        except InvalidStateError as error:
-            self._doubt(str(error))
-        except LinkError as error:
-            self._lose(str(error))
-        return None
-
-    def _doubt(self, detail: str) -> None:
-        """Drop a state that cannot be believed; several in a row are as good as none."""
-        self._invalid += 1
-        if self._invalid == 1:
-            self._tell({"dropped": detail})
-        if self._invalid >= INVALID_IN_A_ROW:
-            self._supervisor.take(Cause.STALE, detail)
-        self._fall_silent(detail)
-
-    def _fall_silent(self, detail: str) -> None:
-        silent = time.monotonic() - self._heard
-        if silent > SILENCE:
-            self._supervisor.take(Cause.SILENCE, detail)
-        if silent > (LOST_AFTER_WRITING if self._has_written else LOST):
-            self._lose(detail)
 
     def _check_robot(self, state: RobotState) -> None:
         """Take note of a robot that cannot move, and of its coming back."""
@@ -236,7 +199,7 @@ class Loop:
     def _arm_driver(self, state: RobotState) -> None:
         """Make the driver ready, which takes a moment: a fresh state is needed after it."""
         self._page.enter(Phase.ARMING)
-        self._has_written = True
+        self._watch.has_written = True
         try:
             self._driver.arm(state)
             self._ready_to_write = True

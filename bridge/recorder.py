@@ -18,6 +18,7 @@ from bridge.cycle_row import OPTIONAL
 from bridge.settings import RecordingSettings
 from bridge.shared_page import slices_of
 from bridge.supervisor import State
+from core.errors import InputError
 
 Array = NDArray[np.float64]
 _VECTORS = (
@@ -45,7 +46,13 @@ class Recorder:
         self._events: IO[str] | None = None
         self._broken = False
         if settings.folder is not None:
-            self._open(settings.folder)
+            try:
+                self._open(settings.folder)
+            except OSError as error:
+                raise InputError(
+                    f"recording.folder: {settings.folder}: {error.strerror}, expected a folder "
+                    "that can be written"
+                ) from None
 
     def _open(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)

@@ -122,6 +122,10 @@ class SetpointStream:
         """Return whether no offset is left and the motion has come to rest."""
         return self.is_bare and self._nominal.rests
 
+    def hasten(self, ramp_time: float) -> None:
+        """Ramp within ``ramp_time`` s from now on, where it was to take longer."""
+        self._ramp_time = min(self._ramp_time, ramp_time)
+
     def end(self) -> None:
         """End the stream; nothing leaves until the next ``start``."""
         self.limiter.reset()

@@ -45,7 +45,7 @@ class RunSummary:
     """One run of the daemon. Times in ms and us as the names say."""
 
     cycles: int  # distinct controller timestamps seen
-    missed: int  # timestamps between them that were not
+    missed: int  # timestamps between them that were not; arming, a break of its own, is left out
     late: int  # cycles finished later than one period after their state
     rate_hz: float  # cycles per second of the controller's clock
     setpoints_written: int
