@@ -39,7 +39,7 @@ def assert_came_back_observing(run: Run, robot: Robot) -> None:
     assert summary.faults
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV, signal.SIGABRT])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
 def test_a_loop_that_dies_comes_back_observing(robot: Robot, number: signal.Signals) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.wait(State.COMPENSATING)

@@ -74,6 +74,12 @@ def test_a_second_run_in_the_same_second_has_a_file_of_its_own(tmp_path: Path) -
     assert record(tmp_path, [np.array([row(0)])]) != record(tmp_path, [np.array([row(1)])])
 
 
+def test_a_folder_that_cannot_be_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("a file")
+    with pytest.raises(InputError, match=r"recording\.folder: .*taken"):
+        Recorder(RecordingSettings(folder=tmp_path / "taken"), N)
+
+
 def test_without_a_folder_nothing_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
