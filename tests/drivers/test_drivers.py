@@ -1,0 +1,92 @@
+"""What every driver of the table must be, without any hardware."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+from bridge.settings import LinkSettings
+from core.arm import Arm, builtin_arm
+from core.errors import LinkError
+from core.model import Model
+from drivers import DRIVERS, make_driver
+from drivers.driver import Driver, DriverSettings
+
+
+@pytest.fixture
+def model() -> Model:
+    return Model(builtin_arm("ur5e"))
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+def test_a_driver_is_made_without_touching_hardware(name: str, model: Model) -> None:
+    settings = LinkSettings(driver=name, host="127.255.255.254")
+    driver = make_driver(settings, model)
+    assert isinstance(driver, Driver)
+    assert driver.n == model.arm.n
+    assert driver.rate == settings.rate
+    driver.close()  # also without connect, and again
+    driver.close()
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+def test_a_controller_that_is_not_there_is_a_link_error(name: str, model: Model) -> None:
+    driver = make_driver(LinkSettings(driver=name, host="127.255.255.254"), model)
+    with pytest.raises(LinkError, match=r"127\.255\.255\.254"):
+        driver.connect()
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+def test_reading_before_connecting_is_refused(name: str, model: Model) -> None:
+    driver = make_driver(LinkSettings(driver=name), model)
+    with pytest.raises(LinkError):
+        driver.read_state()
+
+
+def test_an_unknown_driver_is_told_with_those_that_exist(model: Model) -> None:
+    class Other(DriverSettings):
+        driver: str = "telepathy"
+
+    with pytest.raises(LinkError, match="found 'telepathy', expected one of ur_rtde"):
+        make_driver(Other(), model)
+
+
+def test_a_library_that_is_missing_is_told(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(DRIVERS, "ur_rtde", "drivers.nowhere:Nothing")
+    with pytest.raises(LinkError, match="its library cannot be imported"):
+        make_driver(LinkSettings(), model)
+
+
+def test_a_ur_has_six_joints(model: Model) -> None:
+    arm = model.arm
+    seven = Arm(
+        "seven", arm.link_in_link[[0, 1, 2, 3, 4, 5, 5, 6]], *(_grown(v) for v in _rows(arm)),
+        limits=type(arm.limits).none(7),
+    )  # fmt: skip
+    with pytest.raises(LinkError, match="7 joints"):
+        make_driver(LinkSettings(), Model(seven))
+
+
+def _rows(arm: Arm) -> tuple[Any, ...]:
+    return arm.mass, arm.cog, arm.inertia
+
+
+def _grown(values: Any) -> Any:
+    return values[[0, 1, 2, 3, 4, 5, 5]]
+
+
+def test_a_robots_library_is_loaded_only_when_its_driver_connects() -> None:
+    code = (
+        "import sys, drivers, bridge.settings\n"
+        "import drivers.ur_rtde.driver\n"
+        "assert not {'rtde_receive', 'rtde_control', 'rtde_io'} & set(sys.modules)\n"
+    )
+    paths = [p for p in sys.path if p]
+    found = subprocess.run(
+        [sys.executable, "-c", f"import sys; sys.path[:0] = {paths!r}\n{code}"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert found.returncode == 0, found.stderr
