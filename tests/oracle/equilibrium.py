@@ -32,43 +32,51 @@ class Case:
 
 def place(case: Case, bends: np.ndarray):
     """Return joint origins, links' rotations, links' centres, flange and TCP."""
-    turn, point = Rotation.identity(), np.zeros(3)
-    origins, turns, centres = [], [], []
-    for row, q, bend in zip(case.dh, case.q, bends, strict=True):
-        origins.append(point)
-        # the row's offset is part of the joint's own turn
-        joint = Rotation.from_euler("z", q + row.get("offset", 0.0))
-        link = turn * joint * Rotation.from_rotvec(bend)
-        turns.append(link)
-        point = point + link.apply([row["a"], 0.0, row["d"]])
-        turn = link * Rotation.from_euler("x", row["alpha"])
-        centres.append(point + turn.apply(row.get("cog", np.zeros(3))))
-    return origins, turns, centres, (turn, point), point + turn.apply(case.tool_position)
+    n = len(case.dh)
+    # the row's offset is part of the joint's own turn
+    angles = case.q + np.array([row.get("offset", 0.0) for row in case.dh])
+    joints = Rotation.from_rotvec(angles[:, None] * [0, 0, 1.0]) * Rotation.from_rotvec(bends)
+    twists = Rotation.from_rotvec([[row["alpha"], 0, 0] for row in case.dh]).as_matrix()
+    joints = joints.as_matrix()
+    turn, point = np.eye(3), np.zeros(3)
+    origins, turns, centres = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3))
+    for i, row in enumerate(case.dh):
+        origins[i] = point
+        turns[i] = turn @ joints[i]
+        point = point + turns[i] @ [row["a"], 0.0, row["d"]]
+        turn = turns[i] @ twists[i]
+        centres[i] = point + turn @ row.get("cog", np.zeros(3))
+    return origins, turns, centres, (turn, point), point + turn @ case.tool_position
 
 
 def residual(case: Case, flat: np.ndarray) -> np.ndarray:
     """Return bend minus compliance times moment, (3n,) rad."""
     bends = flat.reshape(-1, 3)
     origins, turns, centres, (flange, point), tcp = place(case, bends)
-    load_at = point + flange.apply(case.payload_cog)
+    mass = np.array([row.get("mass", 0.0) for row in case.dh])
+    points = np.vstack([centres, point + flange @ case.payload_cog, tcp])
+    forces = np.vstack([np.outer([*mass, case.payload], case.gravity), case.wrench[:3]])
     out = np.empty_like(bends)
     for i, origin in enumerate(origins):
-        moment = case.wrench[3:] + np.cross(tcp - origin, case.wrench[:3])
-        moment = moment + np.cross(load_at - origin, case.payload * case.gravity)
-        for centre, row in zip(centres[i:], case.dh[i:], strict=True):
-            moment = moment + np.cross(centre - origin, row.get("mass", 0.0) * case.gravity)
-        local = turns[i].inv().apply(moment)
-        out[i] = bends[i] - np.array([case.radial[i], case.radial[i], case.axial[i]]) * local
+        lever = points[i:] - origin
+        moment = case.wrench[3:] + np.cross(lever, forces[i:]).sum(axis=0)
+        softness = np.array([case.radial[i], case.radial[i], case.axial[i]])
+        out[i] = bends[i] - softness * (turns[i].T @ moment)
     return out.ravel()
 
 
 def solve(case: Case) -> tuple[np.ndarray, np.ndarray]:
     """Return TCP position (3,) and rotation (3, 3) of the bent arm."""
-    start = np.zeros(3 * len(case.dh))
-    found = root(lambda x: 1e3 * residual(case, x), start, method="hybr", options={"xtol": 1e-13})
+    unknowns = 3 * len(case.dh)
+    found = root(
+        lambda x: 1e3 * residual(case, x), np.zeros(unknowns), method="hybr",
+        jac=lambda x: 1e3 * np.eye(unknowns), options={"xtol": 1e-13},
+    )  # fmt: skip
+    if np.abs(residual(case, found.x)).max() > 1e-12:  # soft arms need the true Jacobian
+        found = root(lambda x: 1e3 * residual(case, x), found.x, options={"xtol": 1e-13})
     assert np.abs(residual(case, found.x)).max() < 1e-11, found.message
     _, _, _, (flange, _), tcp = place(case, found.x.reshape(-1, 3))
-    return tcp, (flange * case.tool_rotation).as_matrix()
+    return tcp, flange @ case.tool_rotation.as_matrix()
 
 
 def random_case(rng: np.random.Generator, dh: list[dict], payload: float, softness: float) -> Case:
