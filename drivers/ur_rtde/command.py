@@ -86,8 +86,11 @@ class ServoWriter:
         elif not self._control.isProgramRunning():
             self._control.reuploadScript()
             self._wait_running()
-        if not self._control.setWatchdog(self._settings.watchdog):
+        control = self._control
+        if not control.setWatchdog(self._settings.watchdog):
             raise WriteError(f"{host}: the controller refused the watchdog")
+        # comes back when the script takes commands again: else the first servoJ would wait for it
+        control.kickWatchdog()
         self._count, self._kicked = 0, 0.0
 
     def _open(self) -> Any:

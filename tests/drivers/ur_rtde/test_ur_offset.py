@@ -35,13 +35,14 @@ def test_an_offset_moves_the_tcp_and_is_taken_out_of_the_nominal_joints(
     out = run(
         offset_robot.host,
         f"""
+        driver.nominal_q(stream(5, {OFFSET}))  # what is compiled is compiled now
         state = stream(150, {OFFSET})
+        out["truth"] = bench.truth()["rigid_tcp"]
         out["applied"] = driver.reader.applied.tolist()
         out["echo"] = driver.reader.echo - driver._writer._sequence
         out["program"] = driver.reader.program
         out["nominal"] = (driver.nominal_q(state) - nominal).tolist()
         out["moved"] = float(np.abs(state.target_q - nominal).max())
-        out["truth"] = bench.truth()["rigid_tcp"]
         driver.release()
         state = read_for(150)
         out["released"] = driver.reader.applied.tolist()
@@ -203,3 +204,24 @@ def test_the_shipped_program_is_whole() -> None:
     # one cycle's steps: those of the simulator, and no more than the limiter's rates need
     assert "gb_shift_step = 0.0001" in text
     assert "gb_turn_step = 0.0002" in text
+
+
+def test_registers_that_another_client_holds_are_refused_in_one_line(
+    offset_robot: SimulatedController,
+) -> None:
+    out = run(
+        offset_robot.host,
+        """
+        other = make_driver(UrRtdeSettings(host=host, mode="offset"), model)
+        other.connect()
+        state = other.read_state()
+        out["unarmed"] = error_of(other.write_setpoint, setpoint(state, nominal, nominal))
+        other.release()
+        out["error"] = error_of(other.arm, state)
+        driver.close()
+        driver.close()
+        """,
+    )
+    assert "expected arm() first" in str(out["unarmed"])
+    assert str(out["error"]).startswith("WriteError: ")
+    assert "in use" in str(out["error"])

@@ -164,3 +164,62 @@ def test_writing_needs_arming_and_reading_first(controller: SimulatedController)
     )
     assert "expected read_state() first" in out["unread"]
     assert "expected arm() first" in out["unarmed"]
+
+
+def test_a_robot_that_another_client_controls_is_refused_in_one_line(
+    controller: SimulatedController,
+) -> None:
+    out = run_driver(
+        controller.host,
+        """
+        driver.connect()
+        driver.arm(driver.read_state())
+        driver._writer._control.stopScript()
+        state = read_for(50)
+        other = make_driver(UrRtdeSettings(host=host, remote_control=False), model)
+        other.connect()
+        out["error"] = error_of(other.arm, other.read_state())
+        """,
+    )
+    assert out["error"].startswith("WriteError: ")
+    assert "in use" in out["error"]
+    assert "\n" not in out["error"]
+
+
+def test_an_emergency_stop_ends_the_stream_and_arming_is_refused(
+    controller: SimulatedController,
+) -> None:
+    out = run(
+        controller.host,
+        """
+        stream(30, start + 0.005)
+        bench.do("emergency_stop")
+        error, after = "", 0
+        while not error and after < 200:
+            state, after = driver.read_state(), after + 1
+            error = error_of(driver.write_setpoint, setpoint(state, start, start))
+        out["error"] = error
+        out["rearm"] = error_of(driver.arm, read_for(20))
+        driver.close()
+        driver.close()
+        """,
+    )
+    assert str(out["error"]).startswith("WriteError: ")
+    assert "_mode: found" in str(out["rearm"])
+
+
+def test_the_first_setpoint_does_not_wait_for_the_script(controller: SimulatedController) -> None:
+    out = run(
+        controller.host,
+        """
+        took = []
+        for _ in range(20):
+            state = driver.read_state()
+            begun = time.monotonic()
+            driver.write_setpoint(setpoint(state, start, start))
+            took.append(time.monotonic() - begun)
+        out["first"], out["usual"] = took[0], sorted(took)[10]
+        """,
+    )
+    # a script that is not ready makes it wait a cycle or more, 2 to 11 ms
+    assert out["first"] < out["usual"] + 0.0015  # type: ignore[operator]
