@@ -15,7 +15,7 @@ from rich.console import Console
 
 from bridge.cell import Cell, load_cell, save_cell
 from bridge.cell.simulation import server_settings
-from bridge.cli.answer import answer
+from bridge.demo.diagnosing import Diagnosing
 from bridge.demo.page import page
 from bridge.demo.picture import picture
 from bridge.demo.poses import CALIBRATION_LOADS, TEST_LOADS, Load, Plan, plan
@@ -25,7 +25,6 @@ from bridge.demo.session import Session
 from bridge.demo.terminal import show
 from bridge.output_file import write_text
 from bridge.warm_up import warm_up
-from core.diagnosis.diagnosis import diagnose
 from core.errors import InputError, RunError
 from core.identification import identify_compliance
 from core.log import read_log
@@ -39,6 +38,7 @@ from drivers.simulated.settings import (
 )
 
 Array = NDArray[np.float64]
+VISITS = 3  # of each test pose: what differs between them is the arm's repeatability
 LINKS = ("ur_rtde",)
 PORTS = (RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, BENCH_PORT)
 LAST_HOST = 60  # 127.0.0.2 to this are tried
@@ -56,8 +56,9 @@ class _Visits:
 def run_demo(seed: int, out: Path, link: str = "ur_rtde", console: Console | None = None) -> Result:
     """Do the whole job on a simulated cell, write its results into ``out`` and print them.
 
-    Writes summary.json, report.html, picture.svg, calibration.csv, and the cells before and after
-    the fit. Raises InputError for an unknown link, RunError where the job fails.
+    Writes summary.json, report.html, picture.svg, calibration.csv, the cells before and after the
+    fit, and the diagnosis of the calibration log. Raises InputError for an unknown link, RunError
+    where the job fails.
     """
     if link not in LINKS:
         raise InputError(f"--link: found {link!r}, expected one of {', '.join(LINKS)}")
@@ -84,23 +85,23 @@ def _job(
     session = Session(settings, home, out, console.print)
     planned = plan(cell.model, home, seed)
     log = _calibrate(cell, session, planned, out, console)
-    rows = read_log(log, cell.arm.n)
-    found = identify_compliance(cell.model, rows, cell.metrology)
+    found = identify_compliance(cell.model, read_log(log, cell.arm.n), cell.metrology)
     save_cell(cell, out / "calibrated.yaml", found.model)
     calibrated = load_cell(out / "calibrated.yaml")
     console.print(
         f"fitted on {found.samples} poses: gap {found.gap_rms * 1e3:.3f} mm per coordinate before, "
         f"{found.remaining_rms * 1e3:.3f} mm after"
     )
-    link = cell.link.driver if cell.link else ""
     seen = _Visits()
-    for load, poses in zip(TEST_LOADS, planned.test, strict=True):
-        _check(cell, calibrated, session, load, np.vstack([poses, poses]), seen, console)
-    console.print("diagnosing the calibration log")
-    diagnosis = answer(diagnose(cell.model, rows, cell.metrology))
+    with Diagnosing(log, cell.path, out / "diagnosis") as diagnosing:
+        for load, poses in zip(TEST_LOADS, planned.test, strict=True):
+            visits = np.tile(poses, (VISITS, 1))
+            _check(cell, calibrated, session, load, visits, seen, console)
+        console.print("diagnosing the calibration log")
+        diagnosis = diagnosing.answer()
     result = Result(
-        link=link, seed=seed, identification=found, model=calibrated.model,
-        without=joined(seen.without), compensated=joined(seen.compensated),
+        link=cell.link.driver if cell.link else "", seed=seed, identification=found,
+        model=calibrated.model, without=joined(seen.without), compensated=joined(seen.compensated),
         loads=tuple(seen.loads), setpoints_written=session.written, loop=session.figures(),
         duration=time.monotonic() - begun,
     )  # fmt: skip

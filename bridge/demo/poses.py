@@ -42,9 +42,9 @@ class Load:
 
 
 CALIBRATION_LOADS = (
-    Load("nothing", 0.0),
-    Load("10 kg", 10.0),
-    Load("4 kg and a pull", 4.0, wrench=(25.0, 30.0, -10.0, 0.0, 0.0, 0.0)),
+    Load("5 kg", 5.0),
+    Load("12 kg", 12.0),
+    Load("4 kg and a pull", 4.0, wrench=(40.0, 50.0, -30.0, 0.0, 0.0, 0.0)),
 )
 TEST_LOADS = (
     Load("12 kg", 12.0, (0.01, 0.0, 0.08)),
@@ -101,7 +101,7 @@ class Plan:
     test: tuple[Array, ...]  # per test load (M, 6), none of them in the calibration
 
 
-def plan(model: Model, home: Array, seed: int, calibrate: int = 10, test: int = 5) -> Plan:
+def plan(model: Model, home: Array, seed: int, calibrate: int = 11, test: int = 4) -> Plan:
     """Return telling poses per calibration load and random ones per test load (so many each)."""
     free = candidates(model, seed)
     n = model.arm.n

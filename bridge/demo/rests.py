@@ -15,7 +15,8 @@ from core.rotation import rotation_matrix, rotation_vector
 
 Array = NDArray[np.float64]
 STILL = 0.003  # rad/s: slower than this, the arm stands
-SETTLING = 0.3  # s from standing still until readings count
+SETTLING = 0.15  # s from standing still until readings count
+LEAVING = 0.04  # s before it moves on from which they no longer count
 FEWEST = 8  # readings of the tracker at one rest
 NEAR = 0.05  # rad between a visited pose and the one that was meant
 
@@ -59,7 +60,7 @@ def _spans(recording: Mapping[str, Array]) -> list[slice]:
     still = np.abs(recording["actual_qd"]).max(axis=1) < STILL
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
     pairs = zip(edges[::2], edges[1::2] - 1, strict=True)
-    return [slice(a, b + 1) for a, b in pairs if t[b] - t[a] > SETTLING + 0.05]
+    return [slice(a, b + 1) for a, b in pairs if t[b] - t[a] > SETTLING + LEAVING]
 
 
 def _next_span(recording: Mapping[str, Array], spans: list[slice], pose: Array) -> slice | None:
@@ -75,13 +76,13 @@ def _rest(
     recording: Mapping[str, Array], readings: Array, span: slice, pose: Array, number: int
 ) -> tuple[Array, ...]:
     t = recording["timestamp"][span]
-    begin, end = t[0] + SETTLING, t[-1] - 0.01
+    begin, end = t[0] + SETTLING, t[-1] - LEAVING
     seen = readings[(readings[:, 0] >= begin) & (readings[:, 0] <= end)]
     if len(seen) < FEWEST:
         raise RunError(
             f"visit {number + 1}: found {len(seen)} readings of the tracker, expected {FEWEST}"
         )
-    during = np.arange(span.start, span.stop)[t >= begin]
+    during = np.arange(span.start, span.stop)[(t >= begin) & (t <= end)]
     return (
         np.array(begin),
         pose,

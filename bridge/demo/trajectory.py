@@ -14,7 +14,7 @@ PERIOD = 0.002  # s
 SPEED = 1.8  # rad/s, fastest joint in the middle of a move
 ACCELERATION = 14.0  # rad/s2, fastest joint
 SHORTEST = 0.3  # s a move takes at least
-REST = 0.65  # s at each pose: settle, then be measured
+REST = 0.45  # s at each pose: settle, then be measured
 
 
 def move(start: Array, goal: Array) -> Array:

@@ -1,0 +1,59 @@
+"""The diagnosis of the calibration log, by the command that users have, while the arm moves on."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from core.errors import RunError
+
+LONGEST = 120.0  # s
+POLITE = 10  # niceness: the loop comes first
+
+
+class Diagnosing:
+    """``gapbridge diagnose`` as a process of its own while the ``with`` block lasts."""
+
+    def __init__(self, log: Path, cell: Path, out: Path) -> None:
+        self._command = [
+            sys.executable, "-m", "bridge.cli", "diagnose", str(log), "--cell", str(cell),
+            "--out", str(out),
+        ]  # fmt: skip
+        self._process: subprocess.Popen[str] | None = None
+
+    def __enter__(self) -> Self:
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+        self._process = subprocess.Popen(
+            self._command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            stdin=subprocess.DEVNULL, env=environment, preexec_fn=_be_polite,
+        )  # fmt: skip
+        return self
+
+    def answer(self) -> str:
+        """Wait for the answer in plain sentences. Raises RunError where there is none."""
+        assert self._process is not None
+        try:
+            told, _ = self._process.communicate(timeout=LONGEST)
+        except subprocess.TimeoutExpired:
+            raise RunError(f"the diagnosis did not end within {LONGEST:g} s") from None
+        if self._process.returncode:
+            raise RunError(f"the diagnosis failed: {told.strip()[-300:]}")
+        return told.strip()
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._process is not None and self._process.poll() is None:
+            self._process.kill()
+            self._process.wait()
+
+
+def _be_polite() -> None:
+    os.nice(POLITE)
