@@ -16,7 +16,7 @@ body { font: 16px/1.5 system-ui, sans-serif; color: #1f2933; max-width: 980px; m
 h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2rem; }
 table { border-collapse: collapse; } td, th { padding: .2rem .8rem; text-align: right; }
 th { border-bottom: 1px solid #9aa5b1; } .figures td:first-child { text-align: left; }
-svg { max-width: 100%; height: auto; } pre { background: #f5f7fa; padding: 1rem; overflow-x: auto; }
+svg { max-width: 100%; height: auto; } pre { background: #f5f7fa; padding: 1rem; white-space: pre-wrap; }
 """
 
 
@@ -37,6 +37,7 @@ def page(result: Result, diagnosis: str) -> str:
         "<h2>What was found of the arm</h2>", charts[1], _flexibility_table(result),
         "<h2>What the diagnosis says of the calibration log</h2>",
         f"<pre>{escape(diagnosis)}</pre>",
+        '<p>In pictures: <a href="diagnosis/report.html">the diagnosis</a>.</p>',
         "<h2>How it was done</h2>", _figures(result),
         "</body></html>",
     ]) + "\n"  # fmt: skip
@@ -95,7 +96,12 @@ def _flexibilities(result: Result) -> str:
     found = result.identification
     joints = [f"joint {i + 1}" for i in range(len(found.axial))]
     traces = [
-        go.Bar(x=joints, y=value * 1e6, name=name, error_y={"array": 2e6 * np.where(shown, std, 0)})
+        go.Bar(
+            x=joints,
+            y=np.where(shown, value * 1e6, 0),
+            name=name,
+            error_y={"array": 2e6 * np.where(shown, std, 0)},
+        )
         for name, value, std, shown in (
             ("axial", found.axial, found.std_axial, found.identifiable[: len(joints)]),
             ("radial", found.radial, found.std_radial, found.identifiable[len(joints) :]),
@@ -106,10 +112,18 @@ def _flexibilities(result: Result) -> str:
 
 def _flexibility_table(result: Result) -> str:
     found = result.identification
+    n = len(found.axial)
+
+    def cell(value: float, std: float, shown: bool) -> str:
+        told = f"{value * 1e6:.3f} ± {std * 1e6:.3f}" if shown else "not shown by these poses"
+        return f"<td>{told}</td>"
+
     rows = "".join(
-        f"<tr><td>{i + 1}</td><td>{found.axial[i] * 1e6:.3f} ± {found.std_axial[i] * 1e6:.3f}</td>"
-        f"<td>{found.radial[i] * 1e6:.3f} ± {found.std_radial[i] * 1e6:.3f}</td></tr>"
-        for i in range(len(found.axial))
+        f"<tr><td>{i + 1}</td>"
+        + cell(found.axial[i], found.std_axial[i], bool(found.identifiable[i]))
+        + cell(found.radial[i], found.std_radial[i], bool(found.identifiable[n + i]))
+        + "</tr>"
+        for i in range(n)
     )
     notes = "".join(f"<li>{escape(n)}</li>" for n in (*found.notes, *found.combinations))
     return (

@@ -106,7 +106,7 @@ def _bars(result: Result) -> str:
     errors = figures["tcp_error_mm"]
     without, with_it = errors["without"]["rms"], errors["with"]["rms"]
     repeats = figures["repeatability_mm"]
-    parts.append(_bold(490, 388, f"without compensation {without:.2f} mm rms", RED))
-    parts.append(_bold(490, 406, f"with compensation {with_it:.3f} mm rms", GREEN))
-    parts.append(_bold(752, 388, f"the arm repeats to {repeats:.3f} mm", "#6b7785"))
+    parts.append(_bold(490, 370, f"without compensation {without:.2f} mm rms", RED))
+    parts.append(_bold(490, 388, f"with compensation {with_it:.3f} mm rms", GREEN))
+    parts.append(_bold(490, 406, f"the arm repeats to {repeats:.3f} mm", "#6b7785"))
     return "\n".join(parts)
