@@ -151,8 +151,12 @@ class Loop:
         loads = self._loads.update(state)
         if self._supervisor.state == State.ARMED and self._start(state, own):
             return  # the state is old by now
+        holding = self._supervisor.state == State.HOLDING
         written = self._write(state, own, loads) if self._supervisor.state.writes else None
         self._record(state, missed, own, loads, written)
+        if written is not None and holding and self._at_rest(written, state):
+            self._release()  # takes a moment: after the cycle has been timed
+            self._supervisor.take(Cause.RAMPED_OUT)
 
     def _check_robot(self, state: RobotState) -> None:
         """Take note of a robot that cannot move, and of its coming back."""
@@ -228,9 +232,6 @@ class Loop:
             self._ready_to_write = False
             self._lose(str(error))
             return None
-        if holding and self._at_rest(setpoint, state):
-            self._release()
-            self._supervisor.take(Cause.RAMPED_OUT)
         return setpoint
 
     def _at_rest(self, setpoint: Setpoint, state: RobotState) -> bool:

@@ -6,6 +6,7 @@ import pytest
 from driver_runs import run_driver
 
 from drivers.simulated.process import SimulatedController
+from drivers.ur_rtde.settings import UrRtdeSettings
 
 
 def test_a_state_is_the_plants(controller: SimulatedController) -> None:
@@ -82,15 +83,17 @@ def test_a_frozen_clock_is_stale_in_time_although_packets_flow(
         out["error"], out["after"] = until_error(2.0)
         out["connected"] = driver.reader._receive.isConnected()
         bench.do("thaw")
-        time.sleep(0.05)
-        out["again"] = driver.read_state().timestamp > 0
+        begun = time.monotonic()
+        while error_of(driver.read_state) and time.monotonic() - begun < 5.0:
+            time.sleep(0.01)
+        out["again"] = error_of(driver.read_state)
         """,
         state_timeout=0.05,
     )
     assert out["error"].startswith("StaleStateError: ")
     assert 0.04 < out["after"] < 0.5
     assert out["connected"]  # which is why nobody asks it
-    assert out["again"]
+    assert out["again"] == ""
 
 
 def test_a_stalled_and_a_dropped_link_are_stale(controller: SimulatedController) -> None:
@@ -99,16 +102,16 @@ def test_a_stalled_and_a_dropped_link_are_stale(controller: SimulatedController)
         """
         driver.connect()
         read_for(20)
-        bench.do("stall 0.4")
+        bench.do("stall 0.8")
         out["stalled"], out["after"] = until_error(2.0)
-        time.sleep(0.5)
+        time.sleep(1.0)
         read_for(20)
         bench.do("drop")
         out["dropped"], _ = until_error(2.0)
         """,
     )
     assert out["stalled"].startswith("StaleStateError: ")
-    assert out["after"] < 0.3
+    assert out["after"] < 0.7
     assert out["dropped"].startswith("StaleStateError: ")
 
 
@@ -230,3 +233,9 @@ def test_torques_need_the_motors_constants(controller: SimulatedController) -> N
     for torque, current, constant in zip(out["torque"], out["current"], range(10, 16), strict=True):
         assert torque == pytest.approx(current * constant, abs=0.1 + 0.5 * abs(torque))
     assert any(abs(t) > 1e-3 for t in out["torque"])
+
+
+@pytest.mark.parametrize("host", ["", "127.0.0.2:30004", "::1", " 127.0.0.2"])
+def test_hosts_that_the_library_cannot_reach_are_refused(host: str) -> None:
+    with pytest.raises(ValueError, match="without a port"):
+        UrRtdeSettings(host=host)
