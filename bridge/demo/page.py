@@ -16,7 +16,8 @@ body { font: 16px/1.5 system-ui, sans-serif; color: #1f2933; max-width: 980px; m
 h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2rem; }
 table { border-collapse: collapse; } td, th { padding: .2rem .8rem; text-align: right; }
 th { border-bottom: 1px solid #9aa5b1; } .figures td:first-child { text-align: left; }
-svg { max-width: 100%; height: auto; } pre { background: #f5f7fa; padding: 1rem; white-space: pre-wrap; }
+svg { max-width: 100%; height: auto; }
+pre { background: #f5f7fa; padding: 1rem; white-space: pre-wrap; }
 """
 
 

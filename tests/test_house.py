@@ -1,0 +1,53 @@
+"""What the house promises about itself: packages, commands and cells that are named exist."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from bridge.cli.table import COMMANDS
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+
+
+def test_every_package_is_listed_for_the_build() -> None:
+    listed = set(PROJECT["tool"]["setuptools"]["packages"])
+    found = {
+        ".".join(path.relative_to(ROOT).parts)
+        for top in ("core", "drivers", "bridge")
+        for path in [ROOT / top, *(ROOT / top).rglob("*/")]
+        if path.is_dir() and list(path.glob("*.py"))
+    }
+    assert found <= listed
+    assert {p for p in listed if (ROOT / p.replace(".", "/")).is_dir()} == listed
+
+
+def test_every_data_file_of_a_package_is_listed_for_the_build() -> None:
+    listed = PROJECT["tool"]["setuptools"]["package-data"]
+    for top in ("core", "drivers", "bridge"):
+        shipped = {path for pattern in listed[top] for path in (ROOT / top).glob(pattern)}
+        for path in (ROOT / top).rglob("*"):
+            if path.suffix in (".yaml", ".script", ".css", ".js", ".html", ".typed"):
+                assert path in shipped, f"{path} would be missing in an installation"
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_readme_names_every_command(name: str) -> None:
+    assert f"`gapbridge {name}" in README
+
+
+def test_files_that_the_readme_names_exist() -> None:
+    named = set(re.findall(r"(?:config|docs|drivers|bridge)/[\w./]+\.\w+", README))
+    assert named
+    for name in named:
+        assert (ROOT / name).is_file(), name
+
+
+@pytest.mark.parametrize("target", ["demo", "test", "check", "coverage"])
+def test_make_has_the_targets_that_are_promised(target: str) -> None:
+    assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
