@@ -5,7 +5,7 @@ import pytest
 from oracle import equilibrium as oracle
 from test_equilibrium import SEVEN
 
-from benchmarks.evidence import paper
+from benchmarks.evidence import paper, poses
 from benchmarks.evidence.finite_elements import STIFF
 from core.arm import arm_from_dh, builtin_rows
 from core.errors import ExcitationError, LogError
@@ -87,6 +87,7 @@ def test_errors_of_the_flexibilities_are_as_large_as_their_intervals_say():
         z.append((np.concatenate([found.axial, found.radial]) - planted) / std)
         np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)), std)
     assert 0.75 < np.sqrt(np.mean(np.square(z))) < 1.3
+    assert np.abs(z).max() < 4
 
 
 def test_a_frame_that_nobody_registered_is_found_along():
@@ -217,3 +218,18 @@ def test_the_linear_form_predicts_finite_elements_from_the_true_flexibilities(na
     for part in (slice(3), slice(3, 6)):
         scale = np.abs(case.deflection[:, part]).max()
         np.testing.assert_allclose(linear[:, part], case.deflection[:, part], atol=1e-4 * scale)
+
+
+def test_fifty_noisy_poses_foretell_fifty_others_of_finite_elements_to_the_noise():
+    columns = poses.measured(paper.frame_arm("ur10e", np.random.default_rng(1)),
+                             np.random.default_rng(1), "ur10e")  # fmt: skip
+    for registered in (True, False):
+        found = poses.tell("ur10e", columns, 1, registered)
+        rest = slice(poses.POSES, None)
+        loads = Loads(columns["payload"], columns["payload_cog"], columns["actual_TCP_force"])[rest]
+        predicted = found.model.predict(columns["actual_q"][rest], loads).position
+        if registered:
+            gap = predicted - columns["measured_position"][rest]
+            # what the model is off from the truth, the noise of a reading beside it
+            assert np.sqrt(np.mean(gap**2) + poses.NOISE**2) < 1.2 * poses.NOISE
+        assert found.remaining_rms_held_out < 1.2 * poses.NOISE
