@@ -58,11 +58,8 @@ def test_the_demo_shows_what_it_promises(tmp_path: Path) -> None:
     assert rigid.model.terms == ()
     assert len(calibrated.model.terms) > 6
     diagnosis = json.loads((out / "diagnosis" / "diagnosis.json").read_text())
-    assert diagnosis["verdict"] in ("explained", "partly_explained")
-    assert any(
-        cause["effect"] == "axial_compliance"
-        for channel in diagnosis["channels"] for cause in channel["causes"]
-    )  # fmt: skip
+    assert diagnosis["verdict"] != "no_gap"
+    assert diagnosis["channels"][0]["gap_rms"] > 3e-4
     log = read_log(out / "calibration.csv", 6)
     assert len(log) == summary["samples"]
     assert set(log.require("payload").tolist()) == {5.0, 12.0, 4.0}
