@@ -150,7 +150,7 @@ def test_one_pose_shows_too_little_for_a_held_out_figure():
     _, columns = truth(6, 12, 7, still=range(6))
     found = identify_compliance(model_of(6), log_of(6, columns), KNOWN)
     assert np.isnan(found.remaining_rms_held_out)
-    assert found.remaining_rms > 0
+    assert found.remaining_rms < 2 * NOISE
 
 
 def test_flexibilities_stay_at_or_above_zero_unless_asked_otherwise():
