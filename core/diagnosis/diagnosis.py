@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from core.diagnosis.cause import Cause, Considered, causes_of, considered_of
 from core.diagnosis.held_out import HeldOut
 from core.diagnosis.judgement import Judgement, judge, pure_error
 from core.diagnosis.location import Where, locate
-from core.diagnosis.observation import NotObservable, Observation
+from core.diagnosis.observation import NotObservable, Observation, thinned
 from core.diagnosis.selection import Selection, select
 from core.diagnosis.separation import Measurement, next_measurements
 from core.diagnosis.suspicion import check_units, findings
@@ -32,6 +32,10 @@ CHANNELS: Mapping[str, Observe] = {
     "tracking": tracking.observe,
     "torque": torque.observe,
 }
+
+
+# samples that a diagnosis looks at: more cost time and tell hardly more
+MOST = {"position": 450, "wrench": 300, "tracking": 300, "torque": 300}
 
 
 @dataclass(frozen=True)
@@ -103,6 +107,11 @@ def diagnose(
         if isinstance(seen, NotObservable):
             hidden.append(seen)
             continue
+        if len(seen.rows) > MOST[seen.channel]:
+            told.append(
+                f"{seen.channel}: {MOST[seen.channel]} of {len(seen.rows)} rows were taken, evenly"
+            )
+            seen = _thinned(seen, model, log, metrology, observe)
         enough = _enough(seen)
         if enough is not None:
             told.append(enough)
@@ -119,6 +128,21 @@ def diagnose(
         _overall(observed), tuple(observed), tuple(hidden),
         next_measurements(model, log, observed), tuple(told), with_found(model, terms),
     )  # fmt: skip
+
+
+def _thinned(
+    seen: Observation, model: Model, log: Log, metrology: Metrology, observe: Observe
+) -> Observation:
+    """Return the channel with fewer samples; poses are looked at anew, so that frames stay free."""
+    if seen.channel != "position":
+        return thinned(seen, MOST[seen.channel])
+    take = np.unique(np.linspace(0, len(seen.rows) - 1, MOST["position"]).astype(int))
+    # last motions come from neighbouring rows: they are told before rows are left out
+    approach = log.approach()
+    columns = dict(log.columns) | ({} if approach is None else {"approach": approach})
+    part = observe(model, replace(log, columns=columns).select(seen.rows[take]), metrology)
+    assert isinstance(part, Observation)
+    return replace(part, rows=seen.rows[take])
 
 
 def with_found(model: Model, terms: Sequence[Term]) -> Model:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,3 +54,33 @@ class Observation:
         """Return d prediction / d axial compliance (N, k, n), to first order."""
         assert self.joint_columns is not None and self.axial_moment is not None
         return self.joint_columns * self.axial_moment[:, None, :]
+
+
+def thinned(observation: Observation, most: int) -> Observation:
+    """Return the observation with at most so many samples, evenly taken; predictions stay whole.
+
+    Delays and derivatives are then still those of the full log.
+    """
+    count = len(observation.rows)
+    if count <= most:
+        return observation
+    take = np.unique(np.linspace(0, count - 1, most).astype(int))
+    whole = observation.predict
+
+    def some(columns: Array | None) -> Array | None:
+        return None if columns is None else columns[take]
+
+    return replace(
+        observation,
+        measured=observation.measured[take],
+        predict=lambda terms: whole(terms)[take],
+        nuisance=observation.nuisance[take],
+        quantities={name: z[take] for name, z in observation.quantities.items()},
+        groups=observation.groups[take],
+        rows=observation.rows[take],
+        joint_columns=some(observation.joint_columns),
+        unnamed=tuple((target, columns[take]) for target, columns in observation.unnamed),
+        tool_axes=some(observation.tool_axes),
+        axial_moment=some(observation.axial_moment),
+        rebase=None,
+    )

@@ -9,7 +9,7 @@ Sets grow in a beam and are then improved by dropping and swapping.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from core.diagnosis.candidate import Candidate
 
 Array = NDArray[np.float64]
+BEST_LINES = 10  # lines of a joint that a search looks at
+BEST_SMOOTH = 60  # smooth functions that a search looks at
+LARGE = 900  # rows of the sample space from which the beam is narrow
 MERGED = 9  # terms up to which every pair is tried against one
 BEAM = 6
 DEPTH = 16
@@ -207,6 +210,59 @@ def _children(
     return found
 
 
+def screened(space: Space, base: Sequence[int] = ()) -> NDArray[np.int64]:
+    """Return the candidates worth a search: all single causes, the best of the many alike.
+
+    Periodic lines and smooth functions come by the thousand; of each joint's lines and of all
+    smooth functions only those are kept that take most of the gap as it is, of what a fit of all
+    single causes leaves, or of what ``base`` leaves.
+    """
+    many = np.array([_many(c) for c in space.candidates])
+    keep = set(np.flatnonzero(~many))
+    single = space.columns(sorted(keep))
+    unit = single / (np.sqrt(np.einsum("ij,ij->j", single, single)) + 1e-300)
+    ridge = unit.T @ unit + 1e-2 * np.eye(unit.shape[1])
+    left = space.y - unit @ np.linalg.solve(ridge, unit.T @ space.y)
+    targets = [space.y, left]
+    if base:
+        state = _projected(space, base)
+        targets.append(state.r)
+    for r in targets:
+        gain, _ = gains(space, space.X, r)
+        pools: dict[tuple[str, int | None], list[int]] = {}
+        for c in np.flatnonzero(many)[np.argsort(-(gain[many] / space.price[many]))]:
+            candidate = space.candidates[c]
+            pool = pools.setdefault((candidate.family, candidate.site.joint), [])
+            if len(pool) < (BEST_LINES if candidate.named else BEST_SMOOTH):
+                pool.append(int(c))
+        keep.update(c for pool in pools.values() for c in pool)
+    return np.array(sorted(keep | set(base)))
+
+
+def _many(candidate: Candidate) -> bool:
+    """Return whether a candidate is one of very many alike."""
+    line = candidate.family == "transmission_error"
+    return not candidate.named or (line and candidate.site.order not in USUAL_ORDERS)
+
+
+def part(space: Space, keep: NDArray[np.int64]) -> Space:
+    """Return the space with some of its candidates only."""
+    columns = np.concatenate([np.arange(space.start[c], space.start[c + 1]) for c in keep])
+    size = np.diff(space.start)[keep]
+    return replace(
+        space, X=np.ascontiguousarray(space.X[:, columns]),
+        start=np.concatenate([[0], np.cumsum(size)]),
+        candidates=tuple(space.candidates[c] for c in keep), price=space.price[keep],
+    )  # fmt: skip
+
+
+def screened_search(space: Space, depth: int = DEPTH, base: Sequence[int] = ()) -> Found:
+    """Return the best set among the candidates worth a search, in the indices of ``space``."""
+    keep = screened(space, base)
+    found = search(part(space, keep), depth)
+    return replace(found, chosen=tuple(int(keep[c]) for c in found.chosen))
+
+
 def search(space: Space, depth: int = DEPTH) -> Found:
     """Return the best set: named causes alone, unless an unnamed function beside them pays.
 
@@ -226,6 +282,7 @@ def beam_search(
     space: Space, allowed_depth: int = DEPTH, beam: int = BEAM, named_only: bool = False
 ) -> list[Found]:
     """Return the best sets met, best first (the empty one among them)."""
+    beam = beam if len(space.y) < LARGE else 2
     rss = float(space.y @ space.y)
     empty = _State((), space.X, space.y, rss, float(space.misfit(np.array(rss))))
     states, best, waited = [empty], empty.score, 0

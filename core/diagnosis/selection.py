@@ -22,7 +22,7 @@ from core.diagnosis.candidate import (
 from core.diagnosis.noise import Noise, estimate_noise
 from core.diagnosis.observation import Observation
 from core.diagnosis.smooth import smooth_candidates
-from core.diagnosis.search import Found, Space, children, fit, prices, search
+from core.diagnosis.search import Found, Space, children, fit, prices, screened_search
 from core.effects import CATALOGUE, Term
 from core.errors import InputError
 from core.model import Model
@@ -115,7 +115,8 @@ def select(
             _look_for_wild(work, columns)
         space, raw, nuisance, target = _space(work, columns, base, smooth)
         depth = min(40, 8 + len(space.y) // 200)
-        best = search(space, depth)
+        inside = [_locate(work.candidates, t)[0] for t in base]
+        best = screened_search(space, depth, inside)
         if turn > 0 and not work.kept.all():
             space, raw, nuisance, target, best = _with_wild_explained(
                 work, columns, base, smooth, (space, raw, nuisance, target, best)
@@ -265,7 +266,7 @@ def _share(
     parts: list[Array], A: Array, b: Array,
 ) -> float:  # fmt: skip
     """Return the share of a Gauss-Newton step to go: less than all where a curve would overshoot."""
-    if not any(freed[c].family == "stiffness_nonlinearity" for c in index):
+    if not index:
         return 1.0
     linear = A[:, sum(len(v) for v in x) :]  # smooth terms and nuisance, refitted for each trial
     Q = np.linalg.qr(linear)[0] if linear.shape[1] else linear

@@ -109,7 +109,8 @@ class Effect(ABC):
         """Return the term's parameters as they are told; ``covariance`` is (k, k) or None."""
         told = []
         for k, parameter in enumerate(self.parameters(arm, term.site)):
-            std = None if covariance is None else float(np.sqrt(max(covariance[k, k], 0.0)))
+            known = covariance is not None and k < len(covariance)  # the rest was not fitted
+            std = float(np.sqrt(max(covariance[k, k], 0.0))) if known else None
             told.append(Reported(self.label(term.site, parameter), term.values[k], std, parameter.unit))
         return tuple(told)
 
