@@ -155,7 +155,7 @@ class Compensator:
         self._offset = (best_q - row)[0] if best < np.inf else np.zeros(row.shape[1])
         pose = self._rigid_pose(self._plain(best_q))
         moved = np.concatenate([pose[0] - position, rotation_vector(pose[1] @ rotation.T)])
-        return Correction(best_q[0], moved, np.float64(best), np.int64(steps))
+        return Correction(best_q[0], moved, np.asarray(best), np.asarray(steps))
 
     def _plain(self, q: Array) -> Rows:
         n = q.shape[1]

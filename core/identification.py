@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +60,7 @@ class _Data:
     rotation: Array | None  # (N, 3, 3)
     registered: bool
 
-    def part(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> _Data:
+    def part(self, rows: NDArray[Any]) -> _Data:
         rotation = None if self.rotation is None else self.rotation[rows]
         return _Data(
             self.q[rows], self.loads[rows], self.position[rows], rotation, self.registered
@@ -296,7 +297,7 @@ def _result(
     )  # fmt: skip
 
 
-def _name(i: int, n: int) -> str:
+def _name(i: int | np.integer[Any], n: int) -> str:
     return f"axial_compliance_{i + 1}" if i < n else f"radial_compliance_{i - n + 1}"
 
 

@@ -7,14 +7,14 @@ functions then solve the deflected shape, its Jacobian and its linear form. Conv
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-JIT = {"cache": True, "nogil": True, "error_model": "numpy"}
+JIT: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
 TOLERANCE = 1e-14  # rad and m: change of the shape at which the equilibrium counts as found
 MAX_ITERATIONS = 200
 

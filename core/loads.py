@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ class Loads:
     temperature: Array | None = None  # (N, n) °C, joint temperatures
     approach: Array | None = None  # (N, n) sign of each joint's last motion: -1, 0, +1
 
-    def __getitem__(self, rows: slice | Array) -> Loads:
+    def __getitem__(self, rows: slice | NDArray[Any]) -> Loads:
         """Return the loads of some of the rows."""
         given = {f.name: getattr(self, f.name) for f in fields(self)}
         return Loads(**{k: None if v is None else v[rows] for k, v in given.items()})

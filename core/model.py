@@ -62,7 +62,9 @@ class Model:
         """Return the rigid, effect-free model."""
         return replace(self, terms=())
 
-    def with_compliance(self, axial: Sequence[float], radial: Sequence[float]) -> Model:
+    def with_compliance(
+        self, axial: Sequence[float] | Array, radial: Sequence[float] | Array
+    ) -> Model:
         """Return the model with these joint flexibilities (n each, rad/Nm) instead of its own."""
         kept = [t for t in self.terms if t.effect not in ("axial_compliance", "radial_compliance")]
         for effect, values in (("axial_compliance", axial), ("radial_compliance", radial)):
