@@ -12,6 +12,7 @@ from core.arm import builtin_arm
 from core.compensation import correct
 from core.limits import Limiter, Limits
 from core.model import Model
+from drivers.ur_rtde.nominal import Nominal
 
 
 def warm_up() -> None:
@@ -22,6 +23,7 @@ def warm_up() -> None:
     model.predict(q)
     model.linear_form(q)
     corrected = correct(model, q)
+    Nominal(model)
     limits = Limits(np.full(n, -7.0), np.full(n, 7.0), np.full(n, 3.0))
     limiter = Limiter(limits, n)
     limiter.start(q[0])

@@ -133,9 +133,7 @@ def builtin_rows(name: str) -> dict[str, Any]:
     if name not in names:
         near = difflib.get_close_matches(str(name), names, n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ArmError(
-            f"robot.model: found {name!r}, expected one of {', '.join(names)}{hint}"
-        )
+        raise ArmError(f"robot.model: found {name!r}, expected one of {', '.join(names)}{hint}")
     text = resources.files("core").joinpath("arms", f"{name}.yaml").read_text(encoding="utf-8")
     table: dict[str, Any] = yaml.safe_load(text)
     return table
@@ -155,8 +153,7 @@ def builtin_arm(name: str, calibration: Mapping[str, Sequence[float]] | None = N
             continue
         if len(values) != len(rows):
             raise ArmError(
-                f"robot.calibration.delta_{delta}: found {len(values)} values, "
-                f"expected {len(rows)}"
+                f"robot.calibration.delta_{delta}: found {len(values)} values, expected {len(rows)}"
             )
         for row, value in zip(rows, values, strict=True):
             row[key] = row.get(key, 0.0) + float(value)

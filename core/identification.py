@@ -62,9 +62,7 @@ class _Data:
 
     def part(self, rows: NDArray[Any]) -> _Data:
         rotation = None if self.rotation is None else self.rotation[rows]
-        return _Data(
-            self.q[rows], self.loads[rows], self.position[rows], rotation, self.registered
-        )
+        return _Data(self.q[rows], self.loads[rows], self.position[rows], rotation, self.registered)
 
 
 @dataclass(frozen=True)
@@ -121,9 +119,7 @@ def _data(log: Log, metrology: Metrology) -> tuple[_Data, NDArray[np.int64]]:
     return _Data(q[used], loads, measured[used], matrix, metrology.registered), used
 
 
-def _require_excitation(
-    model: Model, data: _Data, metrology: Metrology, prior_std: float
-) -> None:
+def _require_excitation(model: Model, data: _Data, metrology: Metrology, prior_std: float) -> None:
     n = model.arm.n
     unknown = 2 if data.registered else 8
     if 3 * len(data.q) < unknown:
@@ -142,8 +138,7 @@ def _require_excitation(
         reason = (
             "the arm's links have no mass in the cell, and no payload or pull is in the log"
             if weightless and not _any_payload(model, data)
-            else "no payload, pull or pose in it changes a joint's moment enough to bend it "
-            "visibly"
+            else "no payload, pull or pose in it changes a joint's moment enough to bend it visibly"
         )
         raise ExcitationError(
             f"nothing in the log excites the compliance: {reason}; expected poses under different "
@@ -227,6 +222,7 @@ def _solve(
 
 def _robust_weights(gap: Array, data: _Data, position: Array) -> tuple[Array, Array]:
     """Return weights (N,) (Tukey's biweight on wild rows) and the noise scale of each unit."""
+
     def spread(part: Array) -> float:
         middle = np.median(np.abs(part))
         return max(float(1.4826 * middle), 1e-12)
@@ -301,9 +297,7 @@ def _name(i: int | np.integer[Any], n: int) -> str:
     return f"axial_compliance_{i + 1}" if i < n else f"radial_compliance_{i - n + 1}"
 
 
-def _combinations(
-    covariance: Array, identifiable: NDArray[np.bool_], n: int
-) -> tuple[str, ...]:
+def _combinations(covariance: Array, identifiable: NDArray[np.bool_], n: int) -> tuple[str, ...]:
     told = [f"{_name(i, n)}: not shown by these data" for i in np.flatnonzero(~identifiable)]
     std = np.sqrt(np.diag(covariance))
     for i in np.flatnonzero(identifiable):

@@ -314,7 +314,7 @@ def regressor_rows(chain, rows, A, jacobians, moments):  # type: ignore[no-untyp
             for column in (i, n + i):
                 for k in range(3):
                     a, b = (k + 1) % 3, (k + 2) % 3
-                    A[r, k, column] = A[r, 3 + a, column] * (p[b] - o[b]) - A[
-                        r, 3 + b, column
-                    ] * (p[a] - o[a])
+                    A[r, k, column] = A[r, 3 + a, column] * (p[b] - o[b]) - A[r, 3 + b, column] * (
+                        p[a] - o[a]
+                    )
     return bad

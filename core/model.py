@@ -157,5 +157,7 @@ class Model:
 
 def _require_equilibrium(bad: int) -> None:
     if bad >= 0:
-        raise InputError(f"row {bad + 1}: the arm finds no equilibrium under its load; expected "
-                         "smaller flexibilities or loads")
+        raise InputError(
+            f"row {bad + 1}: the arm finds no equilibrium under its load; expected "
+            "smaller flexibilities or loads"
+        )

@@ -40,8 +40,9 @@ def arm_from_urdf(path: Path | str, tip: str | None = None) -> Arm:
     links = {str(link.get("name")): link for link in robot.findall("link")}
     tip = tip or _only_leaf(path, links, joints)
     if tip not in links:
-        raise ArmError(f"{path}: robot.tip: found {tip!r}, expected a link of the file: "
-                       f"{', '.join(links)}")
+        raise ArmError(
+            f"{path}: robot.tip: found {tip!r}, expected a link of the file: {', '.join(links)}"
+        )
     chain = _chain(tip, joints)
     return _assemble(path, str(robot.get("name", path.stem)), chain, joints, links)
 

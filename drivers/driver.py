@@ -67,13 +67,13 @@ class Driver(ABC):
     def close(self) -> None:
         """Leave the link: the arm stops where setpoints moved it. Never raises; may be repeated."""
 
-    def arm(self, state: RobotState) -> None:  # noqa: B027
+    def arm(self, state: RobotState) -> None:
         """Make ready for writing; may take seconds and never moves the arm. Raises WriteError.
 
         ``state`` is the sample last read; states read before are stale afterwards.
         """
 
-    def release(self) -> None:  # noqa: B027
+    def release(self) -> None:
         """Stop writing: the arm comes to rest and the controller is as before ``arm``.
 
         May take a while. Raises WriteError where the link is gone.

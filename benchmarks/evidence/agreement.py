@@ -81,8 +81,10 @@ def rigid_arms(count: int, rng: np.random.Generator) -> None:
             M = rigid.joint_moments(peer, case.q, case.gravity, case.tool_position, case.wrench,
                                     case.payload, case.payload_cog)  # fmt: skip
             moments.append(np.abs(form.moment[0] - M).max())
-    print(f"Pinocchio, {len(frames)} cases: largest difference {max(frames):.1e} m in position, "
-          f"{max(jacobians):.1e} in the Jacobian, {max(moments):.1e} Nm in the joint moments")
+    print(
+        f"Pinocchio, {len(frames)} cases: largest difference {max(frames):.1e} m in position, "
+        f"{max(jacobians):.1e} in the Jacobian, {max(moments):.1e} Nm in the joint moments"
+    )
 
 
 def main() -> None:

@@ -81,9 +81,7 @@ def _cause(cause: Cause, unit: str) -> list[str]:
         )
     lines += [f"  {_parameter(parameter)}" for parameter in cause.parameters]
     if cause.indistinguishable_from:
-        lines.append(
-            f"  these data cannot tell it from {', '.join(cause.indistinguishable_from)}"
-        )
+        lines.append(f"  these data cannot tell it from {', '.join(cause.indistinguishable_from)}")
     return lines
 
 

@@ -11,12 +11,26 @@ from core.errors import InputError
 
 
 @click.command()
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True,
-              help="Seed of the hidden plant and of all noise.")
-@click.option("--out", type=click.Path(path_type=Path), default=Path("out/demo"),
-              show_default=True, help="Folder for summary.json and report.html.")
-@click.option("--link", default="ur_rtde", show_default=True,
-              help="Driver by which the simulated cell is reached.")
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=1,
+    show_default=True,
+    help="Seed of the hidden plant and of all noise.",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("out/demo"),
+    show_default=True,
+    help="Folder for summary.json and report.html.",
+)
+@click.option(
+    "--link",
+    default="ur_rtde",
+    show_default=True,
+    help="Driver by which the simulated cell is reached.",
+)
 def demo(seed: int, out: Path, link: str) -> None:  # fmt: skip
     """Do the whole job on a simulated cell, no hardware needed.
 

@@ -27,19 +27,46 @@ if TYPE_CHECKING:
 @click.command()
 @log_argument
 @cell_option
-@click.option("--out", type=click.Path(path_type=Path), metavar="DIR",
-              help="Folder for diagnosis.json and report.html; made where it is missing.")
-@click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
-              help="Write the diagnosis as JSON.")
-@click.option("--apply", "new_cell", type=click.Path(path_type=Path), metavar="NEW_CELL",
-              help="Write the cell with the found effects added.")
-@click.option("--withhold", multiple=True, metavar="EFFECT",
-              help="Take an effect out of the catalogue; may be given several times.")
-@click.option("--sim", type=click.Path(path_type=Path), metavar="SIM_LOG",
-              help="Take the prediction, row by row, from a log of your own simulator.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Folder for diagnosis.json and report.html; made where it is missing.",
+)
+@click.option(
+    "--json",
+    "json_file",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write the diagnosis as JSON.",
+)
+@click.option(
+    "--apply",
+    "new_cell",
+    type=click.Path(path_type=Path),
+    metavar="NEW_CELL",
+    help="Write the cell with the found effects added.",
+)
+@click.option(
+    "--withhold",
+    multiple=True,
+    metavar="EFFECT",
+    help="Take an effect out of the catalogue; may be given several times.",
+)
+@click.option(
+    "--sim",
+    type=click.Path(path_type=Path),
+    metavar="SIM_LOG",
+    help="Take the prediction, row by row, from a log of your own simulator.",
+)
 def diagnose(
-    log: Path, cell: Path, out: Path | None, json_file: Path | None, new_cell: Path | None,
-    withhold: tuple[str, ...], sim: Path | None,
+    log: Path,
+    cell: Path,
+    out: Path | None,
+    json_file: Path | None,
+    new_cell: Path | None,
+    withhold: tuple[str, ...],
+    sim: Path | None,
 ) -> None:
     """Diagnose the sim-to-real gap of a log.
 
@@ -117,9 +144,7 @@ def _folder(path: Path) -> None:
         raise InputError(f"{path}: folder cannot be made: {error.strerror}") from None
 
 
-def _write_folder(
-    folder: Path, text: str, found: Diagnosis, cell: Cell, log: Log
-) -> list[Path]:
+def _write_folder(folder: Path, text: str, found: Diagnosis, cell: Cell, log: Log) -> list[Path]:
     """Write diagnosis.json and report.html; returns their paths."""
     from bridge.report import write_report  # plotly takes its time, and only --out needs it
 

@@ -15,8 +15,12 @@ from core.errors import InputError
 @cell_argument
 @click.option("--observe", is_flag=True, help="Compute and record, but write nothing.")
 @click.option("--arm", is_flag=True, help="Write setpoints, whatever the cell says.")
-@click.option("--duration", type=click.FloatRange(min=0, min_open=True), metavar="S",
-              help="End after so many seconds; else on SIGINT or SIGTERM.")
+@click.option(
+    "--duration",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="S",
+    help="End after so many seconds; else on SIGINT or SIGTERM.",
+)
 def run(cell: Path, observe: bool, arm: bool, duration: float | None) -> None:  # fmt: skip
     """Run the on-cell daemon: read the arm's state, predict how it bends, correct its setpoints.
 

@@ -28,7 +28,7 @@ class Source(ABC):
         self.settings = settings
         self.n = n
 
-    def open(self) -> None:  # noqa: B027
+    def open(self) -> None:
         """Open what the source listens on. Raises RunError."""
 
     @abstractmethod
@@ -39,7 +39,7 @@ class Source(ABC):
         near the arm: starting never jumps.
         """
 
-    def begin(self, timestamp: float, own_q: Vector) -> None:  # noqa: B027
+    def begin(self, timestamp: float, own_q: Vector) -> None:
         """Start the motion at controller time ``timestamp`` (s)."""
 
     @abstractmethod
@@ -51,5 +51,5 @@ class Source(ABC):
         """Return whether the source has come to its end, and stays there."""
         return False
 
-    def close(self) -> None:  # noqa: B027
+    def close(self) -> None:
         """Close what ``open`` has opened; may be repeated."""

@@ -77,7 +77,11 @@ def named_candidates(
 
 
 def _at(
-    arm: Arm, effect: Effect, site: Site, with_rotation: bool, inside: Sequence[Term],
+    arm: Arm,
+    effect: Effect,
+    site: Site,
+    with_rotation: bool,
+    inside: Sequence[Term],
     turns: Sequence[float],
 ) -> list[Candidate]:
     parameters = effect.parameters(arm, site)
@@ -98,7 +102,10 @@ def _at(
     if effect.identifier == "stiffness_nonlinearity" and not inside:
         return [
             Candidate(
-                effect.identifier, site, (replace(parameters[0], lower=-np.inf),) * 2, free,
+                effect.identifier,
+                site,
+                (replace(parameters[0], lower=-np.inf),) * 2,
+                free,
                 curve=s * parameters[1].scale,
             )
             for s in SOFTENING
@@ -108,9 +115,7 @@ def _at(
     return [Candidate(effect.identifier, site, parameters, free)]
 
 
-def named_columns(
-    observation: Observation, candidate: Candidate, base: Sequence[Term]
-) -> Array:
+def named_columns(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> Array:
     """Return d prediction / d parameter (N, k, d), ``base`` terms already in the model."""
     J = observation.joint_columns
     if candidate.family == "transmission_error" and J is not None:

@@ -1,4 +1,4 @@
-"""The diagnosis of a log: channel by channel, where the gap lies, what causes it, how far it shrinks."""
+"""The diagnosis of a log: where each channel's gap lies, what causes it, how far it shrinks."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from core.diagnosis import position, torque, tracking, wrench
 from core.diagnosis.cause import Cause, Considered, causes_of, considered_of
 from core.diagnosis.held_out import HeldOut
-from core.diagnosis.judgement import Judgement, judge, pure_error
+from core.diagnosis.judgement import Judgement, holding, judge, pure_error
 from core.diagnosis.location import Where, locate
 from core.diagnosis.observation import NotObservable, Observation, thinned
 from core.diagnosis.selection import Selection, select
 from core.diagnosis.separation import Measurement, next_measurements
+from core.diagnosis.simulation import joined, predicted_by
 from core.diagnosis.suspicion import check_units, findings
 from core.effects import Term
 from core.errors import LogError
@@ -90,11 +91,13 @@ def diagnose(
     withhold: Iterable[str] = (),
     progress: Callable[[str], None] | None = None,
     observers: Mapping[str, Observe] = CHANNELS,
+    simulated: Log | None = None,
 ) -> Diagnosis:
     """Return the diagnosis of ``log`` against ``model``, in every channel that the log shows.
 
-    ``withhold`` names effects to take out of the catalogue. Raises LogError where the log cannot be
-    used at all (units, numbers, no channel to look at).
+    ``withhold`` names effects to take out of the catalogue; ``simulated`` is the log of another
+    simulator, row by row, whose values are the prediction instead of the model's. Raises LogError
+    where the log cannot be used at all (units, numbers, no channel to look at).
     """
     metrology = metrology or Metrology()
     withhold = tuple(withhold)
@@ -102,6 +105,9 @@ def diagnose(
     told = findings(log)
     observed: list[ChannelDiagnosis] = []
     hidden: list[NotObservable] = []
+    if simulated is not None:
+        log = joined(log, simulated)
+        observers = {name: predicted_by(name, o) for name, o in observers.items()}
     for observe in observers.values():
         seen = observe(model, log, metrology)
         if isinstance(seen, NotObservable):
@@ -175,8 +181,8 @@ def _channel(
     progress: Callable[[str], None] | None,
 ) -> ChannelDiagnosis:  # fmt: skip
     selection = select(seen, model, withhold, progress)
-    verdict = judge(selection)
     held = HeldOut(selection)
+    verdict = holding(selection, judge(selection), held)
     chosen = [selection.term_index[p] for p in verdict.accused]
     gap, remaining = gaps(selection, chosen)
     k = 3 if seen.channel in ("position", "wrench") else gap.shape[1]
@@ -207,7 +213,7 @@ def _channel(
 def gaps(selection: Selection, chosen: Sequence[int]) -> tuple[Array, Array]:
     """Return the gap (N, k) without and with the chosen terms, the nuisance fitted each time."""
     observation = selection.observation
-    at = {c: t for c, t in zip(selection.term_index, selection.terms, strict=True)}
+    at = dict(zip(selection.term_index, selection.terms, strict=True))
     found = []
     for terms in ([], [at[c] for c in chosen]):
         gap = observation.measured - observation.predict(terms)

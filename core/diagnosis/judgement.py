@@ -7,18 +7,19 @@ cause that it does not hold. Then only what much data makes sure of is kept.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from core.diagnosis.held_out import HeldOut
 from core.diagnosis.leftover import dependence, structure_p_value
 from core.diagnosis.search import Found, Space, fit, rivals
 from core.diagnosis.selection import Selection
 
 Array = NDArray[np.float64]
 SURE = 0.002  # probability below which a leftover counts as structured
-MANY = 300  # samples from which causes are kept beside a structured leftover
+MANY = 150  # samples from which causes are kept beside a structured leftover
 ACCOMPLICES = 4  # effects that one short log can hardly hold at once
 TIE = 7.0  # score within which another explanation counts as equally good
 STATED = 1.5  # times the stated noise: beyond, more than noise is left
@@ -26,6 +27,7 @@ REPEATED = 1.6  # times the scatter of repeated poses
 ENOUGH_REPEATS = 30  # degrees of freedom from which repeats are a measure of the noise
 USUAL = 1.2e-4  # m, one coordinate: a worse repeatability than that is none
 INSTRUMENTS = 5.0  # times the instrument's sigma, for coarse instruments
+LEAST = 0.002  # share of the held-out gap that a cause has to take beside a leftover
 BENT = 10.8  # gain of a bent stiffness curve over a straight one that makes it one
 
 
@@ -36,7 +38,9 @@ class Judgement:
     accused: tuple[int, ...]  # positions in ``selection.terms``
     structured: bool
     p_value: float | None
-    depends_on: tuple[tuple[str, float], ...]  # quantity, held-out share of what is not accounted for
+    depends_on: tuple[
+        tuple[str, float], ...
+    ]  # quantity, held-out share of what is not accounted for
     ties: dict[int, tuple[str, ...]]  # position -> effects that would do as well
     withdrawn: tuple[tuple[int, str], ...]  # position, reason
 
@@ -59,17 +63,37 @@ def judge(selection: Selection) -> Judgement:
     if samples < MANY and len(effects) >= ACCOMPLICES:
         structured = True
     if structured and samples < MANY:
-        for c in believed:
-            withdrawn.append((selection.term_index.index(c), "structure is left beside it"))
+        why = "structure is left beside it"
+        withdrawn += [(selection.term_index.index(c), why) for c in believed]
         believed = []
     accused = tuple(selection.term_index.index(c) for c in believed)
-    depends = ()
+    depends: tuple[tuple[str, float], ...] = ()
     if structured or not accused:
         depends = tuple(dependence(space, nuisance, believed, selection.groups))
     return Judgement(
         accused, structured, p_value, depends, _ties(space, found, selection, accused),
         tuple(withdrawn),
     )  # fmt: skip
+
+
+def holding(selection: Selection, judgement: Judgement, held: HeldOut) -> Judgement:
+    """Return the judgement without accusations that do not hold on samples the fit did not see.
+
+    Only where structure is left beside causes: there a training score is no witness.
+    """
+    if not (judgement.structured and judgement.accused and held.possible):
+        return judgement
+    accused, withdrawn = list(judgement.accused), list(judgement.withdrawn)
+    while accused:
+        index = {p: selection.term_index[p] for p in accused}
+        whole = held.rms(list(index.values()))
+        rest = {p: held.rms([c for o, c in index.items() if o != p]) for p in accused}
+        worst = min(accused, key=lambda p: rest[p])
+        if rest[worst] > whole * (1 + LEAST):
+            break
+        accused.remove(worst)
+        withdrawn.append((worst, "it does not hold on samples that its fit did not see"))
+    return replace(judgement, accused=tuple(accused), withdrawn=tuple(withdrawn))
 
 
 def _too_much_left(selection: Selection) -> bool:

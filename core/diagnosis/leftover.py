@@ -29,9 +29,7 @@ def basis_of(columns: Array) -> Array:
     return np.asarray(U[:, s > 1e-6 * max(s[0], 1e-300)])
 
 
-def structure_p_value(
-    space: Space, nuisance: Array, chosen: Sequence[int], seed: int = 0
-) -> float:
+def structure_p_value(space: Space, nuisance: Array, chosen: Sequence[int], seed: int = 0) -> float:
     """Return the probability that noise alone leaves as much structure as is left."""
     fitted = basis_of(np.hstack([nuisance, space.columns(chosen)]))
     r = space.y - fitted @ (fitted.T @ space.y)

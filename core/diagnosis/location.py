@@ -37,7 +37,7 @@ def locate(selection: Selection, gap: Array, accused: Sequence[int]) -> Where:
     total = max(float(space.y @ space.y), 1e-300)
     shares: dict[int, float] = {}
     if accused:
-        fitted = {c: v for c, v in zip(selection.found.chosen, selection.found.values, strict=True)}
+        fitted = dict(zip(selection.found.chosen, selection.found.values, strict=True))
         for c in accused:
             joint = space.candidates[c].site.joint
             if joint is not None:

@@ -16,6 +16,7 @@ from scipy.optimize import minimize
 from core.diagnosis.observation import Observation
 
 Array = NDArray[np.float64]
+LARGE = 150  # samples from which every coordinate is taken to scatter alike
 ENOUGH = 400  # samples from which the sizes are estimated
 
 
@@ -46,7 +47,8 @@ def estimate_noise(
     """
     block = blocks(observation)
     count = int(block.max()) + 1
-    J = observation.joint_columns
+    # a large log is asked for many causes: joint noise would swallow those not yet found
+    J = observation.joint_columns if len(kept) < LARGE else None
     use = np.flatnonzero(kept)
     if len(use) > ENOUGH:
         use = use[:: len(use) // ENOUGH + 1]
@@ -85,7 +87,7 @@ def _floored(variance: Array, known: float) -> Array:
 def _noise(
     observation: Observation, block: NDArray[np.int64], variance: Array, joint: float
 ) -> Noise:
-    N, k = observation.measured.shape
+    N, _k = observation.measured.shape
     V = np.tile(np.diag(variance[block]), (N, 1, 1))
     J = observation.joint_columns
     if J is not None and joint > 0:

@@ -19,10 +19,11 @@ from core.diagnosis.candidate import Candidate
 Array = NDArray[np.float64]
 BEST_LINES = 10  # lines of a joint that a search looks at
 BEST_SMOOTH = 60  # smooth functions that a search looks at
-LARGE = 900  # rows of the sample space from which the beam is narrow
+LARGE = 450  # rows of the sample space from which many causes are looked for, one by one
 MERGED = 9  # terms up to which every pair is tried against one
 BEAM = 6
-DEPTH = 16
+DEPTH = 9
+DEEP = 40  # terms that a large log may show
 PATIENCE = 2  # depths without a better set before the beam stops
 RANK = 1e-10  # share of a block's own size below which a direction counts as already explained
 USUAL_ORDERS = (1.0, 2.0, 3.0, 4.0)  # eccentricity and its kin
@@ -132,7 +133,7 @@ def fit(space: Space, chosen: Sequence[int]) -> Found:
         return Found((), float(space.misfit(np.array(rss))), rss)
     X = space.columns(chosen)
     unit = 1 / np.sqrt(np.einsum("ij,ij->j", X, X) + 1e-300)
-    solution, _, rank, _ = np.linalg.lstsq(X * unit, space.y, rcond=1e-6)
+    solution, _, _rank, _ = np.linalg.lstsq(X * unit, space.y, rcond=1e-6)
     rss = float(np.sum((space.y - (X * unit) @ solution) ** 2))
     variance = max(rss / max(space.freedom - X.shape[1], 1.0), space.floor)
     inverse = np.linalg.pinv((X * unit).T @ (X * unit), rcond=1e-12, hermitian=True)
@@ -171,9 +172,10 @@ def _clash(space: Space, chosen: Sequence[int], new: int) -> bool:
             lines += 1
             if abs((a.site.order or 0) - (b.site.order or 0)) < 0.75 or lines >= LINES:
                 return True
-        elif a.family == b.family:
-            return True
-        elif {a.family, b.family} == {"axial_compliance", "stiffness_nonlinearity"}:
+        elif a.family == b.family or {a.family, b.family} == {
+            "axial_compliance",
+            "stiffness_nonlinearity",
+        }:
             return True
     return False
 
@@ -218,7 +220,7 @@ def screened(space: Space, base: Sequence[int] = ()) -> NDArray[np.int64]:
     single causes leaves, or of what ``base`` leaves.
     """
     many = np.array([_many(c) for c in space.candidates])
-    keep = set(np.flatnonzero(~many))
+    keep = {int(c) for c in np.flatnonzero(~many)}
     single = space.columns(sorted(keep))
     unit = single / (np.sqrt(np.einsum("ij,ij->j", single, single)) + 1e-300)
     ridge = unit.T @ unit + 1e-2 * np.eye(unit.shape[1])
@@ -269,6 +271,8 @@ def search(space: Space, depth: int = DEPTH) -> Found:
     The catalogue is searched by itself first, so that a smooth function, which imitates several
     causes at once, does not stand in their way.
     """
+    if len(space.y) >= LARGE:
+        return _deep_search(space)
     named = improve(space, beam_search(space, depth, named_only=True)[0], named_only=True)
     joined = [fit(space, (*named.chosen, c)) for _, c in children(space, named.chosen, 4)]
     if not any(j.score < named.score for j in joined):
@@ -278,11 +282,27 @@ def search(space: Space, depth: int = DEPTH) -> Found:
     return min([named, whole, grown], key=lambda f: f.score)
 
 
+def _deep_search(space: Space) -> Found:
+    """Return the best set of a large log: many causes at once, each cheap to tell apart.
+
+    Terms are added one by one and dropped again where later ones make them needless; an unnamed
+    function joins at the end, where one still pays.
+    """
+    found = beam_search(space, DEEP, beam=1, named_only=True)[0]
+    dropped = True
+    while dropped and found.chosen:
+        trials = [fit(space, tuple(o for o in found.chosen if o != c)) for c in found.chosen]
+        best = min(trials, key=lambda f: f.score)
+        dropped = best.score < found.score
+        found = best if dropped else found
+    joined = [fit(space, (*found.chosen, c)) for _, c in children(space, found.chosen, 4)]
+    return min([found, *joined], key=lambda f: f.score)
+
+
 def beam_search(
     space: Space, allowed_depth: int = DEPTH, beam: int = BEAM, named_only: bool = False
 ) -> list[Found]:
     """Return the best sets met, best first (the empty one among them)."""
-    beam = beam if len(space.y) < LARGE else 2
     rss = float(space.y @ space.y)
     empty = _State((), space.X, space.y, rss, float(space.misfit(np.array(rss))))
     states, best, waited = [empty], empty.score, 0
@@ -290,13 +310,13 @@ def beam_search(
     for _ in range(allowed_depth):
         children: dict[frozenset[int], tuple[float, int, int]] = {}
         for s, state in enumerate(states):
-            for score, c in _children(space, state, 2 * beam, named_only):
+            for score, c in _children(space, state, max(2 * beam, 12), named_only):
                 key = frozenset((*state.chosen, c))
                 if key not in children or score < children[key][0]:
                     children[key] = (score, s, c)
-        ranked = sorted(children.values())[: 2 * beam]
+        ranked = sorted(children.values())[: max(2 * beam, 12)]
         checked = []
-        for score, s, c in ranked:
+        for _, s, c in ranked:
             found = fit(space, (*states[s].chosen, c))
             met[frozenset(found.chosen)] = found
             if np.isfinite(found.score):
@@ -394,8 +414,11 @@ def unpack(space: Space, found: Found) -> Found:
 
 def _lines(space: Space, rest: tuple[int, ...], joint: int) -> list[Found]:
     """Return the best sets of up to three lines of a joint beside ``rest``."""
-    own = [k for k, candidate in enumerate(space.candidates)
-           if candidate.family == "transmission_error" and candidate.site.joint == joint]  # fmt: skip
+    own = [
+        k
+        for k, candidate in enumerate(space.candidates)
+        if candidate.family == "transmission_error" and candidate.site.joint == joint
+    ]
     grown: list[Found] = []
     sets = [rest]
     for _ in range(3):
@@ -403,9 +426,8 @@ def _lines(space: Space, rest: tuple[int, ...], joint: int) -> list[Found]:
         for chosen in sets:
             state = _projected(space, chosen)
             gain, _ = gains(space, state.P, state.r)
-            for k in sorted(own, key=lambda k: -gain[k])[:6]:
-                if not _clash(space, chosen, k):
-                    step.append(fit(space, (*chosen, k)))
+            ranked = sorted(own, key=lambda k: -gain[k])[:6]
+            step += [fit(space, (*chosen, k)) for k in ranked if not _clash(space, chosen, k)]
         step.sort(key=lambda f: f.score)
         grown += step
         sets = [f.chosen for f in step[:5]]

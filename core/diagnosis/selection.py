@@ -6,6 +6,7 @@ prediction, frames and all), wild readings looked at again; until the set stays 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
@@ -21,8 +22,8 @@ from core.diagnosis.candidate import (
 )
 from core.diagnosis.noise import Noise, estimate_noise
 from core.diagnosis.observation import Observation
-from core.diagnosis.smooth import smooth_candidates
 from core.diagnosis.search import Found, Space, children, fit, prices, screened_search
+from core.diagnosis.smooth import smooth_candidates
 from core.effects import CATALOGUE, Term
 from core.errors import InputError
 from core.model import Model
@@ -31,7 +32,10 @@ Array = NDArray[np.float64]
 ROUNDS = 5
 REFITS = 8
 WILD_SHARE = 0.05  # of the samples: more of them is structure, not bad luck
+BENDING = ("axial_compliance", "radial_compliance", "stiffness_nonlinearity",
+           "link_flexibility", "base_compliance", "payload")  # fmt: skip
 WILD_SIGMA = 5.0
+WEAK = 100.0  # usual sizes of a parameter: how far the data may take it against nothing
 KNOWN_SHARE = 0.7  # a stated repeatability is an average: less than this share of it is not assumed
 RIDGE = 5.0  # usual sizes of a parameter: prior of the fit that only looks for wild readings
 
@@ -114,18 +118,18 @@ def select(
         if turn == 0:
             _look_for_wild(work, columns)
         space, raw, nuisance, target = _space(work, columns, base, smooth)
-        depth = min(40, 8 + len(space.y) // 200)
         inside = [_locate(work.candidates, t)[0] for t in base]
-        best = screened_search(space, depth, inside)
+        best = screened_search(space, base=inside)
         if turn > 0 and not work.kept.all():
             space, raw, nuisance, target, best = _with_wild_explained(
                 work, columns, base, smooth, (space, raw, nuisance, target, best)
             )
-        counted = work.kept.copy()
+        counted, whitened_by = work.kept.copy(), work.noise
         try:
             terms, index, covariance, residual = _refit(work, space, best)
-        except InputError:  # absurd values: the arm would buckle
-            best = fit(space, ())
+        except InputError:  # absurd flexibilities: the arm would buckle
+            stiff = [c for c in best.chosen if space.candidates[c].family not in BENDING]
+            best = fit(space, stiff)
             terms, index, covariance, residual = _refit(work, space, best)
         same = terms_alike(terms, base) and turn > 0
         found = best
@@ -136,7 +140,7 @@ def select(
         base = terms
     assert space is not None and found is not None
     return Selection(
-        work.observation, space, found, terms, index, covariance, counted, work.noise,
+        work.observation, space, found, terms, index, covariance, counted, whitened_by,
         residual, base, raw, nuisance, target,
     )  # fmt: skip
 
@@ -166,7 +170,9 @@ def _flat(columns: Array, work: _Work) -> Array:
 
 
 def _space(
-    work: _Work, columns: list[Array], base: tuple[Term, ...],
+    work: _Work,
+    columns: list[Array],
+    base: tuple[Term, ...],
     smooth: list[tuple[Candidate, Array]],
 ) -> tuple[Space, Array, Array, Array]:
     observation = work.observation
@@ -231,7 +237,10 @@ def _refit(
         A = np.hstack([*blocks, extra, nuisance])
         b = _flat(gap[..., None], work)[:, 0]
         unit = 1 / np.sqrt(np.einsum("ij,ij->j", A, A) + 1e-300)
-        step = np.linalg.lstsq(A * unit, b, rcond=1e-9)[0] * unit
+        pull, towards = _pull(freed, index, x, A.shape[1])
+        step = np.linalg.lstsq(
+            np.vstack([A, pull]) * unit, np.concatenate([b, towards]), rcond=1e-9
+        )[0] * unit  # fmt: skip
         sizes = [len(v) for v in x]
         cuts = np.cumsum([*sizes, extra.shape[1]])
         parts = np.split(step, cuts)
@@ -247,7 +256,7 @@ def _refit(
         inverse = np.linalg.pinv((A * unit).T @ (A * unit), rcond=1e-13, hermitian=True)
         whole = inverse * np.outer(unit, unit) * variance
         begin = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
-        covariance = [whole[i:j, i:j] for i, j in zip(begin[:-1], begin[1:], strict=True)]
+        covariance = [whole[i:j, i:j] for i, j in itertools.pairwise(begin)]
         if moved < 1e-6:
             break
     terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
@@ -261,11 +270,25 @@ def _refit(
     return terms, index, tuple(covariance), gap
 
 
+def _pull(
+    freed: dict[int, Candidate], index: tuple[int, ...], x: list[Array], width: int
+) -> tuple[Array, Array]:
+    """Return rows (k, width) and targets that pull what the data leave open towards zero.
+
+    So weak (many usual sizes) that only combinations without any trace in the data feel it: lengths
+    along parallel axes, which otherwise run off against each other.
+    """
+    usual = np.array([WEAK * p.scale for c in index for p in freed[c].parameters])
+    rows = np.zeros((len(usual), width))
+    rows[np.arange(len(usual)), np.arange(len(usual))] = 1 / usual
+    return rows, -np.concatenate([*x, np.zeros(0)]) / usual
+
+
 def _share(
     work: _Work, freed: dict[int, Candidate], index: tuple[int, ...], x: list[Array],
     parts: list[Array], A: Array, b: Array,
 ) -> float:  # fmt: skip
-    """Return the share of a Gauss-Newton step to go: less than all where a curve would overshoot."""
+    """Return the share of a Gauss-Newton step to go: less than all where it would overshoot."""
     if not index:
         return 1.0
     linear = A[:, sum(len(v) for v in x) :]  # smooth terms and nuisance, refitted for each trial
@@ -327,7 +350,9 @@ def _look_for_wild(work: _Work, columns: list[Array]) -> None:
         parts.append(block)
         usual += [p.scale for p in c.parameters]
     A = np.concatenate(parts, axis=2) * np.array(usual) if parts else np.zeros((N, k, 0))
-    prior = np.concatenate([np.full(A.shape[2], 1 / RIDGE), np.zeros(observation.nuisance.shape[2])])
+    prior = np.concatenate(
+        [np.full(A.shape[2], 1 / RIDGE), np.zeros(observation.nuisance.shape[2])]
+    )
     A = np.concatenate([A, observation.nuisance], axis=2)
     weight, r, used = np.ones(N), gap, 0.0
     for step in range(8):

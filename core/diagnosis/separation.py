@@ -72,7 +72,8 @@ def _questions(
     model: Model, channel: ChannelDiagnosis, q: Array, loads: Loads
 ) -> list[tuple[tuple[str, ...], Array]]:
     """Return open questions: effects to be told apart, and how their predictions differ (N, 3)."""
-    selection, asked = channel.selection, []
+    selection = channel.selection
+    asked: list[tuple[tuple[str, ...], Array]] = []
     for position in channel.judgement.accused:
         own = selection.term_index[position]
         told: set[str] = set()
@@ -97,9 +98,7 @@ def _questions(
     return asked
 
 
-def _difference(
-    model: Model, one: Term, other: Term, q: Array, loads: Loads
-) -> Array | None:
+def _difference(model: Model, one: Term, other: Term, q: Array, loads: Loads) -> Array | None:
     try:
         a = model.with_terms([one]).predict(q, loads).position
         b = model.with_terms([other]).predict(q, loads).position
@@ -132,8 +131,11 @@ def _best(
             approach = tuple(int(v) for v in loads.approach[r]) if "backlash" in names else None
             told.append(
                 Measurement(
-                    tuple(float(v) for v in q[r]), float(loads.payload_mass[r]), names,
-                    float(gain[r]), approach,
+                    tuple(float(v) for v in q[r]),
+                    float(loads.payload_mass[r]),
+                    names,
+                    float(gain[r]),
+                    approach,
                 )
             )
         if len(told) == EACH:

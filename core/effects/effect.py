@@ -103,15 +103,16 @@ class Effect(ABC):
         """Return the joint torques that would be measured instead of ``torque`` (N, n)."""
         return torque
 
-    def reported(
-        self, arm: Arm, term: Term, covariance: Array | None
-    ) -> tuple[Reported, ...]:
+    def reported(self, arm: Arm, term: Term, covariance: Array | None) -> tuple[Reported, ...]:
         """Return the term's parameters as they are told; ``covariance`` is (k, k) or None."""
         told = []
         for k, parameter in enumerate(self.parameters(arm, term.site)):
-            known = covariance is not None and k < len(covariance)  # the rest was not fitted
-            std = float(np.sqrt(max(covariance[k, k], 0.0))) if known else None
-            told.append(Reported(self.label(term.site, parameter), term.values[k], std, parameter.unit))
+            std = None
+            if covariance is not None and k < len(covariance):  # the rest was not fitted
+                std = float(np.sqrt(max(covariance[k, k], 0.0)))
+            told.append(
+                Reported(self.label(term.site, parameter), term.values[k], std, parameter.unit)
+            )
         return tuple(told)
 
     def label(self, site: Site, parameter: Parameter) -> str:

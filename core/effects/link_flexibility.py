@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 class LinkFlexibility(Effect):
     """A link bends as a cantilever from its joint to the next, loaded at its far end.
 
-    One EI a link; the parameter is 1/EI. Deflection F L^3/3EI + M L^2/2EI, slope F L^2/2EI + M L/EI;
+    One EI a link; the parameter is 1/EI. Deflection F L^3/3EI + M L^2/2EI, slope F L^2/2EI + ML/EI;
     the link's own weight is left out. A near twin of the compliance of its two joints, told apart
     by force and moment that change separately.
     Source: Euler-Bernoulli cantilever; Klimchik, Pashkevich, "Complete stiffness model".

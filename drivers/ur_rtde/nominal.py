@@ -35,6 +35,9 @@ class Nominal:
         )
         self._shift = np.zeros(n)  # target minus nominal joints of the last sample
         self._step = np.empty(n)
+        # compiled here: the loop's first offset must not wait for a compiler
+        position, rotation = self.tcp(self._shift)
+        newton_step(self._chain, self._rows, 0, self._shape, position, rotation, LEVER, self._step)
 
     def tcp(self, q: Vector) -> tuple[Vector, Vector]:
         """Return position (3,) and rotation (3, 3) of the rigid arm's TCP at joints q (n,)."""

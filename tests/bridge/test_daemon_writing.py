@@ -132,6 +132,18 @@ def test_a_recording_is_a_log_as_it_stands(robot: Robot) -> None:
     assert told[-1]["summary"]["setpoints_written"] > 100
 
 
+def settled_error(robot: Robot, wanted: np.ndarray, patience: float = 15.0) -> float:
+    """Return how far the tracker sees the TCP from the wanted place once the ramp is over.
+
+    A busy machine may starve the heartbeat, and the robot ramps out and in again.
+    """
+    end, error = time.monotonic() + patience, np.inf
+    while time.monotonic() < end and error >= 1e-4:
+        time.sleep(0.5)
+        error = float(np.linalg.norm(robot.tcp() - wanted))
+    return error
+
+
 def test_offset_mode_corrects_under_the_robots_own_program(robot: Robot) -> None:
     program = robot.start_offset_program()
     cell = robot.cell(link=", mode: offset")
@@ -139,8 +151,7 @@ def test_offset_mode_corrects_under_the_robots_own_program(robot: Robot) -> None
     without = np.linalg.norm(robot.tcp() - wanted)
     with Run(cell, arm=True) as run:
         run.wait(State.COMPENSATING)
-        time.sleep(1.5)
-        with_compensation = np.linalg.norm(robot.tcp() - wanted)
+        with_compensation = settled_error(robot, wanted)
         start = robot.settings.start_q
         robot.bench("move 0.2 " + " ".join(map(str, start[1:])))
         time.sleep(1.5)

@@ -126,9 +126,7 @@ def test_the_correction_holds_for_an_arm_that_bends_by_other_code():
         if smallest_singular_value(model, case.q[None])[0] < 0.03:
             continue
         found = correct(model, case.q[None], loads)
-        position, rotation = oracle.solve(
-            oracle.Case(**{**case.__dict__, "q": found.q[0]})
-        )
+        position, rotation = oracle.solve(oracle.Case(**{**case.__dict__, "q": found.q[0]}))
         np.testing.assert_allclose(position, wanted.position[0], atol=1e-8)
         np.testing.assert_allclose(rotation, wanted.rotation[0], atol=1e-8)
 

@@ -86,7 +86,6 @@ def test_zero_values_change_nothing_and_usual_ones_something(effect, name):
     assert 1e-6 < moved < 5e-2
 
 
-
 @ARMS
 @pytest.mark.parametrize("joint", [1, 3, 6])
 def test_a_joint_offset_is_added_to_the_encoder_angle(name, joint):
@@ -122,9 +121,9 @@ def test_only_parallel_axes_have_a_second_twist():
 def test_the_second_twist_turns_about_y_behind_the_link(joint):
     model, beta = model_of("ur10e"), 2e-3
     q, loads = scene(6)
-    poses = model.with_terms(
-        [Term("link_geometry", Site(joint), (0.0, 0.0, 0.0, beta))]
-    ).predict(q, loads)
+    poses = model.with_terms([Term("link_geometry", Site(joint), (0.0, 0.0, 0.0, beta))]).predict(
+        q, loads
+    )
     for r in range(POSES):
         origins, turns, _, _, tcp = oracle.place(case("ur10e", q, loads, r), np.zeros((6, 3)))
         # all beyond turns about the link's y axis through the next joint's origin

@@ -36,17 +36,23 @@ def branched(n):
         x, y, z = rng.uniform(-0.3, 0.3, 3)
         roll, pitch, yaw = rng.uniform(-1, 1, 3)
         if i == 3:
-            parts += [link("spacer", 1.1, "0 0.1 0"),
-                      joint("bolted", "fixed", before, "spacer", "0.1 0 0.05", "0.2 -0.3 0.4")]
+            parts += [
+                link("spacer", 1.1, "0 0.1 0"),
+                joint("bolted", "fixed", before, "spacer", "0.1 0 0.05", "0.2 -0.3 0.4"),
+            ]
             before = "spacer"
         parts += [link(f"l{i}", 6.0 / i, f"{x / 3} 0.02 {z / 3}", "0.1 0.2 0.3"),
                   joint(f"j{i}", "revolute", before, f"l{i}", f"{x} {y} {z}",
                         f"{roll} {pitch} {yaw}", AXES[i - 1], LIMIT)]  # fmt: skip
         before = f"l{i}"
-    parts += [link("cover", 0.7, "0.01 0.02 0.03"), link("lamp", 0.2, "0 0 0.1"),
-              joint("snap", "fixed", "l2", "cover", "0.1 0.1 0", "1 0 0"),
-              joint("clip", "fixed", "cover", "lamp", "0 0.1 0", "0 1 0"),
-              link("flange"), joint("end", "fixed", before, "flange", "0 0 0.1", "0 0.5 0")]
+    parts += [
+        link("cover", 0.7, "0.01 0.02 0.03"),
+        link("lamp", 0.2, "0 0 0.1"),
+        joint("snap", "fixed", "l2", "cover", "0.1 0.1 0", "1 0 0"),
+        joint("clip", "fixed", "cover", "lamp", "0 0.1 0", "0 1 0"),
+        link("flange"),
+        joint("end", "fixed", before, "flange", "0 0 0.1", "0 0.5 0"),
+    ]
     return f'<robot name="odd"><!-- arm -->{"".join(parts)}</robot>'
 
 

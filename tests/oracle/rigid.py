@@ -39,9 +39,7 @@ def tool_jacobian(model: pin.Model, q: np.ndarray, tcp: np.ndarray, frame: str =
     with_tool = model.copy()
     old = model.frames[model.getFrameId(frame)]
     place = old.placement * pin.SE3(np.eye(3), tcp)
-    index = with_tool.addFrame(
-        pin.Frame("tcp", old.parentJoint, place, pin.FrameType.OP_FRAME)
-    )
+    index = with_tool.addFrame(pin.Frame("tcp", old.parentJoint, place, pin.FrameType.OP_FRAME))
     data = with_tool.createData()
     pin.computeJointJacobians(with_tool, data, q)
     pin.framesForwardKinematics(with_tool, data, q)
