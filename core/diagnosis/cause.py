@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from core.arm import Arm
 from core.diagnosis.held_out import HeldOut, Shrink
 from core.diagnosis.judgement import Judgement
-from core.diagnosis.search import Found, children, fit
+from core.diagnosis.search import children
 from core.diagnosis.selection import Selection
+from core.diagnosis.space import Found, fit
 from core.effects import CATALOGUE, Reported, Term
 
 Array = NDArray[np.float64]

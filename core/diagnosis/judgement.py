@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from core.diagnosis.held_out import HeldOut
 from core.diagnosis.leftover import dependence, structure_p_value
-from core.diagnosis.search import Found, Space, fit, rivals
+from core.diagnosis.search import rivals
 from core.diagnosis.selection import Selection
+from core.diagnosis.space import Found, Space, fit
 
 Array = NDArray[np.float64]
 SURE = 0.002  # probability below which a leftover counts as structured

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.search import Space
+from core.diagnosis.space import Space
 
 Array = NDArray[np.float64]
 DRAWS = 1500

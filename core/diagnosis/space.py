@@ -1,0 +1,133 @@
+"""The sample space in which candidates compete: whitened, without nuisance, every try priced."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.candidate import Candidate
+
+Array = NDArray[np.float64]
+RANK = 1e-10  # share of a block's own size below which a direction counts as already explained
+SMOOTH_PRICE = 18.0  # what an unnamed function pays beyond a named cause
+MARGIN = 4.0  # what every accusation pays: keeps clean logs clean
+ABSURD = 60.0  # times a parameter's usual size: beyond, a fit is no explanation
+USUAL_ORDERS = (1.0, 2.0, 3.0, 4.0)  # eccentricity and its kin
+
+
+@dataclass(frozen=True)
+class Space:
+    """The whitened sample space: y and the blocks of columns, nuisance projected out."""
+
+    y: Array  # (m,)
+    X: Array  # (m, K)
+    start: NDArray[np.int64]  # (C+1,) first column of each candidate
+    candidates: tuple[Candidate, ...]
+    price: Array  # (C,)
+    freedom: float  # m minus nuisance
+    floor: float  # variance of one coordinate that is known to be there
+
+    def columns(self, chosen: Sequence[int]) -> Array:
+        """Return the columns of a set of candidates (m, sum d)."""
+        parts = [self.X[:, self.start[c] : self.start[c + 1]] for c in chosen]
+        return np.hstack(parts) if parts else np.zeros((len(self.y), 0))
+
+    def misfit(self, rss: Array) -> Array:
+        """Return -2 log likelihood of residual sums of squares, variance profiled out."""
+        variance = np.maximum(rss / self.freedom, self.floor)
+        return np.asarray(self.freedom * np.log(variance) + rss / variance)
+
+
+@dataclass(frozen=True)
+class Found:
+    """One set of candidates with its joint least-squares fit."""
+
+    chosen: tuple[int, ...]
+    score: float
+    rss: float
+    values: tuple[Array, ...] = field(default=())  # per candidate (d,)
+    deviations: tuple[Array, ...] = field(default=())  # per candidate (d,), 1 sigma
+
+
+def prices(candidates: Sequence[Candidate], freedom: float) -> Array:
+    """Return what each candidate pays: d log m + 2 log(number of its like) + a margin."""
+    families = {c.family for c in candidates if c.named} or {""}
+    count: dict[str, int] = {}
+    for c in candidates:
+        count[_kind(c)] = count.get(_kind(c), 0) + 1
+    paid = []
+    for c in candidates:
+        tried = count[_kind(c)] * (len(families) if c.named else 1)
+        d = len(c.parameters)
+        extra = MARGIN if c.named else SMOOTH_PRICE
+        paid.append(d * np.log(max(freedom, 2.0)) + 2 * np.log(tried) + extra)
+    return np.array(paid)
+
+
+def _kind(candidate: Candidate) -> str:
+    """Return among how many of its like a candidate was tried: usual lines are few."""
+    if candidate.family == "transmission_error" and (candidate.site.order or 0) in USUAL_ORDERS:
+        return "usual lines"
+    return candidate.family
+
+
+def gains(space: Space, P: Array, r: Array) -> tuple[Array, Array]:
+    """Return how much of |r|^2 each candidate takes (C,), and its first value's sign (C,)."""
+    size = np.diff(space.start)
+    gain, sign = np.zeros(len(size)), np.ones(len(size))
+    g = P.T @ r
+    square = np.einsum("ij,ij->j", P, P)
+    whole = np.einsum("ij,ij->j", space.X, space.X)
+    for d in np.unique(size):
+        index = np.flatnonzero(size == d)
+        columns = space.start[index][:, None] + np.arange(d)
+        if d == 1:
+            c = columns[:, 0]
+            alive = square[c] > RANK * whole[c] + 1e-300
+            gain[index] = np.where(alive, g[c] ** 2 / np.where(alive, square[c], 1), 0)
+            sign[index] = np.sign(g[c])
+            continue
+        unit = 1 / np.sqrt(whole[columns] + 1e-300)
+        block = P[:, columns.ravel()].reshape(len(P), len(index), d)
+        G = np.einsum("mci,mcj->cij", block, block, optimize=True)
+        G *= unit[:, :, None] * unit[:, None, :]
+        values, vectors = np.linalg.eigh(G)
+        along = np.einsum("cji,cj->ci", vectors, g[columns] * unit)
+        alive = values > 1e-8
+        gain[index] = (np.where(alive, along**2 / np.where(alive, values, 1), 0)).sum(axis=1)
+    return gain, sign
+
+
+def fit(space: Space, chosen: Sequence[int]) -> Found:
+    """Return the joint fit of a set; its score is infinite where it breaks a bound or is absurd."""
+    if not chosen:
+        rss = float(space.y @ space.y)
+        return Found((), float(space.misfit(np.array(rss))), rss)
+    X = space.columns(chosen)
+    unit = 1 / np.sqrt(np.einsum("ij,ij->j", X, X) + 1e-300)
+    solution, _, _rank, _ = np.linalg.lstsq(X * unit, space.y, rcond=1e-6)
+    rss = float(np.sum((space.y - (X * unit) @ solution) ** 2))
+    variance = max(rss / max(space.freedom - X.shape[1], 1.0), space.floor)
+    inverse = np.linalg.pinv((X * unit).T @ (X * unit), rcond=1e-12, hermitian=True)
+    values, deviation = solution * unit, np.sqrt(np.maximum(np.diag(inverse), 0) * variance) * unit
+    score = float(space.misfit(np.array(rss)) + space.price[list(chosen)].sum())
+    split = np.cumsum([len(space.candidates[c].parameters) for c in chosen])[:-1]
+    parts, spread = np.split(values, split), np.split(deviation, split)
+    for c, x, s in zip(chosen, parts, spread, strict=True):
+        if not _plausible(space.candidates[c], x, s):
+            score = np.inf
+    return Found(tuple(chosen), score, rss, tuple(parts), tuple(spread))
+
+
+def _plausible(candidate: Candidate, x: Array, s: Array) -> bool:
+    if not candidate.named:
+        return True
+    for parameter, value, deviation in zip(candidate.parameters, x, s, strict=True):
+        if value < parameter.lower - 2.5 * deviation or value > parameter.upper:
+            return False
+        if abs(value) - 3 * deviation > ABSURD * parameter.scale:
+            return False
+    return True

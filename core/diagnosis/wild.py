@@ -1,0 +1,105 @@
+"""Wild readings: which samples are set aside, and when they are taken back in."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.candidate import Candidate
+from core.diagnosis.noise import estimate_noise
+from core.diagnosis.search import children
+from core.diagnosis.space import Found, Space, fit
+from core.diagnosis.work import Work, sample_space
+from core.effects import Term
+
+Array = NDArray[np.float64]
+WILD_SHARE = 0.05  # of the samples: more of them is structure, not bad luck
+WILD_SIGMA = 5.0
+RIDGE = 5.0  # usual sizes of a parameter: prior of the fit that only looks for wild readings
+
+
+def look_for_wild(work: Work, columns: list[Array]) -> None:
+    """Mark wild readings before anything is searched: by a fit that can explain nearly anything."""
+    observation = work.observation
+    gap = observation.measured - observation.predict(())
+    N, k = gap.shape
+    usual, parts = [], []
+    for c, block in zip(work.candidates, columns, strict=True):
+        if c.family == "transmission_error" and (c.site.order or 0) > 3:
+            continue
+        parts.append(block)
+        usual += [p.scale for p in c.parameters]
+    A = np.concatenate(parts, axis=2) * np.array(usual) if parts else np.zeros((N, k, 0))
+    prior = np.concatenate(
+        [np.full(A.shape[2], 1 / RIDGE), np.zeros(observation.nuisance.shape[2])]
+    )
+    A = np.concatenate([A, observation.nuisance], axis=2)
+    weight, r, used = np.ones(N), gap, 0.0
+    for step in range(8):
+        W = work.noise.whitener * np.sqrt(weight)[:, None, None]
+        M, rhs = (W @ A).reshape(N * k, -1), (W @ gap[..., None]).ravel()
+        G = M.T @ M
+        inverse = np.linalg.pinv(G + np.diag(prior**2), rcond=1e-14, hermitian=True)
+        r = gap - A @ (inverse @ (M.T @ rhs))
+        used = float(np.trace(inverse @ G))
+        work.kept = _keep(work, r)
+        if step in (2, 5, 7):
+            work.noise = estimate_noise(observation, r, work.kept, 1 - used / (N * k))
+        distance = _distance(work, r)
+        weight = 1 / (1 + (distance / 2) ** 2)
+    work.kept = _keep(work, r)
+
+
+def _distance(work: Work, residual: Array) -> Array:
+    """Return how many standard deviations (rms over coordinates) each sample is off (N,)."""
+    white = (work.noise.whitener @ residual[..., None])[..., 0]
+    distance = np.sqrt(np.mean(white**2, axis=1))
+    usual = np.sqrt(np.median(white**2) / 0.4549)
+    return np.asarray(distance / max(usual, 1e-12))
+
+
+def _keep(work: Work, residual: Array) -> NDArray[np.bool_]:
+    """Return the samples to keep: all but the few wildest, and only if they are few."""
+    distance = _distance(work, residual)
+    wild = np.flatnonzero(distance > WILD_SIGMA)
+    limit = int(np.ceil(WILD_SHARE * len(residual)))
+    kept = np.ones(len(residual), dtype=bool)
+    kept[wild[np.argsort(-distance[wild])][:limit]] = False
+    return kept
+
+
+def with_wild_explained(
+    work: Work,
+    columns: list[Array],
+    base: tuple[Term, ...],
+    smooth: list[tuple[Candidate, Array]],
+    known: tuple[Space, Array, Array, Array, Found],
+) -> tuple[Space, Array, Array, Array, Found]:
+    """Take wild readings back in where one local or smooth function makes them ordinary.
+
+    A chipped tooth or a knocked instrument looks like a few wild readings; bad luck has no place.
+    """
+    kept, found = work.kept, known[-1]
+    work.kept = np.ones_like(kept)
+    space, raw, nuisance, target = sample_space(work, columns, base, smooth)
+    gain = children(space, found.chosen, 12)
+    k = work.observation.measured.shape[1]
+    for _, c in gain:
+        if space.candidates[c].named:
+            continue
+        trial = fit(space, (*found.chosen, c))
+        left = space.y - space.columns(trial.chosen) @ np.concatenate(trial.values)
+        distance = np.sqrt(np.mean(left.reshape(-1, k) ** 2, axis=1))
+        if (distance[~kept] < WILD_SIGMA * np.median(distance)).all():
+            return space, raw, nuisance, target, trial
+    work.kept = kept
+    return known
+
+
+def look_again(work: Work, residual: Array, free: float) -> bool:
+    """Judge noise and wild readings by the best explanation; returns whether those changed."""
+    kept = _keep(work, residual)
+    changed = bool((kept != work.kept).any())
+    work.kept = kept
+    work.noise = estimate_noise(work.observation, residual, kept, free)
+    return changed

@@ -1,0 +1,78 @@
+"""The state of a selection: what is observed, by whom it may be explained, and how it scatters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arm import Arm
+from core.diagnosis.candidate import Candidate
+from core.diagnosis.noise import Noise
+from core.diagnosis.observation import Observation
+from core.diagnosis.space import Space, prices
+from core.effects import Term
+
+Array = NDArray[np.float64]
+KNOWN_SHARE = 0.7  # a stated repeatability is an average: less than this share of it is not assumed
+
+
+@dataclass
+class Work:
+    """What a selection works on; candidates, noise and kept samples change from round to round."""
+
+    observation: Observation
+    arm: Arm
+    candidates: list[Candidate]
+    noise: Noise
+    kept: NDArray[np.bool_]
+
+
+def flat(columns: Array, work: Work) -> Array:
+    """Return (N, k, d) columns as whitened (m, d) rows of the kept samples."""
+    kept = work.noise.whitener[work.kept] @ columns[work.kept]
+    return np.asarray(kept.reshape(kept.shape[0] * kept.shape[1], columns.shape[-1]))
+
+
+def sample_space(
+    work: Work,
+    columns: list[Array],
+    base: tuple[Term, ...],
+    smooth: list[tuple[Candidate, Array]],
+) -> tuple[Space, Array, Array, Array]:
+    """Return the sample space at the model found so far, and its raw columns, nuisance, target."""
+    observation = work.observation
+    candidates = [*work.candidates, *(c for c, _ in smooth)]
+    raw = np.hstack([flat(c, work) for c in [*columns, *(s for _, s in smooth)]])
+    size = np.array([len(c.parameters) for c in candidates])
+    start = np.concatenate([[0], np.cumsum(size)])
+    gap = (observation.measured - observation.predict(base))[..., None]
+    # what the terms already in the model explain is put back, in the linear form at hand
+    for term in base:
+        c, x = locate(work.candidates, term)
+        gap = gap + columns[c] @ x[:, None]
+    target = flat(gap, work)[:, 0]
+    nuisance = flat(observation.nuisance, work)
+    Q = np.linalg.qr(nuisance)[0] if nuisance.shape[1] else nuisance
+    X, y = raw - Q @ (Q.T @ raw), target - Q @ (Q.T @ target)
+    freedom = float(len(target) - Q.shape[1])
+    space = Space(
+        y, X, start, tuple(candidates), prices(candidates, freedom), freedom,
+        KNOWN_SHARE if observation.sigma_is_whole else work.noise.floor_share,
+    )  # fmt: skip
+    return space, raw, nuisance, target
+
+
+def locate(candidates: list[Candidate], term: Term) -> tuple[int, Array]:
+    """Return the candidate of a term, and the term's fitted values."""
+    for c, candidate in enumerate(candidates):
+        if candidate.family == term.effect and candidate.site == term.site:
+            if candidate.fixed != (None,) * len(term.values) and not np.allclose(
+                [f for f in candidate.fixed if f is not None],
+                [v for f, v in zip(candidate.fixed, term.values, strict=True) if f is not None],
+            ):
+                continue
+            free = [v for f, v in zip(candidate.fixed, term.values, strict=True) if f is None]
+            return c, np.array(free)
+    raise KeyError(term)
