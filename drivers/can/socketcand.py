@@ -1,0 +1,34 @@
+"""python-can's socketcand bus, but the end of the connection is told.
+
+python-can 4.6's own spins at full load, without an exception, once the server is gone.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from typing import Any
+
+import can
+from can.interfaces.socketcand.socketcand import SocketCanDaemonBus
+
+
+class SocketcandBus(SocketCanDaemonBus):
+    """A bus served by socketcand; raises CanOperationError when the server has left."""
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        before = time.monotonic()
+        message, filtered = super()._recv_internal(timeout)  # type: ignore[no-untyped-call]
+        early = timeout is None or time.monotonic() - before < timeout or timeout <= 0.0
+        if message is None and early and self._ended():
+            raise can.CanOperationError("the socketcand server has closed the connection")
+        return message, filtered
+
+    def _ended(self) -> bool:
+        link: Any = getattr(self, "_SocketCanDaemonBus__socket")  # noqa: B009 - no public way to it
+        try:
+            return bool(link.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b"")
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True

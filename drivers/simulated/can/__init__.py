@@ -1,0 +1,1 @@
+"""Simulated CAN peers and the hub between processes."""

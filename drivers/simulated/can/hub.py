@@ -1,0 +1,160 @@
+"""A CAN bus between processes: every frame goes to every other connection.
+
+TCP connections speak socketcand's protocol (python-can's ``socketcand`` interface is the client),
+serial lines that of an slcan adapter; both hang on the same bus. Loopback only.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import selectors
+import socket
+import threading
+import time
+from types import TracebackType
+from typing import Self
+
+from drivers.simulated.can.frame import Frame
+from drivers.simulated.can.port import Port, SerialPort, SocketcandPort
+
+MOST_PORTS = 64
+
+
+class Hub:
+    """One simulated bus, served by a thread of its own between ``start`` and ``close``."""
+
+    def __init__(self, host: str = "127.0.0.1", port: int = 0) -> None:
+        if not host.startswith("127."):
+            raise ValueError(f"host: found {host!r}, expected a loopback address (127.x.x.x)")
+        self.host = host
+        self.port = port  # TCP; 0 until start() where the system chooses
+        self.frames = 0  # that went over the bus
+        self._selector = selectors.DefaultSelector()
+        self._ports: dict[int, Port] = {}
+        self._listener: socket.socket | None = None
+        self._thread: threading.Thread | None = None
+        self._wake_in, self._wake_out = -1, -1
+        self._terminals: list[int] = []
+        self._stopping = False
+
+    def start(self) -> Hub:
+        """Listen, and serve in a thread. Raises OSError where the port is taken."""
+        listener = socket.create_server((self.host, self.port), backlog=16)
+        listener.setblocking(False)
+        self.port = listener.getsockname()[1]
+        self._listener = listener
+        self._wake_out, self._wake_in = os.pipe()
+        self._selector.register(listener, selectors.EVENT_READ)
+        self._selector.register(self._wake_out, selectors.EVENT_READ)
+        self._thread = threading.Thread(target=self._serve, name="can-hub", daemon=True)
+        self._thread.start()
+        return self
+
+    def add_terminal(self) -> str:
+        """Return the path of a serial line behind which an slcan adapter hangs on this bus."""
+        ours, theirs = os.openpty()
+        path = os.ttyname(theirs)
+        self._terminals.append(theirs)  # kept open, so that a client may come and go
+        self._add(SerialPort(ours))
+        self._poke()
+        return path
+
+    def close(self) -> None:
+        """Cut every connection; may be repeated."""
+        self._stopping = True
+        thread, self._thread = self._thread, None
+        if thread is None:
+            return
+        self._poke()
+        thread.join(5.0)
+        for port in list(self._ports.values()):
+            self._drop(port)
+        for fd in (*self._terminals, self._wake_in, self._wake_out):
+            os.close(fd)
+        if self._listener is not None:
+            self._listener.close()
+        self._selector.close()
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _poke(self) -> None:
+        with contextlib.suppress(OSError):
+            os.write(self._wake_in, b".")
+
+    def _serve(self) -> None:
+        while not self._stopping:
+            for key, events in self._selector.select():
+                if key.fileobj is self._listener:
+                    self._accept()
+                elif key.fd == self._wake_out:
+                    os.read(self._wake_out, 64)
+                elif (port := self._ports.get(key.fd)) is not None:
+                    self._attend(port, events)
+
+    def _accept(self) -> None:
+        assert self._listener is not None
+        try:
+            link, _ = self._listener.accept()
+        except OSError:
+            return
+        if len(self._ports) >= MOST_PORTS:
+            link.close()
+            return
+        link.setblocking(False)
+        link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._add(SocketcandPort(link))
+
+    def _add(self, port: Port) -> None:
+        self._ports[port.fd] = port
+        self._selector.register(port.fd, self._wanted(port))
+
+    def _attend(self, port: Port, events: int) -> None:
+        try:
+            frames = port.receive() if events & selectors.EVENT_READ else []
+            port.flush()
+        except OSError:
+            self._drop(port)
+            return
+        self._watch(port)
+        for frame in frames:
+            self._spread(frame, port)
+
+    def _spread(self, frame: Frame, source: Port) -> None:
+        self.frames += 1
+        stamp = time.time()
+        for port in list(self._ports.values()):
+            if port is source:
+                continue
+            try:
+                port.deliver(frame, stamp)
+            except OSError:
+                self._drop(port)
+                continue
+            self._watch(port)
+
+    @staticmethod
+    def _wanted(port: Port) -> int:
+        return selectors.EVENT_READ | (selectors.EVENT_WRITE if port.waiting else 0)
+
+    def _watch(self, port: Port) -> None:
+        if port.watched != port.waiting:
+            port.watched = port.waiting
+            self._selector.modify(port.fd, self._wanted(port))
+
+    def _drop(self, port: Port) -> None:
+        if self._ports.pop(port.fd, None) is None:
+            return
+        with contextlib.suppress(OSError, KeyError, ValueError):
+            self._selector.unregister(port.fd)
+        port.close()

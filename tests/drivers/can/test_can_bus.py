@@ -1,0 +1,109 @@
+import socket
+import time
+
+import can
+import pytest
+from pydantic import ValidationError
+
+from core.errors import LinkError
+from drivers.can.bus import BusSettings, close_bus, open_bus
+from drivers.simulated.can.hub import Hub
+
+
+@pytest.fixture
+def hub():
+    with Hub() as served:
+        yield served
+
+
+def settings_of(hub, **more):
+    return BusSettings(interface="socketcand", channel="can0", host=hub.host, port=hub.port, **more)
+
+
+def frames_of(bus, number, timeout=2.0):
+    found = [bus.recv(timeout) for _ in range(number)]
+    return [(f.arbitration_id, bytes(f.data), f.is_extended_id) for f in found if f]
+
+
+def test_a_frame_on_the_hub_reaches_every_other_connection_and_not_its_sender(hub):
+    buses = [open_bus(settings_of(hub)) for _ in range(3)]
+    buses[0].send(can.Message(arbitration_id=0x155, data=[1, 2, 3], is_extended_id=False))
+    buses[0].send(can.Message(arbitration_id=0x1ABCDEF0, data=[], is_extended_id=True))
+    wanted = [(0x155, b"\1\2\3", False), (0x1ABCDEF0, b"", True)]
+    assert frames_of(buses[1], 2) == wanted
+    assert frames_of(buses[2], 2) == wanted
+    assert buses[0].recv(0.05) is None
+    for bus in buses:
+        close_bus(bus)
+
+
+def test_a_serial_adapter_and_a_socketcand_client_share_the_bus(hub):
+    serial = open_bus(BusSettings(interface="slcan", channel=hub.add_terminal()))
+    tcp = open_bus(settings_of(hub))
+    serial.send(can.Message(arbitration_id=0x2A5, data=range(8), is_extended_id=False))
+    assert frames_of(tcp, 1) == [(0x2A5, bytes(range(8)), False)]
+    tcp.send(can.Message(arbitration_id=0x12345, data=[9], is_extended_id=True))
+    assert frames_of(serial, 1) == [(0x12345, b"\x09", True)]
+    close_bus(serial)
+    close_bus(tcp)
+
+
+def test_thousands_of_frames_arrive_once_and_in_order(hub):
+    sender, receiver = open_bus(settings_of(hub)), open_bus(settings_of(hub))
+    for i in range(3000):
+        sender.send(can.Message(arbitration_id=i % 0x7FF, data=i.to_bytes(4, "big")))
+    got = frames_of(receiver, 3000)
+    assert [int.from_bytes(data, "big") for _, data, _ in got] == list(range(3000))
+    close_bus(sender)
+    close_bus(receiver)
+
+
+def test_the_end_of_the_hub_is_told_instead_of_spinning(hub):
+    bus = open_bus(settings_of(hub))
+    hub.close()
+    before = time.process_time()
+    with pytest.raises(can.CanError, match="closed the connection"):
+        bus.recv(1.0)
+    assert time.process_time() - before < 0.5
+    close_bus(bus)
+
+
+def test_a_hub_that_nobody_serves_is_one_line_and_soon():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    start = time.monotonic()
+    with pytest.raises(LinkError, match=rf"socketcand can0@127.0.0.1:{port}: cannot be reached"):
+        open_bus(BusSettings(interface="socketcand", port=port))
+    assert time.monotonic() - start < 3.0
+
+
+def test_garbage_from_a_client_harms_nobody_else(hub):
+    bus, other = open_bus(settings_of(hub)), open_bus(settings_of(hub))
+    with socket.create_connection((hub.host, hub.port)) as wild:
+        wild.sendall(b"< send zzz 8 1 >< send 155 2 1 ><send 155 1 100 >< nonsense >" + b"x" * 500)
+        bus.send(can.Message(arbitration_id=1, data=[1], is_extended_id=False))
+        assert frames_of(other, 1) == [(1, b"\1", False)]
+    close_bus(bus)
+    close_bus(other)
+
+
+def test_an_interface_that_python_can_lacks_is_refused_with_those_it_has():
+    with pytest.raises(ValidationError, match=r"expected one of .*socketcand"):
+        BusSettings(interface="soketcan")
+
+
+def test_a_socketcan_channel_that_is_not_there_is_one_line():
+    with pytest.raises(LinkError, match="socketcan nowhere0: cannot be opened"):
+        open_bus(BusSettings(interface="socketcan", channel="nowhere0"))
+
+
+def test_socketcan_where_vcan0_exists():
+    try:
+        one = open_bus(BusSettings(interface="socketcan", channel="vcan0"))
+    except LinkError as error:
+        pytest.skip(f"no vcan0 in this kernel: {error}")
+    two = open_bus(BusSettings(interface="socketcan", channel="vcan0"))
+    one.send(can.Message(arbitration_id=0x155, data=[7], is_extended_id=False))
+    assert frames_of(two, 1) == [(0x155, b"\7", False)]
+    close_bus(one)
+    close_bus(two)
