@@ -7,6 +7,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from bridge.settings import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
+from drivers.ur_rtde.settings import UrRtdeSettings
 
 
 class DaemonSettings(BaseModel):
@@ -19,7 +20,7 @@ class DaemonSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     cell: Path = Field(description="the cell file; the loop's process takes its model from there")
-    link: LinkSettings = Field(default_factory=LinkSettings)
+    link: LinkSettings = Field(default_factory=UrRtdeSettings)
     limits: LimitSettings = Field(default_factory=LimitSettings)
     setpoints: SetpointSettings = Field(default_factory=SetpointSettings)
     recording: RecordingSettings = Field(default_factory=RecordingSettings)
@@ -32,10 +33,10 @@ class DaemonSettings(BaseModel):
     @model_validator(mode="after")
     def _source_fits_link(self) -> DaemonSettings:
         """Refuse a source of motion where the motion is the robot's own."""
-        if self.link.mode == "offset" and self.setpoints.source != "target":
+        if not self.link.moves_arm and self.setpoints.source != "target":
             raise ValueError(
-                f"setpoints.source: found {self.setpoints.source!r} with link.mode 'offset', "
-                "expected 'target': there the robot's own program moves the arm"
+                f"setpoints.source: found {self.setpoints.source!r} with a link that sends "
+                "offsets only, expected 'target': there the robot's own program moves the arm"
             )
         if self.setpoints.source == "trajectory" and self.setpoints.file is None:
             raise ValueError("setpoints.file: found nothing, expected the trajectory's CSV")

@@ -6,14 +6,39 @@ Small pydantic models without a robot library behind them, so that a cell is rea
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, TypeAdapter, field_validator
 
+from drivers.modbus.settings import ModbusSettings
 from drivers.ur_rtde.settings import UrRtdeSettings
 
-LinkSettings = UrRtdeSettings
-"""Section ``link``. With further drivers: a union of their settings, told apart by ``driver``."""
+DEFAULT_DRIVER = "ur_rtde"
+
+
+def _driver_of(link: Any) -> Any:
+    """Return the name of the driver in a link's keys or settings."""
+    if isinstance(link, dict):
+        return link.get("driver", DEFAULT_DRIVER)
+    return getattr(link, "driver", DEFAULT_DRIVER)
+
+
+LinkSettings = Annotated[
+    Annotated[UrRtdeSettings, Tag("ur_rtde")] | Annotated[ModbusSettings, Tag("modbus")],
+    Discriminator(_driver_of),
+]
+"""Section ``link``: the settings of the driver that it names (left out: ur_rtde)."""
+
+_LINK: TypeAdapter[LinkSettings] = TypeAdapter(LinkSettings)
+
+
+def link_settings(**keys: Any) -> LinkSettings:
+    """Return the settings of a link from its keys, as a cell file has them.
+
+    Raises pydantic's ValidationError.
+    """
+    return _LINK.validate_python(keys)
+
 
 _FROZEN = ConfigDict(extra="forbid", frozen=True)
 

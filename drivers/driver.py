@@ -7,6 +7,7 @@ more have a sensible default: ``arm``, ``release`` and ``nominal_q``.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
@@ -33,6 +34,18 @@ class DriverSettings(BaseModel):
     connect_timeout: float = Field(
         15.0, gt=0.0, description="s that connecting or arming may take before it counts as hung"
     )
+
+    @property
+    def moves_arm(self) -> bool:
+        """Return whether setpoints are the arm's motion; False: they ride on the robot's own."""
+        return True
+
+    def located(self, folder: Path) -> Self:
+        """Return the settings with relative paths, which are seen from ``folder``, made whole.
+
+        Raises InputError where a file that they name cannot be used.
+        """
+        return self
 
 
 class Driver(ABC):

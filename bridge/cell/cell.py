@@ -42,8 +42,12 @@ class Cell:
 
     @property
     def link(self) -> LinkSettings | None:
-        """Return section ``link``; None where the cell has none."""
-        return self.file.link
+        """Return section ``link``, its paths seen from here; None where the cell has none.
+
+        Raises InputError where a file that it names cannot be used.
+        """
+        given = self.file.link
+        return None if given is None else given.located(self.path.parent)
 
     @property
     def limits(self) -> LimitSettings:

@@ -59,11 +59,20 @@ def message(document: Document, schema: type[BaseModel], error: ValidationError)
     if worst["type"] == "invalid_key":
         return f"{document.path}: found a key {worst['input']!r}, expected a word"
     keys, model = _own_keys(schema, worst["loc"])
+    if worst["type"] == "union_tag_invalid":
+        keys.append("driver")
+        return _not_one_of(document, keys, worst["ctx"]["tag"], worst["ctx"]["expected_tags"])
     if worst["type"] == "extra_forbidden":
         return _unknown_key(document, keys, model)
     found, expected = _found(worst), _expected(worst, _description(schema, keys))
     where = f"{document.path}, line {document.line(keys)}"
     return f"{where}: {key_path(keys)}: found {found}, expected {expected}"
+
+
+def _not_one_of(document: Document, keys: list[str | int], found: object, expected: str) -> str:
+    """Return the line for a word that is none of those that choose what else may stand there."""
+    where = f"{document.path}, line {document.line(keys)}"
+    return f"{where}: {key_path(keys)}: found {found!r}, expected one of {expected}"
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
@@ -109,10 +118,18 @@ def _own_keys(
             holder = owner
             keys.append(part)
             models = _models(owner.model_fields[part].annotation)
+        elif chosen := [m for m in models if _tag(m) == part]:
+            models = chosen
         elif part == loc[-1] and models and not _is_union_label(part, models):
             chosen = [m for m in models if m.__name__ in loc] or models
             return [*keys, part], chosen[0]
     return keys, holder
+
+
+def _tag(model: type[BaseModel]) -> str | None:
+    """Return the driver that settings belong to, None where they belong to none."""
+    field = model.model_fields.get("driver")
+    return None if field is None else str(field.default)
 
 
 def _is_union_label(part: str, models: list[type[BaseModel]]) -> bool:

@@ -1,19 +1,107 @@
-"""The simulated controller of a cell: same arm and tool, hidden flexibilities of its own."""
+"""The simulated controller of a cell: same arm and tool, hidden flexibilities of its own.
+
+A UR controller has a server of its own; every other protocol is a set of servers around a Peer.
+"""
 
 from __future__ import annotations
 
+import importlib
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bridge.cell.cell import Cell
 from core.errors import CellError
 from core.rotation import rotation_vector
-from drivers.simulated.settings import ServerSettings, simulated_cell
+from drivers.driver import DriverSettings
+from drivers.simulated.peer import Peer, make_peer
+from drivers.simulated.peer_server import PeerServer, serve_peer
+from drivers.simulated.server import serve
+from drivers.simulated.settings import (
+    BENCH_PORT,
+    ServerSettings,
+    simulated_arm,
+    simulated_cell,
+)
 
 HOST = "127.0.0.2"
 PORTS = ("rtde_port", "dashboard_port", "script_port", "bench_port")
+PERIOD = 0.004  # s, of a Peer's cycle
+
+SIMULATORS: dict[str, str] = {
+    "modbus": "drivers.simulated.modbus.server:make_servers",
+}
+"""link.driver -> ``module:function(link, host, peer) -> list[PeerServer]``, imported on use."""
+
+
+class SimulatedPeer(NamedTuple):
+    """A cell's controller, not yet served."""
+
+    peer: Peer
+    servers: list[PeerServer]
+    host: str
+    bench_port: int
+
+
+def serve_cell(
+    cell: Cell,
+    host: str | None,
+    seed: int | None,
+    stop: Callable[[], bool],
+    say: Callable[[str], None],
+) -> None:
+    """Serve the simulated controller of a cell until ``stop()`` is true.
+
+    ``say`` is told where it listens. Raises CellError where the cell cannot be simulated, LinkError
+    where a port is taken.
+    """
+    link = cell.link
+    if link is not None and link.driver in SIMULATORS:
+        found = simulated_peer(cell, link, host, seed)
+        names = ", ".join(server.name for server in found.servers)
+        say(f"{cell.arm.name} at {found.host}: {names}, bench {found.bench_port}")
+        serve_peer(found.peer, found.servers, found.host, found.bench_port, stop)
+        return
+    settings = server_settings(cell, host, seed)
+    say(
+        f"{settings.arm.name} at {settings.host}: RTDE {settings.rtde_port}, dashboard "
+        f"{settings.dashboard_port}, scripts {settings.script_port}, bench {settings.bench_port}"
+    )
+    serve(settings, stop)
+
+
+def simulated_peer(
+    cell: Cell, link: DriverSettings, host: str | None = None, seed: int | None = None
+) -> SimulatedPeer:
+    """Return the peer and the servers of a cell whose link is no UR controller's.
+
+    Its plant is drawn as ``server_settings`` says. Raises CellError.
+    """
+    simulation, address = cell.file.simulation, _address(cell, host)
+    arm, plant, start = simulated_arm(
+        cell.arm,
+        simulation.seed if seed is None else seed,
+        simulation.start_q,
+        **_plant(cell),
+    )
+    peer = make_peer(arm, plant, start, PERIOD)
+    module, function = SIMULATORS[str(getattr(link, "driver", ""))].split(":")
+    servers = getattr(importlib.import_module(module), function)(link, address, peer)
+    return SimulatedPeer(peer, servers, address, simulation.bench_port or BENCH_PORT)
+
+
+def _address(cell: Cell, host: str | None) -> str:
+    """Return the loopback address that the controller is served at. Raises CellError."""
+    link = cell.file.link
+    address = host or cell.file.simulation.host or str(getattr(link, "host", None) or HOST)
+    if not address.startswith("127."):
+        raise CellError(
+            f"{cell.path}: simulation.host: found {address!r}, expected a loopback address "
+            "(127.x.x.x): a simulated controller is never served to others"
+        )
+    return address
 
 
 def server_settings(cell: Cell, host: str | None = None, seed: int | None = None) -> ServerSettings:
@@ -23,13 +111,7 @@ def server_settings(cell: Cell, host: str | None = None, seed: int | None = None
     seed unless ``simulation.compliance`` gives them. The cell's own compliance and effects are what
     is believed of it, so they play no part. Raises CellError where the cell cannot be simulated.
     """
-    simulation, link = cell.file.simulation, cell.file.link
-    address = host or simulation.host or (link.host if link else HOST)
-    if not address.startswith("127."):
-        raise CellError(
-            f"{cell.path}: simulation.host: found {address!r}, expected a loopback address "
-            "(127.x.x.x): a simulated controller is never served to others"
-        )
+    simulation, address = cell.file.simulation, _address(cell, host)
     chosen = {name: getattr(simulation, name) for name in PORTS}
     settings = simulated_cell(
         cell.arm,

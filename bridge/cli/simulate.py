@@ -7,9 +7,8 @@ from pathlib import Path
 
 import click
 
-from bridge.cell.simulation import server_settings
+from bridge.cell.simulation import serve_cell
 from bridge.cli.options import cell_argument, open_cell
-from drivers.simulated.server import serve
 
 
 @click.command()
@@ -25,12 +24,7 @@ def simulate(cell: Path, host: str | None, seed: int | None) -> None:
 
     Example: gapbridge simulate config/ur10e_simulated.yaml
     """
-    settings = server_settings(open_cell(cell), host, seed)
     stopped: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda n, _: stopped.append(n))
-    click.echo(
-        f"{settings.arm.name} at {settings.host}: RTDE {settings.rtde_port}, dashboard "
-        f"{settings.dashboard_port}, scripts {settings.script_port}, bench {settings.bench_port}"
-    )
-    serve(settings, lambda: bool(stopped))
+    serve_cell(open_cell(cell), host, seed, lambda: bool(stopped), click.echo)

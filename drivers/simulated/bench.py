@@ -1,6 +1,6 @@
 """The bench on port 30100: what a person and a laser tracker do beside a real cell.
 
-One command a line, one line back; `help` lists them. None of it is known to a UR controller.
+One command a line, one line back; `help` lists them. None of it is known to the controller.
 """
 
 from __future__ import annotations
@@ -8,17 +8,14 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from drivers.simulated.connection import Connection
-from drivers.simulated.controller import Controller
 from drivers.simulated.kinematics import pose_of
-from drivers.simulated.motion import MoveJoints
-from drivers.simulated.offset_program import OffsetMotion
-from drivers.simulated.plant import Load
+from drivers.simulated.plant import Load, Plant
 from drivers.simulated.plant_arm import place
 from drivers.simulated.rotations import compose, from_vector, to_vector
 
@@ -29,34 +26,74 @@ log = logging.getLogger("drivers.simulated")
 
 HEAVIEST = 200.0  # kg
 LONGEST_LINE = 1000  # characters
-DEFAULT_SPEED = 0.5  # rad/s
+
+Joints = tuple[float, ...]
+Command = tuple[int, Callable[[list[float]], str], str]
+"""How many numbers a command takes, what it does, and what help says of it."""
 
 
 class BenchError(ValueError):
     """A command that cannot be done; the message goes back to the person."""
 
 
-class BenchServer:
-    """Answers bench commands on one plant."""
+class BenchSubject(Protocol):
+    """The controller beside the bench: a UR controller or a Peer."""
 
-    def __init__(self, controller: Controller, drop_clients: Callable[[], None]) -> None:
+    plant: Plant
+    memory: dict[str, Any]
+    frozen: bool
+    largest_servo_step: float
+
+    def stall(self, seconds: float) -> None:
+        """Send and answer nothing for a while."""
+        ...
+
+    def protective_stop(self) -> None:
+        """Stop as after a collision."""
+        ...
+
+    def emergency_stop(self) -> None:
+        """Stop as after a push of the button."""
+        ...
+
+    def release_emergency_stop(self) -> None:
+        """Let the button go."""
+        ...
+
+
+class BenchServer:
+    """Answers bench commands on one plant.
+
+    `move_own` has the robot's own program move to joints (n, rad) and raises BenchError where it
+    cannot; `further` commands are those of one protocol.
+    """
+
+    def __init__(
+        self,
+        controller: BenchSubject,
+        drop_clients: Callable[[], None],
+        move_own: Callable[[Joints], None],
+        further: Mapping[str, Command] | None = None,
+    ) -> None:
         self._controller = controller
-        self._drop_clients = drop_clients
+        self._drop_clients, self._move_own = drop_clients, move_own
         self._random = np.random.default_rng((controller.plant.settings.seed, 2))
-        self._commands: dict[str, tuple[int, Callable[[list[float]], str], str]] = {
+        n = len(controller.plant.q)
+        self._commands: dict[str, Command] = {
             "measure": (0, self._measure, "timestamp,x,y,z,rx,ry,rz of the true TCP, with noise"),
             "payload": (4, self._payload, "MASS CX CY CZ: hang a load on the flange, kg, m"),
             "wrench": (6, self._wrench, "FX FY FZ TX TY TZ: pull at the TCP, base axes, N, Nm"),
-            "move": (6, self._move, "Q1..Q6: the robot's own program moves there, rad"),
+            "move": (n, self._move, f"Q1..Q{n}: the robot's own program moves there, rad"),
             "protective_stop": (0, self._protective_stop, "as a collision would"),
             "emergency_stop": (0, self._emergency_stop, "press the button"),
             "release": (0, self._release, "release the emergency stop button"),
-            "freeze": (0, self._freeze, "the timestamp stands still, packets go on"),
-            "thaw": (0, self._thaw, "the timestamp goes on"),
-            "stall": (1, self._stall, "SECONDS: no RTDE packet leaves"),
-            "drop": (0, self._drop, "close every RTDE connection"),
+            "freeze": (0, self._freeze, "the controller's clock stands still, packets go on"),
+            "thaw": (0, self._thaw, "the clock goes on"),
+            "stall": (1, self._stall, "SECONDS: the controller sends and answers nothing"),
+            "drop": (0, self._drop, "close every client's connection"),
             "truth": (0, self._truth, "the hidden plant as JSON, for scoring only"),
             "help": (0, self._help, "this list"),
+            **(further or {}),
         }
 
     def handle(self, connection: Connection) -> None:
@@ -109,16 +146,7 @@ class BenchServer:
         return "ok"
 
     def _move(self, numbers: list[float]) -> str:
-        controller, goal = self._controller, tuple(numbers)
-        if not controller.can_move:
-            raise BenchError("move: the robot is not running")
-        motion = controller.motion
-        if isinstance(motion, OffsetMotion):
-            motion.own = MoveJoints(motion.nominal, goal, DEFAULT_SPEED, 2.0 * DEFAULT_SPEED)
-            return "ok"
-        if controller.program is not None:
-            raise BenchError("move: another program runs")
-        controller.motion = MoveJoints(controller.target_q, goal, DEFAULT_SPEED, 1.0)
+        self._move_own(tuple(numbers))
         return "ok"
 
     def _protective_stop(self, _: list[float]) -> str:
@@ -144,7 +172,7 @@ class BenchServer:
         return "ok"
 
     def _stall(self, numbers: list[float]) -> str:
-        self._controller.stall_until = self._controller.clock + max(numbers[0], 0.0)
+        self._controller.stall(max(numbers[0], 0.0))
         return "ok"
 
     def _drop(self, _: list[float]) -> str:
@@ -181,7 +209,7 @@ class BenchServer:
         return "; ".join(f"{name}: {text}" for name, (_n, _a, text) in self._commands.items())
 
 
-def tcp_scatter(controller: Controller) -> float:
+def tcp_scatter(controller: BenchSubject) -> float:
     """Return the rms length (m) of the TCP's placement error at the present joints."""
     plant = controller.plant
     step = 1e-6

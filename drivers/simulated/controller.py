@@ -269,6 +269,10 @@ class Controller:
         if self.memory["safety_mode"] == modes.SAFETY_ROBOT_EMERGENCY:
             self.set_safety(modes.SAFETY_NORMAL)
 
+    def stall(self, seconds: float) -> None:
+        """Let no RTDE packet leave for `seconds`."""
+        self.stall_until = self.clock + seconds
+
     def finite(self, values: Sequence[float], what: str) -> Joints:
         """Return `values` as joints or pose; raises ScriptError where one is not finite."""
         found = tuple(float(v) for v in values)

@@ -20,7 +20,6 @@ from drivers.simulated.rotations import (
     turn_z,
 )
 
-JOINTS = 6  # a UR controller's fields hold six
 FASTEST = 6.2831853  # rad/s, for an arm without velocity limits
 
 
@@ -45,7 +44,7 @@ def place(outer: Frame, inner: Frame) -> Frame:
 
 @dataclass(frozen=True, slots=True)
 class PlantArm:
-    """A six-joint arm.
+    """An arm of any number of turning joints.
 
     ``links`` are n + 1 fixed frames: base to joint 1 at zero, link i to joint i + 1, link n to
     flange; every joint turns about its own z. ``cog`` (m) is in the link's own joint frame.
@@ -102,15 +101,15 @@ def _frame(matrix: Sequence[Sequence[float]]) -> Frame:
     return Frame(rotation, (r[0][3], r[1][3], r[2][3]))
 
 
-def plant_arm(arm: Arm | str) -> PlantArm:
+def plant_arm(arm: Arm | str, joints: int | None = None) -> PlantArm:
     """Return the plant's arm from the data of a nominal arm, or of a built-in one by its name.
 
-    Raises ArmError unless it has six joints: a UR controller's fields hold no other number.
+    Raises ArmError where it has not `joints` joints (None: any number will do).
     """
     if isinstance(arm, str):
         arm = builtin_arm(arm)
-    if arm.n != JOINTS:
-        raise ArmError(f"robot: found {arm.n} joints, expected {JOINTS}: a UR controller has six")
+    if joints is not None and arm.n != joints:
+        raise ArmError(f"robot: found {arm.n} joints, expected {joints}: the controller has those")
     limits = arm.limits
     return PlantArm(
         name=arm.name,

@@ -48,7 +48,7 @@ class Sensors:
         self._zero = plant.settings.sensor_bias  # taken off actual_TCP_force; zeroFt sets it anew
         self._bend = IDENTITY  # true flange seen from the rigid one
         self._bent_at: object = None
-        self._wrench: tuple[float, ...] = _ZERO6
+        self._wrench: tuple[float, ...] = (0.0,) * len(plant.q)
         self._flange = plant.arm.flange(plant.q)
         self._centres: list[Vector3] = []
         self._q: tuple[float, ...] | None = None
@@ -84,10 +84,11 @@ class Sensors:
         self._memory[f"{which}_TCP_speed"] = tuple(v / dt for v in step)
 
     def _draw_noise(self) -> None:
-        """Draw the noise of the next cycles: force (3), torque (3), joint torques (6)."""
+        """Draw the noise of the next cycles: force (3), torque (3), joint torques (n)."""
         s = self._plant.settings
-        size = (3 * (s.force_noise,), 3 * (s.torque_noise,), 6 * (s.joint_torque_noise,))
-        drawn = self._random.standard_normal((NOISE_BATCH, 12)) * np.concatenate(size)
+        n = len(self._plant.q)
+        size = (3 * (s.force_noise,), 3 * (s.torque_noise,), n * (s.joint_torque_noise,))
+        drawn = self._random.standard_normal((NOISE_BATCH, 6 + n)) * np.concatenate(size)
         self._noise = drawn.tolist()
 
     def _sense_force(self, dt: float) -> None:

@@ -10,12 +10,14 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from core.errors import LinkError
 from drivers.simulated.bench import BenchServer
 from drivers.simulated.connection import Connection, listen
 from drivers.simulated.controller import CYCLE, Controller
 from drivers.simulated.dashboard_server import DashboardServer
+from drivers.simulated.own_motion import move_own
 from drivers.simulated.punctual import become_punctual
 from drivers.simulated.rtde_server import RtdeServer, RtdeSession
 from drivers.simulated.script_server import ScriptServer
@@ -46,7 +48,9 @@ class Server:
         self.rtde = RtdeServer(self.controller, (*settings.version, 0))
         self._dashboard = DashboardServer(self.controller, version, settings.serial)
         self._script = ScriptServer(self.controller)
-        self._bench = BenchServer(self.controller, self.rtde.close_all)
+        self._bench = BenchServer(
+            self.controller, self.rtde.close_all, partial(move_own, self.controller)
+        )
         self._clients: dict[socket.socket, tuple[Connection, Callable[[Connection], None]]] = {}
         self._listeners: dict[socket.socket, Listener] = {}
         self._open_ports(settings)

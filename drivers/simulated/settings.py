@@ -16,6 +16,7 @@ from drivers.simulated.plant_arm import Frame, PlantArm, plant_arm
 from drivers.simulated.plant_settings import PlantSettings, draw_plant_settings
 
 START_Q = (0.0, -1.5, 1.8, -1.87, -1.57, 0.0)  # rad: elbow up, tool pointing down
+UR_JOINTS = 6  # the fields of its protocols hold six
 RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, BENCH_PORT = 30004, 29999, 30003, 30100
 
 
@@ -54,13 +55,30 @@ def simulated_cell(
     Without `start_q` (6,) (rad) the arm starts elbow up, tool down, within its joint limits.
     Raises ArmError for an arm that is unknown or has not six joints.
     """
+    plant_arm(arm, UR_JOINTS)
+    table, drawn, start = simulated_arm(arm, seed, start_q, **plant)
+    return ServerSettings(table, drawn, host, start)
+
+
+def simulated_arm(
+    arm: Arm | str, seed: int = 0, start_q: Sequence[float] | None = None, **plant: Any
+) -> tuple[PlantArm, PlantSettings, tuple[float, ...]]:
+    """Return an arm of any number of joints, its plant drawn from `seed`, and where it starts.
+
+    `plant` sets single fields of PlantSettings. Without `start_q` (n,) (rad) the arm starts as
+    START_Q says, further joints at zero, all within its limits. Raises ArmError.
+    """
     table = plant_arm(arm)
-    limits = zip(START_Q, table.lower, table.upper, strict=True)
-    start = [min(max(q, lo), hi) for q, lo, hi in limits] if start_q is None else start_q
-    if not within_limits(table, start):
-        raise ArmError(f"start_q: found {list(start)}, expected joints within the arm's limits")
-    drawn = replace(draw_plant_settings(table, seed), **plant)
-    return ServerSettings(table, drawn, host, tuple(float(q) for q in start))
+    n = len(table.mass)
+    given = [*START_Q, *[0.0] * n][:n] if start_q is None else [float(q) for q in start_q]
+    if len(given) != n:
+        raise ArmError(f"start_q: found {len(given)} values, expected {n}")
+    if start_q is None:
+        limits = zip(given, table.lower, table.upper, strict=True)
+        given = [min(max(q, lo), hi) for q, lo, hi in limits]
+    if not within_limits(table, given):
+        raise ArmError(f"start_q: found {given}, expected joints within the arm's limits")
+    return table, replace(draw_plant_settings(table, seed), **plant), tuple(given)
 
 
 def make_controller(settings: ServerSettings) -> Controller:

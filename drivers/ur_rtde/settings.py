@@ -45,6 +45,11 @@ class UrRtdeSettings(DriverSettings):
         description="Nm/A of each joint motor current; without them there is no joint torque",
     )
 
+    @property
+    def moves_arm(self) -> bool:
+        """Return whether setpoints are the arm's motion."""
+        return self.mode == "servoj"
+
     @field_validator("host")
     @classmethod
     def _plain_host(cls, value: str) -> str:

@@ -143,7 +143,8 @@ def test_an_arm_of_seven_joints_is_refused_by_name_of_the_reason() -> None:
         link_in_link=np.tile(np.eye(4), (8, 1, 1)),
     )
     with pytest.raises(ArmError, match="found 7 joints, expected 6"):
-        plant_arm(seven)
+        plant_arm(seven, 6)
+    assert len(plant_arm(seven).mass) == 7
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 0.5, 3.0, math.pi - 1e-9, math.pi])

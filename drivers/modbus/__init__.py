@@ -1,0 +1,1 @@
+"""Arms and controllers on Modbus (TCP, RTU, TLS): a driver whose register map is data."""

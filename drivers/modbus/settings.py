@@ -1,0 +1,91 @@
+"""The link to a Modbus controller: what a cell file says under ``link``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from drivers.driver import DriverSettings
+
+SHIPPED = Path(__file__).with_name("profiles")
+
+
+class ModbusSettings(DriverSettings):
+    """How to reach a Modbus controller, and which register map it has.
+
+    ``profile`` is the name of a shipped one (``ur``, ``igus``, ...) or a path ending in .yaml, seen
+    from the cell's folder.
+    """
+
+    driver: Literal["modbus"] = "modbus"
+    profile: str = Field(min_length=1, description="a shipped register map, or a path to one")
+    transport: Literal["tcp", "tls", "rtu"] = "tcp"
+    host: str = Field("127.0.0.2", min_length=1, description="tcp, tls: address or name")
+    port: int | None = Field(
+        None, gt=0, lt=65536, description="tcp, tls: port; left out: the profile's"
+    )
+    device_id: int | None = Field(
+        None, ge=0, le=255, description="unit id; left out: the profile's"
+    )
+    serial: str | None = Field(None, description="rtu: the serial port, as /dev/ttyUSB0")
+    baudrate: int = Field(19200, ge=1200, le=4000000, description="rtu: bit/s")
+    parity: Literal["N", "E", "O"] = "N"
+    stopbits: Literal[1, 2] = 1
+    authority: Path | None = Field(None, description="tls: PEM of the CA that is trusted")
+    certificate: Path | None = Field(None, description="tls: PEM of our own certificate")
+    key: Path | None = Field(None, description="tls: PEM of our own key")
+    rate: float = Field(20.0, gt=0.0, le=500.0, description="cycles per second asked for")
+    state_timeout: float = Field(
+        0.5, gt=0.0, le=5.0, description="s without a new sample after which the state is stale"
+    )
+    timeout: float = Field(0.1, gt=0.0, le=2.0, description="s that one answer may take")
+    coarsest: float | None = Field(
+        None, gt=0.0,
+        description="m that one count of a target register may move the TCP; left out: the "
+        "offset that the model predicts where the arm stands",
+    )  # fmt: skip
+
+    @model_validator(mode="after")
+    def _has_its_transport(self) -> Self:
+        """Refuse a transport without what it needs."""
+        if self.transport == "rtu" and self.serial is None:
+            raise ValueError("expected serial, the port to open, with transport rtu")
+        if self.transport == "tls" and self.authority is None:
+            raise ValueError("expected authority, the CA that is trusted, with transport tls")
+        return self
+
+    @field_validator("host")
+    @classmethod
+    def _plain_host(cls, value: str) -> str:
+        """Refuse a port in the host: it has a key of its own."""
+        if ":" in value or value.strip() != value:
+            raise ValueError("expected an IPv4 address or host name without a port")
+        return value
+
+    @property
+    def names_file(self) -> bool:
+        """Return whether ``profile`` is a path rather than a shipped name."""
+        return self.profile.endswith((".yaml", ".yml"))
+
+    @property
+    def profile_path(self) -> Path:
+        """Return the file of the register map."""
+        return Path(self.profile) if self.names_file else SHIPPED / f"{self.profile}.yaml"
+
+    @property
+    def address(self) -> str:
+        """Return what messages call the controller."""
+        return self.serial or self.host if self.transport == "rtu" else self.host
+
+    def located(self, folder: Path) -> Self:
+        """Return the settings with paths seen from ``folder`` made whole."""
+        update: dict[str, object] = {
+            name: folder / path
+            for name in ("authority", "certificate", "key")
+            if (path := getattr(self, name)) is not None
+        }
+        if self.names_file:
+            update["profile"] = str((folder / self.profile).resolve())
+        return self.model_copy(update=update)
