@@ -9,8 +9,9 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,9 +48,14 @@ class Log:
     columns: Mapping[str, Array]
     n: int  # joints
     first_row: int = 2  # line of the first data row in the file, for messages
+    lines: NDArray[np.int64] | None = None  # (N,) line of each row; None: one after the other
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
+
+    def line(self, row: int | np.integer[Any]) -> int:
+        """Return the line of the file that row ``row`` (from 0) stood in, for messages."""
+        return int(row) + self.first_row if self.lines is None else int(self.lines[row])
 
     def has(self, name: str) -> bool:
         """Return whether the log carries the column (group)."""
@@ -80,7 +86,7 @@ class Log:
             row, column = (int(v) for v in bad[0])
             label = name if values.ndim == 1 else f"{name}_{column}"
             raise LogError(
-                f"{self.path}: row {row + self.first_row}, column {label}: found "
+                f"{self.path}: row {self.line(row)}, column {label}: found "
                 f"{flat[row, column]}, expected a finite number"
             )
 
@@ -97,7 +103,7 @@ class Log:
         if mass is not None and (mass < 0).any():
             row = int(np.argmax(mass < 0))
             raise LogError(
-                f"{self.path}: row {row + self.first_row}, column payload: found {mass[row]:g}, "
+                f"{self.path}: row {self.line(row)}, column payload: found {mass[row]:g}, "
                 "expected 0 or more kg"
             )
         return Loads(**found, approach=self.approach())
@@ -116,8 +122,10 @@ class Log:
         return last_motion(q)
 
     def select(self, rows: Array | slice) -> Log:
-        """Return the log of some of the rows."""
-        return Log(self.path, {k: v[rows] for k, v in self.columns.items()}, self.n, self.first_row)
+        """Return the log of some of the rows; each keeps the line that it had in the file."""
+        lines = np.arange(len(self)) + self.first_row if self.lines is None else self.lines
+        columns = {name: values[rows] for name, values in self.columns.items()}
+        return replace(self, columns=columns, lines=lines[rows])
 
 
 def last_motion(q: Array, dead_band: float = 1e-6) -> Array:

@@ -148,7 +148,7 @@ def _check_order(log: Log, time: Array) -> None:
     if len(back):
         row = int(back[0]) + 1
         raise LogError(
-            f"{log.path}: row {row + log.first_row}, column timestamp: found {time[row]:g} after "
+            f"{log.path}: row {log.line(row)}, column timestamp: found {time[row]:g} after "
             f"{time[row - 1]:g}, expected rows in time order"
         )
 
@@ -159,7 +159,7 @@ def _clock(log: Log, time: Array) -> tuple[Index, Array, str | None]:
     everything: Index = np.arange(len(time))
     if not len(repeats):
         return everything, time, None
-    first = f"the first is row {repeats[0] + log.first_row}"
+    first = f"the first is row {log.line(repeats[0])}"
     same = np.ones(len(repeats), dtype=bool)
     for column in log.columns.values():
         flat = column.reshape(len(column), -1)
@@ -176,7 +176,7 @@ def _clock(log: Log, time: Array) -> tuple[Index, Array, str | None]:
         )
         return everything, even, f"{told}; the rows were taken as evenly spaced"
     raise LogError(
-        f"{log.path}: row {repeats[0] + log.first_row}, column timestamp: found "
+        f"{log.path}: row {log.line(repeats[0])}, column timestamp: found "
         f"{time[repeats[0]]:g} again (as in {len(repeats)} of {len(time)} rows), expected a time "
         "of its own per row"
     )

@@ -167,6 +167,19 @@ def test_a_selection_holds_its_rows_only(tmp_path):
     assert len(log.select(slice(1, None))) == 2
 
 
+def test_a_selection_of_a_selection_names_the_lines_of_the_file(tmp_path):
+    rows = [[*r, 5.0] for r in joints(9)]
+    rows[6][6], rows[7][2] = -1.0, "nan"
+    log = read_log(write(tmp_path, table([*JOINTS, "payload"], rows)), 6)
+    assert log.line(6) == 8
+    part = log.select(np.arange(9) % 2 == 0).select(slice(1, None)).select(np.array([2, 0, 1]))
+    assert [part.line(row) for row in range(3)] == [8, 4, 6]
+    with pytest.raises(LogError, match="row 8, column payload: found -1"):
+        part.loads()
+    with pytest.raises(LogError, match="row 9, column actual_q_2: found nan"):
+        log.select(np.array([0, 7])).require("actual_q")
+
+
 def test_a_missing_column_is_named_with_its_alternative(tmp_path):
     log = read_log(write(tmp_path, table(["payload"], [[1]])), 6)
     with pytest.raises(LogError, match=r"found no actual_q_0\.\.5 or target_q_0\.\.5, expected"):

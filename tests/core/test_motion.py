@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import moving_truth as truth
 import numpy as np
 import pytest
@@ -85,6 +87,14 @@ def test_a_gap_in_time_ends_a_stretch():
     assert motion.stretch[-1] == 1
     assert not motion.valid[[0, 1999, 2000, -1]].any()
     assert np.abs(motion.qd - COURSE.at(t[kept], 1))[motion.valid].max() < 0.01
+
+
+def test_time_that_runs_back_is_told_with_its_line_also_in_a_selection():
+    t, log = recording()
+    back = replace(log, columns=dict(log.columns) | {"timestamp": np.where(t == t[900], 0.0, t)})
+    for part, line in ((back, 902), (back.select(slice(500, None)), 902)):
+        with pytest.raises(LogError, match=f"row {line}, column timestamp: found 0 after"):
+            motion_of(part)
 
 
 def test_uneven_timestamps_are_honoured():
