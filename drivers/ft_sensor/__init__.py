@@ -1,0 +1,37 @@
+"""Force-torque sensors: a link of their own that any arm's driver can be joined with."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, cast
+
+from core.errors import LinkError
+
+if TYPE_CHECKING:
+    from drivers.ft_sensor.sensor import ForceTorqueSensor
+    from drivers.ft_sensor.settings import FtSensorSettings
+
+FT_SENSORS: dict[str, str] = {
+    "robotous_rft": "drivers.ft_sensor.robotous_rft:RobotousRft",
+    "ati_netcanoem": "drivers.ft_sensor.ati_netcanoem:AtiNetCanOem",
+    "robotiq_ft300": "drivers.ft_sensor.robotiq_ft300:RobotiqFt300",
+}
+"""Sensor name in a cell file -> ``module:Class``, imported when it is used."""
+
+
+def make_sensor(settings: FtSensorSettings) -> ForceTorqueSensor:
+    """Return the sensor that the settings name, not yet connected.
+
+    Raises LinkError where it is unknown or its library is missing.
+    """
+    name = settings.driver
+    if name not in FT_SENSORS:
+        raise LinkError(
+            f"ft_sensor.driver: found {name!r}, expected one of {', '.join(FT_SENSORS)}"
+        )
+    module, kind = FT_SENSORS[name].split(":")
+    try:
+        found = getattr(importlib.import_module(module), kind)
+    except ImportError as error:
+        raise LinkError(f"ft_sensor.driver {name}: cannot be imported: {error}") from None
+    return cast("ForceTorqueSensor", found(settings))

@@ -1,0 +1,191 @@
+"""ATI NETCANOEM on CAN: asked sample by sample; calibration and units are read from it.
+
+The lower four bits of an id are the operation, the upper seven the sensor. Everything is
+big-endian. Operation 0 answers with status, gauges 0, 2, 4 (id 0) and gauges 1, 3, 5 (id 1), all
+int16; 2 with a row of the calibration matrix, float32, two a frame (ids 2, 3, 4); 7 with the counts
+per force and torque unit, uint32; 8 with the codes of these units. Wrench = matrix gauges / counts.
+Sources: KITrobotics/ati_force_torque ForceTorqueCtrl, ati_netcanoem_ft_driver, ATI 9610-05-1030.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import LinkError
+from drivers.can.bus import close_bus, first_line, open_bus
+from drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
+from drivers.ft_sensor.settings import AtiSettings
+
+GAUGES, MATRIX, COUNTS, UNITS = 0x0, 0x2, 0x7, 0x8
+ANSWER = 0.1  # s: an answer about the calibration that has not come by then is asked for again
+ATTEMPTS = 3
+SATURATED = 0x10000  # our own bit: a gauge at the end of its range
+# code -> N or Nm
+FORCE_UNITS = {1: 4.4482216152605, 2: 1.0, 3: 4448.2216152605, 4: 1e3, 5: 9.80665, 6: 9.80665e-3}
+TORQUE_UNITS = {1: 0.1129848290276, 2: 1.3558179483314, 3: 1.0, 4: 1e-3, 5: 9.80665e-2, 6: 1e3}
+STATUS = (
+    "watchdog reset", "excitation voltage high", "excitation voltage low", "analog ground",
+    "power high", "power low", "bit 6", "EEPROM", "invalid configuration", "gauge supply high",
+    "gauge supply low", "thermistor high", "thermistor low", "DAC reading out of range", "bit 14",
+    "bit 15", "gauge saturated",
+)  # fmt: skip
+
+Array = NDArray[np.float64]
+
+
+def decode_gauges(first: bytes, second: bytes) -> tuple[int, tuple[int, ...]] | None:
+    """Return status and gauges 0..5 of the two frames of an answer; None where they are none."""
+    if len(first) != 8 or len(second) != 6:
+        return None
+    status, a, c, e = struct.unpack(">H3h", first)
+    b, d, f = struct.unpack(">3h", second)
+    gauges = (a, b, c, d, e, f)
+    if max(gauges) == 32767 or min(gauges) == -32768:
+        status |= SATURATED
+    return status, gauges
+
+
+class AtiNetCanOem(ForceTorqueSensor):
+    """The sensor on its bus."""
+
+    def __init__(self, settings: AtiSettings) -> None:
+        super().__init__()
+        self.settings = settings
+        self.name = f"ati_netcanoem at {settings.where()}"
+        self._base = settings.base_id << 4
+        self._bus: Any = None
+        self._matrix: Array = np.zeros((6, 6))  # N, Nm per gauge count
+        self._due = 0.0  # s, monotonic: when the next sample is asked for
+
+    def connect(self) -> None:
+        """Open the bus and read calibration and units. Raises LinkError."""
+        filters: Any = [{"can_id": self._base, "can_mask": 0x7F0, "extended": False}]
+        self._bus = open_bus(self.settings, filters)
+        try:
+            self._matrix = self._calibration()
+        except LinkError:
+            self.close()
+            raise
+        self._due = time.monotonic()
+
+    def _calibration(self) -> Array:
+        (units,) = self._ask(UNITS, b"", (2,))
+        force, torque = FORCE_UNITS.get(units[0]), TORQUE_UNITS.get(units[1])
+        if force is None or torque is None:
+            raise LinkError(
+                f"{self.name}: found unit codes {units[0]} and {units[1]}, expected 1 to 6"
+            )
+        (answer,) = self._ask(COUNTS, b"", (8,))
+        counts = struct.unpack(">2I", answer)
+        rows = [b"".join(self._ask(MATRIX, bytes([i]), (8, 8, 8))) for i in range(6)]
+        matrix = np.array([struct.unpack(">6f", row) for row in rows], dtype=float)
+        if min(counts) == 0 or not np.isfinite(matrix).all() or np.linalg.matrix_rank(matrix) < 6:
+            raise LinkError(
+                f"{self.name}: found a calibration that is none (counts {counts[0]}, {counts[1]}, "
+                f"matrix of rank {_rank(matrix)}), expected one of rank 6"
+            )
+        unit = np.array(3 * (force / counts[0],) + 3 * (torque / counts[1],))
+        return np.asarray(self.settings.sign * unit[:, None] * matrix)
+
+    def _ask(self, operation: int, data: bytes, lengths: tuple[int, ...]) -> list[bytes]:
+        """Return the frames of an answer, of these lengths; asks again where none comes."""
+        for _ in range(ATTEMPTS):
+            self._drain()
+            self._send(operation, data)
+            answer = self._answer(operation, len(lengths), time.monotonic() + ANSWER)
+            if answer is not None and tuple(map(len, answer)) == lengths:
+                return answer
+        raise LinkError(
+            f"{self.name}: no answer to operation {operation}, expected a NETCANOEM with base id "
+            f"0x{self.settings.base_id:02X}"
+        )
+
+    def _answer(self, operation: int, frames: int, until: float) -> list[bytes] | None:
+        """Return the data of frames with the ids operation, operation + 1, ... in this order."""
+        found: list[bytes] = []
+        while len(found) < frames:
+            frame = self._receive(max(until - time.monotonic(), 0.0))
+            if frame is None:
+                return None
+            if frame.arbitration_id == self._base | (operation + len(found)):
+                found.append(bytes(frame.data))
+            elif frame.arbitration_id == self._base | operation:
+                self.dropped += 1
+                found = [bytes(frame.data)]
+            elif found:
+                self.dropped += 1
+                found = []
+        return found
+
+    def read(self, timeout: float) -> Reading | None:
+        """Ask for a sample when it is due and return it; see ForceTorqueSensor.read."""
+        if self._bus is None:
+            raise LinkError(f"{self.name}: found no connection, expected connect() first")
+        until = time.monotonic() + timeout
+        pause = min(self._due, until) - time.monotonic()
+        if pause > 0.0:
+            time.sleep(pause)
+        self._drain()
+        asked = time.monotonic()
+        self._due = max(self._due + 1.0 / self.settings.rate, asked)
+        self._send(GAUGES)
+        answer = self._answer(GAUGES, 2, max(until, asked + 0.005))
+        received = time.monotonic()
+        if answer is None:
+            return None
+        decoded = decode_gauges(*answer)
+        if decoded is None:
+            self.dropped += 1
+            return None
+        status, gauges = decoded
+        # it samples between question and answer, whose ways are taken for equally long
+        return Reading(0.5 * (asked + received), received, self._matrix @ np.array(gauges), status)
+
+    def _send(self, operation: int, data: bytes = b"") -> None:
+        import can
+
+        frame = can.Message(arbitration_id=self._base | operation, data=data, is_extended_id=False)
+        try:
+            self._bus.send(frame, timeout=0.1)
+        except (can.CanError, OSError) as error:
+            raise LinkError(f"{self.name}: cannot be written to: {first_line(error)}") from None
+
+    def _receive(self, timeout: float) -> Any:
+        """Return the next data frame with a standard id, or None."""
+        import can
+
+        until = time.monotonic() + timeout
+        while True:
+            try:
+                frame = self._bus.recv(max(until - time.monotonic(), 0.0))
+            except (can.CanError, OSError, ValueError) as error:
+                raise LinkError(f"{self.name}: {first_line(error)}") from None
+            if frame is None:
+                return None
+            if not (frame.is_error_frame or frame.is_remote_frame or frame.is_extended_id):
+                return frame
+
+    def _drain(self) -> None:
+        """Drop late answers to former questions."""
+        while self._receive(0.0) is not None:
+            self.dropped += 1
+
+    def describe(self, status: int) -> str:
+        """Return the bits of the status in words."""
+        words = [word for i, word in enumerate(STATUS) if status >> i & 1]
+        return f"status 0x{status & 0xFFFF:04X}: {', '.join(words)}"
+
+    def close(self) -> None:
+        """Leave the bus."""
+        if self._bus is not None:
+            close_bus(self._bus)
+            self._bus = None
+
+
+def _rank(matrix: Array) -> int:
+    return int(np.linalg.matrix_rank(matrix)) if np.isfinite(matrix).all() else 0

@@ -1,0 +1,201 @@
+"""Robotiq FT300 on a serial line: Modbus RTU, or its stream of 100 samples a second.
+
+Holding registers 180..185 are Fx, Fy, Fz in 0.01 N and Mx, My, Mz in 0.001 Nm, int16. Writing
+0x0200 to register 410 starts the stream: 16 bytes a sample, 0x20 0x4E, six int16 (little-endian),
+CRC-16 as Modbus has it. Some fifty bytes of 0xFF end it. Source: FT300 manual, p. 65;
+ros-industrial/robotiq rq_sensor_com.cpp.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+import time
+from typing import Any
+
+import numpy as np
+
+from core.errors import LinkError
+from drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
+from drivers.ft_sensor.settings import RobotiqSettings
+
+REGISTER, STREAM_REGISTER, STREAM = 180, 410, 0x0200
+STREAM_RATE = 100.0  # Hz
+HEAD = b"\x20\x4e"
+FRAME = struct.Struct("<2x6h2x")
+QUIET = b"\xff" * 50  # ends the stream
+UNIT = np.array((1e-2, 1e-2, 1e-2, 1e-3, 1e-3, 1e-3))  # N, Nm per count
+RESPONSE = 0.2  # s
+BITS = 10.0  # per byte on the line, 8N1
+SILENCE = 0.5  # s without a sample after which the stream is asked for again
+LONGEST = 4096  # bytes kept at most
+
+
+class StreamDecoder:
+    """Finds samples in the bytes of the stream; what has no right CRC is dropped."""
+
+    def __init__(self) -> None:
+        self._bytes = bytearray()
+        self.dropped = 0  # bytes that belonged to no sample
+
+    def take(self, data: bytes) -> list[tuple[int, ...]]:
+        """Take bytes as they come; returns the counts (6 each) of the samples completed."""
+        from pymodbus.framer import FramerRTU
+
+        held, found = self._bytes, []
+        held += data
+        while True:
+            start = held.find(HEAD)
+            if start < 0:
+                start = len(held) - (held[-1:] == HEAD[:1])
+            self.dropped += start
+            del held[:start]
+            if len(held) < FRAME.size:
+                break
+            whole = bytes(held[: FRAME.size])
+            if FramerRTU.compute_CRC(whole[:-2]).to_bytes(2, "big") == whole[-2:]:
+                found.append(FRAME.unpack(whole))
+                del held[: FRAME.size]
+            else:
+                self.dropped += 1
+                del held[:1]
+        return found
+
+
+class RobotiqFt300(ForceTorqueSensor):
+    """The sensor on its line."""
+
+    def __init__(self, settings: RobotiqSettings) -> None:
+        super().__init__()
+        self.settings = settings
+        self.name = f"robotiq_ft300 at {settings.port}"
+        self._client: Any = None
+        self._decoder = StreamDecoder()
+        self._waiting: list[Reading] = []
+        self._heard = 0.0  # s, monotonic
+
+    def connect(self) -> None:
+        """Open the line, end a stream that was left running, start ours. Raises LinkError."""
+        from pymodbus.client import ModbusSerialClient
+
+        settings = self.settings
+        self._client = ModbusSerialClient(
+            settings.port, baudrate=settings.baudrate, bytesize=8, parity="N", stopbits=1,
+            timeout=RESPONSE, retries=0,
+        )  # fmt: skip
+        if not self._client.connect():
+            self._client = None
+            raise LinkError(f"{self.name}: the serial line cannot be opened")
+        try:
+            self._quieten()
+            if settings.mode == "stream":
+                self._start_stream()
+        except LinkError:
+            self.close()
+            raise
+
+    def _quieten(self) -> None:
+        """End a stream and drop what is left of it."""
+        line = self._line()
+        try:
+            line.write(QUIET)
+            line.flush()
+            time.sleep(len(QUIET) * BITS / self.settings.baudrate + 0.02)
+            line.reset_input_buffer()
+        except OSError as error:  # pyserial's errors are OSErrors
+            raise self._broken(error) from None
+
+    def _start_stream(self) -> None:
+        from pymodbus.exceptions import ModbusException
+
+        try:
+            answer = self._client.write_registers(
+                STREAM_REGISTER, [STREAM], device_id=self.settings.device_id
+            )
+        except (ModbusException, OSError) as error:
+            raise self._broken(error) from None
+        if answer.isError() or answer.function_code != 16:
+            raise LinkError(f"{self.name}: the sensor refused to start its stream ({answer})")
+        self._decoder, self._heard = StreamDecoder(), time.monotonic()
+
+    def _line(self) -> Any:
+        line = self._client and self._client.socket
+        if not line:
+            raise LinkError(f"{self.name}: found no connection, expected connect() first")
+        return line
+
+    def _broken(self, error: Exception) -> LinkError:
+        words = str(error).strip().splitlines() or [type(error).__name__]
+        return LinkError(f"{self.name}: {words[0]}")
+
+    def read(self, timeout: float) -> Reading | None:
+        """Return the next sample; see ForceTorqueSensor.read."""
+        if self.settings.mode == "registers":
+            return self._ask()
+        until = time.monotonic() + timeout
+        while not self._waiting:
+            left = until - time.monotonic()
+            if left <= 0.0:
+                if time.monotonic() - self._heard > SILENCE:
+                    self._start_stream()  # it may have been switched off meanwhile
+                return None
+            self._take_bytes(left)
+        return self._waiting.pop(0)
+
+    def _take_bytes(self, timeout: float) -> None:
+        """Wait for bytes of the stream and keep the samples that they complete."""
+        line = self._line()
+        try:
+            line.timeout = timeout
+            data = line.read(1)
+            data += line.read(min(line.in_waiting, LONGEST)) if data else b""
+        except (OSError, TypeError) as error:  # TypeError: closed while reading
+            raise self._broken(error) from None
+        received = time.monotonic()
+        samples = self._decoder.take(data)
+        self.dropped = self._decoder.dropped
+        way = FRAME.size * BITS / self.settings.baudrate
+        for behind, counts in enumerate(reversed(samples)):
+            stamp = received - way - behind / STREAM_RATE
+            self._waiting.insert(0, self._reading(stamp, received, counts))
+        if samples:
+            self._heard = received
+
+    def _ask(self) -> Reading | None:
+        """Return the registers' sample; None where the answer is none."""
+        from pymodbus.exceptions import ConnectionException, ModbusException
+
+        line = self._line()
+        asked = time.monotonic()
+        try:
+            answer = self._client.read_holding_registers(
+                REGISTER, count=6, device_id=self.settings.device_id
+            )
+        except (ConnectionException, OSError) as error:
+            raise self._broken(error) from None
+        except ModbusException:
+            self.dropped += 1
+            with contextlib.suppress(OSError):
+                line.reset_input_buffer()
+            return None
+        received = time.monotonic()
+        if answer.isError() or answer.function_code != 3 or len(answer.registers) != 6:
+            self.dropped += 1
+            return None
+        counts = struct.unpack(">6h", struct.pack(">6H", *answer.registers))
+        return self._reading(0.5 * (asked + received), received, counts)
+
+    def _reading(self, stamp: float, received: float, counts: tuple[int, ...]) -> Reading:
+        return Reading(stamp, received, self.settings.sign * UNIT * np.array(counts))
+
+    def close(self) -> None:
+        """End the stream and leave the line."""
+        client, self._client = self._client, None
+        if client is None:
+            return
+        with contextlib.suppress(Exception):
+            if self.settings.mode == "stream" and client.socket:
+                client.socket.write(QUIET)
+                client.socket.flush()
+        with contextlib.suppress(Exception):
+            client.close()

@@ -1,0 +1,135 @@
+"""Robotous RFT on CAN: a stream of samples, each in two frames.
+
+A command of 8 bytes starts (0x0B) and stops (0x0C) the stream. A sample is 16 bytes in two frames:
+0x0B, Fx, Fy, Fz, Tx, Ty, Tz as big-endian int16, the overload status, two spare bytes; Tx lies
+across the border of the frames. Source: CORC, src/hardware/IO/RobotousRFT.cpp.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from typing import Any
+
+import numpy as np
+
+from core.errors import LinkError
+from drivers.can.bus import close_bus, first_line, open_bus
+from drivers.ft_sensor.clock_offset import ClockOffset
+from drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
+from drivers.ft_sensor.settings import RobotousSettings
+
+START, STOP = 0x0B, 0x0C
+LAYOUT = struct.Struct(">B6hB2x")
+SILENCE = 0.5  # s without a sample after which the stream is asked for again
+
+
+class PairDecoder:
+    """Puts the two frames of a sample together; what does not belong together is dropped."""
+
+    def __init__(self, reply_ids: tuple[int, int], window: float) -> None:
+        self._first_id, self._second_id = reply_ids
+        self._window = window  # s between the two frames at most
+        self._first: tuple[bytes, float] | None = None
+        self.dropped = 0
+
+    def take(self, identifier: int, data: bytes, stamp: float) -> tuple[int, ...] | None:
+        """Take one frame with its time stamp (s).
+
+        Returns the counts of Fx..Tz and the overload status where it completes a sample.
+        """
+        if identifier == self._first_id:
+            self.dropped += self._first is not None
+            good = len(data) == 8 and data[0] == START
+            self._first = (data, stamp) if good else None
+            self.dropped += not good
+            return None
+        if identifier != self._second_id:
+            return None
+        first, self._first = self._first, None
+        if first is None or len(data) != 8 or not 0.0 <= stamp - first[1] <= self._window:
+            self.dropped += 1
+            return None
+        return LAYOUT.unpack(first[0] + data)[1:]
+
+
+class RobotousRft(ForceTorqueSensor):
+    """The sensor on its bus."""
+
+    def __init__(self, settings: RobotousSettings) -> None:
+        super().__init__()
+        self.settings = settings
+        self.name = f"robotous_rft at {settings.where()}"
+        counts = 3 * (settings.force_counts,) + 3 * (settings.torque_counts,)
+        self._unit = settings.sign / np.array(counts)
+        self._bus: Any = None
+        self._decoder = PairDecoder(settings.reply_ids, 0.5 / settings.rate)
+        self._clock = ClockOffset()
+        self._heard = 0.0  # s, monotonic
+
+    def connect(self) -> None:
+        """Open the bus and start the stream. Raises LinkError."""
+        filters: Any = [
+            {"can_id": i, "can_mask": 0x7FF, "extended": False} for i in self.settings.reply_ids
+        ]
+        self._bus = open_bus(self.settings, filters)
+        self._clock = ClockOffset()
+        self._decoder = PairDecoder(self.settings.reply_ids, 0.5 / self.settings.rate)
+        self._command(START)
+
+    def _command(self, code: int) -> None:
+        import can
+
+        frame = can.Message(
+            arbitration_id=self.settings.command_id, data=bytes([code]) + bytes(7),
+            is_extended_id=False,
+        )  # fmt: skip
+        self._heard = time.monotonic()
+        try:
+            self._bus.send(frame, timeout=0.1)
+        except (can.CanError, OSError) as error:
+            raise LinkError(f"{self.name}: cannot be written to: {first_line(error)}") from None
+
+    def read(self, timeout: float) -> Reading | None:
+        """Return the next sample; see ForceTorqueSensor.read."""
+        import can
+
+        if self._bus is None:
+            raise LinkError(f"{self.name}: found no connection, expected connect() first")
+        until = time.monotonic() + timeout
+        while (left := until - time.monotonic()) > 0.0:
+            try:
+                frame = self._bus.recv(left)
+            except (can.CanError, OSError, ValueError) as error:
+                raise LinkError(f"{self.name}: {first_line(error)}") from None
+            if frame is None:
+                break
+            if frame.is_error_frame or frame.is_remote_frame or frame.is_extended_id:
+                continue
+            received = time.monotonic()
+            stamp = frame.timestamp or received
+            found = self._decoder.take(frame.arbitration_id, bytes(frame.data), stamp)
+            self.dropped = self._decoder.dropped
+            if found is not None:
+                self._heard = received
+                wrench = np.array(found[:6]) * self._unit
+                return Reading(self._clock.take(stamp, received), received, wrench, found[6])
+        if time.monotonic() - self._heard > SILENCE:
+            self._command(START)  # it may have been switched off meanwhile
+        return None
+
+    def describe(self, status: int) -> str:
+        """Return what the overload status says."""
+        return f"overload (status 0x{status:02X})"
+
+    def close(self) -> None:
+        """Stop the stream and leave the bus."""
+        if self._bus is None:
+            return
+        try:
+            self._command(STOP)
+        except LinkError:
+            pass
+        finally:
+            close_bus(self._bus)
+            self._bus = None
