@@ -6,8 +6,6 @@ asked for when it is used. CSV goes through numpy, Parquet through pyarrow.
 
 from __future__ import annotations
 
-import difflib
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,26 +16,9 @@ from numpy.typing import NDArray
 
 from core.errors import LogError
 from core.loads import Loads
+from core.log_columns import COLUMNS, INDEXED, is_known, misspelt, nearest, written
 
 Array = NDArray[np.float64]
-
-# name -> number of columns: 0 = one column without index, None = one per joint
-COLUMNS: dict[str, int | None] = {
-    "timestamp": 0,
-    "target_q": None,
-    "actual_q": None,
-    "actual_qd": None,
-    "actual_current_as_torque": None,
-    "joint_temperatures": None,
-    "payload": 0,
-    "payload_cog": 3,
-    "actual_TCP_force": 6,
-    "ft_raw_wrench": 6,
-    "approach": None,
-    "measured_position": 3,
-    "measured_rotation": 3,
-}
-_INDEXED = re.compile(r"(.+)_(\d+)$")
 
 
 @dataclass(frozen=True)
@@ -49,6 +30,7 @@ class Log:
     n: int  # joints
     first_row: int = 2  # line of the first data row in the file, for messages
     lines: NDArray[np.int64] | None = None  # (N,) line of each row; None: one after the other
+    unknown: tuple[str, ...] = ()  # names of the file's columns that the contract does not name
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
@@ -68,15 +50,18 @@ class Log:
     def require(self, *names: str) -> Array:
         """Return the first of these columns that the log has, all of its cells finite.
 
-        Raises LogError naming what is missing, or row and column of the first cell that is not a
-        finite number.
+        Raises LogError naming what is missing, and the misspelt column that may be meant, or row
+        and column of the first cell that is not a finite number.
         """
         for name in names:
             if name in self.columns:
                 self._check_finite(name)
                 return self.columns[name]
-        wanted = " or ".join(f"{name}{_suffix(name, self.n)}" for name in names)
-        raise LogError(f"{self.path}: columns: found no {wanted}, expected it for this command")
+        wanted = " or ".join(written(name, self.n) for name in names)
+        hint = misspelt(self.unknown, names, self.n)
+        raise LogError(
+            f"{self.path}: columns: found no {wanted}, expected it for this command{hint}"
+        )
 
     def _check_finite(self, name: str) -> None:
         values = self.columns[name]
@@ -138,11 +123,6 @@ def last_motion(q: Array, dead_band: float = 1e-6) -> Array:
     return np.take_along_axis(sign, last, axis=0)
 
 
-def _suffix(name: str, n: int) -> str:
-    count = COLUMNS[name]
-    return "" if count == 0 else f"_0..{(n if count is None else count) - 1}"
-
-
 def read_log(path: Path | str, n: int) -> Log:
     """Return the log of a CSV or Parquet file for an arm of n joints.
 
@@ -158,22 +138,19 @@ def read_log(path: Path | str, n: int) -> Log:
         names, table = _read_csv(path)
     if not len(table):
         raise LogError(f"{path}: found no data rows, expected at least one")
-    columns = _group(path, names, table, n)
+    columns = _group(path, [name for name in names if is_known(name)], table, n)
     if not columns:
-        near = _nearest(names)
-        raise LogError(f"{path}: columns: found none that the contract names{near}")
-    return Log(str(path), columns, n)
+        raise LogError(f"{path}: columns: found none that the contract names{nearest(names)}")
+    unknown = tuple(name for name in names if not is_known(name))
+    return Log(str(path), columns, n, unknown=unknown)
 
 
 def _wanted(names: Sequence[str]) -> list[int]:
-    def known(name: str) -> bool:
-        match = _INDEXED.match(name)
-        return COLUMNS.get(name) == 0 or bool(match and COLUMNS.get(match[1], 0) != 0)
-
-    return [i for i, name in enumerate(names) if known(name)]
+    return [i for i, name in enumerate(names) if is_known(name)]
 
 
 def _read_csv(path: Path) -> tuple[list[str], Array]:
+    """Return the names of all columns, and those that are known (rows, known columns)."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
@@ -201,7 +178,7 @@ def _read_csv(path: Path) -> tuple[list[str], Array]:
         table = np.loadtxt(lines[1:], delimiter=delimiter, usecols=wanted, ndmin=2, comments=None)
     except ValueError:
         table = _read_cells(path, lines, delimiter, names, wanted)
-    return [names[i] for i in wanted], table
+    return names, table
 
 
 def _read_cells(
@@ -226,6 +203,7 @@ def _read_cells(
 
 
 def _read_parquet(path: Path) -> tuple[list[str], Array]:
+    """Return the names of all columns, and those that are known (rows, known columns)."""
     import pyarrow
     from pyarrow import parquet
 
@@ -245,7 +223,7 @@ def _read_parquet(path: Path) -> tuple[list[str], Array]:
     except (pyarrow.ArrowException, OSError) as error:
         raise LogError(f"{path}: found no readable Parquet file ({error})") from None
     rows = frame.num_rows
-    return wanted, np.column_stack(table) if wanted else np.empty((rows, 0))
+    return names, np.column_stack(table) if wanted else np.empty((rows, 0))
 
 
 def _group(path: Path, names: Sequence[str], table: Array, n: int) -> dict[str, Array]:
@@ -257,7 +235,7 @@ def _group(path: Path, names: Sequence[str], table: Array, n: int) -> dict[str, 
                 raise LogError(f"{path}: column {name}: found twice, expected once")
             columns[name] = np.ascontiguousarray(table[:, position])
             continue
-        match = _INDEXED.match(name)
+        match = INDEXED.match(name)
         if match and COLUMNS.get(match[1], 0) != 0:
             indices = found.setdefault(match[1], {})
             if int(match[2]) in indices:
@@ -276,13 +254,3 @@ def _group(path: Path, names: Sequence[str], table: Array, n: int) -> dict[str, 
                 raise LogError(f"{path}: column {name}_{index}: not found, expected {what}")
         columns[name] = np.ascontiguousarray(table[:, [indices[k] for k in range(expected)]])
     return columns
-
-
-def _nearest(names: Sequence[str]) -> str:
-    for name in names:
-        stem = re.sub(r"_\d+$", "", name)
-        near = difflib.get_close_matches(stem, COLUMNS, n=1, cutoff=0.6)
-        if near:
-            return f"; found {name!r}, did you mean {near[0]!r}?"
-    more = ", ..." if len(names) > 6 else ""
-    return f" ({', '.join(names[:6])}{more}), expected RTDE field names"

@@ -186,6 +186,31 @@ def test_a_missing_column_is_named_with_its_alternative(tmp_path):
         log.require("actual_q", "target_q")
 
 
+@pytest.mark.parametrize(
+    ("header", "hint"),
+    [
+        ("target_qq_{}", "; found target_qq_0; did you mean target_q_0?"),
+        ("Actual_Q_{}", "; found Actual_Q_0; did you mean actual_q_0?"),
+        ("actual_q{}", "; found actual_q0; did you mean actual_q_0?"),
+        ("target_qd_{}", ""),  # RTDE has that field
+        ("elbow_{}", ""),
+    ],
+)
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_a_misspelt_column_is_named_where_the_right_one_is_missing(tmp_path, header, hint, kind):
+    names = [*(header.format(i) for i in range(6)), "payload"]
+    path = tmp_path / f"log.{kind}"
+    if kind == "csv":
+        path.write_text(table(names, [range(7)]), encoding="utf-8")
+    else:
+        parquet.write_table(pyarrow.table({name: [1.0] for name in names}), path)
+    log = read_log(path, 6)
+    with pytest.raises(LogError) as caught:
+        log.select(slice(None)).require("actual_q", "target_q")
+    wanted = "found no actual_q_0..5 or target_q_0..5, expected it for this command"
+    assert str(caught.value) == f"{path}: columns: {wanted}{hint}"
+
+
 def test_loads_come_from_their_columns_and_a_negative_payload_is_told(tmp_path):
     names = [*JOINTS, "payload", *(f"payload_cog_{i}" for i in range(3)),
              *(f"actual_TCP_force_{i}" for i in range(6))]  # fmt: skip
