@@ -15,9 +15,14 @@ REACHES = 50.0  # times the arm's reach from the middle: no arm gets there; mill
 
 
 def check_units(model: Model, log: Log) -> None:
-    """Raise LogError where joints look like degrees, or positions like millimetres."""
+    """Raise LogError where joints look like degrees, or positions like millimetres.
+
+    An endless angle is no degrees: it is told as such, with its row.
+    """
     for name in ("actual_q", "target_q"):
         q = log.get(name)
+        if q is not None and np.isinf(q).any():
+            log.require(name)
         if q is not None and np.isfinite(q).any() and np.nanmax(np.abs(q)) > TURNS:
             worst = float(np.nanmax(np.abs(q)))
             raise LogError(

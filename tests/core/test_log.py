@@ -7,8 +7,11 @@ import pyarrow
 import pytest
 from pyarrow import parquet
 
+from core.arm import builtin_arm
+from core.diagnosis.suspicion import check_units
 from core.errors import LogError
 from core.log import last_motion, read_log
+from core.model import Model
 
 RECORDING = Path(__file__).parents[2] / ".." / "shared" / "data" / "rad_ur3e_rtde" / "log.csv"
 JOINTS = [f"actual_q_{i}" for i in range(6)]
@@ -209,6 +212,19 @@ def test_a_misspelt_column_is_named_where_the_right_one_is_missing(tmp_path, hea
         log.select(slice(None)).require("actual_q", "target_q")
     wanted = "found no actual_q_0..5 or target_q_0..5, expected it for this command"
     assert str(caught.value) == f"{path}: columns: {wanted}{hint}"
+
+
+@pytest.mark.parametrize("value", ["inf", "-inf", "nan"])
+@pytest.mark.parametrize("name", ["actual_q", "target_q"])
+def test_an_angle_that_is_not_finite_is_told_with_its_row_not_as_degrees(tmp_path, value, name):
+    rows = joints()
+    rows[1][3] = value
+    log = read_log(write(tmp_path, table([f"{name}_{i}" for i in range(6)], rows)), 6)
+    with pytest.raises(LogError) as caught:
+        check_units(Model(builtin_arm("ur5e")), log)
+        log.require(name)  # an empty cell is told where it is needed, and only there
+    assert f"row 3, column {name}_3: found {value}, expected a finite number" in str(caught.value)
+    assert "degrees" not in str(caught.value)
 
 
 def test_loads_come_from_their_columns_and_a_negative_payload_is_told(tmp_path):
