@@ -220,9 +220,10 @@ def test_an_angle_that_is_not_finite_is_told_with_its_row_not_as_degrees(tmp_pat
     rows = joints()
     rows[1][3] = value
     log = read_log(write(tmp_path, table([f"{name}_{i}" for i in range(6)], rows)), 6)
-    with pytest.raises(LogError) as caught:
+    if value == "nan":  # an empty cell is told where it is needed, and only there
         check_units(Model(builtin_arm("ur5e")), log)
-        log.require(name)  # an empty cell is told where it is needed, and only there
+    with pytest.raises(LogError) as caught:
+        log.require(name) if value == "nan" else check_units(Model(builtin_arm("ur5e")), log)
     assert f"row 3, column {name}_3: found {value}, expected a finite number" in str(caught.value)
     assert "degrees" not in str(caught.value)
 
