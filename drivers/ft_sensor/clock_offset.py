@@ -27,4 +27,4 @@ class ClockOffset:
         if self._offset is None or gap < 0.0 or lead - self._offset > JUMP:
             self._offset = lead
         self._offset = min(lead, self._offset + DRIFT * gap)
-        return theirs + self._offset
+        return min(theirs + self._offset, received)

@@ -1,0 +1,90 @@
+"""Any arm's driver joined with a force-torque sensor: one driver for the loop."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import LinkError, WriteError
+from core.model import Model
+from core.setpoint import Setpoint
+from core.state import RobotState
+from drivers.driver import Driver
+from drivers.ft_sensor import make_sensor
+from drivers.ft_sensor.clock_offset import ClockOffset
+from drivers.ft_sensor.reader import SensorReader
+from drivers.ft_sensor.settings import FtSensorSettings
+from drivers.ft_sensor.wrench import TcpForce, sensor_to_flange
+
+Vector = NDArray[np.float64]
+
+
+class DriverWithSensor(Driver):
+    """An arm's driver whose states carry the wrench of a sensor on the flange.
+
+    The arm's clock is tied to this machine's by the quickest arrivals, the sensor's samples carry
+    this machine's time, and each state gets the wrench of the moment it was sampled at. The arm's
+    cycle never waits for the sensor.
+    """
+
+    def __init__(self, arm: Driver, settings: FtSensorSettings, model: Model) -> None:
+        super().__init__(arm.rate, arm.n, arm.moves_arm)
+        self.settings = settings
+        self._arm = arm
+        self._reader = SensorReader(make_sensor(settings), settings)
+        self._clock = ClockOffset()
+        self._to_flange = sensor_to_flange(settings.sensor_in_flange)
+        self._tcp_force = TcpForce(model) if settings.tcp_force == "sensor" else None
+
+    def connect(self) -> None:
+        """Open both links. Raises LinkError."""
+        self._clock = ClockOffset()
+        self._arm.connect()
+        try:
+            self._reader.start()
+        except LinkError:
+            self._arm.close()
+            raise
+
+    def read_state(self) -> RobotState:
+        """Return the arm's next sample with the sensor's wrench; see Driver.read_state.
+
+        Raises StaleStateError, InvalidStateError also where the sensor is the reason.
+        """
+        state = self._arm.read_state()
+        moment = self._clock.take(state.timestamp, state.received)
+        raw = self._to_flange @ self._reader.at(moment).wrench
+        if self._tcp_force is None:
+            return replace(state, ft_raw_wrench=raw)
+        force = self._tcp_force.of(raw, state)
+        return replace(state, ft_raw_wrench=raw, actual_TCP_force=force)
+
+    def write_setpoint(self, setpoint: Setpoint) -> None:
+        """Send one setpoint to the arm."""
+        self._arm.write_setpoint(setpoint)
+
+    def close(self) -> None:
+        """Leave both links."""
+        try:
+            self._arm.close()
+        finally:
+            self._reader.stop()
+
+    def arm(self, state: RobotState) -> None:
+        """Make the arm ready, and see that the sensor has not been held up by it."""
+        self._arm.arm(state)
+        if not self._reader.wait(self.settings.connect_timeout):
+            raise WriteError(
+                f"found no sample of the sensor within {self.settings.connect_timeout:g} s of "
+                "arming (ft_sensor.connect_timeout)"
+            )
+
+    def release(self) -> None:
+        """Stop writing to the arm."""
+        self._arm.release()
+
+    def nominal_q(self, state: RobotState) -> Vector:
+        """Return the joints (n,) that the robot itself wants, rad."""
+        return self._arm.nominal_q(state)

@@ -1,0 +1,89 @@
+"""From what a sensor reads to what acts on the flange and on the tool."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.dynamics import SENSING
+from core.effects import CATALOGUE
+from core.loads import Loads
+from core.model import Model
+from core.motion import Motion
+from core.rotation import rpy_matrix, skew
+from core.state import RobotState
+from drivers.ft_sensor.settings import SensorFrame
+
+Array = NDArray[np.float64]
+UNDONE = ("ft_misalignment", "ft_gain", "ft_bias")  # a drift needs the time of its log
+
+
+def sensor_to_flange(frame: SensorFrame) -> Array:
+    """Return the matrix (6, 6) that takes a wrench in sensor axes to one in flange axes.
+
+    Torques are about the sensor's origin before and about the flange's origin after.
+    """
+    rotation, position = rpy_matrix(np.array(frame.rpy)), np.array(frame.xyz)
+    matrix = np.zeros((6, 6))
+    matrix[:3, :3] = matrix[3:, 3:] = rotation
+    matrix[3:, :3] = skew(position) @ rotation
+    return matrix
+
+
+class TcpForce:
+    """Derives ``actual_TCP_force`` from the flange sensor, as controllers do from their own.
+
+    The declared payload's weight is taken off (its inertia is not: the figure holds for slow
+    motion), and the sensor's errors that the model knows are undone. Bending is left out.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self._model = model
+        self._rigid = model.without_terms()
+        self._tool = np.array(model.tool_in_flange, dtype=float)
+        self._undo, self._bias = _undoing(model)
+
+    def of(self, raw_in_flange: Array, state: RobotState) -> Array:
+        """Return force and torque (6,) of the surroundings on the tool, at the TCP, base axes.
+
+        ``raw_in_flange`` is the sensor's wrench (6,), flange axes, about the flange origin. The
+        payload is the one that the controller declares, else the model's.
+        """
+        model = self._model
+        mass = model.payload_mass if state.payload is None else state.payload
+        cog = model.payload_cog if state.payload_cog is None else state.payload_cog
+        tcp_in_base = self._rigid.predict(state.actual_q[None, :]).rotation[0]
+        flange_in_base = tcp_in_base @ self._tool[:3, :3].T
+        weight = flange_in_base.T @ (mass * model.gravity)
+        wrench = self._undo @ (raw_in_flange - self._bias)
+        force = wrench[:3] - weight
+        torque = wrench[3:] - _cross(cog, weight) - _cross(self._tool[:3, 3], force)
+        return np.concatenate([flange_in_base @ force, flange_in_base @ torque])
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Return a x b of two vectors (3,); numpy's own takes ten times as long."""
+    return np.array(
+        (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+    )
+
+
+def _undoing(model: Model) -> tuple[Array, Array]:
+    """Return matrix (6, 6) and bias (6,): what acts = matrix (reading - bias)."""
+    probes = np.vstack([np.zeros((1, 6)), np.eye(6)])
+    for effect in SENSING:
+        if effect in UNDONE:
+            for term in (t for t in model.terms if t.effect == effect):
+                probes = CATALOGUE[effect].sense(term, model.arm, probes, _standing(model))
+    bias = probes[0]
+    return np.linalg.inv((probes[1:] - bias).T), bias
+
+
+def _standing(model: Model) -> Motion:
+    """Return seven rows of an arm at rest, for the probes."""
+    rest, rows = np.zeros((7, model.arm.n)), np.arange(7)
+    return Motion(
+        t=np.zeros(7), q=rest, qd=rest, qdd=rest, target_q=None, loads=Loads(), rows=rows,
+        valid=np.ones(7, dtype=bool), stretch=np.zeros(7, dtype=np.int64), start=0.0,
+        moving=False, still=np.zeros(model.arm.n),
+    )  # fmt: skip

@@ -1,0 +1,96 @@
+"""An ATI NETCANOEM on a CAN bus: gauges, a calibration matrix of its own, units."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import can
+import numpy as np
+
+from drivers.can.bus import BusSettings, close_bus, open_bus
+from drivers.simulated.ft_sensor.mounting import Felt
+from drivers.simulated.ft_sensor.node import SimulatedSensor
+
+RANGE = np.array((600.0, 600.0, 600.0, 60.0, 60.0, 60.0))  # N, Nm at about full gauges
+FULL = 30000.0  # gauge counts
+
+
+class AtiNode(SimulatedSensor):
+    """Answers questions; its gauges are mixed by a matrix that is drawn from the seed.
+
+    ``units``: codes of force and torque unit, with what one unit is in N and in Nm.
+    """
+
+    def __init__(
+        self,
+        felt: Felt,
+        bus: BusSettings,
+        base_id: int = 0x20,
+        seed: int = 0,
+        units: tuple[tuple[int, float], tuple[int, float]] = ((2, 1.0), (3, 1.0)),
+    ) -> None:
+        super().__init__(felt)
+        self._settings, self._base = bus, base_id << 4
+        self._bus: Any = None
+        (self._force_code, newton), (self._torque_code, newton_metre) = units
+        self._counts = (1_000_000, 500_000)  # per unit of force, of torque
+        scale = np.array(3 * (self._counts[0] / newton,) + 3 * (self._counts[1] / newton_metre,))
+        mixing = np.eye(6) + np.random.default_rng(seed).uniform(-0.12, 0.12, (6, 6))
+        # wrench = diag(1/scale) matrix gauges
+        exact = (scale * RANGE / FULL)[:, None] * mixing
+        self._matrix = exact.astype(np.float32)
+        self._inverse = np.linalg.inv(self._matrix.astype(float)) * scale
+        self.answered = 0  # samples
+
+    def open(self) -> None:
+        """Open the bus."""
+        self._bus = open_bus(
+            self._settings, [{"can_id": self._base, "can_mask": 0x7F0, "extended": False}]
+        )
+
+    def gauges(self) -> list[int]:
+        """Return the gauges (6,), held at the ends of their range."""
+        found = np.rint(self._inverse @ np.array(self.felt()))
+        return [int(v) for v in np.clip(found, -32768, 32767)]
+
+    def answer(self, operation: int, data: bytes) -> list[bytes]:
+        """Return the frames that answer a question; their ids count up from the operation."""
+        if operation == 0x0:
+            g = self.gauges()
+            self.answered += 1
+            return [struct.pack(">H3h", self.status, g[0], g[2], g[4]),
+                    struct.pack(">3h", g[1], g[3], g[5])]  # fmt: skip
+        if operation == 0x2 and len(data) == 1 and data[0] < 6:
+            row = struct.pack(">6f", *self._matrix[data[0]])
+            return [row[:8], row[8:16], row[16:]]
+        if operation == 0x7:
+            return [struct.pack(">2I", *self._counts)]
+        if operation == 0x8:
+            return [bytes((self._force_code, self._torque_code))]
+        return []
+
+    def serve(self) -> None:
+        """Answer questions."""
+        try:
+            while not self._ended.is_set():
+                question = self._bus.recv(0.05)
+                if question is None or self.silent:
+                    continue
+                operation = question.arbitration_id & 0xF
+                for i, data in enumerate(self.answer(operation, bytes(question.data))):
+                    self._bus.send(
+                        can.Message(
+                            arbitration_id=self._base | (operation + i), data=data,
+                            is_extended_id=False,
+                        ),
+                        timeout=0.1,
+                    )  # fmt: skip
+        except (can.CanError, OSError):
+            return  # the bus has gone
+
+    def close_wire(self) -> None:
+        """Leave the bus."""
+        if self._bus is not None:
+            close_bus(self._bus)
+            self._bus = None

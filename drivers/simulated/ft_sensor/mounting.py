@@ -1,0 +1,42 @@
+"""What a sensor on the flange feels, in its own axes: shares no mathematics with the driver."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from drivers.simulated.plant_settings import Vector6
+from drivers.simulated.rotations import (
+    Vector3,
+    compose,
+    cross,
+    from_vector,
+    subtract,
+    unrotate,
+)
+
+Felt = Callable[[], Vector6]
+"""Returns the wrench that a sensor feels now, N and Nm, in its own axes, about its origin."""
+
+
+def felt_by(
+    in_flange: Callable[[], Sequence[float]], xyz: Vector3, rpy: Vector3, sign: int = 1
+) -> Felt:
+    """Return what a sensor mounted at ``xyz``, ``rpy`` feels of the flange's wrench (6,).
+
+    ``sign`` -1: it reports the reaction.
+    """
+    roll, pitch, yaw = (
+        from_vector(tuple(angle if i == axis else 0.0 for i in range(3)))
+        for axis, angle in enumerate(rpy)
+    )
+    rotation = compose(yaw, compose(pitch, roll))
+
+    def felt() -> Vector6:
+        a, b, c, d, e, f = in_flange()
+        force = (a, b, c)
+        torque = subtract((d, e, f), cross(xyz, force))
+        found = (*unrotate(rotation, force), *unrotate(rotation, torque))
+        u, v, w, x, y, z = (sign * value for value in found)
+        return (u, v, w, x, y, z)
+
+    return felt

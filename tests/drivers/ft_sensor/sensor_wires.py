@@ -1,0 +1,120 @@
+"""Sensors on real wires: each kind with its simulated device, its settings and its resolution."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter
+
+from core.arm import builtin_arm
+from core.rotation import rpy_matrix
+from drivers.can.bus import BusSettings
+from drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
+from drivers.ft_sensor.settings import AnyFtSensor, FtSensorSettings
+from drivers.simulated.ft_sensor.ati_node import AtiNode
+from drivers.simulated.ft_sensor.ft300_device import Ft300Device
+from drivers.simulated.ft_sensor.mounting import felt_by
+from drivers.simulated.ft_sensor.node import SimulatedSensor
+from drivers.simulated.ft_sensor.robotous_node import RobotousNode
+from drivers.simulated.peer import Peer, make_peer
+from drivers.simulated.plant_arm import plant_arm
+from drivers.simulated.plant_settings import draw_plant_settings
+
+Array = NDArray[np.float64]
+KINDS = ("robotous_rft", "ati_netcanoem", "robotiq_ft300", "robotiq_ft300 registers")
+# N and Nm that one count is worth, at most
+RESOLUTION = {"robotous_rft": (0.02, 0.0005), "ati_netcanoem": (0.05, 0.005),
+              "robotiq_ft300": (0.01, 0.001), "robotiq_ft300 registers": (0.01, 0.001)}  # fmt: skip
+MASS, COG = 4.0, (0.01, -0.02, 0.07)
+XYZ, RPY = (0.0, 0.003, 0.045), (0.1, -0.2, 0.7)
+_channels = itertools.count()
+_settings: TypeAdapter[Any] = TypeAdapter(AnyFtSensor)
+
+
+def settings_of(**keys: Any) -> FtSensorSettings:
+    """Return the section ``ft_sensor`` of these keys."""
+    found: FtSensorSettings = _settings.validate_python(keys)
+    return found
+
+
+@dataclass
+class Felt:
+    """What the device is made to feel; a plant behind it is felt through ``felt_by``."""
+
+    wrench: tuple[float, ...] = (3.0, -4.5, 12.25, 0.35, -0.6, 1.1)
+
+    def __call__(self) -> Any:
+        return self.wrench
+
+
+@dataclass
+class Wire:
+    """A simulated device with the settings that reach it."""
+
+    device: SimulatedSensor
+    keys: dict[str, Any] = field(default_factory=dict)
+
+    def settings(self, **more: Any) -> FtSensorSettings:
+        keys = {**self.keys, **more}
+        if isinstance(self.device, Ft300Device):
+            keys["port"] = self.device.path
+        return settings_of(**keys)
+
+
+def make_wire(kind: str, felt: Callable[[], Any]) -> Wire:
+    """Return a device of a kind on a wire of its own, not yet started."""
+    name, *mode = kind.split()
+    if name == "robotiq_ft300":
+        keys: dict[str, Any] = {"driver": name, "mode": (mode or ["stream"])[0], "max_age": 0.2}
+        return Wire(Ft300Device(felt), keys)
+    channel = f"ft-{os.getpid()}-{next(_channels)}"
+    bus = BusSettings(interface="virtual", channel=channel)
+    keys = {"driver": name, "interface": "virtual", "channel": channel, "max_age": 0.2}
+    node = RobotousNode(felt, bus) if name == "robotous_rft" else AtiNode(felt, bus, seed=5)
+    return Wire(node, keys)
+
+
+def next_reading(sensor: ForceTorqueSensor, limit: float = 3.0) -> Reading:
+    """Return the next sample; a busy machine may take a while."""
+    until = time.monotonic() + limit
+    while time.monotonic() < until:
+        found = sensor.read(0.2)
+        if found is not None:
+            return found
+    raise AssertionError(f"no sample within {limit:g} s, {sensor.dropped} dropped")
+
+
+def resting_peer(q: tuple[float, ...]) -> Peer:
+    """Return an arm at rest with a known mass on its flange; its sensor has no noise, no bias."""
+    arm = plant_arm("ur10e")
+    plant = replace(
+        draw_plant_settings(arm, 3), payload_mass=MASS, payload_cog=COG, force_noise=0.0,
+        torque_noise=0.0, sensor_bias=(0.0,) * 6, axial=(0.0,) * 6, radial=(0.0,) * 6,
+        tcp=(0.0, 0.0, 0.18, 0.0, 0.0, 0.0),
+    )  # fmt: skip
+    peer = make_peer(arm, plant, q, 0.004)
+    for _ in range(5):
+        peer.cycle()
+    return peer
+
+
+def felt_of(peer: Peer, sign: int = 1) -> Callable[[], Any]:
+    """Return what a sensor mounted at XYZ, RPY on the peer's flange feels."""
+    return felt_by(lambda: peer.raw_wrench, XYZ, RPY, sign)
+
+
+def flange_rotation(q: tuple[float, ...]) -> Array:
+    """Return the flange's rotation in base, from the arm's own table."""
+    flange = plant_arm(builtin_arm("ur10e")).flange(q).rotation
+    return np.array(flange, dtype=float).reshape(3, 3)
+
+
+def sensor_rotation() -> Array:
+    return rpy_matrix(np.array(RPY))

@@ -1,0 +1,234 @@
+"""Each sensor over its real wire: units, signs, overload, silence, garbage."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+from sensor_wires import (
+    COG,
+    KINDS,
+    MASS,
+    RESOLUTION,
+    RPY,
+    XYZ,
+    Felt,
+    Wire,
+    felt_of,
+    flange_rotation,
+    make_wire,
+    next_reading,
+    resting_peer,
+    settings_of,
+)
+
+from core.errors import LinkError
+from drivers.ft_sensor import FT_SENSORS, make_sensor
+from drivers.ft_sensor.wrench import sensor_to_flange
+from drivers.simulated.ft_sensor.ati_node import AtiNode
+from drivers.simulated.ft_sensor.ft300_device import Ft300Device
+from drivers.simulated.ft_sensor.robotous_node import RobotousNode
+
+TURNED = (0.3, -1.2, 1.4, -1.1, -1.3, 0.8)  # rad
+GRAVITY = 9.80665
+
+
+def tolerance(kind: str) -> np.ndarray[Any, Any]:
+    force, torque = RESOLUTION[kind]
+    return np.array(3 * (force,) + 3 * (torque,))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_known_wrench_is_read_in_newtons_and_newton_metres(kind: str) -> None:
+    felt = Felt()
+    wire = make_wire(kind, felt)
+    with wire.device, make_sensor(wire.settings()) as sensor:
+        reading = next_reading(sensor)
+        assert np.all(np.abs(reading.wrench - felt.wrench) <= tolerance(kind))
+        assert reading.status == 0
+        assert reading.timestamp <= reading.received <= time.monotonic()
+        felt.wrench = tuple(-v for v in felt.wrench)
+        time.sleep(0.05)
+        for _ in range(20):
+            reading = next_reading(sensor)
+        assert np.all(np.abs(reading.wrench - felt.wrench) <= tolerance(kind))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_mass_at_rest_reads_its_weight_pointing_down(kind: str, sign: int) -> None:
+    peer = resting_peer(TURNED)
+    wire = make_wire(kind, felt_of(peer, sign))
+    wire.keys |= {"sensor_in_flange": {"xyz": XYZ, "rpy": RPY}, "sign": sign}
+    with wire.device, make_sensor(wire.settings()) as sensor:
+        reading = next_reading(sensor)
+    in_flange = sensor_to_flange(wire.settings().sensor_in_flange) @ reading.wrench
+    rotation = flange_rotation(TURNED)
+    weight = rotation.T @ (0.0, 0.0, -MASS * GRAVITY)
+    expected = np.concatenate([weight, np.cross(COG, weight)])
+    assert np.all(np.abs(in_flange - expected) <= 3.0 * tolerance(kind))
+    assert (rotation @ in_flange[:3])[2] == pytest.approx(-MASS * GRAVITY, abs=0.1)
+
+
+def test_the_constructor_touches_no_wire_and_the_table_is_whole() -> None:
+    keys: dict[str, dict[str, Any]] = {
+        "robotous_rft": {"interface": "socketcand", "port": 9},
+        "ati_netcanoem": {"interface": "socketcand", "port": 9},
+        "robotiq_ft300": {"port": "/dev/nothing-here"},
+    }
+    assert set(keys) == set(FT_SENSORS)
+    for name, more in keys.items():
+        sensor = make_sensor(settings_of(driver=name, **more))
+        with pytest.raises(LinkError, match=name):
+            sensor.read(0.01)
+        with pytest.raises(LinkError):
+            sensor.connect()
+        sensor.close()
+        sensor.close()
+
+
+@pytest.mark.parametrize("kind", ["robotous_rft", "ati_netcanoem"])
+def test_overload_bits_are_told(kind: str) -> None:
+    wire = make_wire(kind, Felt())
+    wire.device.status = 0x2000 if kind == "ati_netcanoem" else 0x04
+    with wire.device, make_sensor(wire.settings()) as sensor:
+        reading = next_reading(sensor)
+        assert reading.status == wire.device.status
+        words = sensor.describe(reading.status)
+    assert ("DAC" if kind == "ati_netcanoem" else "overload") in words
+
+
+def test_a_saturated_gauge_is_overload() -> None:
+    wire = make_wire("ati_netcanoem", Felt((900.0, 0.0, 0.0, 0.0, 0.0, 0.0)))
+    with wire.device, make_sensor(wire.settings()) as sensor:
+        reading = next_reading(sensor)
+        assert "saturated" in sensor.describe(reading.status)
+
+
+def test_a_sensor_calibrated_in_pounds_is_read_in_newtons() -> None:
+    felt = Felt()
+    wire = make_wire("ati_netcanoem", felt)
+    assert isinstance(wire.device, AtiNode)
+    pounds = AtiNode(felt, wire.device._settings, seed=9, units=((1, 4.4482216), (2, 1.3558179)))
+    with pounds, make_sensor(wire.settings()) as sensor:
+        assert np.all(
+            np.abs(next_reading(sensor).wrench - felt.wrench) <= tolerance("ati_netcanoem")
+        )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_silent_sensor_gives_no_reading_and_its_return_does(kind: str) -> None:
+    wire = make_wire(kind, Felt())
+    with wire.device, make_sensor(wire.settings()) as sensor:
+        next_reading(sensor)
+        wire.device.silent = True
+        time.sleep(0.1)
+        for _ in range(30):
+            sensor.read(0.0)
+        assert sensor.read(0.1) is None
+        wire.device.silent = False
+        assert next_reading(sensor).wrench[2] == pytest.approx(12.25, abs=0.1)
+
+
+def test_a_sensor_that_does_not_answer_is_no_sensor() -> None:
+    wire = make_wire("ati_netcanoem", Felt())
+    wire.device.silent = True
+    with wire.device, pytest.raises(LinkError, match="base id 0x20"):
+        make_sensor(wire.settings()).connect()
+
+
+@pytest.mark.parametrize("kind", ["robotous_rft", "robotiq_ft300"])
+def test_close_ends_the_stream(kind: str) -> None:
+    wire = make_wire(kind, Felt())
+    device: Any = wire.device
+    with device:
+        with make_sensor(wire.settings()) as sensor:
+            next_reading(sensor)
+            assert device.streaming
+        until = time.monotonic() + 2.0
+        while device.streaming and time.monotonic() < until:
+            time.sleep(0.01)
+        assert not device.streaming
+
+
+def test_a_stream_left_running_does_not_disturb_the_start() -> None:
+    wire = make_wire("robotiq_ft300", Felt())
+    device = wire.device
+    assert isinstance(device, Ft300Device)
+    with device:
+        device.streaming = True
+        device._due = time.monotonic()
+        time.sleep(0.05)
+        with make_sensor(wire.settings()) as sensor:
+            assert next_reading(sensor).wrench[2] == pytest.approx(12.25, abs=0.02)
+
+
+def test_garbage_on_the_line_is_dropped_and_the_stream_goes_on() -> None:
+    wire = make_wire("robotiq_ft300", Felt())
+    device = wire.device
+    assert isinstance(device, Ft300Device)
+    with device, make_sensor(wire.settings()) as sensor:
+        next_reading(sensor)
+        half, broken = device.frame()[:9], bytearray(device.frame())
+        broken[5] ^= 0x40
+        for garbage in (b"\x20", b"\x20\x4e\x20", b"\x00" * 33, half, bytes(broken)):
+            device.put(garbage)
+            for _ in range(5):
+                assert np.allclose(next_reading(sensor).wrench, Felt().wrench, atol=0.01)
+        assert sensor.dropped >= 33
+
+
+def flood(wire: Wire, stop: threading.Event, rng: np.random.Generator) -> None:
+    """Send frames of others, and pieces of samples under the sensor's own ids."""
+    bus = can.Bus(interface="virtual", channel=wire.keys["channel"])
+    ids = (0x01, 0x02, 0x01, 0x200, 0x201, 0x2A5, 0x7FF)
+    while not stop.wait(0.002):
+        data = rng.bytes(int(rng.integers(0, 8)))  # never whole
+        bus.send(can.Message(arbitration_id=int(rng.choice(ids)), data=data, is_extended_id=False))
+    bus.shutdown()
+
+
+@pytest.mark.parametrize("kind", ["robotous_rft", "ati_netcanoem"])
+def test_foreign_and_broken_frames_on_the_bus_never_make_a_sample(kind: str) -> None:
+    wire, stop = make_wire(kind, Felt()), threading.Event()
+    noise = threading.Thread(target=flood, args=(wire, stop, np.random.default_rng(1)))
+    with wire.device, make_sensor(wire.settings()) as sensor:
+        noise.start()
+        try:
+            for _ in range(60):
+                found = next_reading(sensor).wrench
+                assert np.all(np.abs(found - Felt().wrench) <= tolerance(kind))
+        finally:
+            stop.set()
+            noise.join()
+        assert sensor.dropped > 0
+
+
+def test_a_second_robotous_on_the_bus_is_another_pair_of_ids() -> None:
+    wire = make_wire("robotous_rft", Felt())
+    assert isinstance(wire.device, RobotousNode)
+    other = RobotousNode(Felt((0.0,) * 6), wire.device._settings, 0x65, (0x11, 0x12))
+    second = wire.settings(command_id=0x65, reply_ids=(0x11, 0x12))
+    with wire.device, other, make_sensor(wire.settings()) as a, make_sensor(second) as b:
+        assert next_reading(a).wrench[2] == pytest.approx(12.25, abs=0.02)
+        assert next_reading(b).wrench == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"driver": "robotous_rft", "reply_ids": (1, 1)}, "different"),
+        ({"driver": "robotous_rft", "reply_ids": (1, 0x800)}, "11-bit"),
+        ({"driver": "bota"}, "robotous_rft"),
+        ({"driver": "ati_netcanoem", "base_id": 0x80}, "base_id"),
+        ({"driver": "robotiq_ft300", "sign": 0}, "sign"),
+        ({"driver": "robotiq_ft300", "channel": "can0"}, "channel"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(keys: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        settings_of(**keys)
