@@ -1,0 +1,155 @@
+"""What a profile comes to: messages, joints, sequences, ready for the wire."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+Key = tuple[int, bool]  # identifier, whether it has 29 bits
+
+NORMAL = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """A signal that is one joint's part of a quantity."""
+
+    signal: str
+    quantity: str  # position, velocity, torque, temperature
+    joint: int  # from 0
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """A signal that tells whether the arm is well."""
+
+    signal: str
+    normal: frozenset[int]
+    values: dict[int, str]
+    otherwise: str
+    while_writing: bool = False  # counts only then
+
+    def trouble(self, value: int) -> str:
+        """Return what a value means; empty where the arm is well."""
+        return NORMAL if value in self.normal else self.values.get(value, self.otherwise)
+
+
+@dataclass(frozen=True, slots=True)
+class Incoming:
+    """A message that we read."""
+
+    name: str
+    key: Key
+    length: int
+    message: Any  # cantools
+    readings: tuple[Reading, ...]
+    checks: tuple[Check, ...]
+    enabled: tuple[str, ...]  # signals
+    counter: str | None
+
+    def decode(self, data: bytes) -> dict[str, float]:
+        """Return the signals. Raises ValueError where the bytes are not this message's."""
+        if len(data) != self.length:
+            raise ValueError(f"{self.name}: found {len(data)} bytes, expected {self.length}")
+        try:
+            found: dict[str, float] = self.message.decode(data, decode_choices=False)
+        except Exception as error:  # cantools, bitstruct and struct each raise their own
+            raise ValueError(f"{self.name}: {error}") from None
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Outgoing:
+    """A frame as it goes out; its bytes, or the signals that are constant in it."""
+
+    name: str
+    key: Key
+    message: Any  # cantools
+    constants: dict[str, float]
+    data: bytes | None = None
+    joints: tuple[tuple[str, int], ...] = ()  # signal, joint
+
+    def encode(self, wire: Vector | None = None) -> bytes:
+        """Return the bytes, joints filled from ``wire`` (n,). Raises ValueError."""
+        if self.data is not None:
+            return self.data
+        values = dict(self.constants)
+        if wire is not None:
+            for signal, joint in self.joints:
+                values[signal] = float(wire[joint])
+        try:
+            return bytes(self.message.encode(values, strict=True))
+        except Exception as error:  # cantools, bitstruct and struct each raise their own
+            words = " ".join(str(error).split())
+            raise ValueError(f"{self.name}: {words}") from None
+
+
+@dataclass(frozen=True, slots=True)
+class Action:
+    """One step of a sequence."""
+
+    frames: tuple[Outgoing, ...]
+    hold: bool
+    wait: float  # s
+    until: str | None  # "enabled", "disabled", "ready"
+    within: float  # s
+    every: float  # s
+
+
+@dataclass(frozen=True, slots=True)
+class JointMap:
+    """Wire <-> SI, all (n,): ``q = wire * scale[position] + zero``."""
+
+    scale: dict[str, Vector]
+    zero: Vector  # rad
+    setpoint_scale: Vector | None  # rad in one unit of the setpoint's signals
+    resolution: Vector | None  # rad, one count of the setpoint's signals
+
+    def to_si(self, quantity: str, wire: Vector) -> Vector:
+        """Return a quantity (n,) in SI units."""
+        value = wire * self.scale[quantity]
+        return value + self.zero if quantity == "position" else value
+
+    def to_wire(self, q: Vector) -> Vector:
+        """Return a setpoint (n,) in the wire's units."""
+        assert self.setpoint_scale is not None
+        return (q - self.zero) / self.setpoint_scale
+
+
+@dataclass(frozen=True, slots=True)
+class CanProfile:
+    """One arm's map, checked."""
+
+    name: str
+    path: str
+    n: int
+    rate: float  # Hz
+    incoming: dict[Key, Incoming]
+    joints: JointMap
+    sample: tuple[Key, ...]
+    window: float  # s
+    ordered: bool
+    counted: bool
+    enabled_values: frozenset[int]
+    status_timeout: float  # s
+    request: tuple[Outgoing, ...]
+    setpoint: tuple[Outgoing, ...]
+    enable: tuple[Action, ...]
+    release: tuple[Action, ...]
+    stop: tuple[Action, ...]
+    sends: frozenset[Key]  # allow-list
+    control: frozenset[Key]  # who sends these commands the arm
+
+    @property
+    def quantities(self) -> frozenset[str]:
+        """Return what the feedback tells."""
+        return frozenset(self.joints.scale)
+
+    @property
+    def writes(self) -> bool:
+        """Return whether setpoints can be sent."""
+        return bool(self.setpoint)
