@@ -45,7 +45,7 @@ def settings_of(cell: Cell) -> DaemonSettings:
             setpoints=cell.setpoints.model_copy(
                 update={"file": cell.setpoints.file and cell.setpoints.file.resolve()}
             ),
-            recording=cell.recording,
+            recording=cell.recording, ft_sensor=cell.ft_sensor,
         )  # fmt: skip
     except ValidationError as error:
         words = str(error.errors()[0]["msg"]).removeprefix("Value error, ")

@@ -7,6 +7,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from bridge.settings import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
+from drivers.ft_sensor.settings import AnyFtSensor
 from drivers.ur_rtde.settings import UrRtdeSettings
 
 
@@ -21,6 +22,7 @@ class DaemonSettings(BaseModel):
 
     cell: Path = Field(description="the cell file; the loop's process takes its model from there")
     link: LinkSettings = Field(default_factory=UrRtdeSettings)
+    ft_sensor: AnyFtSensor | None = None
     limits: LimitSettings = Field(default_factory=LimitSettings)
     setpoints: SetpointSettings = Field(default_factory=SetpointSettings)
     recording: RecordingSettings = Field(default_factory=RecordingSettings)

@@ -33,6 +33,7 @@ from core.errors import GapbridgeError, InputError
 from core.loads import Loads
 from core.model import Model
 from drivers import make_driver
+from drivers.ft_sensor.joined import DriverWithSensor
 
 _PR_SET_PDEATHSIG = 1
 
@@ -64,6 +65,8 @@ def _run(order: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Exit:
     page.enter(Phase.STARTING)
     model = _read_model(settings)
     driver = make_driver(settings.link, model)
+    if settings.ft_sensor is not None:
+        driver = DriverWithSensor(driver, settings.ft_sensor, model)
     source = make_source(settings.setpoints, model.arm.n, driver.moves_arm, settings.cell.parent)
     loop = Loop(settings, model, driver, source, page, tell)
     for number in (signal.SIGTERM, signal.SIGINT):

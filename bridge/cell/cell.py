@@ -19,6 +19,7 @@ from core.errors import ArmError, CellError
 from core.metrology import Metrology
 from core.model import Model
 from core.rotation import rpy_matrix, transform
+from drivers.ft_sensor.settings import FtSensorSettings
 
 HEAVIEST = 1.5  # times the rated payload: beyond, the number is a mistake
 FINEST = 1.0e-9  # m: what a sigma of zero counts as
@@ -48,6 +49,11 @@ class Cell:
         """
         given = self.file.link
         return None if given is None else given.located(self.path.parent)
+
+    @property
+    def ft_sensor(self) -> FtSensorSettings | None:
+        """Return section ``ft_sensor``; None where the cell has none."""
+        return self.file.ft_sensor
 
     @property
     def limits(self) -> LimitSettings:

@@ -7,6 +7,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 from bridge.settings import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
+from drivers.ft_sensor.settings import AnyFtSensor
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0)]
@@ -127,6 +128,9 @@ class CellFile(Section):
     effects: list[EffectEntry] = []
     metrology: MetrologyEntry = MetrologyEntry()
     link: LinkSettings | None = Field(default=None, description="driver, host, ...")
+    ft_sensor: AnyFtSensor | None = Field(
+        default=None, description="driver, sensor_in_flange, ...: a sensor with a link of its own"
+    )
     limits: LimitSettings = LimitSettings()
     setpoints: SetpointSettings = SetpointSettings()
     recording: RecordingSettings = RecordingSettings()

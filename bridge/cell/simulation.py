@@ -16,6 +16,7 @@ from bridge.cell.cell import Cell
 from core.errors import CellError
 from core.rotation import rotation_vector
 from drivers.driver import DriverSettings
+from drivers.simulated.ft_sensor.serving import served_sensor
 from drivers.simulated.peer import Peer, make_peer
 from drivers.simulated.peer_server import PeerServer, serve_peer
 from drivers.simulated.server import serve
@@ -62,14 +63,15 @@ def serve_cell(
         found = simulated_peer(cell, link, host, seed)
         names = ", ".join(server.name for server in found.servers)
         say(f"{cell.arm.name} at {found.host}: {names}, bench {found.bench_port}")
-        serve_peer(found.peer, found.servers, found.host, found.bench_port, stop)
+        with served_sensor(cell.ft_sensor, lambda: found.peer.raw_wrench, link):
+            serve_peer(found.peer, found.servers, found.host, found.bench_port, stop)
         return
     settings = server_settings(cell, host, seed)
     say(
         f"{settings.arm.name} at {settings.host}: RTDE {settings.rtde_port}, dashboard "
         f"{settings.dashboard_port}, scripts {settings.script_port}, bench {settings.bench_port}"
     )
-    serve(settings, stop)
+    serve(settings, stop, lambda in_flange: served_sensor(cell.ft_sensor, in_flange))
 
 
 def simulated_peer(

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
-
-import numpy as np
 
 from core.errors import InvalidStateError, LinkError, StaleStateError
 from drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
@@ -111,8 +110,10 @@ class SensorReader:
             ("force", "N", limits.force, reading.wrench[:3]),
             ("torque", "Nm", limits.torque, reading.wrench[3:]),
         ):
-            size = float(np.linalg.norm(part))
-            if limit is not None and not size <= limit:
+            if limit is None:
+                continue
+            size = math.hypot(*part)
+            if not size <= limit:
                 raise InvalidStateError(
                     f"{name}: overload: found a {what} of {size:.1f} {unit}, expected at most "
                     f"{limit:g} (ft_sensor.overload.{what})"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from core import kernel
 from core.dynamics import SENSING
 from core.effects import CATALOGUE
 from core.loads import Loads
@@ -39,9 +40,13 @@ class TcpForce:
 
     def __init__(self, model: Model) -> None:
         self._model = model
-        self._rigid = model.without_terms()
         self._tool = np.array(model.tool_in_flange, dtype=float)
         self._undo, self._bias = _undoing(model)
+        # laid out once: Model.predict would do it anew in every cycle
+        rigid = model.without_terms()
+        self._chain, self._rows = rigid.chain(), rigid.rows(np.zeros((1, model.arm.n)))
+        self._place = np.empty((1, 3)), np.empty((1, 3, 3))
+        self._flange_in_base()  # loads what is compiled, before the first cycle
 
     def of(self, raw_in_flange: Array, state: RobotState) -> Array:
         """Return force and torque (6,) of the surroundings on the tool, at the TCP, base axes.
@@ -52,13 +57,19 @@ class TcpForce:
         model = self._model
         mass = model.payload_mass if state.payload is None else state.payload
         cog = model.payload_cog if state.payload_cog is None else state.payload_cog
-        tcp_in_base = self._rigid.predict(state.actual_q[None, :]).rotation[0]
-        flange_in_base = tcp_in_base @ self._tool[:3, :3].T
+        self._rows.q[0] = state.actual_q
+        flange_in_base = self._flange_in_base()
         weight = flange_in_base.T @ (mass * model.gravity)
         wrench = self._undo @ (raw_in_flange - self._bias)
         force = wrench[:3] - weight
         torque = wrench[3:] - _cross(cog, weight) - _cross(self._tool[:3, 3], force)
         return np.concatenate([flange_in_base @ force, flange_in_base @ torque])
+
+    def _flange_in_base(self) -> Array:
+        """Return the rigid arm's flange rotation (3, 3) at the joints in ``_rows``."""
+        kernel.predict_rows(self._chain, self._rows, *self._place)
+        rotation: Array = self._place[1][0] @ self._tool[:3, :3].T
+        return rotation
 
 
 def _cross(a: Array, b: Array) -> Array:

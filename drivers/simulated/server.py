@@ -8,7 +8,8 @@ import select
 import socket
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 
@@ -151,17 +152,28 @@ class Server:
             sock.close()
 
 
-def serve(settings: ServerSettings, stop: Callable[[], bool] | None = None) -> None:
+Beside = Callable[[Callable[[], Sequence[float]]], AbstractContextManager[None]]
+"""Serves a flange sensor while its context lasts, given the wrench (6,) on the flange."""
+
+
+def serve(
+    settings: ServerSettings,
+    stop: Callable[[], bool] | None = None,
+    beside: Beside = lambda _: nullcontext(),
+) -> None:
     """Serve a simulated controller until `stop()` is true (never, where it is left out).
 
-    Prints ``ready <host>`` to stdout when every port listens. Raises LinkError where a port is
-    taken. Must run in a process of its own: ur_rtde's constructors hold the interpreter lock.
+    ``beside`` serves what else feels the plant. Prints ``ready <host>`` to stdout when every port
+    listens. Raises LinkError where a port is taken. Must run in a process of its own: ur_rtde's
+    constructors hold the interpreter lock.
     """
     server = Server(settings)
-    become_punctual()
-    sys.stdout.write(f"ready {settings.host}\n")
-    sys.stdout.flush()
+    memory = server.controller.memory
     try:
-        server.run(stop or (lambda: False))
+        with beside(lambda: memory["ft_raw_wrench"]):
+            become_punctual()
+            sys.stdout.write(f"ready {settings.host}\n")
+            sys.stdout.flush()
+            server.run(stop or (lambda: False))
     finally:
         server.close()
