@@ -28,6 +28,8 @@ REPEATED = 1.6  # times the scatter of repeated poses
 ENOUGH_REPEATS = 30  # degrees of freedom from which repeats are a measure of the noise
 USUAL = 1.2e-4  # m, one coordinate: a worse repeatability than that is none
 INSTRUMENTS = 5.0  # times the instrument's sigma, for coarse instruments
+HINT = 0.05  # probability from which a coordinate is suspect once structure is sure
+TOUCH = 0.1  # share of a cause that acts on a coordinate: more than that touches it
 LEAST = 0.002  # share of the held-out gap that a cause has to take beside a leftover
 BENT = 10.8  # gain of a bent stiffness curve over a straight one that makes it one
 
@@ -59,14 +61,16 @@ def judge(selection: Selection) -> Judgement:
     nuisance = selection.nuisance_basis
     p_value = structure_p_value(space, nuisance, found.chosen)
     effects = {space.candidates[c].family for c in believed}
-    structured = bool(smooth) or p_value < SURE or bool(straight) or _too_much_left(selection)
+    sure = SURE * (1 + len(believed))  # the more is accused, the less may be left
+    structured = bool(smooth) or p_value < sure or bool(straight) or _too_much_left(selection)
     samples = int(selection.kept.sum())
     if samples < MANY and len(effects) >= ACCOMPLICES:
         structured = True
-    if structured and samples < MANY:
+    if structured:
+        weak = _weak(selection, believed, smooth)
         why = "structure is left beside it"
-        withdrawn += [(selection.term_index.index(c), why) for c in believed]
-        believed = []
+        withdrawn += [(selection.term_index.index(c), why) for c in weak]
+        believed = [c for c in believed if c not in weak]
     accused = tuple(selection.term_index.index(c) for c in believed)
     depends: tuple[tuple[str, float], ...] = ()
     if structured or not accused:
@@ -95,6 +99,39 @@ def holding(selection: Selection, judgement: Judgement, held: HeldOut) -> Judgem
         accused.remove(worst)
         withdrawn.append((worst, "it does not hold on samples that its fit did not see"))
     return replace(judgement, accused=tuple(accused), withdrawn=tuple(withdrawn))
+
+
+def _weak(selection: Selection, believed: list[int], smooth: list[int]) -> list[int]:
+    """Return the accusations that structure beside them makes weak.
+
+    A large log of poses tells many causes apart, so there what holds on unseen poses may stay
+    (``holding``). Where each joint has a coordinate of its own, causes stay that touch none of the
+    coordinates with structure.
+    """
+    space, observation = selection.space, selection.observation
+    if observation.channel == "position" and selection.kept.sum() >= MANY:
+        return []
+    k = observation.measured.shape[1]
+    coordinate = np.arange(len(space.y)) % k
+    if observation.channel not in ("tracking", "torque"):
+        return believed
+    nuisance, chosen = selection.nuisance_basis, selection.found.chosen
+    touched = {c: _touches(space, c, coordinate, k) for c in (*believed, *smooth)}
+    bad = np.zeros(k, dtype=bool)
+    for c in smooth:
+        bad |= touched[c] > TOUCH
+    for j in range(k):
+        bad[j] |= structure_p_value(space, nuisance, chosen, rows=coordinate == j) < HINT
+    if not bad.any():
+        return believed
+    return [c for c in believed if touched[c][bad].sum() > TOUCH]
+
+
+def _touches(space: Space, c: int, coordinate: NDArray[np.int64], k: int) -> Array:
+    """Return how the size of a candidate's columns is shared among the coordinates (k,)."""
+    block = space.columns([c])
+    size = np.bincount(coordinate, np.einsum("ij,ij->i", block, block), k)
+    return np.asarray(size / max(float(size.sum()), 1e-300))
 
 
 def _too_much_left(selection: Selection) -> bool:

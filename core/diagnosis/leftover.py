@@ -8,6 +8,7 @@ up in it where each alone would drown in the number of hypotheses tried.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +30,20 @@ def basis_of(columns: Array) -> Array:
     return np.asarray(U[:, s > 1e-6 * max(s[0], 1e-300)])
 
 
-def structure_p_value(space: Space, nuisance: Array, chosen: Sequence[int], seed: int = 0) -> float:
-    """Return the probability that noise alone leaves as much structure as is left."""
+def structure_p_value(
+    space: Space,
+    nuisance: Array,
+    chosen: Sequence[int],
+    seed: int = 0,
+    rows: NDArray[np.bool_] | None = None,
+) -> float:
+    """Return the probability that noise alone leaves as much structure as is left.
+
+    ``rows`` (m,) looks at some rows of the sample space only.
+    """
+    if rows is not None:
+        space = replace(space, y=space.y[rows], X=space.X[rows])
+        nuisance = nuisance[rows]
     fitted = basis_of(np.hstack([nuisance, space.columns(chosen)]))
     r = space.y - fitted @ (fitted.T @ space.y)
     spread = _families(space, fitted)

@@ -8,11 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.diagnosis.observation import NotObservable, Observation
+from core.diagnosis.unnamed import unnamed_rivals
 from core.effects import Term
-from core.effects.effect import typical_moment
 from core.identification import pose_groups
-from core.kernel import predict_rows
-from core.loads import Loads
 from core.log import Log
 from core.metrology import Metrology
 from core.model import Model
@@ -91,7 +89,7 @@ def observe(
         axes=("x", "y", "z", "rx", "ry", "rz")[:k],
         joint_columns=form.jacobian[:, :k],
         axial_moment=np.einsum("nij,nji->ni", form.moment, form.jacobian[:, 3:]),
-        unnamed=_bending(model, q, loads, k),
+        unnamed=unnamed_rivals(model, q, loads, k),
         tool_axes=poses.rotation,
         rebase=None if metrology.registered else rebase,
     )
@@ -119,29 +117,3 @@ def approaches(approach: Array | None) -> dict[str, Array]:
         return {}
     both = (np.sum(approach > 0, axis=0) >= 4) & (np.sum(approach < 0, axis=0) >= 4)
     return {f"approach_{i}": approach[:, i] for i in np.flatnonzero(both)}
-
-
-def _bending(model: Model, q: Array, loads: Loads, k: int) -> tuple[tuple[str, Array], ...]:
-    """Return what each joint would do if it bent about its own x, y and z, each as it likes.
-
-    A rival that is no member of the catalogue: something at the joint gives way under load.
-    """
-    chain, rows = model.chain(), model.rows(q, loads)
-    step = 1e-2 * 1e-3 / typical_moment(model.arm)
-    found = []
-    for i in range(model.arm.n):
-        columns = np.zeros((len(q), k, 3))
-        for axis in range(3):
-            ends = []
-            for h in (step, -step):
-                bent = chain.compliance.copy()
-                bent[i, axis] += h
-                position, rotation = np.empty((len(q), 3)), np.empty((len(q), 3, 3))
-                predict_rows(chain._replace(compliance=bent), rows, position, rotation)
-                ends.append((position, rotation))
-            columns[:, :3, axis] = (ends[0][0] - ends[1][0]) / (2 * step)
-            if k > 3:
-                turn = ends[0][1] @ np.swapaxes(ends[1][1], 1, 2)
-                columns[:, 3:, axis] = rotation_vector(turn) / (2 * step)
-        found.append((f"joint_{i + 1}", columns))
-    return tuple(found)

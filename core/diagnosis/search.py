@@ -27,6 +27,7 @@ DEPTH = 9
 DEEP = 40  # terms that a large log may show
 PATIENCE = 2  # depths without a better set before the beam stops
 SMOOTH_TERMS = 2  # more unnamed functions than that tell nothing more
+BY_ANGLE = ("joint_offset", "transmission_error")  # what a joint does by its own angle alone
 LINES = 4  # periodic lines a joint may have
 
 
@@ -142,12 +143,15 @@ def part(space: Space, keep: NDArray[np.int64]) -> Space:
 def screened_search(space: Space, depth: int = DEPTH, base: Sequence[int] = ()) -> Found:
     """Return the best set among the candidates worth a search, in the indices of ``space``."""
     keep = screened(space, base)
-    found = search(part(space, keep), depth)
+    place = {int(c): i for i, c in enumerate(keep)}
+    found = search(part(space, keep), depth, [place[c] for c in base])
     return replace(found, chosen=tuple(int(keep[c]) for c in found.chosen))
 
 
-def search(space: Space, depth: int = DEPTH) -> Found:
+def search(space: Space, depth: int = DEPTH, base: Sequence[int] = ()) -> Found:
     """Return the best set: named causes alone, unless an unnamed function beside them pays.
+
+    ``base`` is a set already found (named causes), from which the search starts as well.
 
     The catalogue is searched by itself first, so that a smooth function, which imitates several
     causes at once, does not stand in their way.
@@ -155,12 +159,54 @@ def search(space: Space, depth: int = DEPTH) -> Found:
     if len(space.y) >= LARGE:
         return _deep_search(space)
     named = improve(space, beam_search(space, depth, named_only=True)[0], named_only=True)
-    joined = [fit(space, (*named.chosen, c)) for _, c in children(space, named.chosen, 4)]
+    if base:
+        again = improve(space, fit(space, tuple(base)), named_only=True)
+        named = min([named, again], key=lambda f: f.score)
+    joiners = {c for _, c in children(space, named.chosen, 4)}
+    joiners |= {
+        c for c, rival in enumerate(space.candidates) if not (rival.named or rival.quantity)
+    }
+    joined = [pruned(space, fit(space, (*named.chosen, c))) for c in joiners - set(named.chosen)]
+    joined += packed(space, named)
     if not any(j.score < named.score for j in joined):
         return named
     whole = improve(space, unpack(space, beam_search(space, depth)[0]))
     grown = improve(space, min(joined, key=lambda f: f.score))
     return min([named, whole, grown], key=lambda f: f.score)
+
+
+def pruned(space: Space, found: Found) -> Found:
+    """Return the set without the terms that it is better off without, dropped one by one."""
+    while found.chosen:
+        better = None
+        for score, c in _drops(space, found):
+            if score >= found.score:
+                break
+            better = fit(space, tuple(o for o in found.chosen if o != c))
+            if np.isfinite(better.score):
+                break
+        if better is None or better.score >= found.score:
+            break
+        found = better
+    return found
+
+
+def _drops(space: Space, found: Found) -> list[tuple[float, int]]:
+    """Return the score of the set less each of its terms, best first, out of one inverse."""
+    X = space.columns(found.chosen)
+    unit = 1 / np.sqrt(np.einsum("ij,ij->j", X, X) + 1e-300)
+    A = X * unit
+    inverse = np.linalg.pinv(A.T @ A, rcond=1e-12, hermitian=True)
+    x = inverse @ (A.T @ space.y)
+    rss = float(np.sum((space.y - A @ x) ** 2))
+    paid = float(space.price[list(found.chosen)].sum())
+    begin, scores = 0, []
+    for c in found.chosen:
+        own = slice(begin, begin + len(space.candidates[c].parameters))
+        begin = own.stop
+        more = float(x[own] @ np.linalg.pinv(inverse[own, own], hermitian=True) @ x[own])
+        scores.append((float(space.misfit(np.array(rss + more))) + paid - space.price[c], c))
+    return sorted(scores)
 
 
 def _deep_search(space: Space) -> Found:
@@ -170,14 +216,21 @@ def _deep_search(space: Space) -> Found:
     function joins at the end, where one still pays.
     """
     found = beam_search(space, DEEP, beam=1, named_only=True)[0]
-    dropped = True
-    while dropped and found.chosen:
-        trials = [fit(space, tuple(o for o in found.chosen if o != c)) for c in found.chosen]
-        best = min(trials, key=lambda f: f.score)
-        dropped = best.score < found.score
-        found = best if dropped else found
-    joined = [fit(space, (*found.chosen, c)) for _, c in children(space, found.chosen, 4)]
-    return min([found, *joined], key=lambda f: f.score)
+    found = pruned(space, found)
+    return min([found, *_joined(space, found), *packed(space, found)], key=lambda f: f.score)
+
+
+def _joined(space: Space, found: Found) -> list[Found]:
+    """Return the set with one more term, less what that makes needless: unnamed rivals above all.
+
+    Named causes that together imitate something unknown fall away where it is given its own term.
+    """
+    joiners = {c for _, c in children(space, found.chosen, 4)}
+    joiners |= {
+        c for c, rival in enumerate(space.candidates) if not (rival.named or rival.quantity)
+    }
+    new = sorted(joiners - set(found.chosen))
+    return [pruned(space, fit(space, (*found.chosen, c))) for c in new]
 
 
 def beam_search(
@@ -291,6 +344,26 @@ def unpack(space: Space, found: Found) -> Found:
         rest = tuple(o for o in found.chosen if o != c)
         found = min([found, *_lines(space, rest, int(joint))], key=lambda f: f.score)
     return found
+
+
+def packed(space: Space, found: Found) -> list[Found]:
+    """Return sets with all that a joint does by its own angle told as one smooth function."""
+    sets = []
+    joints = {space.candidates[c].site.joint for c in found.chosen}
+    for joint in joints - {None}:
+        own = {
+            c for c in found.chosen
+            if space.candidates[c].site.joint == joint and space.candidates[c].family in BY_ANGLE
+        }  # fmt: skip
+        if len(own) < 2:
+            continue
+        rest = tuple(c for c in found.chosen if c not in own)
+        for c, candidate in enumerate(space.candidates):
+            if candidate.target == f"joint_{joint}" and candidate.quantity.endswith(
+                f"l_q_{int(joint or 0) - 1}"
+            ):
+                sets.append(fit(space, (*rest, c)))
+    return sorted(sets, key=lambda f: f.score)[:4]
 
 
 def _lines(space: Space, rest: tuple[int, ...], joint: int) -> list[Found]:

@@ -14,7 +14,8 @@ Array = NDArray[np.float64]
 RANK = 1e-10  # share of a block's own size below which a direction counts as already explained
 SMOOTH_PRICE = 18.0  # what an unnamed function pays beyond a named cause
 MARGIN = 4.0  # what every accusation pays: keeps clean logs clean
-ABSURD = 60.0  # times a parameter's usual size: beyond, a fit is no explanation
+ABSURD = 200.0  # times a parameter's usual size: beyond, a fit is no explanation
+SHARP = 6000.0  # times the usual softening of a stiffness curve
 USUAL_ORDERS = (1.0, 2.0, 3.0, 4.0)  # eccentricity and its kin
 
 
@@ -71,6 +72,8 @@ def _kind(candidate: Candidate) -> str:
     """Return among how many of its like a candidate was tried: usual lines are few."""
     if candidate.family == "transmission_error" and (candidate.site.order or 0) in USUAL_ORDERS:
         return "usual lines"
+    if not candidate.named and not candidate.quantity:
+        return "rivals"
     return candidate.family
 
 
@@ -128,6 +131,7 @@ def _plausible(candidate: Candidate, x: Array, s: Array) -> bool:
     for parameter, value, deviation in zip(candidate.parameters, x, s, strict=True):
         if value < parameter.lower - 2.5 * deviation or value > parameter.upper:
             return False
-        if abs(value) - 3 * deviation > ABSURD * parameter.scale:
+        most = (SHARP if parameter.name == "softening" else ABSURD) * parameter.scale
+        if abs(value) - 3 * deviation > most:
             return False
     return True

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from core.diagnosis.moving import conditions, joint_axes, own_joints, picked, quantities
 from core.diagnosis.observation import NotObservable, Observation
+from core.diagnosis.unnamed import unnamed_pulls
 from core.dynamics import predict_torque, with_pieces
 from core.effects import Term
 from core.log import Log
@@ -59,6 +60,7 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
         axes=joint_axes(n),
         joint_columns=own_joints(len(motion), n),
         order_in_time=motion.moving,
+        unnamed=unnamed_pulls(model, motion, "torque"),
     )
 
 

@@ -15,6 +15,7 @@ from core.effects import Term
 Array = NDArray[np.float64]
 WILD_SHARE = 0.05  # of the samples: more of them is structure, not bad luck
 WILD_SIGMA = 5.0
+FORETOLD = 0.5  # share of a wild reading that may be left where something else explains it
 RIDGE = 5.0  # usual sizes of a parameter: prior of the fit that only looks for wild readings
 
 
@@ -82,18 +83,41 @@ def with_wild_explained(
     kept, found = work.kept, known[-1]
     work.kept = np.ones_like(kept)
     space, raw, nuisance, target = sample_space(work, columns, base, smooth)
-    gain = children(space, found.chosen, 12)
-    k = work.observation.measured.shape[1]
-    for _, c in gain:
+    wild = np.flatnonzero(~kept)
+    for _, c in children(space, found.chosen, 12):
         if space.candidates[c].named:
             continue
         trial = fit(space, (*found.chosen, c))
         left = space.y - space.columns(trial.chosen) @ np.concatenate(trial.values)
+        k = work.observation.measured.shape[1]
         distance = np.sqrt(np.mean(left.reshape(-1, k) ** 2, axis=1))
-        if (distance[~kept] < WILD_SIGMA * np.median(distance)).all():
+        if not (distance[wild] < WILD_SIGMA * np.median(distance)).all():
+            continue
+        block = [np.arange(space.start[o], space.start[o + 1]) for o in trial.chosen]
+        A = np.hstack([nuisance, raw[:, np.concatenate(block)]])
+        d = int(space.start[c + 1] - space.start[c])
+        if _foretold(A, target, wild, k, d):
             return space, raw, nuisance, target, trial
     work.kept = kept
     return known
+
+
+def _foretold(A: Array, target: Array, wild: NDArray[np.int64], k: int, d: int) -> bool:
+    """Return whether each wild reading is mostly what the last ``d`` columns say without it.
+
+    A flexible function can bend to any single reading; it is believed only where the others,
+    wild and ordinary, tell of it beforehand.
+    """
+    for sample in wild:
+        out = np.arange(k * sample, k * sample + k)
+        rest = np.delete(np.arange(len(target)), out)
+        with_it, without = A[rest], A[rest, :-d]
+        x = np.linalg.lstsq(with_it, target[rest], rcond=1e-9)[0]
+        plain = np.linalg.lstsq(without, target[rest], rcond=1e-9)[0]
+        off = float(np.linalg.norm(target[out] - A[out] @ x))
+        if off > FORETOLD * float(np.linalg.norm(target[out] - A[out, :-d] @ plain)):
+            return False
+    return True
 
 
 def look_again(work: Work, residual: Array, free: float) -> bool:

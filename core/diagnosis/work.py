@@ -15,6 +15,7 @@ from core.diagnosis.space import Space, prices
 from core.effects import Term
 
 Array = NDArray[np.float64]
+DEAD = 1e-7  # share of a column that the nuisance leaves: below, nothing is left
 KNOWN_SHARE = 0.7  # a stated repeatability is an average: less than this share of it is not assumed
 
 
@@ -56,6 +57,8 @@ def sample_space(
     nuisance = flat(observation.nuisance, work)
     Q = np.linalg.qr(nuisance)[0] if nuisance.shape[1] else nuisance
     X, y = raw - Q @ (Q.T @ raw), target - Q @ (Q.T @ target)
+    whole, left = (np.sqrt(np.einsum("ij,ij->j", A, A)) for A in (raw, X))
+    X[:, left < DEAD * whole] = 0.0  # the frame takes it up wholly; the rest is rounding
     freedom = float(len(target) - Q.shape[1])
     space = Space(
         y, X, start, tuple(candidates), prices(candidates, freedom), freedom,

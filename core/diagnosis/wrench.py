@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.derivatives import signal_noise
-from core.diagnosis.moving import conditions, picked, quantities
+from core.diagnosis.moving import VARIES, conditions, picked, quantities
 from core.diagnosis.observation import NotObservable, Observation
+from core.diagnosis.unnamed import unnamed_pulls
 from core.dynamics import predict_wrench, with_pieces
 from core.effects import Term
 from core.log import Log
@@ -57,12 +58,19 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
         weight=np.repeat([1.0, torque_weight(noise, value)], 3),
         sigma=0.0,
         sigma_is_whole=False,
-        quantities=quantities(log, motion),
+        quantities=quantities(log, motion) | _readings(predict(())),
         groups=conditions(motion),
         rows=motion.rows,
         axes=AXES,
         order_in_time=motion.moving,
+        unnamed=unnamed_pulls(model, motion, "wrench"),
     )
+
+
+def _readings(wrench: Array) -> dict[str, Array]:
+    """Return the expected readings (N, 6) as quantities: a bad sensor errs by what it carries."""
+    spread = np.ptp(wrench, axis=0)
+    return {f"ft_raw_wrench_{i}": wrench[:, i] for i in np.flatnonzero(spread > VARIES)}
 
 
 def torque_weight(noise: Array, wrench: Array) -> float:
