@@ -7,6 +7,7 @@ from typing import Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
+from core.errors import InputError
 from drivers.driver import DriverSettings
 
 SHIPPED = Path(__file__).with_name("profiles")
@@ -65,6 +66,16 @@ class ModbusSettings(DriverSettings):
         return value
 
     @property
+    def moves_arm(self) -> bool:
+        """Return whether setpoints are the arm's motion. Raises InputError: it reads the profile.
+
+        With a mailbox they ride on the robot's own.
+        """
+        from drivers.modbus.profile import read_profile
+
+        return read_profile(self.profile_path).write.mode != "mailbox"
+
+    @property
     def names_file(self) -> bool:
         """Return whether ``profile`` is a path rather than a shipped name."""
         return self.profile.endswith((".yaml", ".yml"))
@@ -80,7 +91,7 @@ class ModbusSettings(DriverSettings):
         return self.serial or self.host if self.transport == "rtu" else self.host
 
     def located(self, folder: Path) -> Self:
-        """Return the settings with paths seen from ``folder`` made whole."""
+        """Return the settings with paths seen from ``folder`` made whole; see DriverSettings."""
         update: dict[str, object] = {
             name: folder / path
             for name in ("authority", "certificate", "key")
@@ -88,4 +99,10 @@ class ModbusSettings(DriverSettings):
         }
         if self.names_file:
             update["profile"] = str((folder / self.profile).resolve())
+        elif not self.profile_path.is_file():
+            shipped = ", ".join(sorted(path.stem for path in SHIPPED.glob("*.yaml")))
+            raise InputError(
+                f"link.profile: found {self.profile!r}, expected one of {shipped}, or a path "
+                "ending in .yaml"
+            )
         return self.model_copy(update=update)

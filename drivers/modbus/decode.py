@@ -1,0 +1,206 @@
+"""Registers -> one checked sample. Arrays of counts in, SI out; no socket, no clock."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import InvalidStateError
+from drivers.modbus.map import Block, RegisterMap
+from drivers.modbus.profile import ECHO_WORDS, addresses, turns_of, vectors
+from drivers.modbus.registers import BIT_TABLES, UNITS, Coding
+from drivers.modbus.schema import Condition, Place, ProfileFile, Trouble, Vector
+
+Array = NDArray[np.float64]
+Registers = Mapping[Block, Sequence[int]]
+
+BOUNDS = {
+    "position": 20.0, "velocity": 30.0, "target": 20.0, "joint_torque": 1e5, "temperature": 300.0,
+    "force": 1e5, "moment": 1e5,
+}  # fmt: skip
+"""Largest plausible magnitudes, SI."""
+JITTER = 0.01  # rad beyond what the fastest joint can have come
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """What one reading of the blocks says."""
+
+    vectors: dict[str, Array]  # by the profile's names, SI
+    clock: float | None  # counts of the clock register
+    troubles: tuple[tuple[Trouble, str], ...]  # conditions that are not met
+    motion: tuple[tuple[str, str], ...]  # of the last target: ("busy" or "result", what it says)
+    echo: tuple[int, ...] | None  # the eight registers of the mailbox's answer
+
+
+@dataclass(frozen=True, slots=True)
+class _Field:
+    """A vector compiled: where each of its numbers starts in its block."""
+
+    name: str
+    block: Block
+    indices: tuple[int, ...]  # register indices in the block, all words of all numbers
+    coding: Coding
+    size: float  # SI units per count
+    turn_block: Block | None
+    turn_indices: tuple[int, ...]
+    turn_coding: Coding | None
+    contiguous: bool
+
+
+class Decoder:
+    """Decodes the blocks of one profile; remembers nothing."""
+
+    def __init__(self, profile: ProfileFile, compiled: RegisterMap) -> None:
+        self._profile, self._map = profile, compiled
+        self._fields = [
+            self._field(str(keys[1]), entry, count)
+            for keys, _, entry, count in vectors(profile)
+            if keys[0] == "state"
+        ]
+        self._conditions = [(self._spot(c), c) for c in profile.status]
+        clock, write = profile.clock, profile.write
+        self._motion: list[tuple[str, tuple[Block, int, Coding], Condition]] = []
+        if write.mode == "target_trigger":
+            self._motion = [
+                (name, self._spot(condition), condition)
+                for name, condition in (("busy", write.busy), ("result", write.result))
+                if condition is not None
+            ]
+        self._clock = self._spot(clock) if clock is not None else None
+        self._again = (
+            self._spot(clock.model_copy(update={"address": clock.again}))
+            if clock is not None and clock.again is not None
+            else None
+        )
+        self._echo: tuple[Block, int] | None = None
+        if write.mode == "mailbox":
+            block = compiled.block_of(write.echo_table, write.echo_address, ECHO_WORDS)
+            self._echo = (block, write.echo_address - block.first)
+
+    def _field(self, name: str, entry: Vector, count: int) -> _Field:
+        block, indices = self._indices(entry, count)
+        turns = None if entry.turns is None else turns_of(entry, entry.turns)
+        turn_block, turn_indices = (None, ()) if turns is None else self._indices(turns, count)
+        return _Field(
+            name, block, indices, entry.coding, entry.scale * UNITS[entry.unit][1],
+            turn_block, turn_indices, None if turns is None else turns.coding,
+            indices == tuple(range(indices[0], indices[0] + len(indices))),
+        )  # fmt: skip
+
+    def _indices(self, entry: Vector, count: int) -> tuple[Block, tuple[int, ...]]:
+        words = entry.coding.words
+        places = addresses(entry, count)
+        block = self._map.block_of(entry.table, places[0], words)
+        return block, tuple(a - block.first + k for a in places for k in range(words))
+
+    def _spot(self, place: Place) -> tuple[Block, int, Coding]:
+        coding = Coding("bit") if place.table in BIT_TABLES else place.coding
+        block = self._map.block_of(place.table, place.address, coding.words)
+        return block, place.address - block.first, coding
+
+    def decode(self, registers: Registers) -> Sample:
+        """Return the sample in the registers of every block.
+
+        Raises InvalidStateError where a number is not finite or implausible, or where the sample
+        is torn.
+        """
+        self._check_lengths(registers)
+        clock = None if self._clock is None else _number(registers, self._clock)
+        if self._again is not None and _number(registers, self._again) != clock:
+            raise InvalidStateError(
+                f"clock: found {clock:g} before and {_number(registers, self._again):g} after the "
+                "sample, which is torn"
+            )
+        if clock is not None and not math.isfinite(clock):
+            raise InvalidStateError(f"clock: found {clock:g}, expected a finite number")
+        return Sample(
+            {field.name: self._vector(field, registers) for field in self._fields},
+            clock,
+            tuple(
+                (condition.otherwise, _words(condition, count))
+                for spot, condition in self._conditions
+                if not condition.fine(count := int(_number(registers, spot)))
+            ),
+            tuple(
+                (name, _words(condition, count))
+                for name, spot, condition in self._motion
+                if not condition.fine(count := int(_number(registers, spot)))
+            ),
+            self._echo_of(registers),
+        )
+
+    def _check_lengths(self, registers: Registers) -> None:
+        for block in (*self._map.fast, *self._map.slow):
+            found = registers.get(block)
+            if found is None or len(found) != block.count:
+                raise InvalidStateError(
+                    f"{block.table} {block.first}: found {0 if found is None else len(found)} "
+                    f"registers, expected {block.count}"
+                )
+
+    def _vector(self, field: _Field, registers: Registers) -> Array:
+        raw = registers[field.block]
+        if field.contiguous:
+            words: Sequence[int] = raw[field.indices[0] : field.indices[-1] + 1]
+        else:
+            words = [raw[i] for i in field.indices]
+        values = np.array(field.coding.decode(words)) * field.size
+        if field.turn_block is not None and field.turn_coding is not None:
+            turns = registers[field.turn_block]
+            counts = field.turn_coding.decode([turns[i] for i in field.turn_indices])
+            values += 2.0 * math.pi * np.array(counts)
+        bound = BOUNDS[field.name]
+        if not (np.abs(values) <= bound).all():  # NaN fails too
+            bad = int(np.argmax(~(np.abs(values) <= bound)))
+            raise InvalidStateError(
+                f"{field.name} {bad + 1}: found {values[bad]:g}, expected a finite number within "
+                f"+-{bound:g}"
+            )
+        return values
+
+    def _echo_of(self, registers: Registers) -> tuple[int, ...] | None:
+        if self._echo is None:
+            return None
+        block, start = self._echo
+        return tuple(registers[block][start : start + ECHO_WORDS])
+
+
+def check_identity(profile: ProfileFile, compiled: RegisterMap, registers: Registers) -> None:
+    """Refuse a controller that is another than the profile's. Raises InvalidStateError."""
+    for condition in profile.identity:
+        block = compiled.block_of(condition.table, condition.address, condition.coding.words)
+        spot = (block, condition.address - block.first, condition.coding)
+        count = int(_number(registers, spot))
+        if not condition.fine(count):
+            raise InvalidStateError(f"{_words(condition, count)}: not the profile's controller")
+
+
+def check_step(q: Array, before: Array, gap: float, fastest: float) -> None:
+    """Refuse joints that cannot have come there in ``gap`` s: a torn or a wrong sample.
+
+    Raises InvalidStateError.
+    """
+    way = np.abs(q - before)
+    if (way > fastest * gap + JITTER).any():
+        joint = int(np.argmax(way))
+        raise InvalidStateError(
+            f"position {joint + 1}: found a step of {way[joint]:.4f} rad in {gap:.3f} s"
+        )
+
+
+def _number(registers: Registers, spot: tuple[Block, int, Coding]) -> float:
+    block, start, coding = spot
+    return coding.decode(registers[block][start : start + coding.words])[0]
+
+
+def _words(condition: Condition, count: int) -> str:
+    wanted = " or ".join(str(v) for v in condition.good)
+    return (
+        f"{condition.name} ({condition.table} {condition.address}): found {count}, expected "
+        f"{wanted}"
+    )

@@ -1,0 +1,283 @@
+"""The Modbus driver: profile, transport, decoder, freshness and writer put together."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.compensation import wanted_pose
+from core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
+from core.model import Model
+from core.setpoint import Setpoint
+from core.state import RobotState
+from drivers.driver import Driver
+from drivers.modbus import encode
+from drivers.modbus.decode import Decoder, Sample, check_identity, check_step
+from drivers.modbus.freshness import Freshness
+from drivers.modbus.map import Block, compile_map
+from drivers.modbus.profile import read_profile
+from drivers.modbus.registers import UNITS
+from drivers.modbus.schema import ProfileFile
+from drivers.modbus.settings import ModbusSettings
+from drivers.modbus.transport import Transport
+from drivers.modbus.write import make_writer
+from drivers.ur_rtde.nominal import Nominal
+
+Vector = NDArray[np.float64]
+SLOW_EVERY = 0.2  # s between two readings of conditions that lie apart
+BEYOND = 0.1  # rad outside the arm's joint limits: the register map is wrong
+MODES = {"not_ready": (5, 1), "protective_stop": (7, 3), "emergency_stop": (3, 7), "fault": (7, 9)}
+"""Trouble -> RTDE robot_mode and safety_mode."""
+
+
+class ModbusDriver(Driver):
+    """One arm on Modbus. What lies where, and how setpoints get there, says the profile."""
+
+    def __init__(self, settings: ModbusSettings, model: Model) -> None:
+        self.profile = profile = read_profile(settings.profile_path, model.arm.n)
+        super().__init__(settings.rate, model.arm.n, profile.write.mode != "mailbox")
+        self.settings = settings
+        self.map = compile_map(profile)
+        device = profile.device_id if settings.device_id is None else settings.device_id
+        self.transport = Transport(settings, settings.port or profile.port, device)
+        self.transport.allow(self.map)
+        self._model = model
+        self._decoder = Decoder(profile, self.map)
+        self._freshness = Freshness(profile)
+        self._writer = make_writer(profile, self.transport, model)
+        self._nominal = None if self.moves_arm else Nominal(model)
+        self._slow: dict[Block, list[int]] = {}
+        self._slow_at = 0.0
+        self._due = 0.0  # s, monotonic: when the next reading is due
+        self._fresh_at = 0.0  # s, monotonic: of the last new sample
+        self._sample: Sample | None = None
+        self._q: Vector | None = None  # of the last sample that was believed
+        self._doubtful: Vector | None = None  # of the last sample that was not
+        self._seen_at = 0.0
+        self._connected = False
+
+    # -- reading ----------------------------------------------------------------------------------
+
+    def connect(self) -> None:
+        """Open the link and check that it is the profile's controller. Writes nothing."""
+        self.transport.open()
+        try:
+            found = {block: self.transport.read(block) for block in self.map.identity}
+            check_identity(self.profile, self.map, found)
+            self._slow, self._slow_at = {}, 0.0
+            sample = self._decoder.decode(self._read_blocks())
+            self._check_limits(sample.vectors["position"])
+        except InvalidStateError as error:
+            self.transport.close()
+            name = self.transport.name
+            words = str(error).removeprefix(f"{name}: ")
+            raise LinkError(f"{name}: {words}") from None
+        except LinkError:
+            self.transport.close()
+            raise
+        self._q, self._doubtful = None, sample.vectors["position"]
+        self._freshness.restart()
+        self._connected = True
+        self._due = self._fresh_at = self._seen_at = time.monotonic()
+
+    def _check_limits(self, q: Vector) -> None:
+        """Refuse joints where the arm cannot be: units, word order or signs are wrong."""
+        limits = self._model.arm.limits
+        outside = (q < limits.lower - BEYOND) | (q > limits.upper + BEYOND)
+        if outside.any():
+            joint = int(np.argmax(outside))
+            raise InvalidStateError(
+                f"joint {joint + 1}: found {q[joint]:.4f} rad, expected the arm's limits, "
+                f"{limits.lower[joint]:.4f} to {limits.upper[joint]:.4f}: is the profile right?"
+            )
+
+    def read_state(self) -> RobotState:
+        """Return the next new sample; see Driver.read_state."""
+        if not self._connected:
+            raise LinkError(f"{self.transport.name}: found no connection, expected connect() first")
+        now = time.monotonic()
+        self._due = max(self._due + 1.0 / self.rate, now)
+        if self._due > now:
+            time.sleep(self._due - now)
+        limit = max(self._fresh_at, now) + self.settings.state_timeout
+        while True:
+            sample = self._attempt()
+            received = time.monotonic()
+            if sample is not None:
+                q = sample.vectors["position"]
+                if self._freshness.is_new(sample.clock, q, sample.vectors.get("velocity")):
+                    return self._believe(sample, received)
+            if received > limit:
+                raise StaleStateError(
+                    f"{self.transport.name}: found no new sample for "
+                    f"{received - self._fresh_at:.3f} s"
+                )
+            time.sleep(min(self.profile.period / 4.0, 0.01))
+
+    def _attempt(self) -> Sample | None:
+        """Return a sample, or None where the controller kept silent once."""
+        try:
+            return self._decoder.decode(self._read_blocks())
+        except StaleStateError:
+            self.transport.open()  # raises LinkError where nobody is there any more
+            return None
+
+    def _read_blocks(self) -> dict[Block, list[int]]:
+        """Return the registers of one cycle: one block, where the profile's map allows it."""
+        now = time.monotonic()
+        if self.map.slow and now - self._slow_at > SLOW_EVERY:
+            self._slow = {block: self.transport.read(block) for block in self.map.slow}
+            self._slow_at = now
+        found = dict(self._slow)
+        first, *others = self.map.fast
+        words = self._writer.pending()
+        if words is not None and first.table == "holding":
+            found[first] = self.transport.exchange(first, *words)
+        else:
+            if words is not None:
+                self.transport.write("holding", *words)
+            found[first] = self.transport.read(first)
+        for block in others:
+            found[block] = self.transport.read(block)
+        return found
+
+    def _believe(self, sample: Sample, received: float) -> RobotState:
+        """Return the state of a sample. Raises InvalidStateError where it makes a leap."""
+        q = sample.vectors["position"]
+        gap = received - self._seen_at + self.profile.period
+        self._seen_at = received
+        if self._q is None or not _steady(q, self._q, received - self._fresh_at, self.profile):
+            before, self._doubtful = self._doubtful, q
+            if before is None:
+                before = q
+            try:
+                check_step(q, before, gap, self.profile.fastest)
+            except InvalidStateError as error:
+                raise InvalidStateError(f"{self.transport.name}: {error}") from None
+        timestamp = self._freshness.take(sample.clock, q, received)
+        state = self._state(sample, timestamp, received)
+        self._q, self._doubtful = q, None
+        self._fresh_at, self._sample = received, sample
+        return state
+
+    def _state(self, sample: Sample, timestamp: float, received: float) -> RobotState:
+        found = sample.vectors
+        q = found["position"]
+        velocity = found.get("velocity")
+        if velocity is None:
+            gap = received - self._fresh_at
+            velocity = (q - self._q) / gap if self._q is not None and gap > 0.0 else 0.0 * q
+        sent = self._writer.target()
+        target = found.get("target", q if sent is None else sent)
+        nothing = np.zeros(3)
+        force = np.concatenate([found.get("force", nothing), found.get("moment", nothing)])
+        robot_mode, safety_mode = 7, 1
+        for trouble, _ in sample.troubles:
+            mode, safety = MODES[trouble]
+            robot_mode, safety_mode = min(robot_mode, mode), max(safety_mode, safety)
+        return RobotState(
+            timestamp, received, q, velocity, target, force,
+            joint_temperatures=found.get("temperature"),
+            actual_current_as_torque=found.get("joint_torque"),
+            robot_mode=robot_mode, safety_mode=safety_mode,
+        )  # fmt: skip
+
+    def nominal_q(self, state: RobotState) -> Vector:
+        """Return what the robot itself wants (n,), rad: with a mailbox, without its offset."""
+        box, sample = self.profile.write, self._sample
+        if self._nominal is None or box.mode != "mailbox" or sample is None or not sample.echo:
+            return state.target_q
+        applied = np.array(encode.offset_of(box, sample.echo[2:]))
+        return self._nominal.without(state.target_q, applied)
+
+    # -- writing ----------------------------------------------------------------------------------
+
+    def arm(self, state: RobotState) -> None:
+        """Check robot and resolution, and make ready for writing; moves nothing."""
+        name = self.transport.name
+        if self.profile.write.mode != "read_only":
+            if state.robot_mode != 7 or state.safety_mode not in (1, 2):
+                words = "; ".join(text for _, text in self._sample.troubles) if self._sample else ""
+                raise WriteError(f"{name}: the robot is not ready: {words}")
+            self._check_resolution(state.actual_q)
+        self._writer.arm(state, self._look)
+
+    def _look(self) -> Sample:
+        try:
+            return self._decoder.decode(self._read_blocks())
+        except LinkError as error:
+            raise WriteError(str(error)) from None
+
+    def _check_resolution(self, q: Vector) -> None:
+        """Refuse where one count of a target moves the TCP farther than the offset at hand."""
+        write = self.profile.write
+        if write.mode != "target_trigger":
+            return
+        predicted = self._model.predict(q[None]).position[0]
+        offset = float(np.linalg.norm(predicted - wanted_pose(self._model, q[None]).position[0]))
+        coarsest = self.settings.coarsest or offset
+        if coarsest == 0.0:
+            return  # nothing bends in the model: there is no offset that could get lost
+        count = abs(write.target.scale) * UNITS[write.target.unit][1]
+        if write.target.type.startswith("f"):
+            count *= 1e-6  # a float's own resolution, of an angle of some radians
+        reach = self.reach
+        if count * reach > coarsest:
+            raise WriteError(
+                f"{self.transport.name}: {self.profile.name}'s target registers are too coarse: "
+                f"one count ({1e3 * count:.3g} mrad) times the reach ({reach:.2f} m) is "
+                f"{1e3 * count * reach:.3g} mm, and the offset at hand is {1e3 * coarsest:.3g} mm "
+                "(link.coarsest)"
+            )
+
+    @property
+    def reach(self) -> float:
+        """Return the length of the stretched arm with its tool, m."""
+        links = self._model.arm.link_in_link[:, :3, 3]
+        tool = self._model.tool_in_flange[:3, 3]
+        return float(np.linalg.norm(links, axis=1).sum() + np.linalg.norm(tool))
+
+    def write_setpoint(self, setpoint: Setpoint) -> None:
+        """Send one setpoint; needs ``arm`` before.
+
+        With a mailbox and function 23 it leaves together with the next reading.
+        """
+        if self._sample is None:
+            raise WriteError(f"{self.transport.name}: found no state, expected read_state() first")
+        try:
+            self._writer.write(setpoint, self._sample)
+        except WriteError:
+            raise
+        except LinkError as error:
+            raise WriteError(str(error)) from None
+
+    def release(self) -> None:
+        """Stop writing: an offset of zero, or the controller's stop."""
+        try:
+            self._writer.release()
+        except WriteError:
+            raise
+        except LinkError as error:
+            raise WriteError(str(error)) from None
+
+    def close(self) -> None:
+        """Release where the link lives, and disconnect."""
+        try:
+            if self._connected:
+                self.release()
+        except LinkError:
+            pass
+        finally:
+            self._connected = False
+            self.transport.close()
+
+
+def _steady(q: Vector, before: Vector, gap: float, profile: ProfileFile) -> bool:
+    """Return whether joints can have come to ``q`` in ``gap`` s."""
+    try:
+        check_step(q, before, gap + profile.period, profile.fastest)
+    except InvalidStateError:
+        return False
+    return True

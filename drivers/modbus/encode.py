@@ -1,0 +1,93 @@
+"""Numbers -> registers: joint targets, the mailbox's nine registers, and a vector's whole row."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from drivers.modbus.profile import addresses, turns_of
+from drivers.modbus.registers import UNITS
+from drivers.modbus.schema import Mailbox, Vector
+
+SEQUENCES = 0x8000  # sequence numbers and heartbeats run from 1 to this less one; 0: nothing sent
+MODULUS, SEED = 65521, 0x4742  # of the checksum: the largest prime below 65536
+
+ABSENT, RUNNING, EXPIRED, REJECTED = 0, 1, 2, 3  # what the robot's program says of itself
+
+
+def next_number(number: int) -> int:
+    """Return the sequence number or heartbeat after ``number``."""
+    return number % (SEQUENCES - 1) + 1
+
+
+def checksum(words: Sequence[int]) -> int:
+    """Return the checksum of registers: a weighted sum, so that order and loss both show."""
+    return (SEED + sum((i + 1) * word for i, word in enumerate(words))) % MODULUS
+
+
+def offset_counts(box: Mailbox, offset_in_base: Sequence[float]) -> list[int]:
+    """Return an offset (6,), m and rad, as signed counts.
+
+    Raises ValueError for one that is not finite or does not fit 16 bits.
+    """
+    found: list[int] = []
+    for i, value in enumerate(offset_in_base):
+        unit = box.length_count if i < 3 else box.angle_count
+        if not math.isfinite(value) or abs(round(value / unit)) > 32767:
+            raise ValueError(
+                f"found an offset of {value:g} {'m' if i < 3 else 'rad'}, expected at most "
+                f"{32767 * unit:g}: what 16 bits hold"
+            )
+        found.append(round(value / unit))
+    return found
+
+
+def mailbox_words(sequence: int, counts: Sequence[int], heartbeat: int) -> list[int]:
+    """Return the nine registers of a mailbox: sequence, offset, heartbeat, checksum."""
+    words = [sequence, *(count & 0xFFFF for count in counts), heartbeat]
+    return [*words, checksum(words)]
+
+
+def signed(word: int) -> int:
+    """Return a register as a signed number."""
+    return word - 0x10000 if word & 0x8000 else word
+
+
+def offset_of(box: Mailbox, words: Sequence[int]) -> list[float]:
+    """Return the offset (6,), m and rad, in six registers."""
+    units = [box.length_count] * 3 + [box.angle_count] * 3
+    return [signed(word) * unit for word, unit in zip(words, units, strict=True)]
+
+
+def vector_registers(entry: Vector, values: Sequence[float]) -> dict[int, int]:
+    """Return address -> register for the numbers of a vector, SI.
+
+    Raises ValueError where one does not fit.
+    """
+    size = entry.scale * UNITS[entry.unit][1]
+    found: dict[int, int] = {}
+    angles = list(values)
+    if entry.turns is not None:
+        turns = [math.floor(v / (2.0 * math.pi)) for v in values]
+        angles = [v - 2.0 * math.pi * t for v, t in zip(values, turns, strict=True)]
+        _place(found, turns_of(entry, entry.turns), [float(t) for t in turns])
+    _place(found, entry, [v / size for v in angles])
+    return found
+
+
+def _place(found: dict[int, int], entry: Vector, counts: Sequence[float]) -> None:
+    coding = entry.coding
+    for address, count in zip(addresses(entry, len(counts)), counts, strict=True):
+        for k, word in enumerate(coding.encode([count])):
+            found[address + k] = word
+
+
+def runs(registers: dict[int, int]) -> list[tuple[int, list[int]]]:
+    """Return registers as unbroken runs: first address and words."""
+    found: list[tuple[int, list[int]]] = []
+    for address in sorted(registers):
+        if found and address == found[-1][0] + len(found[-1][1]):
+            found[-1][1].append(registers[address])
+        else:
+            found.append((address, [registers[address]]))
+    return found

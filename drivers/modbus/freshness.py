@@ -1,0 +1,77 @@
+"""Whether a sample is new, by the controller's own clock, and what its time is."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.modbus.registers import UNITS
+from drivers.modbus.schema import Clock, ProfileFile
+
+Array = NDArray[np.float64]
+MOVING = 0.05  # rad/s: a joint that says it is this fast must change its angle
+
+
+class Freshness:
+    """Follows the controller's clock, counter or heartbeat from sample to sample.
+
+    Without one, an answer is as fresh as its arrival, unless the joints stand still to the last
+    bit while their velocities say otherwise.
+    """
+
+    def __init__(self, profile: ProfileFile) -> None:
+        self._clock = profile.clock
+        self._step = _step(profile.clock, profile.period)
+        self._wrap = _wrap(profile.clock)
+        self._count: float | None = None
+        self._time = 0.0
+        self._q: Array | None = None
+
+    def restart(self) -> None:
+        """Forget the samples before: the next one is new whatever it says."""
+        self._count, self._q = None, None
+
+    def is_new(self, count: float | None, q: Array, qd: Array | None) -> bool:
+        """Return whether a sample with this clock count is not the one before."""
+        if self._clock is not None:
+            return count != self._count
+        if self._q is None or qd is None or not (np.abs(qd) > MOVING).any():
+            return True
+        return not np.array_equal(q, self._q)
+
+    def take(self, count: float | None, q: Array, received: float) -> float:
+        """Take a new sample; returns its time, s, on a clock that never runs back.
+
+        A timestamp or counter gives the controller's time; anything else the time of arrival here.
+        """
+        before, self._count, self._q = self._count, count, q
+        if self._clock is None or count is None or self._clock.kind == "heartbeat":
+            self._time = received
+            return received
+        if before is None:
+            self._time = max(self._time, count * self._step)
+            return self._time
+        ahead = count - before
+        if self._wrap:
+            ahead %= self._wrap
+            if ahead > 0.5 * self._wrap:  # it ran back: the controller has started anew
+                ahead = 1.0
+        self._time += max(ahead, 1.0 if self._wrap else 0.0) * self._step
+        return self._time
+
+
+def _step(clock: Clock | None, period: float) -> float:
+    """Return s per count."""
+    if clock is None:
+        return 0.0
+    if clock.kind == "timestamp":
+        return clock.scale * UNITS[clock.unit][1]
+    return clock.scale * period
+
+
+def _wrap(clock: Clock | None) -> float:
+    """Return after how many counts the clock starts anew; 0: never."""
+    if clock is None or clock.type.startswith("f"):
+        return 0.0
+    low, high = clock.coding.limits
+    return high - low + 1.0

@@ -1,0 +1,156 @@
+"""A register map compiled: which blocks are read how often, and what may ever be written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from drivers.modbus.profile import MAILBOX_WORDS, Keys, Span, spans
+from drivers.modbus.registers import BIT_TABLES, MOST_REGISTERS, Table
+from drivers.modbus.schema import ProfileFile
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Registers (or bits) that one request reads."""
+
+    table: Table
+    first: int
+    count: int
+
+    def holds(self, table: Table, address: int, words: int) -> bool:
+        """Return whether registers lie inside."""
+        inside = self.first <= address and address + words <= self.first + self.count
+        return table == self.table and inside
+
+
+@dataclass(frozen=True, slots=True)
+class RegisterMap:
+    """What one profile comes to.
+
+    fast: blocks read in every cycle, the one with the joints first; where the map allows it there
+    is one. slow: blocks of mere conditions, read now and then. identity: read once. writable: the
+    only table and address pairs that a request may write.
+    """
+
+    fast: tuple[Block, ...]
+    slow: tuple[Block, ...]
+    identity: tuple[Block, ...]
+    writable: frozenset[tuple[Table, int]]
+
+    def block_of(self, table: Table, address: int, words: int) -> Block:
+        """Return the block that holds registers of the state."""
+        blocks = (*self.fast, *self.slow, *self.identity)
+        return next(b for b in blocks if b.holds(table, address, words))
+
+
+def compile_map(profile: ProfileFile) -> RegisterMap:
+    """Return the blocks and the allow-list of a profile."""
+    groups: dict[Keys, list[Span]] = {}
+    for span in spans(profile):
+        groups.setdefault(_group(span.keys), []).append(span)
+    every: list[list[Span]] = [groups[("state", "position")]]
+    every += [g for k, g in groups.items() if _each_cycle(k) and k != ("state", "position")]
+    conditions = [g for k, g in groups.items() if k[0] == "status"]
+    identity = [g for k, g in groups.items() if k[0] == "identity"]
+    fast = _blocks(every, profile.gaps)
+    # conditions that lie within reach of a block that is read anyway cost nothing there
+    if profile.gaps:
+        fast, conditions = _joined(fast, conditions)
+    conditions = [g for g in conditions if not any(_inside(b, g) for b in fast)]
+    return RegisterMap(
+        tuple(fast),
+        tuple(_blocks(conditions, profile.gaps)),
+        tuple(_blocks(identity, profile.gaps)),
+        frozenset(_writable(profile)),
+    )
+
+
+def _group(keys: Keys) -> Keys:
+    """Return what belongs together: angles and their turns, a clock and its repetition."""
+    return keys[:1] if keys[0] == "clock" else keys[:2] if keys[0] == "state" else keys
+
+
+def _each_cycle(keys: Keys) -> bool:
+    return keys[0] in ("state", "clock") or (
+        keys[0] == "write" and keys[1] in ("echo_address", "busy", "result")
+    )
+
+
+def _blocks(groups: Iterable[list[Span]], gaps: bool) -> list[Block]:
+    """Return the fewest blocks that hold the groups, greedily and in their order."""
+    left = list(groups)
+    found: list[Block] = []
+    while left:
+        first, *rest = left
+        table = first[0].table
+        taken, left = list(first), []
+        for group in rest:
+            both = [*taken, *group]
+            if group[0].table == table and _length(both) <= MOST_REGISTERS:
+                taken = both
+            else:
+                left.append(group)
+        found.extend(_cut(taken, gaps))
+    return found
+
+
+def _cut(taken: list[Span], gaps: bool) -> list[Block]:
+    """Return one block, or, where gaps cannot be read across, one for each unbroken run."""
+    ordered = sorted(taken, key=lambda s: s.first)
+    runs: list[tuple[int, int]] = []
+    for span in ordered:
+        if runs and (gaps or span.first <= runs[-1][1]) and _fits(runs[-1][0], span.end):
+            runs[-1] = (runs[-1][0], max(runs[-1][1], span.end))
+        else:
+            runs.append((span.first, span.end))
+    main = min(s.first for s in taken if s.keys == taken[0].keys)
+    blocks = [Block(taken[0].table, first, end - first) for first, end in runs]
+    return sorted(blocks, key=lambda b: not b.first <= main < b.first + b.count)
+
+
+def _fits(first: int, end: int) -> bool:
+    return end - first <= MOST_REGISTERS
+
+
+def _length(group: list[Span]) -> int:
+    return max(s.end for s in group) - min(s.first for s in group)
+
+
+def _joined(
+    fast: list[Block], conditions: list[list[Span]]
+) -> tuple[list[Block], list[list[Span]]]:
+    """Return blocks widened by the conditions that one request still reaches, and the others."""
+    left: list[list[Span]] = []
+    for group in conditions:
+        for i, block in enumerate(fast):
+            first = min(block.first, *(s.first for s in group))
+            end = max(block.first + block.count, *(s.end for s in group))
+            if group[0].table == block.table and _fits(first, end):
+                fast[i] = Block(block.table, first, end - first)
+                break
+        else:
+            left.append(group)
+    return fast, left
+
+
+def _inside(block: Block, group: list[Span]) -> bool:
+    return all(block.holds(s.table, s.first, s.count) for s in group)
+
+
+def _writable(profile: ProfileFile) -> set[tuple[Table, int]]:
+    write = profile.write
+    if write.mode == "read_only":
+        return set()
+    if write.mode == "mailbox":
+        return {(write.table, write.address + i) for i in range(MAILBOX_WORDS)}
+    found: set[tuple[Table, int]] = set()
+    for span in spans(profile):
+        if span.keys[0] == "write" and span.keys[1] not in ("busy", "result"):
+            found |= {(span.table, span.first + i) for i in range(span.count)}
+    return found
+
+
+def word_count(table: Table, words: int) -> int:
+    """Return the addresses that a number takes in its table."""
+    return 1 if table in BIT_TABLES else words

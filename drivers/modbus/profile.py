@@ -1,0 +1,270 @@
+"""Reading a register map and refusing one that cannot be right, with the line that is wrong."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
+from drivers.can.document import ProfileDocument, ProfileError, read_profile_document
+from drivers.modbus.registers import BIT_TABLES, LAST_ADDRESS, UNITS, Table
+from drivers.modbus.schema import Condition, Order, Place, ProfileFile, Turns, Vector
+
+Keys = tuple[str | int, ...]
+MAILBOX_WORDS, ECHO_WORDS = 9, 8
+KINDS = {
+    "position": "angle", "velocity": "speed", "target": "angle", "joint_torque": "torque",
+    "temperature": "temperature", "force": "force", "moment": "torque",
+}  # fmt: skip
+THREE = ("force", "moment")
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """Registers that one entry of the file takes."""
+
+    keys: Keys
+    table: Table
+    first: int
+    count: int
+
+    @property
+    def end(self) -> int:
+        """Return the address after the last."""
+        return self.first + self.count
+
+
+def read_profile(path: Path, joints: int | None = None) -> ProfileFile:
+    """Return the register map of a YAML file.
+
+    ``joints`` is the number that the arm has; None: any. Raises ProfileError, one line that names
+    file, line and key, what was found and what was expected.
+    """
+    document = read_profile_document(path)
+    try:
+        profile = ProfileFile.model_validate(document.data)
+    except ValidationError as error:
+        raise _refusal(document, error) from None
+    _check_vectors(document, profile)
+    _check_places(document, profile)
+    _check_overlap(document, profile)
+    if joints is not None and profile.joints != joints:
+        raise document.error(
+            ("joints",), f"found {profile.joints}, expected {joints}: the arm has those"
+        )
+    return profile
+
+
+def vectors(profile: ProfileFile) -> Iterator[tuple[Keys, str, Vector, int]]:
+    """Yield keys, kind, entry and count of numbers of every vector in the file."""
+    for name in KINDS:
+        found = getattr(profile.state, name)
+        if found is not None:
+            yield ("state", name), KINDS[name], found, 3 if name in THREE else profile.joints
+    if profile.write.mode == "target_trigger":
+        yield ("write", "target"), "angle", profile.write.target, profile.joints
+
+
+def addresses(entry: Vector, count: int) -> list[int]:
+    """Return the address of each number of a vector."""
+    stride = entry.stride or entry.coding.words
+    return [entry.address + i * stride for i in range(count)]
+
+
+def turns_of(entry: Vector, turns: Turns) -> Vector:
+    """Return the revolution counters of a vector as a vector of their own."""
+    return Vector(table=entry.table, unit="turn", **turns.model_dump())
+
+
+def single_places(profile: ProfileFile) -> Iterator[tuple[Keys, Place]]:
+    """Yield every entry that is one number."""
+    if profile.clock is not None:
+        yield ("clock",), profile.clock
+    for i, condition in enumerate(profile.status):
+        yield ("status", i), condition
+    for i, condition in enumerate(profile.identity):
+        yield ("identity", i), condition
+    write = profile.write
+    if write.mode == "target_trigger":
+        for name in ("before", "trigger", "stop"):
+            for i, order in enumerate(getattr(write, name)):
+                yield ("write", name, i), order
+        for name in ("busy", "result"):
+            if getattr(write, name) is not None:
+                yield ("write", name), getattr(write, name)
+
+
+def _check_vectors(document: ProfileDocument, profile: ProfileFile) -> None:
+    for keys, kind, entry, _ in vectors(profile):
+        if entry.scale == 0.0:
+            raise document.error((*keys, "scale"), "found 0, expected a number other than zero")
+        if entry.unit not in UNITS or UNITS[entry.unit][0] != kind:
+            known = ", ".join(name for name, (what, _) in UNITS.items() if what == kind)
+            raise document.error(
+                (*keys, "unit"), f"found {entry.unit!r}, expected a unit of {kind}: {known}"
+            )
+        if entry.turns is not None and kind != "angle":
+            raise document.error((*keys, "turns"), f"found turns of a {kind}, expected an angle")
+        if entry.stride is not None and entry.stride < entry.coding.words:
+            raise document.error(
+                (*keys, "stride"),
+                f"found {entry.stride}, expected {entry.coding.words} or more: the registers of "
+                f"one {entry.type}",
+            )
+
+
+def _check_places(document: ProfileDocument, profile: ProfileFile) -> None:
+    """Refuse tables that cannot hold a type, cannot be written, or end too early."""
+    places = [(keys, entry) for keys, _, entry, _ in vectors(profile)]
+    for keys, place in [*places, *single_places(profile)]:
+        if place.table in BIT_TABLES and place.type not in ("bit", "u16"):
+            raise document.error(
+                (*keys, "type"), f"found {place.type!r} in table {place.table!r}, expected 'bit'"
+            )
+        if place.table not in BIT_TABLES and place.type == "bit":
+            raise document.error(
+                (*keys, "type"),
+                f"found 'bit' in table {place.table!r}, expected a number's type, with a mask",
+            )
+        written = isinstance(place, Order) or keys == ("write", "target")
+        if written and place.table not in ("coil", "holding"):
+            raise document.error(
+                (*keys, "table"),
+                f"found {place.table!r}, expected 'coil' or 'holding': others cannot be written",
+            )
+        if isinstance(place, Condition) and place.type.startswith("f"):
+            raise document.error((*keys, "type"), f"found {place.type!r}, expected whole numbers")
+        if isinstance(place, Order):
+            _check_order(document, keys, place)
+    for span in spans(profile):
+        if span.end - 1 > LAST_ADDRESS:
+            raise document.error(
+                (*span.keys, "address"), f"found {span.first}, whose last register is beyond 65535"
+            )
+
+
+def _check_order(document: ProfileDocument, keys: Keys, order: Order) -> None:
+    low, high = (0, 1) if order.table in BIT_TABLES else order.coding.limits
+    if not low <= order.value <= high:
+        raise document.error(
+            (*keys, "value"), f"found {order.value:g}, expected {low:g} to {high:g}"
+        )
+
+
+def spans(profile: ProfileFile) -> list[Span]:
+    """Return the registers of every entry."""
+    found: list[Span] = []
+    for keys, _, entry, count in vectors(profile):
+        words = entry.coding.words
+        found.extend(Span(keys, entry.table, a, words) for a in addresses(entry, count))
+        if entry.turns is not None:
+            turns = turns_of(entry, entry.turns)
+            found.extend(
+                Span((*keys, "turns"), entry.table, a, turns.coding.words)
+                for a in addresses(turns, count)
+            )
+    found.extend(
+        Span(keys, place.table, place.address, 1 if place.table in BIT_TABLES else words)
+        for keys, place in single_places(profile)
+        for words in (place.coding.words,)
+    )
+    if profile.clock is not None and profile.clock.again is not None:
+        clock = profile.clock
+        found.append(Span(("clock", "again"), clock.table, clock.again or 0, clock.coding.words))
+    if profile.write.mode == "mailbox":
+        box = profile.write
+        found.append(Span(("write", "address"), box.table, box.address, MAILBOX_WORDS))
+        found.append(Span(("write", "echo_address"), box.echo_table, box.echo_address, ECHO_WORDS))
+    return found
+
+
+def _check_overlap(document: ProfileDocument, profile: ProfileFile) -> None:
+    """Refuse two entries on one register.
+
+    Bits of one register may be looked at by several conditions, and a register may be ordered
+    several values; a target may be read back where it is written.
+    """
+    ordered = sorted(spans(profile), key=lambda s: (s.table, s.first))
+    for i, one in enumerate(ordered):
+        for other in ordered[i + 1 :]:
+            if other.table != one.table or other.first >= one.end:
+                break
+            if _may_share(one, other):
+                continue
+            low, high = sorted((one, other), key=lambda s: document.line(s.keys))
+            place = high.keys[-1] if isinstance(high.keys[-1], str) else None
+            keys = high.keys if place in ("address", "echo_address", "again") else (
+                *high.keys, "address"
+            )  # fmt: skip
+            raise document.error(
+                keys,
+                f"found {high.table} registers {high.first} to {high.end - 1}, which overlap "
+                f"{_name(low.keys)} ({low.first} to {low.end - 1}, line "
+                f"{document.line(low.keys)}), expected registers of their own",
+            )
+
+
+def _may_share(one: Span, other: Span) -> bool:
+    same = (one.first, one.count) == (other.first, other.count)
+    sets = {one.keys[0], other.keys[0]}
+    conditions = sets <= {"status", "identity"}
+    orders = sets == {"write"} and one.keys[1] != "target" and other.keys[1] != "target"
+    echoed = {one.keys, other.keys} == {("write", "target"), ("state", "target")}
+    watched = sets == {"status", "write"} and {"busy", "result"} & {*one.keys, *other.keys}
+    return same and bool(conditions or orders or echoed or watched)
+
+
+def _name(keys: Sequence[str | int]) -> str:
+    return ".".join(str(key + 1) if isinstance(key, int) else key for key in keys)
+
+
+def _refusal(document: ProfileDocument, error: ValidationError) -> ProfileError:
+    """Return one line out of what pydantic says; unknown keys come first."""
+    details = sorted(error.errors(), key=lambda d: d["type"] != "extra_forbidden")
+    worst = details[0]
+    modes = ("mailbox", "target_trigger", "read_only")
+    keys = tuple(k for i, k in enumerate(worst["loc"]) if not (i == 1 and k in modes))
+    if worst["type"] == "extra_forbidden":
+        return document.error(keys, f"found an unknown key {keys[-1]!r}{_hint(worst, keys)}")
+    if worst["type"] == "missing":
+        return document.error(keys, f"found nothing, expected {_wanted(keys)}")
+    if worst["type"] in ("union_tag_invalid", "union_tag_not_found"):
+        found = worst.get("ctx", {}).get("tag", "nothing")
+        return document.error(
+            (*keys, "mode"), f"found {found!r}, expected one of {', '.join(modes)}"
+        )
+    expected = str(worst["msg"]).removeprefix("Input should be ")
+    return document.error(keys, f"found {_quoted(worst['input'])}, expected {expected}")
+
+
+def _wanted(keys: Keys) -> str:
+    """Return what belongs at a key, in the schema's words."""
+    text: Any = ProfileFile
+    for key in keys:
+        field = getattr(text, "model_fields", {}).get(key)
+        if field is None:
+            return "it here"
+        if key == keys[-1]:
+            return field.description or "it here"
+        text = field.annotation
+    return "it here"
+
+
+def _hint(worst: ErrorDetails, keys: Keys) -> str:
+    names = set(ProfileFile.model_fields)
+    if len(keys) > 1:
+        names = set(Vector.model_fields) | set(Condition.model_fields)
+    near = difflib.get_close_matches(str(keys[-1]), sorted(names), n=1, cutoff=0.6)
+    return f", expected one that is known: did you mean {near[0]!r}?" if near else (
+        ", expected one that is known (docs/porting.md)"
+    )  # fmt: skip
+
+
+def _quoted(value: Any) -> str:
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else f"{text[:60]}..."

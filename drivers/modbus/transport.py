@@ -1,0 +1,244 @@
+"""One synchronous pymodbus client (TCP, TLS, RTU) whose answers are checked.
+
+The library takes an answer of another function or with too few registers for good, and raises its
+own errors as well as the operating system's; here an answer is what was asked for, or a LinkError.
+"""
+
+from __future__ import annotations
+
+import logging
+import socket
+import ssl
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from pymodbus.client import ModbusSerialClient, ModbusTcpClient, ModbusTlsClient
+from pymodbus.exceptions import ModbusException, ModbusIOException
+from pymodbus.pdu import ModbusPDU
+
+from core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
+from drivers.modbus.map import Block, RegisterMap
+from drivers.modbus.registers import Table
+from drivers.modbus.settings import ModbusSettings
+
+READ_FUNCTIONS: dict[Table, int] = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
+EXCEPTIONS = {
+    1: "illegal function", 2: "illegal address", 3: "illegal value", 4: "device failure",
+    5: "acknowledge", 6: "device busy", 10: "no path to the device",
+    11: "the device does not answer",
+}  # fmt: skip
+
+logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # told by our own errors instead
+
+
+class Transport:
+    """Requests to one device; ``allow`` is the list of what may be written."""
+
+    def __init__(self, settings: ModbusSettings, port: int, device_id: int) -> None:
+        self._settings, self._port, self._device = settings, port, device_id
+        self._writable: frozenset[tuple[Table, int]] = frozenset()
+        self._client: Any = None
+
+    def allow(self, compiled: RegisterMap) -> None:
+        """Let requests write what the map says, and nothing else."""
+        self._writable = compiled.writable
+
+    @property
+    def name(self) -> str:
+        """Return what messages call the controller."""
+        settings = self._settings
+        if settings.transport == "rtu":
+            return f"{settings.serial} device {self._device}"
+        return f"{settings.host}:{self._port}"
+
+    def open(self) -> None:
+        """Connect. Raises LinkError."""
+        self.close()
+        client: Any = None
+        try:
+            client = self._make()
+            fine = client.connect()
+        except (ModbusException, OSError, ValueError) as error:
+            if client is not None:
+                client.close()
+            raise LinkError(f"{self.name}: cannot be reached: {_words(error)}") from None
+        if not fine:
+            client.close()
+            raise LinkError(f"{self.name}: cannot be reached: no answer or refused")
+        if settings_are_tcp(self._settings) and client.socket is not None:
+            client.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._client = client
+
+    def _make(self) -> Any:
+        settings = self._settings
+        if settings.transport == "rtu":
+            return ModbusSerialClient(
+                str(settings.serial), baudrate=settings.baudrate, parity=settings.parity,
+                stopbits=settings.stopbits, timeout=settings.timeout, retries=0,
+            )  # fmt: skip
+        if settings.transport == "tls":
+            return ModbusTlsClient(
+                settings.host, port=self._port, sslctx=_tls(settings), timeout=settings.timeout,
+                retries=0,
+            )  # fmt: skip
+        return ModbusTcpClient(settings.host, port=self._port, timeout=settings.timeout, retries=0)
+
+    def close(self) -> None:
+        """Close the socket, which the library leaves open after some errors; may be repeated."""
+        client, self._client = self._client, None
+        if client is not None:
+            client.close()
+
+    # -- reading ----------------------------------------------------------------------------------
+
+    def read(self, block: Block) -> list[int]:
+        """Return the registers (or bits, 0 and 1) of a block.
+
+        Raises LinkError where the link broke, InvalidStateError for an answer that is none.
+        """
+        function = READ_FUNCTIONS[block.table]
+        client = self._opened()
+        call = {
+            1: client.read_coils, 2: client.read_discrete_inputs,
+            3: client.read_holding_registers, 4: client.read_input_registers,
+        }[function]  # fmt: skip
+        answer = self._ask(call, block.first, count=block.count)
+        return check_answer(answer, function, block.count, f"{self.name}: {block.table}")
+
+    def exchange(self, block: Block, address: int, values: Sequence[int]) -> list[int]:
+        """Write holding registers, then read a block of them, in one request (function 23)."""
+        self._check_allowed("holding", address, values)
+        answer = self._ask(
+            self._opened().readwrite_registers, read_address=block.first, read_count=block.count,
+            write_address=address, values=list(values),
+        )  # fmt: skip
+        return check_answer(answer, 23, block.count, f"{self.name}: holding")
+
+    # -- writing ----------------------------------------------------------------------------------
+
+    def write(
+        self, table: Table, address: int, values: Sequence[int], single: bool = False
+    ) -> None:
+        """Write coils or holding registers; ``single``: one request each (functions 5 and 6).
+
+        Raises WriteError where the map does not allow it or the controller refuses.
+        """
+        self._check_allowed(table, address, values)
+        client = self._opened()
+        one = single or len(values) == 1
+        try:
+            for start, chunk in _chunks(address, values, one):
+                if table == "coil":
+                    call = client.write_coil if one else client.write_coils
+                else:
+                    call = client.write_register if one else client.write_registers
+                sent: Any = chunk[0] if one else chunk
+                sent = bool(sent) if table == "coil" and one else sent
+                function = {("coil", True): 5, ("coil", False): 15, ("holding", True): 6}.get(
+                    (table, one), 16
+                )
+                check_written(
+                    self._ask(call, start, sent), function, start, f"{self.name}: {table}"
+                )
+        except InvalidStateError as error:
+            raise WriteError(str(error)) from None
+
+    def _check_allowed(self, table: Table, address: int, values: Sequence[int]) -> None:
+        for i in range(len(values)):
+            if (table, address + i) not in self._writable:
+                raise WriteError(
+                    f"{self.name}: {table} {address + i}: the profile does not allow it to be "
+                    "written"
+                )
+
+    # -- one request ------------------------------------------------------------------------------
+
+    def _opened(self) -> Any:
+        if self._client is None:
+            raise LinkError(f"{self.name}: found no connection, expected connect() first")
+        return self._client
+
+    def _ask(self, call: Any, *arguments: Any, **keys: Any) -> ModbusPDU:
+        try:
+            answer: ModbusPDU = call(*arguments, device_id=self._device, **keys)
+        except ModbusIOException:
+            self._fresh_socket()
+            raise StaleStateError(
+                f"{self.name}: no answer within {self._settings.timeout:g} s"
+            ) from None
+        except (ModbusException, OSError) as error:
+            self._fresh_socket()
+            raise LinkError(f"{self.name}: no answer: {_words(error)}") from None
+        except Exception as error:  # the library's own mistakes over broken frames
+            self._fresh_socket()
+            raise InvalidStateError(
+                f"{self.name}: found an answer that cannot be read: {type(error).__name__}"
+            ) from None
+        return answer
+
+    def _fresh_socket(self) -> None:
+        """Close the socket: an answer that comes late must not be taken for the next one's."""
+        self.close()
+
+
+def check_answer(answer: Any, function: int, count: int, where: str) -> list[int]:
+    """Return the registers or bits of an answer. Raises InvalidStateError where it is not one."""
+    _check_function(answer, function, where)
+    found = answer.bits[:count] if function in (1, 2) else answer.registers
+    if len(found) != count:
+        raise InvalidStateError(f"{where}: found {len(found)} registers, expected {count}")
+    if function not in (1, 2) and not all(0 <= v <= 0xFFFF for v in found):
+        raise InvalidStateError(f"{where}: found a register beyond 16 bits")
+    return [int(v) for v in found]
+
+
+def check_written(answer: Any, function: int, address: int, where: str) -> None:
+    """Refuse an answer that does not confirm a write. Raises InvalidStateError."""
+    _check_function(answer, function, where)
+    if answer.address != address:
+        raise InvalidStateError(f"{where}: found address {answer.address}, expected {address}")
+
+
+def _check_function(answer: Any, function: int, where: str) -> None:
+    if answer is None:
+        raise InvalidStateError(f"{where}: found no answer")
+    if answer.isError():
+        code = getattr(answer, "exception_code", 0)
+        raise InvalidStateError(
+            f"{where}: the controller refuses: {EXCEPTIONS.get(code, f'exception {code}')}"
+        )
+    if answer.function_code != function:
+        raise InvalidStateError(
+            f"{where}: found an answer to function {answer.function_code}, expected {function}"
+        )
+
+
+def settings_are_tcp(settings: ModbusSettings) -> bool:
+    """Return whether a link goes over TCP, plain or not."""
+    return settings.transport in ("tcp", "tls")
+
+
+def _chunks(address: int, values: Sequence[int], one: bool) -> Iterable[tuple[int, list[int]]]:
+    if one:
+        return [(address + i, [int(v)]) for i, v in enumerate(values)]
+    return [(address, [int(v) for v in values])]
+
+
+def _tls(settings: ModbusSettings) -> ssl.SSLContext:
+    """Return a context that trusts one authority.
+
+    The library cannot check host names, so the authority must be the plant's own.
+    """
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_REQUIRED
+    context.load_verify_locations(settings.authority)
+    if settings.certificate is not None:
+        context.load_cert_chain(settings.certificate, settings.key)
+    return context
+
+
+def _words(error: Exception) -> str:
+    text = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    return " ".join(str(text).split()).removeprefix("Modbus Error: ")

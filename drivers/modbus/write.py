@@ -1,0 +1,260 @@
+"""Writing: Setpoint -> registers, by mailbox, by target and trigger, or not at all.
+
+Knows nothing of reading: it is told the newest sample. What counts is what the controller says
+afterwards, not that a request was answered.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import WriteError
+from core.model import Model
+from core.setpoint import Setpoint
+from core.state import RobotState
+from drivers.modbus import encode
+from drivers.modbus.decode import Sample
+from drivers.modbus.registers import UNITS, Table
+from drivers.modbus.schema import Mailbox, Order, ProfileFile, ReadOnly, TargetTrigger
+from drivers.modbus.transport import Transport
+
+Array = NDArray[np.float64]
+ANNOUNCE = 0.02  # s between two heartbeats while arming
+NEAR = 2.0  # counts: how near a target must be come to
+
+
+class Writer(Protocol):
+    """The writing half of a link."""
+
+    def arm(self, state: RobotState, look: Callable[[], Sample]) -> None:
+        """Make ready; moves nothing. ``look`` reads a sample. Raises WriteError."""
+
+    def write(self, setpoint: Setpoint, sample: Sample) -> None:
+        """Send one setpoint; ``sample`` is the one last read. Raises WriteError."""
+
+    def pending(self) -> tuple[int, list[int]] | None:
+        """Return holding registers that are to go out with the next reading, once."""
+
+    def release(self) -> None:
+        """End the writing so that the arm comes to rest. Raises WriteError."""
+
+    def target(self) -> Array | None:
+        """Return the joints (n,) rad sent last, None where there are none."""
+
+
+def make_writer(profile: ProfileFile, transport: Transport, model: Model) -> Writer:
+    """Return the writer of a profile."""
+    write = profile.write
+    if isinstance(write, Mailbox):
+        return MailboxWriter(write, transport, profile.function_23)
+    if isinstance(write, TargetTrigger):
+        return TargetWriter(write, transport)
+    return ReadOnlyWriter(profile, write, transport)
+
+
+class ReadOnlyWriter:
+    """Refuses to write."""
+
+    def __init__(self, profile: ProfileFile, write: ReadOnly, transport: Transport) -> None:
+        self._words = f"{transport.name}: the profile of {profile.name} is read only: "
+        self._words += write.because
+
+    def arm(self, state: RobotState, look: Callable[[], Sample]) -> None:
+        """Raise WriteError."""
+        raise WriteError(self._words)
+
+    def write(self, setpoint: Setpoint, sample: Sample) -> None:
+        """Raise WriteError."""
+        raise WriteError(self._words)
+
+    def pending(self) -> tuple[int, list[int]] | None:
+        """Return None."""
+        return None
+
+    def release(self) -> None:
+        """Do nothing."""
+
+    def target(self) -> Array | None:
+        """Return None."""
+        return None
+
+
+class MailboxWriter:
+    """Offsets in nine registers; a program on the robot checks, applies and answers them."""
+
+    def __init__(self, box: Mailbox, transport: Transport, together: bool) -> None:
+        self._box, self._transport, self._together = box, transport, together
+        self._armed = False
+        self._sequence = self._heartbeat = 0
+        self._counts: list[int] = [0] * 6
+        self._awaited = 0  # a sequence number that has not come back yet
+        self._since = 0.0
+        self._pending: list[int] | None = None
+
+    def arm(self, state: RobotState, look: Callable[[], Sample]) -> None:
+        """Send offsets of zero until the robot's program answers them. Raises WriteError."""
+        echo = look().echo or (0,) * 8
+        if echo[1] == encode.ABSENT:
+            raise WriteError(
+                f"{self._transport.name}: {self._box.echo_table} {self._box.echo_address + 1}: "
+                f"found {echo[1]}, expected a running mailbox program on the robot "
+                "(docs/porting.md)"
+            )
+        # a number that the program cannot take for the one it has seen last
+        self._sequence = (echo[0] + encode.SEQUENCES // 4) % (encode.SEQUENCES - 1) + 1
+        self._counts = [0] * 6
+        until = time.monotonic() + self._box.echo
+        while True:
+            self._send(self._words())
+            echo = look().echo or (0,) * 8
+            if echo[0] == self._sequence and echo[1] == encode.RUNNING:
+                break
+            if time.monotonic() > until:
+                raise WriteError(self._silence(echo))
+            time.sleep(ANNOUNCE)
+        self._awaited, self._armed = 0, True
+
+    def write(self, setpoint: Setpoint, sample: Sample) -> None:
+        """Send one offset. Raises WriteError where the program does not take them."""
+        if not self._armed:
+            raise WriteError(f"{self._transport.name}: found no mailbox, expected arm() first")
+        try:
+            counts = encode.offset_counts(self._box, setpoint.offset_in_base.tolist())
+        except ValueError as error:
+            raise WriteError(f"{self._transport.name}: {error}") from None
+        self._check_echo(sample)
+        if counts != self._counts:
+            self._counts = counts
+            self._sequence = encode.next_number(self._sequence)
+            if not self._awaited:
+                self._awaited, self._since = self._sequence, time.monotonic()
+        words = self._words()
+        if self._together:
+            self._pending = words
+        else:
+            self._send(words)
+
+    def _words(self) -> list[int]:
+        self._heartbeat = encode.next_number(self._heartbeat)
+        return encode.mailbox_words(self._sequence, self._counts, self._heartbeat)
+
+    def _send(self, words: list[int]) -> None:
+        self._transport.write("holding", self._box.address, words)
+
+    def _check_echo(self, sample: Sample) -> None:
+        """Raise WriteError where an offset has not come back in time, or nobody applies it."""
+        echo = sample.echo or (0,) * 8
+        if self._awaited:
+            ahead = (echo[0] - self._awaited) % (encode.SEQUENCES - 1)
+            if ahead < encode.SEQUENCES // 2:
+                self._awaited = 0
+        late = self._awaited and time.monotonic() - self._since > self._box.echo
+        if late or echo[1] != encode.RUNNING:
+            self._armed = False
+            raise WriteError(self._silence(echo))
+
+    def _silence(self, echo: tuple[int, ...]) -> str:
+        said = {0: "absent", 1: "running", 2: "watchdog expired", 3: "checksum rejected"}
+        return (
+            f"{self._transport.name}: offsets do not arrive: number {self._sequence} was sent, "
+            f"{echo[0]} came back last, the robot's program says {said.get(echo[1], echo[1])}"
+        )
+
+    def pending(self) -> tuple[int, list[int]] | None:
+        """Return the registers of an offset that goes out with the next reading."""
+        words, self._pending = self._pending, None
+        return None if words is None else (self._box.address, words)
+
+    def release(self) -> None:
+        """Leave a zero offset behind; without a heartbeat the program keeps to zero by itself."""
+        if not self._armed:
+            return
+        self._armed, self._pending = False, None
+        self._counts = [0] * 6
+        self._sequence = encode.next_number(self._sequence)
+        self._send(self._words())
+
+    def target(self) -> Array | None:
+        """Return None: the joints are the robot's own."""
+        return None
+
+
+class TargetWriter:
+    """Joint targets in registers, and a trigger that starts the motion there."""
+
+    def __init__(self, entry: TargetTrigger, transport: Transport) -> None:
+        self._entry, self._transport = entry, transport
+        self._size = entry.target.scale * UNITS[entry.target.unit][1]
+        self._armed = False
+        self._sent: dict[int, int] = {}
+        self._target: Array | None = None
+        self._since = 0.0
+
+    def arm(self, state: RobotState, look: Callable[[], Sample]) -> None:
+        """Write speed and the like, once; no target, no trigger. Raises WriteError."""
+        self._order(self._entry.before)
+        self._armed, self._sent, self._target = True, {}, None
+
+    def write(self, setpoint: Setpoint, sample: Sample) -> None:
+        """Send one target and trigger it, unless the robot is busy with the one before.
+
+        The newest setpoint goes out when it is free again. Raises WriteError.
+        """
+        if not self._armed:
+            raise WriteError(f"{self._transport.name}: found no permission, expected arm() first")
+        self._check(sample)
+        entry = self._entry.target
+        try:
+            registers = encode.vector_registers(entry, setpoint.q.tolist())
+        except ValueError as error:
+            raise WriteError(f"{self._transport.name}: target: {error}") from None
+        busy = any(text == "busy" for text, _ in sample.motion)
+        if registers == self._sent or busy:
+            return
+        for first, words in encode.runs(registers):
+            self._transport.write(entry.table, first, words, single=self._entry.single)
+        self._order(self._entry.trigger)
+        self._sent, self._since = registers, time.monotonic()
+        self._target = np.round(setpoint.q / self._size) * self._size
+
+    def _check(self, sample: Sample) -> None:
+        """Raise WriteError where the last target was refused, or is not come to."""
+        for what, words in sample.motion:
+            if what == "result" and self._target is not None:
+                self._armed = False
+                raise WriteError(f"{self._transport.name}: the last target failed: {words}")
+        if self._target is None or time.monotonic() - self._since < self._entry.following:
+            return
+        away = np.abs(sample.vectors["position"] - self._target)
+        if (away > NEAR * abs(self._size) + 2e-3).any():
+            joint = int(np.argmax(away))
+            self._armed = False
+            raise WriteError(
+                f"{self._transport.name}: targets have no effect: joint {joint + 1} is "
+                f"{away[joint]:.4f} rad from where it was sent {self._entry.following:g} s ago"
+            )
+
+    def _order(self, orders: list[Order]) -> None:
+        for order in orders:
+            table: Table = order.table
+            words = [int(order.value)] if table == "coil" else order.coding.encode([order.value])
+            self._transport.write(table, order.address, words, single=self._entry.single)
+
+    def pending(self) -> tuple[int, list[int]] | None:
+        """Return None: a target and its trigger are requests of their own."""
+        return None
+
+    def release(self) -> None:
+        """Stop the motion where the controller can; else it ends at the last target."""
+        if self._armed:
+            self._armed = False
+            self._order(self._entry.stop)
+
+    def target(self) -> Array | None:
+        """Return the joints sent last, as the registers hold them."""
+        return self._target

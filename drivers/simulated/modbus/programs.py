@@ -1,0 +1,191 @@
+"""The robot's side of a Modbus link: the mailbox program, and targets that a trigger starts."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from drivers.modbus import encode
+from drivers.modbus.profile import ECHO_WORDS, MAILBOX_WORDS, addresses
+from drivers.modbus.registers import UNITS, Table
+from drivers.modbus.schema import Condition, Mailbox, ProfileFile, TargetTrigger
+from drivers.simulated.bench import BenchError
+from drivers.simulated.kinematics import offset_frame, solve, tcp_in_base
+from drivers.simulated.modbus.image import bad
+from drivers.simulated.motion import Hold, Stop
+from drivers.simulated.offset_program import NOTHING, approach
+from drivers.simulated.peer import BRAKING, HOLD, Peer
+from drivers.simulated.plant_settings import Vector6
+
+log = logging.getLogger("drivers.simulated")
+
+Read = Callable[[Table, int, int], list[int]]
+"""Table, first address and count -> registers as clients have written them."""
+
+
+class RobotProgram(Protocol):
+    """What runs on the robot beside its own motion; stepped once per cycle."""
+
+    def wrote(self, peer: Peer, table: Table, address: int, values: Sequence[int]) -> None:
+        """Take note of a client's write."""
+
+    def cycle(self, peer: Peer, read: Read) -> None:
+        """Act on what has been written."""
+
+    def registers(self, peer: Peer) -> list[tuple[Table, int, int]]:
+        """Return table, address and register of the program's answers."""
+        ...
+
+
+class NoProgram:
+    """Nothing is ever applied."""
+
+    def wrote(self, peer: Peer, table: Table, address: int, values: Sequence[int]) -> None:
+        """Do nothing."""
+
+    def cycle(self, peer: Peer, read: Read) -> None:
+        """Do nothing."""
+
+    def registers(self, peer: Peer) -> list[tuple[Table, int, int]]:
+        """Return nothing."""
+        return []
+
+
+class MailboxProgram:
+    """Checks offsets (sequence, checksum, heartbeat) and rides them on the robot's own motion.
+
+    A checksum that does not fit leaves the offset as it was; a heartbeat that stands still takes
+    it out. ``running`` False is a program that was stopped: nothing is applied or answered.
+    """
+
+    def __init__(self, box: Mailbox) -> None:
+        self._box = box
+        self.running = True
+        self._sequence = self._heartbeat = 0
+        self._silent = 0.0  # s
+        self._wanted: Vector6 = NOTHING
+        self.applied: Vector6 = NOTHING
+        self._state = encode.EXPIRED
+
+    def wrote(self, peer: Peer, table: Table, address: int, values: Sequence[int]) -> None:
+        """Do nothing: the program polls its registers."""
+
+    def cycle(self, peer: Peer, read: Read) -> None:
+        """Read the mailbox, and move the applied offset towards the one wanted."""
+        if self.running:
+            self._take(read(self._box.table, self._box.address, MAILBOX_WORDS), peer.period)
+        else:
+            self._wanted = NOTHING
+        self.applied = approach(self.applied, self._wanted)
+        self._apply(peer)
+
+    def _take(self, words: list[int], dt: float) -> None:
+        *body, said = words
+        if encode.checksum(body) != said:
+            self._state = encode.REJECTED if any(words) else encode.EXPIRED
+            self._silent += dt
+        else:
+            self._silent = 0.0 if body[7] != self._heartbeat else self._silent + dt
+            self._heartbeat = body[7]
+            self._state = encode.RUNNING
+            if body[0] != self._sequence:
+                self._sequence = body[0]
+                x, y, z, rx, ry, rz = encode.offset_of(self._box, body[1:7])
+                self._wanted = (x, y, z, rx, ry, rz)
+        if self._silent > self._box.watchdog:
+            self._state, self._wanted, self._sequence = encode.EXPIRED, NOTHING, 0
+
+    def _apply(self, peer: Peer) -> None:
+        if self.applied == NOTHING:
+            if any(peer.joint_offset):
+                peer.offset_by((0.0,) * peer.n)
+            return
+        arm, tool = peer.plant.arm, peer.declared.tool
+        wanted = offset_frame(tcp_in_base(arm, peer.own_q, tool), self.applied)
+        near = tuple(a + b for a, b in zip(peer.own_q, peer.joint_offset, strict=True))
+        found = solve(arm, wanted, near, tool, steps=20)
+        if found is None:
+            log.warning("no joints for the offset pose")
+            peer.protective_stop()
+            return
+        peer.offset_by([a - b for a, b in zip(found, peer.own_q, strict=True)])
+
+    def registers(self, peer: Peer) -> list[tuple[Table, int, int]]:
+        """Return the eight registers of the answer."""
+        box = self._box
+        words = [0] * ECHO_WORDS
+        if self.running:
+            applied = encode.offset_counts(box, self.applied)
+            words = [self._sequence, self._state, *(count & 0xFFFF for count in applied)]
+        return [(box.echo_table, box.echo_address + i, word) for i, word in enumerate(words)]
+
+
+class TargetProgram:
+    """Moves to the joints in the target registers when the trigger has been written."""
+
+    def __init__(self, profile: ProfileFile, entry: TargetTrigger) -> None:
+        self._profile, self._entry = profile, entry
+        self._step = 0  # orders of the trigger seen so far
+        self._due = False
+        self._refused = False
+        self._done = 0
+
+    def wrote(self, peer: Peer, table: Table, address: int, values: Sequence[int]) -> None:
+        """Follow the orders of the trigger, in turn; a stop brakes."""
+        trigger, stop = self._entry.trigger, self._entry.stop
+        for i, value in enumerate(values):
+            order = trigger[self._step]
+            if (table, address + i) == (order.table, order.address):
+                self._step = self._step + 1 if value == int(order.value) else 0
+                if self._step == len(trigger):
+                    self._step, self._due = 0, True
+            if stop and (table, address + i, value) == (
+                stop[-1].table, stop[-1].address, int(stop[-1].value),
+            ):  # fmt: skip
+                self._due, peer.motion = False, Stop(peer.target_qd, BRAKING)
+
+    def cycle(self, peer: Peer, read: Read) -> None:
+        """Start the motion that was triggered."""
+        if not self._due:
+            return
+        self._due = False
+        entry = self._entry.target
+        size = entry.scale * UNITS[entry.unit][1]
+        words = entry.coding.words
+        counts = [
+            entry.coding.decode(read(entry.table, a, words))[0]
+            for a in addresses(entry, self._profile.joints)
+        ]
+        try:
+            peer.move_own(tuple(count * size for count in counts))
+            self._refused = False
+            self._done += 1
+        except BenchError as error:
+            log.warning("target refused: %s", error)
+            self._refused = True
+
+    def registers(self, peer: Peer) -> list[tuple[Table, int, int]]:
+        """Return whether a motion runs, and what the last one came to."""
+        moving = not (isinstance(peer.motion, Hold) or peer.motion is HOLD)
+        found: list[tuple[Table, int, int]] = []
+        busy, result = self._entry.busy, self._entry.result
+        if busy is not None:
+            found.append((busy.table, busy.address, bad(busy) if moving else busy.good[0]))
+        if result is not None:
+            fine = result.good[-1] if self._done else result.good[0]
+            found.append((result.table, result.address, _bad_result(result, self._refused, fine)))
+        return found
+
+
+def _bad_result(result: Condition, refused: bool, fine: int) -> int:
+    return bad(result) if refused else fine
+
+
+def make_program(profile: ProfileFile) -> MailboxProgram | TargetProgram | NoProgram:
+    """Return the robot's side of a profile."""
+    if isinstance(profile.write, Mailbox):
+        return MailboxProgram(profile.write)
+    if isinstance(profile.write, TargetTrigger):
+        return TargetProgram(profile, profile.write)
+    return NoProgram()
