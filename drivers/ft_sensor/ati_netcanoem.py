@@ -50,6 +50,39 @@ def decode_gauges(first: bytes, second: bytes) -> tuple[int, tuple[int, ...]] | 
     return status, gauges
 
 
+class AnswerDecoder:
+    """Puts the frames of one answer together: consecutive ids, in order, soon after each other."""
+
+    def __init__(self, first_id: int, frames: int, window: float) -> None:
+        self._first_id, self._frames = first_id, frames
+        self._window = window  # s from the first frame to the last at most
+        self._found: list[bytes] = []
+        self._begun = 0.0
+        self.dropped = 0
+
+    def take(self, identifier: int, data: bytes, stamp: float) -> list[bytes] | None:
+        """Take one frame with its time stamp (s); returns the answer where it is complete."""
+        found = self._found
+        if identifier == self._first_id:
+            self.dropped += len(found)
+            self._found, self._begun = [data], stamp
+        elif found and identifier == self._first_id + len(found):
+            if 0.0 <= stamp - self._begun <= self._window:
+                found.append(data)
+            else:
+                self._drop()
+        else:
+            self._drop()
+        if len(self._found) < self._frames:
+            return None
+        answer, self._found = self._found, []
+        return answer
+
+    def _drop(self) -> None:
+        self.dropped += 1 + len(self._found)
+        self._found = []
+
+
 class AtiNetCanOem(ForceTorqueSensor):
     """The sensor on its bus."""
 
@@ -105,22 +138,21 @@ class AtiNetCanOem(ForceTorqueSensor):
             f"0x{self.settings.base_id:02X}"
         )
 
-    def _answer(self, operation: int, frames: int, until: float) -> list[bytes] | None:
-        """Return the data of frames with the ids operation, operation + 1, ... in this order."""
-        found: list[bytes] = []
-        while len(found) < frames:
-            frame = self._receive(max(until - time.monotonic(), 0.0))
+    def _answer(
+        self, operation: int, frames: int, until: float, window: float = ANSWER
+    ) -> list[bytes] | None:
+        """Return the data of an answer's frames; None where it has not come in time."""
+        decoder = AnswerDecoder(self._base | operation, frames, window)
+        while (left := until - time.monotonic()) > 0.0:
+            frame = self._receive(left)
             if frame is None:
-                return None
-            if frame.arbitration_id == self._base | (operation + len(found)):
-                found.append(bytes(frame.data))
-            elif frame.arbitration_id == self._base | operation:
-                self.dropped += 1
-                found = [bytes(frame.data)]
-            elif found:
-                self.dropped += 1
-                found = []
-        return found
+                break
+            found = decoder.take(frame.arbitration_id, bytes(frame.data), frame.timestamp)
+            if found is not None:
+                self.dropped += decoder.dropped
+                return found
+        self.dropped += decoder.dropped
+        return None
 
     def read(self, timeout: float) -> Reading | None:
         """Ask for a sample when it is due and return it; see ForceTorqueSensor.read."""
@@ -134,7 +166,8 @@ class AtiNetCanOem(ForceTorqueSensor):
         asked = time.monotonic()
         self._due = max(self._due + 1.0 / self.settings.rate, asked)
         self._send(GAUGES)
-        answer = self._answer(GAUGES, 2, max(until, asked + 0.005))
+        window = 0.5 / self.settings.rate
+        answer = self._answer(GAUGES, 2, max(until, asked + 0.005), window)
         received = time.monotonic()
         if answer is None:
             return None
