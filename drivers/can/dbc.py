@@ -57,7 +57,7 @@ def read_dbc(path: Path) -> Dbc:
     lines = _lines_of(text)
     _check_types(path, text)
     try:
-        database = cantools.database.load_string(text, "dbc", strict=False)
+        database: Any = cantools.database.load_string(text, "dbc", strict=False)
     except Exception as error:  # cantools raises its own, textparser's and KeyError
         raise ProfileError(f"{path}, line {_line_in(str(error))}: {_plain(error)}") from None
     messages: dict[str, Any] = {}

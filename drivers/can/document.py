@@ -42,10 +42,9 @@ class ProfileDocument:
                 for name, value in node.value:
                     if name.value == str(key):
                         found, line = value, name.start_mark.line + 1
-            elif isinstance(node, yaml.SequenceNode) and isinstance(key, int):
-                if key < len(node.value):
-                    found = node.value[key]
-                    line = found.start_mark.line + 1
+            elif isinstance(node, yaml.SequenceNode) and key in range(len(node.value)):
+                found = node.value[int(key)]
+                line = found.start_mark.line + 1
             if found is None:
                 break
             node = found

@@ -110,9 +110,9 @@ class OutgoingLoading:
                         f"found {frame.name} ({frame.key[0]:#x}), expected only identifiers that "
                         "`sends` lists",
                     )
-        for i, key in enumerate(self.names.key(v) for i, v in enumerate(self.file.sends)):
-            if key in profile.incoming:
-                name = profile.incoming[key].name
+        for i, identifier in enumerate(self.file.sends):
+            incoming = profile.incoming.get(self.names.key(identifier))
+            if incoming is not None:
                 raise self.names.error(
-                    ("sends", i), f"found {key[0]:#x}, which is {name}, feedback"
+                    ("sends", i), f"found {identifier:#x}, which is {incoming.name}, feedback"
                 )

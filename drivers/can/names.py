@@ -33,7 +33,7 @@ class Names:
         return message, (message.frame_id, message.is_extended_frame)
 
     def signal(self, name: str, keys: Keys) -> tuple[Any, Any]:
-        """Return the message and the signal (cantools) of ``MESSAGE.SIGNAL``. Raises ProfileError."""
+        """Return message and signal (cantools) of ``MESSAGE.SIGNAL``. Raises ProfileError."""
         message_name, _, signal_name = name.partition(".")
         message = self.dbc.messages.get(message_name)
         for signal in message.signals if message else ():

@@ -1,0 +1,248 @@
+"""The CAN driver: an arm by its map of frames, reading and writing halves put together."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
+from core.model import Model
+from core.setpoint import Setpoint
+from core.state import RobotState
+from drivers.can.loading import read_profile
+from drivers.can.reader import FrameReader
+from drivers.can.sample import Sample
+from drivers.can.settings import CanSettings
+from drivers.can.state import StateBuilder
+from drivers.can.writer import FrameWriter
+from drivers.driver import Driver
+
+Vector = NDArray[np.float64]
+FIRST_SAMPLE = 2.0  # s in which an arm on the bus must have told everything once
+SLICE = 0.02  # s, of one wait for a frame
+
+
+class CanDriver(Driver):
+    """One arm whose joints are told and commanded in CAN frames, as a profile maps them.
+
+    Who else sends our control identifiers is another commander: then nothing is armed, and what is
+    armed writes no more.
+    """
+
+    def __init__(self, settings: CanSettings, model: Model) -> None:
+        profile = read_profile(settings.profile_path)
+        super().__init__(min(settings.rate, profile.rate), profile.n)
+        if model.arm.n != profile.n:
+            raise LinkError(
+                f"link.profile: found {profile.n} joints in {profile.name}, the cell's arm has "
+                f"{model.arm.n}"
+            )
+        self.settings, self.profile = settings, profile
+        self.reader = FrameReader(settings, profile)
+        self.writer = FrameWriter(settings, profile)
+        self._builder = StateBuilder(profile, model.arm)
+        self._armed_at: float | None = None  # s, monotonic
+        self._given = -1.0  # s, received of the sample last returned
+        self._slot = 0.0  # s, when an arm that must be asked is asked next
+        self._changed = 0.0  # s, monotonic: when the joints last changed
+        self._q: Vector | None = None
+
+    # -- reading ----------------------------------------------------------------------------------
+
+    def connect(self) -> None:
+        """Open the bus and wait until the arm has told everything once. Sends no command."""
+        self.reader.open()
+        self.writer.bus = self.reader.bus
+        end = time.monotonic() + min(FIRST_SAMPLE, self.settings.connect_timeout)
+        found = False
+        while not found or self.reader.silent_status():
+            if time.monotonic() > end:
+                raise self._nothing_heard(found)
+            self._ask()
+            found = self.reader.listen(max(1.0 / self.rate, SLICE)) is not None or found
+        self._changed = time.monotonic()
+
+    def _nothing_heard(self, complete: bool) -> LinkError:
+        """Return what was missed, and close: a link that is not there is not half open."""
+        heard = self.reader.assembler.heard
+        missing = [i.name for key, i in self.profile.incoming.items() if key not in heard]
+        dropped = dict(self.reader.assembler.dropped)
+        words = f"never heard {', '.join(missing)}" if missing else "no complete sample"
+        if not missing and complete:
+            words = f"{self.reader.silent_status()} has fallen silent"
+        self.close()
+        told = f"; dropped: {dropped}" if dropped else ""
+        return LinkError(f"{self.settings.where()}: {self.profile.name}: {words}{told}")
+
+    def _ask(self) -> None:
+        with contextlib.suppress(WriteError):  # silence follows, and is told
+            self.writer.request()
+
+    def read_state(self) -> RobotState:
+        """Return the newest complete sample that was not returned yet; see Driver.read_state."""
+        sample = self._asked() if self.profile.request else self._awaited()
+        self._given = sample.received
+        if silent := self.reader.silent_status():
+            raise StaleStateError(
+                f"{self.settings.where()}: no {silent} for {self.profile.status_timeout:g} s"
+            )
+        self._check_frozen(sample)
+        armed = self._armed_at is not None
+        trouble, _ = self.reader.trouble(armed)
+        ready = not armed or not self.profile.enabled_values or self.reader.enabled
+        return self._builder.build(sample, self._target(), trouble, ready)
+
+    def _awaited(self) -> Sample:
+        """Return the next sample of an arm that sends by itself; slower where we want fewer."""
+        end = time.monotonic() + self.settings.state_timeout
+        earliest = self._given + 1.0 / self.rate - 0.5 / self.profile.rate
+        sample = self.reader.newest()
+        while sample is None or sample.received < earliest:
+            left = end - time.monotonic()
+            if left <= 0.0:
+                raise self._stale()
+            sample = self.reader.poll(min(left, SLICE)) or sample
+        return sample
+
+    def _asked(self) -> Sample:
+        """Return the sample that an arm gives when it is asked, once per cycle."""
+        now = time.monotonic()
+        self._slot = max(self._slot + 1.0 / self.rate, now - 1.0 / self.rate)
+        if self._slot > now:
+            self.reader.listen(self._slot - now)
+        self.reader.newest()
+        self.reader.assembler.reset()
+        asked = time.monotonic()
+        self._ask()
+        end = asked + self.settings.state_timeout
+        while (left := end - time.monotonic()) > 0.0:
+            sample = self.reader.poll(min(left, SLICE))
+            if sample is not None and sample.began >= asked:
+                return sample
+        raise self._stale()
+
+    def _stale(self) -> StaleStateError:
+        return StaleStateError(
+            f"{self.settings.where()}: {self.profile.name}: no complete sample for "
+            f"{time.monotonic() - max(self._given, 0.0):.3f} s"
+            if self._given > 0.0
+            else f"{self.settings.where()}: {self.profile.name}: no complete sample yet"
+        )
+
+    def _check_frozen(self, sample: Sample) -> None:
+        """Refuse joints that stand still bit by bit though they were sent elsewhere."""
+        now, target = sample.received, self.writer.target
+        if self._q is None or (sample.position != self._q).any():
+            self._q, self._changed = sample.position, now
+        if self._armed_at is None or target is None:
+            return
+        away = float(np.abs(target - sample.position).max())
+        if away < self.settings.frozen_distance:
+            self._changed = now
+        elif now - self._changed > self.settings.frozen_after:
+            raise StaleStateError(
+                f"{self.profile.name}: joints have stood still for {now - self._changed:.2f} s, "
+                f"commanded {away:.3f} rad away"
+            )
+
+    def _target(self) -> Vector | None:
+        """Return what the arm was last told, by us or by another commander."""
+        if self._armed_at is not None:
+            return self.writer.target
+        return self.reader.foreign_target(self.settings.foreign_quiet)
+
+    # -- writing ----------------------------------------------------------------------------------
+
+    def arm(self, state: RobotState) -> None:
+        """Enable the motors where they stand. Raises WriteError, and then nothing is enabled."""
+        if not self.profile.writes:
+            raise WriteError(f"{self.profile.name}: this profile is read only")
+        listening = time.monotonic()
+        self._listen(self.settings.foreign_quiet)
+        foreign = self.reader.foreign
+        if foreign is not None and foreign.seen > listening - self.settings.foreign_quiet:
+            raise self._commanded_by_another()
+        trouble, words = self.reader.trouble(writing=False)
+        if trouble:
+            raise WriteError(f"{self.profile.name}: {trouble}: {words}")
+        start = self._present()
+        try:
+            self.writer.run(self.profile.enable, self._present, self._listen, self._reached)
+            gave = float(np.abs(self._present() - start).max())
+            if gave > self.settings.arming_distance:
+                raise WriteError(f"{self.profile.name}: the arm gave {gave:.3f} rad when enabled")
+        except LinkError:
+            with contextlib.suppress(LinkError):
+                self._run_release(self._present)
+            raise
+        if self.writer.target is None:
+            self.writer.write(self._present())
+        self._armed_at = self._changed = time.monotonic()
+        self._builder.forget()
+
+    def _present(self) -> Vector:
+        if self._q is None:
+            raise WriteError(f"{self.profile.name}: found no state, expected read_state() first")
+        return self._q
+
+    def _listen(self, seconds: float) -> None:
+        """Read for a while, asking those that must be asked; keeps the present joints."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0.0 or seconds == 0.0:
+            self._ask()
+            sample = self.reader.listen(min(max(left, 0.001), 1.0 / self.rate))
+            if sample is not None and np.isfinite(sample.position).all():
+                self._q = sample.position
+            if seconds == 0.0:
+                return
+
+    def _reached(self, goal: str) -> bool:
+        if goal == "disabled":
+            return self.reader.disabled
+        told = not self.profile.enabled_values or self.reader.enabled
+        return told and (goal == "enabled" or not self.reader.trouble(writing=True)[0])
+
+    def _commanded_by_another(self) -> WriteError:
+        foreign = self.reader.foreign
+        assert foreign is not None
+        return WriteError(
+            f"{self.settings.where()}: another commander sent {foreign.key[0]:#x} "
+            f"{time.monotonic() - foreign.seen:.2f} s ago: found two masters, expected one"
+        )
+
+    def write_setpoint(self, setpoint: Setpoint) -> None:
+        """Send one setpoint whole; needs ``arm`` before. Raises WriteError."""
+        if self._armed_at is None:
+            raise WriteError(f"{self.profile.name}: found a setpoint, expected arm() first")
+        foreign = self.reader.foreign
+        if foreign is not None and foreign.seen > self._armed_at:
+            raise self._commanded_by_another()
+        self.writer.write(setpoint.q)
+
+    def release(self) -> None:
+        """Let the arm rest where it was last sent, and give the control back."""
+        if self._armed_at is None:
+            return
+        self._armed_at = None
+        target = self.writer.target
+        try:
+            self._run_release(self._present if target is None else lambda: target)
+        finally:
+            self.writer.forget()
+            self._builder.forget()
+
+    def _run_release(self, hold: object) -> None:
+        assert callable(hold)
+        self.writer.run(self.profile.release, hold, self._listen, self._reached)
+        self.writer.forget()
+
+    def close(self) -> None:
+        """Release where the link lives, and close the bus; see Driver.close."""
+        with contextlib.suppress(LinkError, InvalidStateError):
+            self.release()
+        self._armed_at = None
+        self.writer.bus = None
+        self.reader.close()

@@ -1,0 +1,157 @@
+"""The reading half: frames from the bus, samples and another commander's frames out of them."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import LinkError
+from drivers.can.bus import close_bus, first_line, open_bus
+from drivers.can.profile import CanProfile, Key
+from drivers.can.sample import Assembler, Sample
+from drivers.can.settings import CanSettings
+
+Vector = NDArray[np.float64]
+BACKLOG_TIME = 0.05  # s that reading what has piled up may take
+
+
+@dataclass(frozen=True, slots=True)
+class Foreign:
+    """A frame that only a commander sends, and that we did not send."""
+
+    key: Key
+    seen: float  # s, monotonic
+
+
+class FrameReader:
+    """Reads one bus for one profile. Opens and closes it; knows nothing of writing."""
+
+    def __init__(self, settings: CanSettings, profile: CanProfile) -> None:
+        self._settings, self._profile = settings, profile
+        self.bus: Any = None
+        self.assembler = Assembler(profile)
+        self.foreign: Foreign | None = None
+        self.error_frames = 0
+        self.identifiers: set[int] = set()  # heard at all, for messages
+        self._targets = {f.key: f for f in profile.setpoint if f.joints}
+        self._foreign_wire = np.full(profile.n, np.nan)
+
+    def open(self) -> None:
+        """Open the bus, filtered to what the profile reads. Raises LinkError."""
+        keys = set(self._profile.incoming) | set(self._profile.control)
+        filters: Any = [
+            {"can_id": key[0], "can_mask": 0x1FFFFFFF if key[1] else 0x7FF, "extended": key[1]}
+            for key in sorted(keys)
+        ]
+        self.bus = open_bus(self._settings, filters)
+
+    def close(self) -> None:
+        """Close the bus; may be repeated."""
+        bus, self.bus = self.bus, None
+        if bus is not None:
+            close_bus(bus)
+
+    def poll(self, timeout: float) -> Sample | None:
+        """Take one frame that comes within ``timeout`` s; returns the sample it completes.
+
+        Raises LinkError where the bus has gone.
+        """
+        return self._take(self._receive(timeout))
+
+    def newest(self) -> Sample | None:
+        """Take everything that has piled up; returns the newest complete sample of it."""
+        newest, until = None, time.monotonic() + BACKLOG_TIME
+        while (frame := self._receive(0.0)) is not None:
+            newest = self._take(frame) or newest
+            if time.monotonic() > until:
+                break
+        return newest
+
+    def listen(self, seconds: float) -> Sample | None:
+        """Take frames for a while; returns the newest complete sample of them."""
+        newest, until = None, time.monotonic() + seconds
+        while (left := until - time.monotonic()) > 0.0:
+            newest = self.poll(min(left, 0.02)) or newest
+        return newest
+
+    def _receive(self, timeout: float) -> Any:
+        if self.bus is None:
+            raise LinkError(f"{self._settings.where()}: found no bus, expected connect() first")
+        try:
+            return self.bus.recv(timeout)
+        except Exception as error:  # CanError, OSError, serial's, or a broken text on the wire
+            raise LinkError(f"{self._settings.where()}: {first_line(error)}") from None
+
+    def _take(self, frame: Any) -> Sample | None:
+        if frame is None:
+            return None
+        if frame.is_error_frame:
+            self.error_frames += 1
+            return None
+        if frame.is_remote_frame or frame.is_fd or not frame.is_rx:
+            return None
+        now = time.monotonic()
+        key = (int(frame.arbitration_id), bool(frame.is_extended_id))
+        self.identifiers.add(key[0])
+        if key in self._profile.control:
+            self.foreign = Foreign(key, now)
+            self._overhear(key, bytes(frame.data))
+            return None
+        return self.assembler.take(key, bytes(frame.data), frame.timestamp or now, now)
+
+    def _overhear(self, key: Key, data: bytes) -> None:
+        """Note what another commander has the arm do."""
+        target = self._targets.get(key)
+        if target is None or len(data) != target.message.length:
+            return
+        try:
+            values = target.message.decode(data, decode_choices=False)
+        except Exception:  # another's frame that is none
+            return
+        for signal, joint in target.joints:
+            self._foreign_wire[joint] = values[signal]
+
+    def foreign_target(self, within: float) -> Vector | None:
+        """Return the joints (n,) that another commander asked for in the last ``within`` s, rad."""
+        joints, foreign = self._profile.joints, self.foreign
+        if foreign is None or joints.setpoint_scale is None:
+            return None
+        if time.monotonic() - foreign.seen > within or not np.isfinite(self._foreign_wire).all():
+            return None
+        return self._foreign_wire * joints.setpoint_scale + joints.zero
+
+    # -- what the arm says of itself --------------------------------------------------------------
+
+    @property
+    def enabled(self) -> bool:
+        """Return whether every motor has said that it is enabled."""
+        told = self.assembler.enabled
+        wanted = sum(len(incoming.enabled) for incoming in self._profile.incoming.values())
+        return len(told) == wanted and all(told.values())
+
+    @property
+    def disabled(self) -> bool:
+        """Return whether every motor has said that it is not enabled."""
+        told = self.assembler.enabled
+        return bool(told) and not any(told.values())
+
+    def trouble(self, writing: bool) -> tuple[str, str]:
+        """Return what is wrong with the arm and the words for it; empty where nothing is."""
+        for (key, signal), (value, trouble, only_writing) in self.assembler.status.items():
+            if trouble and (writing or not only_writing):
+                name = self._profile.incoming[key].name
+                return trouble, f"{name}.{signal} is {value:g}"
+        return "", ""
+
+    def silent_status(self) -> str:
+        """Return the name of a status message that has not come for too long; empty: none."""
+        now = time.monotonic()
+        for key, incoming in self._profile.incoming.items():
+            heard = self.assembler.heard.get(key)
+            if heard is None or now - heard > self._profile.status_timeout:
+                return incoming.name
+        return ""

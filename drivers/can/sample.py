@@ -1,0 +1,123 @@
+"""Frames -> samples: a sample counts only when all its frames belong together.
+
+All of its messages must come within the profile's window, none twice, in order where the profile
+says so, and with the same count where they carry one. Everything else is dropped and counted.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.can.profile import CanProfile, Incoming, Key
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One complete sample, SI units; (n,) each, NaN where a joint has not told yet."""
+
+    position: Vector  # rad
+    others: dict[str, Vector]  # velocity rad/s, torque Nm, temperature °C
+    stamp: float  # s, clock of the bus, of its last frame
+    received: float  # s, time.monotonic() of its last frame
+    began: float  # s, time.monotonic() of its first frame
+
+
+class Assembler:
+    """Takes frames one by one and gives a sample whenever one is complete."""
+
+    def __init__(self, profile: CanProfile) -> None:
+        self._profile = profile
+        self._members = frozenset(profile.sample)
+        self._held: dict[Key, dict[str, float]] = {}
+        self._first = 0.0  # s, bus clock
+        self._began = 0.0  # s, monotonic
+        self._count: float | None = None
+        self._values = {name: np.full(profile.n, np.nan) for name in profile.quantities}
+        self.dropped: Counter[str] = Counter()  # reason -> frames or sets
+        self.status: dict[tuple[Key, str], tuple[float, str, bool]] = {}
+        self.enabled: dict[tuple[Key, str], bool] = {}
+        self.heard: dict[Key, float] = {}  # s, monotonic, of each message that we read
+
+    def reset(self) -> None:
+        """Forget a sample that has been begun."""
+        self._held.clear()
+
+    def take(self, key: Key, data: bytes, stamp: float, received: float) -> Sample | None:
+        """Take one frame; returns the sample that it completes. Raises nothing.
+
+        ``stamp`` (s) is the bus's clock, ``received`` (s) ours.
+        """
+        incoming = self._profile.incoming.get(key)
+        if incoming is None:
+            return None
+        try:
+            values = incoming.decode(data)
+        except ValueError:
+            self.dropped["malformed"] += 1
+            return None
+        self.heard[key] = received
+        self._note(incoming, values)
+        if key not in self._members:
+            self._read(incoming, values)
+            return None
+        return self._collect(incoming, values, stamp, received)
+
+    def _note(self, incoming: Incoming, values: dict[str, float]) -> None:
+        """Remember what a message says about the arm's health."""
+        for check in incoming.checks:
+            value = values[check.signal]
+            trouble = check.trouble(int(value)) if np.isfinite(value) else check.otherwise
+            self.status[incoming.key, check.signal] = (value, trouble, check.while_writing)
+        for signal in incoming.enabled:
+            self.enabled[incoming.key, signal] = values[signal] in self._profile.enabled_values
+
+    def _read(self, incoming: Incoming, values: dict[str, float]) -> None:
+        for reading in incoming.readings:
+            self._values[reading.quantity][reading.joint] = values[reading.signal]
+
+    def _collect(
+        self, incoming: Incoming, values: dict[str, float], stamp: float, received: float
+    ) -> Sample | None:
+        profile, key = self._profile, incoming.key
+        if self._held and self._breaks(incoming, values, stamp):
+            self.dropped["torn"] += 1
+            self._held.clear()
+        if profile.ordered and profile.sample[len(self._held)] != key:
+            self.dropped["out of order"] += 1
+            self._held.clear()
+            return None
+        if not self._held:
+            self._first, self._began = stamp, received
+        self._held[key] = values
+        if len(self._held) < len(self._members):
+            return None
+        held, self._held = self._held, {}
+        if incoming.counter is not None:
+            if values[incoming.counter] == self._count:
+                self.dropped["repeated"] += 1
+                return None
+            self._count = values[incoming.counter]
+        for member, found in held.items():
+            self._read(profile.incoming[member], found)
+        return self._sample(stamp, received)
+
+    def _breaks(self, incoming: Incoming, values: dict[str, float], stamp: float) -> bool:
+        """Return whether a frame cannot belong to the sample that has been begun."""
+        if incoming.key in self._held or not 0.0 <= stamp - self._first <= self._profile.window:
+            return True
+        if self._profile.ordered and self._profile.sample[len(self._held)] != incoming.key:
+            return True
+        if incoming.counter is None:
+            return False
+        return any(v[incoming.counter] != values[incoming.counter] for v in self._held.values())
+
+    def _sample(self, stamp: float, received: float) -> Sample:
+        joints = self._profile.joints
+        found = {name: joints.to_si(name, value) for name, value in self._values.items()}
+        return Sample(found.pop("position"), found, stamp, received, self._began)

@@ -1,0 +1,65 @@
+"""The link to an arm on CAN: what a cell file says under ``link``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import Field
+
+from core.errors import InputError
+from drivers.can.bus import BusSettings
+from drivers.driver import DriverSettings
+
+SHIPPED = Path(__file__).with_name("profiles")
+
+
+class CanSettings(DriverSettings, BusSettings):
+    """How to reach an arm on CAN, and which map of frames it has.
+
+    ``profile`` is the name of a shipped one (``piper``, ``openarm``, ``odrive``) or a path ending
+    in .yaml, seen from the cell's folder.
+    """
+
+    driver: Literal["can"] = "can"
+    profile: str = Field(min_length=1, description="a shipped map of frames, or a path to one")
+    rate: float = Field(200.0, gt=0.0, le=1000.0, description="cycles per second asked for")
+    send_timeout: float = Field(
+        0.005, gt=0.0, le=0.1, description="s that one frame may take to leave"
+    )
+    foreign_quiet: float = Field(
+        1.0, gt=0.0, le=10.0,
+        description="s without a frame of another commander before we may write",
+    )  # fmt: skip
+    frozen_after: float = Field(
+        0.5, gt=0.0, le=10.0,
+        description="s that joints may stand still, bit by bit, though they are commanded away",
+    )  # fmt: skip
+    frozen_distance: float = Field(
+        0.02, gt=0.0, le=0.5, description="rad of command from joint that counts as away"
+    )
+    arming_distance: float = Field(
+        0.03, gt=0.0, le=0.3, description="rad that a joint may give while it is enabled"
+    )
+
+    @property
+    def names_file(self) -> bool:
+        """Return whether ``profile`` is a path rather than a shipped name."""
+        return self.profile.endswith((".yaml", ".yml"))
+
+    @property
+    def profile_path(self) -> Path:
+        """Return the file of the map."""
+        return Path(self.profile) if self.names_file else SHIPPED / f"{self.profile}.yaml"
+
+    def located(self, folder: Path) -> Self:
+        """Return the settings with the profile's path seen from ``folder``; see DriverSettings."""
+        if self.names_file:
+            return self.model_copy(update={"profile": str((folder / self.profile).resolve())})
+        if not self.profile_path.is_file():
+            shipped = ", ".join(sorted(path.stem for path in SHIPPED.glob("*.yaml")))
+            raise InputError(
+                f"link.profile: found {self.profile!r}, expected one of {shipped}, or a path "
+                "ending in .yaml"
+            )
+        return self

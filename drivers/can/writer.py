@@ -1,0 +1,137 @@
+"""The writing half: frames out, only those that the profile allows, and never half a setpoint."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import WriteError
+from drivers.can.bus import first_line
+from drivers.can.profile import Action, CanProfile, Key, Outgoing
+from drivers.can.settings import CanSettings
+
+Vector = NDArray[np.float64]
+Frames = list[tuple[Key, bytes]]
+
+
+class FrameWriter:
+    """Sends setpoints and sequences over a bus that is open."""
+
+    def __init__(self, settings: CanSettings, profile: CanProfile) -> None:
+        self._settings, self._profile = settings, profile
+        self.bus: Any = None
+        self._last: Frames | None = None  # the setpoint that got out whole
+        self.target: Vector | None = None  # rad, the same as joints
+        self.mended = 0  # setpoints that had to be taken back
+
+    def forget(self) -> None:
+        """Forget the last setpoint: it is no longer what the arm holds."""
+        self._last = self.target = None
+
+    def write(self, q: Vector) -> None:
+        """Send one setpoint (n,), rad, all its frames or none that is left standing.
+
+        Raises WriteError; then the arm has its previous setpoint again, or its stop sequence,
+        unless the bus takes nothing any more, which the message says.
+        """
+        frames = self._encode(q)
+        for sent, (key, data) in enumerate(frames):
+            try:
+                self._send(key, data)
+            except WriteError as error:
+                done = self._mend() if sent else "nothing of it was sent"
+                raise WriteError(f"{error} ({sent} of {len(frames)} frames out; {done})") from None
+        self._last, self.target = frames, q.copy()
+
+    def _mend(self) -> str:
+        """Take back a setpoint of which a part is out; returns what was done."""
+        self.mended += 1
+        for frames, words in (
+            (self._last, "the setpoint before was sent again"),
+            (self._stop_frames(), "the stop sequence was sent"),
+        ):
+            if not frames:
+                continue
+            try:
+                for key, data in frames:
+                    self._send(key, data)
+            except WriteError:
+                continue
+            return words
+        return "neither the setpoint before nor a stop could be sent"
+
+    def _stop_frames(self) -> Frames:
+        return [(f.key, f.encode()) for action in self._profile.stop for f in action.frames]
+
+    def _encode(self, q: Vector) -> Frames:
+        """Return all frames before any is sent. Raises WriteError."""
+        if q.shape != (self._profile.n,) or not np.isfinite(q).all():
+            raise WriteError(f"{self._profile.name}: found {q}, expected finite joints")
+        wire = self._profile.joints.to_wire(q)
+        try:
+            return [(f.key, f.encode(wire)) for f in self._profile.setpoint]
+        except ValueError as error:
+            raise WriteError(f"{self._profile.name}: {error}") from None
+
+    def request(self) -> None:
+        """Ask an arm that speaks only when spoken to. Raises WriteError."""
+        for frame in self._profile.request:
+            self._send(frame.key, frame.encode())
+
+    def run(
+        self,
+        actions: Sequence[Action],
+        hold: Callable[[], Vector],
+        listen: Callable[[float], object],
+        reached: Callable[[str], bool],
+    ) -> None:
+        """Go through a sequence. Raises WriteError where a frame or an ``until`` fails.
+
+        ``hold`` gives the joints of a hold step, ``listen(s)`` reads meanwhile, ``reached`` says
+        whether an ``until`` is there.
+        """
+        for action in actions:
+            end = time.monotonic() + action.within
+            while True:
+                self._do(action, hold)
+                listen(action.wait if action.until is None else action.every)
+                if action.until is None or reached(action.until):
+                    break
+                if time.monotonic() > end:
+                    names = ", ".join(f.name for f in action.frames) or "hold"
+                    raise WriteError(
+                        f"{self._profile.name}: not {action.until} after {action.within:g} s: {names}"
+                    )
+
+    def _do(self, action: Action, hold: Callable[[], Vector]) -> None:
+        for frame in action.frames:
+            self._send(frame.key, self._bytes_of(frame))
+        if action.hold:
+            self.write(hold())
+
+    def _bytes_of(self, frame: Outgoing) -> bytes:
+        try:
+            return frame.encode()
+        except ValueError as error:
+            raise WriteError(f"{self._profile.name}: {error}") from None
+
+    def _send(self, key: Key, data: bytes) -> None:
+        """Send one frame that the allow-list has. Raises WriteError."""
+        import can
+
+        if key not in self._profile.sends:
+            raise WriteError(f"{self._profile.name}: {key[0]:#x} is not among the profile's sends")
+        if self.bus is None:
+            raise WriteError(f"{self._settings.where()}: found no bus, expected connect() first")
+        frame = can.Message(arbitration_id=key[0], is_extended_id=key[1], data=data)
+        try:
+            self.bus.send(frame, timeout=self._settings.send_timeout)
+        except Exception as error:  # CanError, OSError, serial's
+            raise WriteError(
+                f"{self._settings.where()}: frame {key[0]:#x} could not be sent: "
+                f"{first_line(error)}"
+            ) from None
