@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arm import Arm
+from core.diagnosis.growing import children
 from core.diagnosis.held_out import HeldOut, Shrink
 from core.diagnosis.judgement import Judgement
-from core.diagnosis.search import children
 from core.diagnosis.selection import Selection
 from core.diagnosis.space import Found, fit
 from core.effects import CATALOGUE, Reported, Term

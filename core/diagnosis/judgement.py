@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from core.diagnosis.held_out import HeldOut
 from core.diagnosis.leftover import dependence, structure_p_value
-from core.diagnosis.search import rivals
+from core.diagnosis.neighbours import rivals
 from core.diagnosis.selection import Selection
 from core.diagnosis.space import Found, Space, fit
 
@@ -29,6 +29,7 @@ ENOUGH_REPEATS = 30  # degrees of freedom from which repeats are a measure of th
 USUAL = 1.2e-4  # m, one coordinate: a worse repeatability than that is none
 INSTRUMENTS = 5.0  # times the instrument's sigma, for coarse instruments
 HINT = 0.05  # probability from which a coordinate is suspect once structure is sure
+TRACE = 0.01  # share of an unnamed function from which a coordinate has it
 TOUCH = 0.1  # share of a cause that acts on a coordinate: more than that touches it
 LEAST = 0.002  # share of the held-out gap that a cause has to take beside a leftover
 BENT = 10.8  # gain of a bent stiffness curve over a straight one that makes it one
@@ -119,7 +120,7 @@ def _weak(selection: Selection, believed: list[int], smooth: list[int]) -> list[
     touched = {c: _touches(space, c, coordinate, k) for c in (*believed, *smooth)}
     bad = np.zeros(k, dtype=bool)
     for c in smooth:
-        bad |= touched[c] > TOUCH
+        bad |= touched[c] > TRACE
     for j in range(k):
         bad[j] |= structure_p_value(space, nuisance, chosen, rows=coordinate == j) < HINT
     if not bad.any():

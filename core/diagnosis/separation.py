@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.search import rivals
+from core.diagnosis.neighbours import rivals
 from core.diagnosis.space import fit
 from core.effects import CATALOGUE, Site, Term
 from core.errors import InputError

@@ -84,7 +84,7 @@ def _candidate(quantity: str, target: str, size: int) -> Candidate:
 def _bumps(name: str, target: str, z: Array, directions: Array) -> list[Pair]:
     found = []
     low, high = float(z.min()), float(z.max())
-    for width in ((high - low) / BUMPS, (high - low) / (2.5 * BUMPS)):
+    for width in ((high - low) / BUMPS, (high - low) / (2.5 * BUMPS), 2.4 * (high - low) / BUMPS):
         for centre in np.arange(low, high, width):
             bump = np.exp(-0.5 * ((z - centre) / width) ** 2)
             if (bump > 0.3).sum() >= 2:

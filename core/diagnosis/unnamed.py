@@ -111,8 +111,8 @@ def _pulls(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Arra
 def unnamed_pulls(model: Model, motion: Motion, channel: str) -> tuple[tuple[str, Array], ...]:
     """Return what an undeclared pull at the tool does to torques (N, n, d) or wrenches (N, 6, d).
 
-    A mass somewhere at the tool, a pull in any direction of base and, for torques, in any direction of the
-    tool (to a sensor on the flange that is a bias).
+    A mass somewhere at the tool, a pull in any direction of base and, for torques, in any direction
+    of the tool (to a sensor on the flange that is a bias).
     """
     count, columns = len(motion), []
     for axis in range(3):

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.diagnosis.candidate import Candidate
+from core.diagnosis.growing import children
 from core.diagnosis.noise import estimate_noise
-from core.diagnosis.search import children
 from core.diagnosis.space import Found, Space, fit
 from core.diagnosis.work import Work, sample_space
 from core.effects import Term

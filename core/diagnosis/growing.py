@@ -1,0 +1,132 @@
+"""Sets of candidates that grow term by term, several side by side (a beam)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.space import Found, Space, fit, gains
+
+Array = NDArray[np.float64]
+BEAM = 6
+DEPTH = 9
+PATIENCE = 2  # depths without a better set before the beam stops
+SMOOTH_TERMS = 2  # more unnamed functions than that tell nothing more
+LINES = 4  # periodic lines a joint may have
+
+
+@dataclass
+class State:
+    """A set that grows: what its terms leave of the columns and of the gap."""
+
+    chosen: tuple[int, ...]
+    P: Array  # columns with the chosen ones projected out
+    r: Array
+    rss: float
+    score: float
+
+
+def clash(space: Space, chosen: Sequence[int], new: int) -> bool:
+    """Return whether a candidate stands instead of, not beside, one that is chosen."""
+    b = space.candidates[new]
+    lines = 0
+    if not b.named and sum(not space.candidates[c].named for c in chosen) >= SMOOTH_TERMS:
+        return True
+    for c in chosen:
+        a = space.candidates[c]
+        if not (a.named and b.named) or a.site.joint != b.site.joint:
+            continue
+        if a.family == b.family == "transmission_error":
+            lines += 1
+            if abs((a.site.order or 0) - (b.site.order or 0)) < 0.75 or lines >= LINES:
+                return True
+        elif a.family == b.family or {a.family, b.family} == {
+            "axial_compliance",
+            "stiffness_nonlinearity",
+        }:
+            return True
+    return False
+
+
+def grow(space: Space, state: State, new: int, score: float) -> State:
+    """Return the state with one more term."""
+    block = state.P[:, space.start[new] : space.start[new + 1]]
+    unit = np.sqrt(np.einsum("ij,ij->j", block, block)) + 1e-300
+    U, s, _ = np.linalg.svd(block / unit, full_matrices=False)
+    U = U[:, s > 1e-5]
+    P = state.P - U @ (U.T @ state.P)
+    r = state.r - U @ (U.T @ state.r)
+    return State((*state.chosen, new), P, r, float(r @ r), score)
+
+
+def projected(space: Space, chosen: Sequence[int]) -> State:
+    """Return the state of a whole set."""
+    rss = float(space.y @ space.y)
+    state = State((), space.X, space.y, rss, 0.0)
+    for c in chosen:
+        state = grow(space, state, c, 0.0)
+    return state
+
+
+def offspring(
+    space: Space, state: State, width: int, named_only: bool = False
+) -> list[tuple[float, int]]:
+    """Return the best terms to join a state: (score of the joint set, index), best first."""
+    gain, sign = gains(space, state.P, state.r)
+    score = space.misfit(np.maximum(state.rss - gain, 1e-300)) + space.price
+    score += space.price[list(state.chosen)].sum()
+    found: list[tuple[float, int]] = []
+    for c in np.argsort(score):
+        candidate = space.candidates[c]
+        if c in state.chosen or (named_only and not candidate.named):
+            continue
+        if clash(space, state.chosen, int(c)):
+            continue
+        single = candidate.named and len(candidate.parameters) == 1
+        if single and candidate.parameters[0].lower == 0 and sign[c] < 0:
+            continue
+        found.append((float(score[c]), int(c)))
+        if len(found) >= width:
+            break
+    return found
+
+
+def children(space: Space, chosen: Sequence[int], width: int) -> list[tuple[float, int]]:
+    """Return the best candidates to join a set: (score of the joint set, index), best first."""
+    return offspring(space, projected(space, chosen), width)
+
+
+def beam_search(
+    space: Space, allowed_depth: int = DEPTH, beam: int = BEAM, named_only: bool = False
+) -> list[Found]:
+    """Return the best sets met, best first (the empty one among them)."""
+    rss = float(space.y @ space.y)
+    empty = State((), space.X, space.y, rss, float(space.misfit(np.array(rss))))
+    states, best, waited = [empty], empty.score, 0
+    met: dict[frozenset[int], Found] = {frozenset(): Found((), empty.score, rss)}
+    for _ in range(allowed_depth):
+        children: dict[frozenset[int], tuple[float, int, int]] = {}
+        for s, state in enumerate(states):
+            for score, c in offspring(space, state, max(2 * beam, 12), named_only):
+                key = frozenset((*state.chosen, c))
+                if key not in children or score < children[key][0]:
+                    children[key] = (score, s, c)
+        ranked = sorted(children.values())[: max(2 * beam, 12)]
+        checked = []
+        for _, s, c in ranked:
+            found = fit(space, (*states[s].chosen, c))
+            met[frozenset(found.chosen)] = found
+            if np.isfinite(found.score):
+                checked.append((found.score, s, c))
+        checked.sort()
+        states = [grow(space, states[s], c, score) for score, s, c in checked[:beam]]
+        if not states:
+            break
+        waited = 0 if states[0].score < best - 1e-9 else waited + 1
+        best = min(best, states[0].score)
+        if waited >= PATIENCE:
+            break
+    return sorted(met.values(), key=lambda f: f.score)
