@@ -33,6 +33,7 @@ _EXPECTED = {
     "too_short": "{min_length} values",
     "too_long": "{max_length} values",
     "literal_error": "{expected}",
+    "union_tag_not_found": "a key {discriminator}",
     "enum": "{expected}",
 }
 LONGEST = 60  # characters of a found value that are quoted

@@ -24,6 +24,8 @@ from drivers.ft_sensor.settings import AtiSettings
 GAUGES, MATRIX, COUNTS, UNITS = 0x0, 0x2, 0x7, 0x8
 ANSWER = 0.1  # s: an answer about the calibration that has not come by then is asked for again
 ATTEMPTS = 3
+SAMPLE = 0.03  # s: a sample that has not come by then is lost (a USB adapter may take 0.016)
+TOGETHER = 0.005  # s between the frames of a sample at most
 SATURATED = 0x10000  # our own bit: a gauge at the end of its range
 # code -> N or Nm
 FORCE_UNITS = {1: 4.4482216152605, 2: 1.0, 3: 4448.2216152605, 4: 1e3, 5: 9.80665, 6: 9.80665e-3}
@@ -151,6 +153,8 @@ class AtiNetCanOem(ForceTorqueSensor):
             if found is not None:
                 self.dropped += decoder.dropped
                 return found
+            if frame.arbitration_id == (self._base | operation) + frames - 1:
+                break  # the last one, and not all before it: asking again is quicker
         self.dropped += decoder.dropped
         return None
 
@@ -159,15 +163,14 @@ class AtiNetCanOem(ForceTorqueSensor):
         if self._bus is None:
             raise LinkError(f"{self.name}: found no connection, expected connect() first")
         until = time.monotonic() + timeout
-        pause = min(self._due, until) - time.monotonic()
-        if pause > 0.0:
-            time.sleep(pause)
+        time.sleep(max(min(self._due, until) - time.monotonic(), 0.0))
+        if self._due > until:
+            return None
         self._drain()
         asked = time.monotonic()
         self._due = max(self._due + 1.0 / self.settings.rate, asked)
         self._send(GAUGES)
-        window = 0.5 / self.settings.rate
-        answer = self._answer(GAUGES, 2, max(until, asked + 0.005), window)
+        answer = self._answer(GAUGES, 2, asked + SAMPLE, TOGETHER)
         received = time.monotonic()
         if answer is None:
             return None

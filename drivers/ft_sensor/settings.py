@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 from drivers.can.bus import BusSettings
 
@@ -18,7 +18,7 @@ class SensorFrame(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    xyz: Vector3 = Field((0.0, 0.0, 0.0), description="m")
+    xyz: Vector3 = Field((0.0, 0.0, 0.0), description="x, y, z in m")
     rpy: Vector3 = Field((0.0, 0.0, 0.0), description="rad, roll pitch yaw as in URDF")
 
 
@@ -63,13 +63,14 @@ class RobotousSettings(BusSettings, FtSensorSettings):
     force_counts: float = Field(50.0, gt=0.0, description="counts per N")
     torque_counts: float = Field(2000.0, gt=0.0, description="counts per Nm")
 
-    @model_validator(mode="after")
-    def _ids_differ(self) -> RobotousSettings:
+    @field_validator("reply_ids")
+    @classmethod
+    def _ids_differ(cls, value: tuple[int, int], info: ValidationInfo) -> tuple[int, int]:
         """Refuse identifiers that cannot be told apart."""
-        ids = {self.command_id, *self.reply_ids}
-        if len(ids) < 3 or not all(0 <= i <= STANDARD_IDS for i in self.reply_ids):
-            raise ValueError("expected three different 11-bit ids in command_id and reply_ids")
-        return self
+        ids = {info.data.get("command_id"), *value}
+        if len(ids) < 3 or not all(0 <= i <= STANDARD_IDS for i in value):
+            raise ValueError("expected two 11-bit ids, different from each other and command_id")
+        return value
 
 
 class AtiSettings(BusSettings, FtSensorSettings):

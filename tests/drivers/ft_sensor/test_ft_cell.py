@@ -178,7 +178,8 @@ def test_a_run_without_the_sensor_says_which_and_ends(tmp_path: Path) -> None:
     ("section", "words"),
     [
         ("driver: bota", "ft_sensor.driver"),
-        ("rate: 100", "ft_sensor"),
+        ("rate: 100", "expected a key 'driver'"),
+        ("driver: robotous_rft, reply_ids: [1, 1]", "ft_sensor.reply_ids"),
         ("driver: robotous_rft, chanel: can1", "did you mean 'channel'"),
         ("driver: ati_netcanoem, max_age: 0", "ft_sensor.max_age"),
         ("driver: robotiq_ft300, mode: fast", "'stream' or 'registers'"),
