@@ -180,10 +180,10 @@ def check_identity(profile: ProfileFile, compiled: RegisterMap, registers: Regis
             raise InvalidStateError(f"{_words(condition, count)}: not the profile's controller")
 
 
-def check_step(q: Array, before: Array, gap: float, fastest: float) -> None:
+def check_step(q: Array, before: Array, gap: float, fastest: Array | float) -> None:
     """Refuse joints that cannot have come there in ``gap`` s: a torn or a wrong sample.
 
-    Raises InvalidStateError.
+    ``fastest`` is in rad/s, one number or (n,). Raises InvalidStateError.
     """
     way = np.abs(q - before)
     if (way > fastest * gap + JITTER).any():

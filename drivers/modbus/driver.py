@@ -19,7 +19,6 @@ from drivers.modbus.freshness import Freshness
 from drivers.modbus.map import Block, compile_map
 from drivers.modbus.profile import read_profile
 from drivers.modbus.registers import UNITS
-from drivers.modbus.schema import ProfileFile
 from drivers.modbus.settings import ModbusSettings
 from drivers.modbus.transport import Transport
 from drivers.modbus.write import make_writer
@@ -28,6 +27,7 @@ from drivers.ur_rtde.nominal import Nominal
 Vector = NDArray[np.float64]
 SLOW_EVERY = 0.2  # s between two readings of conditions that lie apart
 BEYOND = 0.1  # rad outside the arm's joint limits: the register map is wrong
+MARGIN = 2.0  # times the arm's own velocity limits: what no joint can pass
 MODES = {"not_ready": (5, 1), "protective_stop": (7, 3), "emergency_stop": (3, 7), "fault": (7, 9)}
 """Trouble -> RTDE robot_mode and safety_mode."""
 
@@ -54,8 +54,8 @@ class ModbusDriver(Driver):
         self._fresh_at = 0.0  # s, monotonic: of the last new sample
         self._sample: Sample | None = None
         self._q: Vector | None = None  # of the last sample that was believed
-        self._doubtful: Vector | None = None  # of the last sample that was not
-        self._seen_at = 0.0
+        self._first: tuple[Vector, float] = (np.zeros(0), 0.0)  # what the first must agree with
+        self._fastest = np.minimum(profile.fastest, MARGIN * model.arm.limits.velocity)
         self._connected = False
 
     # -- reading ----------------------------------------------------------------------------------
@@ -77,10 +77,10 @@ class ModbusDriver(Driver):
         except LinkError:
             self.transport.close()
             raise
-        self._q, self._doubtful = None, sample.vectors["position"]
+        self._q, self._first = None, (sample.vectors["position"], time.monotonic())
         self._freshness.restart()
         self._connected = True
-        self._due = self._fresh_at = self._seen_at = time.monotonic()
+        self._due = self._fresh_at = time.monotonic()
 
     def _check_limits(self, q: Vector) -> None:
         """Refuse joints where the arm cannot be: units, word order or signs are wrong."""
@@ -144,21 +144,22 @@ class ModbusDriver(Driver):
         return found
 
     def _believe(self, sample: Sample, received: float) -> RobotState:
-        """Return the state of a sample. Raises InvalidStateError where it makes a leap."""
+        """Return the state of a sample. Raises InvalidStateError where it makes a leap.
+
+        The first one is compared with the one that connecting has seen: one torn sample is never
+        where all others start from.
+        """
         q = sample.vectors["position"]
-        gap = received - self._seen_at + self.profile.period
-        self._seen_at = received
-        if self._q is None or not _steady(q, self._q, received - self._fresh_at, self.profile):
-            before, self._doubtful = self._doubtful, q
-            if before is None:
-                before = q
-            try:
-                check_step(q, before, gap, self.profile.fastest)
-            except InvalidStateError as error:
-                raise InvalidStateError(f"{self.transport.name}: {error}") from None
+        known, since = (self._q, self._fresh_at) if self._q is not None else self._first
+        try:
+            check_step(q, known, received - since + self.profile.period, self._fastest)
+        except InvalidStateError as error:
+            if self._q is None:
+                self._first = (q, received)
+            raise InvalidStateError(f"{self.transport.name}: {error}") from None
         timestamp = self._freshness.take(sample.clock, q, received)
         state = self._state(sample, timestamp, received)
-        self._q, self._doubtful = q, None
+        self._q = q
         self._fresh_at, self._sample = received, sample
         return state
 
@@ -272,12 +273,3 @@ class ModbusDriver(Driver):
         finally:
             self._connected = False
             self.transport.close()
-
-
-def _steady(q: Vector, before: Vector, gap: float, profile: ProfileFile) -> bool:
-    """Return whether joints can have come to ``q`` in ``gap`` s."""
-    try:
-        check_step(q, before, gap + profile.period, profile.fastest)
-    except InvalidStateError:
-        return False
-    return True

@@ -37,7 +37,7 @@ FUNCTIONS: dict[int, Table] = {
 }  # fmt: skip
 WRITES = (5, 6, 15, 16, 22, 23)
 START_LIMIT = 5.0  # s
-TORN_APART = 0.7  # rad between the two moments that a torn image mixes
+TORN_APART = 2.0  # rad between the two moments that a torn image mixes
 MOST_WRITES = 10000  # kept between two cycles
 
 
@@ -213,13 +213,17 @@ class ModbusServer(PeerServer):
             image.tear(profile, new, image.state_registers(profile, {"position": apart}))
         self._image = new
 
+    def tear(self, count: int) -> None:
+        """Mix two moments in the next ``count`` images."""
+        self._torn = count
+
     # -- the bench --------------------------------------------------------------------------------
 
     def commands(self, peer: Peer) -> Mapping[str, Command]:
         """Return bench commands for faults of this protocol."""
 
         def tear(numbers: list[float]) -> str:
-            self._torn = int(numbers[0])
+            self.tear(int(numbers[0]))
             return "ok"
 
         def program(numbers: list[float]) -> str:

@@ -1,0 +1,102 @@
+"""One case of the contract: a driver, and the simulated controller that it talks to."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from bridge.cell import load_cell
+from core.arm import builtin_arm
+from core.model import Model
+from drivers.driver import Driver
+from drivers.simulated.peer import Peer, make_peer
+from drivers.simulated.peer_server import PeerServer, PeerThread
+from drivers.simulated.settings import simulated_arm
+
+PERIOD = 0.004  # s
+CONFIG = Path(__file__).parents[3] / "config"
+_numbers = itertools.count(2)
+
+
+def own_address() -> str:
+    """Return a loopback address that no other test process uses."""
+    pid = os.getpid()
+    return f"127.{1 + (pid >> 8) % 250}.{pid % 256}.{next(_numbers) % 250 + 2}"
+
+
+def model_of(n: int) -> Model:
+    """Return a rigid arm of six or seven joints."""
+    if n == 6:
+        return Model(builtin_arm("ur10e"))
+    return load_cell(CONFIG / "seven_axis_urdf.yaml").model
+
+
+def wait_for(true: Callable[[], bool], seconds: float, what: str) -> None:
+    """Wait until something is so; fail with its name where it does not come."""
+    until = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < until, f"{what}: not within {seconds:g} s"
+        time.sleep(0.01)
+
+
+class Case(ABC):
+    """A simulated controller served over its wire, and drivers for it.
+
+    resolution: half a count of the joint angles, rad; speed_resolution the same, None where the
+    controller does not tell speeds; clocked: whether it tells a time of its own, so that a clock
+    that stands still can be noticed; force: half a count of the TCP force, N, None where there is
+    none; writes: ``offset``, ``joints`` or None.
+    """
+
+    resolution = 1e-6
+    speed_resolution: float | None = 1e-3
+    clocked = False
+    force: float | None = None
+    writes: str | None = "joints"
+    state_timeout = 0.5
+    n = 6
+
+    def __init__(self) -> None:
+        self.host = own_address()
+        self.model = model_of(self.n)
+        self.peer: Peer = make_peer(*simulated_arm(self.model.arm, seed=11), period=PERIOD)
+        self.servers = self.make_servers()
+        self._thread = PeerThread(self.peer, self.servers, self.host)
+
+    @abstractmethod
+    def make_servers(self) -> list[PeerServer]:
+        """Return the servers of the peer at ``host``."""
+
+    @abstractmethod
+    def driver(self) -> Driver:
+        """Return a driver, not connected."""
+
+    def tear(self) -> None:
+        """Have at least one sample that is read next mixed of two moments."""
+        raise NotImplementedError
+
+    def start(self) -> None:
+        """Serve."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End serving, as a controller that is switched off."""
+        self._thread.stop()
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()

@@ -1,0 +1,251 @@
+"""What every driver owes the loop; the same for a simulated controller and for real hardware."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from contract_case import Case, wait_for
+
+from core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
+from core.model import Model
+from core.setpoint import Setpoint
+from core.state import RobotState
+from drivers.driver import Driver
+from drivers.simulated.kinematics import gap, tcp_in_base
+
+OFFSET = (4e-4, -3e-4, 5e-4, 1e-3, 0.0, -1e-3)  # m, rad: what a write of offsets moves the TCP by
+STEP = 0.02  # rad: what a write of joints moves each joint by
+PACE = 0.1  # rad/s
+LATE = 0.05  # s that a sample may be older than the plant
+
+
+def next_state(driver: Driver, seconds: float = 3.0) -> RobotState:
+    """Return the next believable state; torn ones may come before."""
+    until = time.monotonic() + seconds
+    while True:
+        try:
+            return driver.read_state()
+        except InvalidStateError:
+            assert time.monotonic() < until, "no believable state"
+
+
+def read_on(driver: Driver, count: int = 1000) -> None:
+    """Read states, torn ones too, until something breaks."""
+    for _ in range(count):
+        with contextlib.suppress(InvalidStateError):
+            driver.read_state()
+
+
+def check_reads(driver: Driver, model: Model, count: int = 8) -> list[RobotState]:
+    """States are complete, finite, recent, and time goes on."""
+    states = [next_state(driver) for _ in range(count)]
+    n = model.arm.n
+    for state in states:
+        assert state.actual_q.shape == state.actual_qd.shape == state.target_q.shape == (n,)
+        assert state.actual_TCP_force.shape == (6,)
+        for name in ("actual_q", "actual_qd", "target_q", "actual_TCP_force"):
+            assert np.isfinite(getattr(state, name)).all(), name
+        for name in ("joint_temperatures", "actual_current_as_torque"):
+            found = getattr(state, name)
+            assert found is None or (found.shape == (n,) and np.isfinite(found).all()), name
+        assert time.monotonic() - state.received < 5.0
+    times = np.diff([s.timestamp for s in states])
+    assert (times > 0.0).all()
+    assert (np.diff([s.received for s in states]) > 0.0).all()
+    inside = model.arm.limits.lower - 0.1 <= states[-1].actual_q
+    assert inside.all() and (states[-1].actual_q <= model.arm.limits.upper + 0.1).all()
+    return states
+
+
+def check_not_armed(driver: Driver) -> None:
+    """A setpoint without arming is refused."""
+    state = next_state(driver)
+    q = driver.nominal_q(state)
+    with pytest.raises(WriteError):
+        driver.write_setpoint(_setpoint(state, q, q, (0.0,) * 6))
+
+
+def check_closed(driver: Driver) -> None:
+    """A closed driver reads nothing, and closing it again is no fault."""
+    driver.close()
+    driver.close()
+    with pytest.raises(LinkError):
+        driver.read_state()
+
+
+def check_angles(case: Case, driver: Driver) -> None:
+    """Angles, speeds and their signs are the plant's, each joint on its own."""
+    peer = case.peer
+    start = peer.q
+    goal = tuple(
+        min(max(q + (0.3 + 0.05 * i) * (-1) ** i, lo + 0.01), hi - 0.01)
+        for i, (q, lo, hi) in enumerate(
+            zip(start, peer.plant.arm.lower, peer.plant.arm.upper, strict=True)
+        )
+    )
+    peer.move_own(goal)
+    fastest = 0.0
+    for _ in range(200):
+        state = next_state(driver)
+        speed = np.array(peer.qd)
+        slack = case.resolution + LATE * np.abs(speed).max() + 0.005
+        assert np.abs(state.actual_q - peer.q).max() <= slack + 0.02
+        if case.speed_resolution is not None and np.abs(speed).min() > 0.05:
+            assert (np.sign(state.actual_qd) == np.sign(speed)).all()
+            assert state.actual_qd == pytest.approx(speed, abs=0.1 + case.speed_resolution)
+            fastest = max(fastest, float(np.abs(state.actual_qd).max()))
+        if max(map(abs, peer.qd)) < 1e-6 and np.allclose(peer.q, goal, atol=1e-6):
+            break
+    for _ in range(3):
+        state = next_state(driver)
+    wait_for(
+        lambda: bool(np.abs(next_state(driver).actual_q - goal).max() <= case.resolution * 1.01),
+        2.0, "the joints that the plant has come to",
+    )  # fmt: skip
+    assert case.speed_resolution is None or fastest > 0.1
+
+
+def check_force(case: Case, driver: Driver) -> None:
+    """The force at the TCP is what the surroundings apply, in base axes."""
+    load = case.peer.plant.load
+    before = np.mean([next_state(driver).actual_TCP_force for _ in range(10)], axis=0)
+    case.peer.plant.load = type(load)(load.mass, load.cog, (30.0, -50.0, 40.0), load.torque)
+    settled = time.monotonic() + 0.5  # some controllers renew ten times a second
+    while time.monotonic() < settled:
+        next_state(driver)
+    after = np.mean([next_state(driver).actual_TCP_force for _ in range(10)], axis=0)
+    case.peer.plant.load = load
+    assert (after - before)[:3] == pytest.approx((30.0, -50.0, 40.0), abs=1.5 + (case.force or 0.0))
+
+
+def check_offset(case: Case, driver: Driver) -> None:
+    """An offset moves the plant's TCP by just that, and goes again with its release."""
+    peer = case.peer
+    arm, tool = peer.plant.arm, peer.declared.tool
+    bare = tcp_in_base(arm, peer.q, tool)
+
+    def moved() -> list[float]:
+        return list(gap(bare, tcp_in_base(arm, peer.q, tool)))
+
+    driver.arm(next_state(driver))
+    stream(driver, lambda state, q: _setpoint(state, q, q, OFFSET), 1.0)
+    assert moved() == pytest.approx(OFFSET, abs=2e-6)
+    nominal = driver.nominal_q(next_state(driver))
+    assert np.abs(nominal - peer.own_q).max() <= case.resolution + 2e-5
+    driver.release()
+    wait_for(lambda: max(map(abs, moved())) < 2e-6, 3.0, "the offset's end")
+
+
+def check_joints(case: Case, driver: Driver) -> None:
+    """Joint setpoints bring the plant there; after the release it stays."""
+    peer = case.peer
+    start = np.array(peer.q)
+    sign = np.array([(-1.0) ** i for i in range(peer.n)])
+    goal = start + STEP * sign
+    begun = time.monotonic()
+    driver.arm(next_state(driver))
+
+    def setpoint(state: RobotState, _: np.ndarray) -> Setpoint:
+        share = min((time.monotonic() - begun) * PACE / STEP, 1.0)
+        return _setpoint(state, start + share * (goal - start), start, (0.0,) * 6)
+
+    stream(
+        driver, setpoint, 8.0, lambda: bool(np.abs(goal - peer.q).max() < case.resolution + 1e-4)
+    )
+    assert np.abs(goal - peer.q).max() < case.resolution + 1e-4
+    driver.release()
+    time.sleep(0.2)
+    rest = np.array(peer.q)
+    time.sleep(0.2)
+    assert np.abs(rest - peer.q).max() < 1e-6
+    assert np.abs(goal - peer.q).max() < case.resolution + 1e-3
+
+
+def check_stall(case: Case, driver: Driver) -> None:
+    """A controller that falls silent is stale in time, and is heard again afterwards."""
+    next_state(driver)
+    case.peer.stall(2.0 * case.state_timeout + 0.3)
+    begun = time.monotonic()
+    with pytest.raises(StaleStateError):
+        read_on(driver)
+    assert time.monotonic() - begun < 2.0 * case.state_timeout + 1.0
+    _recovers(driver)
+
+
+def check_frozen(case: Case, driver: Driver) -> None:
+    """A controller that answers while its clock stands still is stale."""
+    next_state(driver)
+    case.peer.frozen = True
+    begun = time.monotonic()
+    with pytest.raises(StaleStateError):
+        read_on(driver)
+    assert time.monotonic() - begun < 2.0 * case.state_timeout + 1.0
+    case.peer.frozen = False
+    _recovers(driver)
+
+
+def check_torn(case: Case, driver: Driver) -> None:
+    """A sample of two moments is noticed, and never taken for one."""
+    for _ in range(3):
+        next_state(driver)
+    dropped = 0
+    for _ in range(3):
+        case.tear()
+        for _ in range(10):
+            try:
+                state = driver.read_state()
+            except InvalidStateError:
+                dropped += 1
+            else:
+                assert np.abs(state.actual_q - case.peer.q).max() <= case.resolution + 1e-3
+    assert dropped > 0, "no torn sample was ever read"
+
+
+def check_loss(case: Case, driver: Driver) -> None:
+    """A controller that goes away is a LinkError; when it is back, a driver connects again."""
+    next_state(driver)
+    case.stop()
+    begun = time.monotonic()
+    with pytest.raises(LinkError):
+        read_on(driver)
+    assert time.monotonic() - begun < case.state_timeout + 3.0
+    driver.close()
+    case.start()
+    with case.driver() as again:
+        check_reads(again, case.model, 3)
+
+
+def stream(
+    driver: Driver,
+    setpoint: Callable[[RobotState, np.ndarray], Setpoint],
+    seconds: float,
+    done: Callable[[], bool] = lambda: False,
+) -> None:
+    """Write a setpoint for every state, for a while or until done."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until and not done():
+        state = next_state(driver)
+        driver.write_setpoint(setpoint(state, driver.nominal_q(state)))
+
+
+def _recovers(driver: Driver) -> None:
+    until = time.monotonic() + 4.0
+    while True:
+        try:
+            driver.read_state()
+        except (StaleStateError, InvalidStateError):
+            assert time.monotonic() < until, "never heard again"
+        else:
+            return
+
+
+def _setpoint(
+    state: RobotState, q: np.ndarray, nominal: np.ndarray, offset: tuple[float, ...]
+) -> Setpoint:
+    assert all(map(math.isfinite, q))
+    return Setpoint(q, nominal, np.array(offset), state.timestamp, state.received)

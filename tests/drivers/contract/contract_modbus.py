@@ -1,0 +1,72 @@
+"""Cases of the contract: every Modbus profile that is shipped, and one that no code knows."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from contract_case import Case
+
+from drivers.driver import Driver
+from drivers.modbus.driver import ModbusDriver
+from drivers.modbus.profile import read_profile
+from drivers.modbus.registers import UNITS
+from drivers.modbus.schema import Vector
+from drivers.modbus.settings import SHIPPED, ModbusSettings
+from drivers.simulated.modbus.server import ModbusServer, make_servers
+from drivers.simulated.peer_server import PeerServer
+
+INVENTED = Path(__file__).parents[1] / "modbus" / "invented.yaml"
+_ports = itertools.count(15100)
+
+
+def _half_a_count(entry: Vector | None) -> float | None:
+    if entry is None:
+        return None
+    count = abs(entry.scale) * UNITS[entry.unit][1]
+    return 1e-6 if entry.type.startswith("f") else 0.5 * count
+
+
+class ModbusCase(Case):
+    """A controller with a profile's register map."""
+
+    def __init__(self, profile: str) -> None:
+        self._profile = profile
+        self.settings = ModbusSettings(profile=profile, port=next(_ports), rate=50.0)
+        self.file = file = read_profile(self.settings.profile_path)
+        self.n = file.joints
+        self.resolution = (_half_a_count(file.state.position) or 0.0) + 1e-9
+        self.speed_resolution = _half_a_count(file.state.velocity)
+        self.force = _half_a_count(file.state.force)
+        self.clocked = file.clock is not None
+        mode = file.write.mode
+        self.writes = {"mailbox": "offset", "target_trigger": "joints"}.get(mode)
+        super().__init__()
+        self.settings = self.settings.model_copy(update={"host": self.host})
+
+    def make_servers(self) -> list[PeerServer]:
+        """Return the Modbus server."""
+        return make_servers(self.settings, self.host, self.peer)
+
+    def driver(self) -> Driver:
+        """Return a Modbus driver."""
+        return ModbusDriver(self.settings, self.model)
+
+    def tear(self) -> None:
+        """Have images mixed of two for as long as one reading comes after the other."""
+        server = self.servers[0]
+        assert isinstance(server, ModbusServer)
+        server.tear(math.ceil(1.0 / (self.settings.rate * self.file.period)) + 1)
+
+
+def modbus_cases() -> dict[str, Callable[[], Case]]:
+    """Return a maker of each case by its name."""
+    found: dict[str, Callable[[], Case]] = {
+        f"modbus {path.stem}": partial(ModbusCase, path.stem)
+        for path in sorted(SHIPPED.glob("*.yaml"))
+    }
+    found["modbus, a map that no code knows"] = partial(ModbusCase, str(INVENTED))
+    return found

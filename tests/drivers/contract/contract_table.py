@@ -1,0 +1,13 @@
+"""Every case of the contract: one file a family, one line here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from contract_case import Case
+from contract_modbus import modbus_cases
+
+CASES: dict[str, Callable[[], Case]] = {
+    **modbus_cases(),
+}
+"""Name -> what makes the case, its controller not yet serving."""
