@@ -59,7 +59,9 @@ class ModbusCase(Case):
         """Have images mixed of two for as long as one reading comes after the other."""
         server = self.servers[0]
         assert isinstance(server, ModbusServer)
-        server.tear(math.ceil(1.0 / (self.settings.rate * self.file.period)) + 1)
+        reading = 1.0 / self.settings.rate
+        images = math.ceil(reading / self.file.period)
+        server.tear(images + 1 if images > 1 else 1)
 
 
 def modbus_cases() -> dict[str, Callable[[], Case]]:
