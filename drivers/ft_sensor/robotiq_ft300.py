@@ -26,6 +26,7 @@ FRAME = struct.Struct("<2x6h2x")
 QUIET = b"\xff" * 50  # ends the stream
 UNIT = np.array((1e-2, 1e-2, 1e-2, 1e-3, 1e-3, 1e-3))  # N, Nm per count
 RESPONSE = 0.2  # s
+TURN = 0.1  # s that the sensor takes from its stream back to Modbus
 BITS = 10.0  # per byte on the line, 8N1
 SILENCE = 0.5  # s without a sample after which the stream is asked for again
 LONGEST = 4096  # bytes kept at most
@@ -100,7 +101,7 @@ class RobotiqFt300(ForceTorqueSensor):
         try:
             line.write(QUIET)
             line.flush()
-            time.sleep(len(QUIET) * BITS / self.settings.baudrate + 0.02)
+            time.sleep(len(QUIET) * BITS / self.settings.baudrate + TURN)
             line.reset_input_buffer()
         except OSError as error:  # pyserial's errors are OSErrors
             raise self._broken(error) from None
