@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from drivers.driver import Driver, DriverSettings
 
 DRIVERS: dict[str, str] = {
+    "can": "drivers.can.driver:CanDriver",
     "modbus": "drivers.modbus.driver:ModbusDriver",
     "ur_rtde": "drivers.ur_rtde.driver:UrRtdeDriver",
 }

@@ -32,6 +32,7 @@ PORTS = ("rtde_port", "dashboard_port", "script_port", "bench_port")
 PERIOD = 0.004  # s, of a Peer's cycle
 
 SIMULATORS: dict[str, str] = {
+    "can": "drivers.simulated.can.server:make_servers",
     "modbus": "drivers.simulated.modbus.server:make_servers",
 }
 """link.driver -> ``module:function(link, host, peer) -> list[PeerServer]``, imported on use."""

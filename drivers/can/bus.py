@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import os
 import socket
 from typing import TYPE_CHECKING, Any
 
@@ -64,9 +65,14 @@ def open_bus(settings: BusSettings, filters: list[can.typechecking.CanFilter] | 
     if settings.interface not in ("virtual", "socketcan", "udp_multicast"):
         arguments["bitrate"] = settings.bitrate
     if settings.interface == "slcan":
-        arguments["sleep_after_open"] = 0.0 if settings.channel.startswith("/dev/pts/") else 2.0
+        arguments["sleep_after_open"] = 0.0 if _is_terminal(settings.channel) else 2.0
     arguments.update(settings.options)
     return _opened(settings, filters, arguments)
+
+
+def _is_terminal(channel: str) -> bool:
+    """Return whether a pseudo-terminal answers, which need not be waited for like an adapter."""
+    return os.path.realpath(channel).startswith("/dev/pts/")
 
 
 def _opened(settings: BusSettings, filters: Any, arguments: dict[str, Any]) -> Any:

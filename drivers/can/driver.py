@@ -23,6 +23,7 @@ from drivers.driver import Driver
 Vector = NDArray[np.float64]
 FIRST_SAMPLE = 2.0  # s in which an arm on the bus must have told everything once
 SLICE = 0.02  # s, of one wait for a frame
+ANSWER = 0.02  # s after which an answer that is not there does not come
 
 
 class CanDriver(Driver):
@@ -33,7 +34,7 @@ class CanDriver(Driver):
     """
 
     def __init__(self, settings: CanSettings, model: Model) -> None:
-        profile = read_profile(settings.profile_path)
+        profile = read_profile(settings.profile_path, settings.installation)
         super().__init__(min(settings.rate, profile.rate), profile.n)
         if model.arm.n != profile.n:
             raise LinkError(
@@ -49,6 +50,8 @@ class CanDriver(Driver):
         self._slot = 0.0  # s, when an arm that must be asked is asked next
         self._changed = 0.0  # s, monotonic: when the joints last changed
         self._q: Vector | None = None
+        self._broken = 0  # samples dropped, as far as they were told
+        self._listening = 0.0  # s, monotonic: since when other commanders would be heard
 
     # -- reading ----------------------------------------------------------------------------------
 
@@ -56,6 +59,7 @@ class CanDriver(Driver):
         """Open the bus and wait until the arm has told everything once. Sends no command."""
         self.reader.open()
         self.writer.bus = self.reader.bus
+        self._listening = time.monotonic()
         end = time.monotonic() + min(FIRST_SAMPLE, self.settings.connect_timeout)
         found = False
         while not found or self.reader.silent_status():
@@ -105,7 +109,19 @@ class CanDriver(Driver):
             if left <= 0.0:
                 raise self._stale()
             sample = self.reader.poll(min(left, SLICE)) or sample
+            if sample is None:
+                self._check_torn()
+        self._broken = self.reader.assembler.broken
         return sample
+
+    def _check_torn(self) -> None:
+        """Tell, once, that frames have come which belong to no sample."""
+        broken, self._broken = self._broken, self.reader.assembler.broken
+        if self._broken > broken:
+            told = ", ".join(f"{n} {why}" for why, n in self.reader.assembler.dropped.items())
+            raise InvalidStateError(
+                f"{self.profile.name}: frames that make no sample were dropped (so far {told})"
+            )
 
     def _asked(self) -> Sample:
         """Return the sample that an arm gives when it is asked, once per cycle."""
@@ -118,10 +134,14 @@ class CanDriver(Driver):
         asked = time.monotonic()
         self._ask()
         end = asked + self.settings.state_timeout
+        whole = asked + max(ANSWER, 2.0 / self.rate)
         while (left := end - time.monotonic()) > 0.0:
             sample = self.reader.poll(min(left, SLICE))
             if sample is not None and sample.began >= asked:
                 return sample
+            missing = self.reader.assembler.missing
+            if missing and time.monotonic() > whole:
+                raise InvalidStateError(f"{self.profile.name}: no answer of {', '.join(missing)}")
         raise self._stale()
 
     def _stale(self) -> StaleStateError:
@@ -160,10 +180,10 @@ class CanDriver(Driver):
         """Enable the motors where they stand. Raises WriteError, and then nothing is enabled."""
         if not self.profile.writes:
             raise WriteError(f"{self.profile.name}: this profile is read only")
-        listening = time.monotonic()
-        self._listen(self.settings.foreign_quiet)
+        quiet = self.settings.foreign_quiet
+        self._listen(max(self._listening + quiet - time.monotonic(), 0.0))
         foreign = self.reader.foreign
-        if foreign is not None and foreign.seen > listening - self.settings.foreign_quiet:
+        if foreign is not None and time.monotonic() - foreign.seen < quiet:
             raise self._commanded_by_another()
         trouble, words = self.reader.trouble(writing=False)
         if trouble:

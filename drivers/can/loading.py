@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,13 +39,17 @@ def load_profile(name: str, folder: Path | None = None) -> CanProfile:
     return read_profile(path)
 
 
-def read_profile(path: Path) -> CanProfile:
-    """Return the profile of a YAML file; raises ProfileError."""
+def read_profile(path: Path, installation: Mapping[str, list[float]] | None = None) -> CanProfile:
+    """Return the profile of a YAML file; raises ProfileError.
+
+    ``installation`` replaces its direction, zero and gear.
+    """
     document = read_profile_document(path)
     try:
         file = ProfileFile.model_validate(document.data)
     except ValidationError as error:
         raise _schema_error(document, error) from None
+    file = file.model_copy(update=dict(installation or {}))
     return _Loading(document, file, read_dbc(path.parent / file.dbc)).profile()
 
 

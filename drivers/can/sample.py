@@ -44,6 +44,18 @@ class Assembler:
         self.enabled: dict[tuple[Key, str], bool] = {}
         self.heard: dict[Key, float] = {}  # s, monotonic, of each message that we read
 
+    @property
+    def broken(self) -> int:
+        """Return how often frames made no sample."""
+        return self.dropped.total()
+
+    @property
+    def missing(self) -> list[str]:
+        """Return the messages that a sample still lacks which has been begun; none: not begun."""
+        if not self._held:
+            return []
+        return [self._profile.incoming[k].name for k in self._profile.sample if k not in self._held]
+
     def reset(self) -> None:
         """Forget a sample that has been begun."""
         self._held.clear()

@@ -23,6 +23,15 @@ class CanSettings(DriverSettings, BusSettings):
 
     driver: Literal["can"] = "can"
     profile: str = Field(min_length=1, description="a shipped map of frames, or a path to one")
+    direction: tuple[Literal[1, -1], ...] | None = Field(
+        None, description="sign of each joint on the wire; left out: the profile's"
+    )
+    zero: tuple[float, ...] | None = Field(
+        None, description="rad of each joint at the wire's zero; left out: the profile's"
+    )
+    gear: tuple[float, ...] | None = Field(
+        None, description="wire turns per joint turn, per joint; left out: the profile's"
+    )
     rate: float = Field(200.0, gt=0.0, le=1000.0, description="cycles per second asked for")
     send_timeout: float = Field(
         0.005, gt=0.0, le=0.1, description="s that one frame may take to leave"
@@ -46,6 +55,12 @@ class CanSettings(DriverSettings, BusSettings):
     def names_file(self) -> bool:
         """Return whether ``profile`` is a path rather than a shipped name."""
         return self.profile.endswith((".yaml", ".yml"))
+
+    @property
+    def installation(self) -> dict[str, list[float]]:
+        """Return what this arm's installation says instead of the profile."""
+        given = {name: getattr(self, name) for name in ("direction", "zero", "gear")}
+        return {name: list(value) for name, value in given.items() if value is not None}
 
     @property
     def profile_path(self) -> Path:

@@ -104,7 +104,8 @@ class FrameWriter:
                 if time.monotonic() > end:
                     names = ", ".join(f.name for f in action.frames) or "hold"
                     raise WriteError(
-                        f"{self._profile.name}: not {action.until} after {action.within:g} s: {names}"
+                        f"{self._profile.name}: {names}: not {action.until} after "
+                        f"{action.within:g} s"
                     )
 
     def _do(self, action: Action, hold: Callable[[], Vector]) -> None:

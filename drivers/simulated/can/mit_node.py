@@ -1,0 +1,85 @@
+"""Simulated Damiao actuators in MIT mode, as OpenArm has them.
+
+Motor i (from 1) listens to identifier i and answers as 0x10 + i, each time it is spoken to. Fields
+are packed big-endian over byte borders, as openarm_can describes them. An actuator holds its
+position as if gravity were compensated: its gains only have to be there.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from drivers.can.settings import CanSettings
+from drivers.simulated.can.nodes import CanNodes
+from drivers.simulated.peer import Peer
+
+
+class Ranges(NamedTuple):
+    """What an actuator's fields reach, from minus to plus."""
+
+    velocity: float  # rad/s
+    torque: float  # Nm
+
+
+POSITION = 12.5  # rad
+DM8009, DM4340, DM4310 = Ranges(45.0, 54.0), Ranges(10.0, 28.0), Ranges(30.0, 10.0)
+MOTORS = (DM8009, DM8009, DM4340, DM4340, DM4310, DM4310, DM4310)
+QUERY, REFRESH = 0x7FF, 0xCC
+ENABLE, DISABLE = b"\xff" * 7 + b"\xfc", b"\xff" * 7 + b"\xfd"
+
+
+class MitNodes(CanNodes):
+    """Seven actuators at most, in a chain."""
+
+    def __init__(self, link: CanSettings, host: str, peer: Peer) -> None:
+        super().__init__(link, host, peer)
+        self.enabled = [False] * peer.n
+        self._target = list(peer.target_q)
+
+    def take(self, identifier: int, data: bytes, peer: Peer) -> None:
+        """Obey enable, disable and MIT commands; answer these and queries."""
+        motor = identifier - 1
+        if identifier == QUERY and len(data) >= 3 and data[2] == REFRESH:
+            motor = int.from_bytes(data[:2], "little") - 1
+        elif not (0 <= motor < peer.n and len(data) == 8):
+            return
+        elif data == ENABLE:
+            self.enabled[motor] = True
+            self._target[motor] = peer.target_q[motor]
+        elif data == DISABLE:
+            self.enabled[motor] = False
+            peer.let_go()
+        else:
+            self._aim(motor, data, peer)
+        if 0 <= motor < peer.n:
+            self._answer(motor, peer)
+
+    def _aim(self, motor: int, data: bytes, peer: Peer) -> None:
+        stiffness = ((data[3] & 0xF) << 8) | data[4]
+        if not self.enabled[motor] or not stiffness:
+            return
+        count = int.from_bytes(data[:2], "big")
+        self._target[motor] = self.joint(motor, 2 * POSITION * count / 0xFFFF - POSITION, 1.0)
+        if all(self.enabled):
+            peer.command(self._target)
+
+    def _answer(self, motor: int, peer: Peer) -> None:
+        if motor == 0:
+            self.begin_sample()
+        ranges = MOTORS[motor % len(MOTORS)]
+        q = _count(self.wire(1.0)[motor], POSITION, 16)
+        dq = _count(self.speeds(peer, 1.0)[motor], ranges.velocity, 12)
+        torque = _count(peer.joint_torque[motor] * self._sign[motor], ranges.torque, 12)
+        state = 0xA if not peer.can_move else int(self.enabled[motor])
+        packed = q << 24 | dq << 12 | torque
+        warm = max(0, min(255, round(peer.temperatures[motor])))
+        head = bytes([state << 4 | (motor + 1) & 0xF])
+        self.send(0x11 + motor, head + packed.to_bytes(5, "big") + bytes([warm, warm]))
+
+    def publish(self, peer: Peer) -> None:
+        """Say nothing: an actuator speaks when it is spoken to."""
+
+
+def _count(value: float, reach: float, bits: int) -> int:
+    most = (1 << bits) - 1
+    return max(0, min(most, round((value + reach) / (2 * reach) * most)))

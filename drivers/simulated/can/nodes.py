@@ -1,0 +1,177 @@
+"""What every simulated arm on CAN shares: its bus, its hub, and how joints stand on the wire."""
+
+from __future__ import annotations
+
+import contextlib
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import can
+
+from core.errors import InputError, LinkError
+from drivers.can.bus import BusSettings, close_bus, open_bus
+from drivers.can.settings import CanSettings
+from drivers.simulated.bench import Command
+from drivers.simulated.can.hub import Hub
+from drivers.simulated.kinematics import Joints
+from drivers.simulated.peer import Peer
+from drivers.simulated.peer_server import PeerServer
+
+BACKLOG = 500  # frames taken in one cycle at most
+TORN = 0.05  # rad that the joints of a torn sample are off
+
+
+class CanNodes(PeerServer):
+    """An arm's nodes on one bus.
+
+    With socketcand the bus is served here, with slcan its serial line (a link to it is put at
+    ``channel``); on virtual and socketcan the nodes join the bus that is there.
+    """
+
+    def __init__(self, link: CanSettings, host: str, peer: Peer) -> None:
+        self.name = f"CAN ({link.profile})"
+        self._link = link.model_copy(update={"host": host})
+        n = peer.n
+        self._sign: Sequence[float] = link.direction or (1,) * n
+        self._zero: Sequence[float] = link.zero or (0.0,) * n
+        self._gear: Sequence[float] = link.gear or (1.0,) * n
+        self._bus: Any = None
+        self._hub: Hub | None = None
+        self._symbol: Path | None = None
+        self.withheld: set[int] = set()  # identifiers that are not sent now
+        self._kept: Joints = peer.q
+        self._tears: deque[frozenset[int]] = deque()
+        self._lost: frozenset[int] = frozenset()  # identifiers lost out of this sample
+        self._shift = 0.0  # rad, of a torn sample: who takes it for one is found out
+
+    # -- the bus ----------------------------------------------------------------------------------
+
+    def open(self, peer: Peer) -> None:
+        """Serve or join the bus. Raises LinkError, OSError, InputError."""
+        link: BusSettings = self._link
+        if link.interface in ("socketcand", "slcan"):
+            port = link.port if link.interface == "socketcand" else 0
+            self._hub = Hub(link.host if link.interface == "socketcand" else "127.0.0.1", port)
+            self._hub.start()
+            if link.interface == "slcan":
+                self._put_terminal(Path(link.channel))
+            link = BusSettings(interface="socketcand", host=self._hub.host, port=self._hub.port)
+        elif link.interface not in ("virtual", "socketcan"):
+            raise InputError(
+                f"link.interface: found {link.interface!r}, which cannot be simulated, expected "
+                "socketcand, slcan, virtual or socketcan"
+            )
+        self._bus = open_bus(link)
+
+    def _put_terminal(self, channel: Path) -> None:
+        assert self._hub is not None
+        if (channel.exists() and not channel.is_symlink()) or not channel.parent.is_dir():
+            raise InputError(
+                f"link.channel: found {channel}, expected a name that is free, as /tmp/arm, where "
+                "a link to the simulated serial line can be put"
+            )
+        channel.unlink(missing_ok=True)
+        channel.symlink_to(self._hub.add_terminal())
+        self._symbol = channel
+
+    @property
+    def port(self) -> int:
+        """Return the TCP port of the bus that is served here; 0 where none is."""
+        return self._hub.port if self._hub else 0
+
+    def close(self) -> None:
+        """Leave the bus, and end it where it is served here."""
+        bus, self._bus = self._bus, None
+        if bus is not None:
+            close_bus(bus)
+        hub, self._hub = self._hub, None
+        if hub is not None:
+            hub.close()
+        symbol, self._symbol = self._symbol, None
+        if symbol is not None:
+            symbol.unlink(missing_ok=True)
+
+    def cycle(self, peer: Peer) -> None:
+        """Take the frames that have come, then send the arm's own."""
+        if self._bus is None:
+            return
+        for _ in range(BACKLOG):
+            try:
+                frame = self._bus.recv(0.0)
+            except (can.CanError, OSError) as error:
+                raise LinkError(f"simulated arm: {error}") from None
+            if frame is None:
+                break
+            if not peer.stalled and not frame.is_remote_frame and not frame.is_error_frame:
+                self.take(int(frame.arbitration_id), bytes(frame.data), peer)
+        if not peer.stalled:
+            if not peer.frozen:
+                self._kept = peer.q
+            self.publish(peer)
+
+    def tear(self, first: int, second: int) -> None:
+        """Lose frame ``second`` of the next sample, ``first`` of the one after; the first is off.
+
+        Who only waits until each identifier has come mixes the two.
+        """
+        self._tears.extend((frozenset({second}), frozenset({first})))
+
+    def begin_sample(self) -> None:
+        """Begin the frames of another sample; protocols call it."""
+        before, self._shift = self._shift, 0.0
+        self._lost = self._tears.popleft() if self._tears else frozenset()
+        if self._lost and not before:
+            self._shift = TORN
+
+    def send(self, identifier: int, data: bytes) -> None:
+        """Send one frame, unless it is withheld."""
+        if identifier in self.withheld or identifier in self._lost:
+            return
+        frame = can.Message(arbitration_id=identifier, is_extended_id=identifier > 0x7FF, data=data)
+        with contextlib.suppress(can.CanError, OSError):
+            self._bus.send(frame)
+
+    def commands(self, peer: Peer) -> Mapping[str, Command]:
+        """Return the bench commands of a bus: frames that get lost."""
+
+        def withhold(numbers: list[float]) -> str:
+            self.withheld.add(int(numbers[0]))
+            return "ok"
+
+        def resume(numbers: list[float]) -> str:
+            self.withheld.clear()
+            return "ok"
+
+        return {
+            "withhold": (1, withhold, "withhold ID: frames of this identifier get lost"),
+            "resume": (0, resume, "resume: no frames get lost any more"),
+        }
+
+    # -- joints -----------------------------------------------------------------------------------
+
+    def wire(self, unit: float) -> list[float]:
+        """Return the encoders as they stand on the wire, in ``unit`` (rad)."""
+        rows = zip(self._kept, self._zero, self._sign, self._gear, strict=True)
+        return [(q + self._shift - zero) * sign * gear / unit for q, zero, sign, gear in rows]
+
+    def speeds(self, peer: Peer, unit: float) -> list[float]:
+        """Return the joint velocities on the wire, in ``unit`` (rad/s)."""
+        rows = zip(peer.qd, self._sign, self._gear, strict=True)
+        return [qd * sign * gear / unit for qd, sign, gear in rows]
+
+    def joint(self, i: int, value: float, unit: float) -> float:
+        """Return joint ``i`` (from 0), rad, of a value on the wire."""
+        return value * unit * self._sign[i] / self._gear[i] + self._zero[i]
+
+    # -- what one protocol adds -------------------------------------------------------------------
+
+    @abstractmethod
+    def take(self, identifier: int, data: bytes, peer: Peer) -> None:
+        """Take one frame that somebody sent."""
+
+    @abstractmethod
+    def publish(self, peer: Peer) -> None:
+        """Send what the arm sends in this cycle."""
