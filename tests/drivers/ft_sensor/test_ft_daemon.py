@@ -1,0 +1,92 @@
+"""The daemon with a sensor that fails: observing and writing, and what becomes of the arm."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+BRIDGE = str(Path(__file__).resolve().parents[2] / "bridge")
+sys.path.insert(0, BRIDGE)
+
+from daemon_cell import Robot, Run, wait_for  # noqa: E402
+from sensor_wires import Felt  # noqa: E402
+
+from bridge.supervisor import State  # noqa: E402
+from drivers.can.bus import BusSettings  # noqa: E402
+from drivers.simulated.can.hub import Hub  # noqa: E402
+from drivers.simulated.ft_sensor.robotous_node import RobotousNode  # noqa: E402
+
+WEIGHT = (0.0, 0.0, 49.0, 0.0, 0.0, 0.0)
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Iterator[Robot]:
+    with Robot(tmp_path) as found:
+        yield found
+
+
+@pytest.fixture
+def sensor(robot: Robot) -> Iterator[RobotousNode]:
+    with Hub(robot.host) as hub:
+        bus = BusSettings(interface="socketcand", host=robot.host, port=hub.port)
+        with RobotousNode(Felt(WEIGHT), bus) as node:
+            yield node
+
+
+def cell_of(robot: Robot, sensor: RobotousNode, max_age: float = 0.1) -> Path:
+    return robot.cell(
+        ", state_timeout: 0.25",
+        ft_sensor=f"{{driver: robotous_rft, interface: socketcand, host: {robot.host}, "
+        f"port: {sensor._settings.port}, max_age: {max_age}}}",
+    )
+
+
+def test_a_silent_sensor_is_a_fault_and_its_return_is_observed(
+    robot: Robot, sensor: RobotousNode
+) -> None:
+    with Run(cell_of(robot, sensor), observe=True) as run:
+        run.wait(State.OBSERVING)
+        time.sleep(0.5)
+        sensor.silent = True
+        assert run.wait(State.FAULT) < 1.5
+        sensor.silent = False
+        run.wait(State.OBSERVING)
+        time.sleep(0.3)
+        run.end()
+        raw = np.stack([run.cycles()[f"ft_raw_wrench_{i}"] for i in range(6)], axis=1)
+    assert any("robotous_rft" in line and "max_age" in line for line in run.said), run.said
+    assert np.abs(raw - WEIGHT).max() <= 0.02  # not one cycle with another wrench
+
+
+def test_a_sensor_lost_while_writing_ends_the_writing_until_a_person_arms_again(
+    robot: Robot, sensor: RobotousNode
+) -> None:
+    with Run(cell_of(robot, sensor), arm=True) as run:
+        run.wait(State.COMPENSATING)
+        time.sleep(0.5)
+        sensor.silent = True
+        wait_for(lambda: run.daemon.state != State.COMPENSATING, 1.0, "no longer compensating")
+        time.sleep(1.0)
+        sensor.silent = False
+        run.wait(State.OBSERVING)
+        time.sleep(1.0)
+        assert run.daemon.state == State.OBSERVING
+        begun = robot.truth()["true_tcp"]
+        time.sleep(0.5)
+        assert np.allclose(robot.truth()["true_tcp"], begun, atol=1e-4)
+        run.end()
+    assert robot.truth()["largest_servo_step"] < 0.01
+
+
+def test_overload_stops_the_writing(robot: Robot, sensor: RobotousNode) -> None:
+    with Run(cell_of(robot, sensor), arm=True) as run:
+        run.wait(State.COMPENSATING)
+        sensor.status = 0x10
+        wait_for(lambda: run.daemon.state != State.COMPENSATING, 1.0, "no longer compensating")
+        run.end()
+    assert any("overload" in line for line in run.said), run.said
