@@ -15,7 +15,7 @@ from bridge.cell.robot import build_arm
 from bridge.cell.schema import CellFile, Frame, Simulation
 from bridge.settings import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
 from core.arm import Arm
-from core.errors import ArmError, CellError
+from core.errors import ArmError, CellError, InputError
 from core.metrology import Metrology
 from core.model import Model
 from core.rotation import rpy_matrix, transform
@@ -48,7 +48,13 @@ class Cell:
         Raises InputError where a file that it names cannot be used.
         """
         given = self.file.link
-        return None if given is None else given.located(self.path.parent)
+        try:
+            return None if given is None else given.located(self.path.parent)
+        except InputError as error:
+            text = str(error)
+            raise type(error)(
+                f"{self.path}: {text}" if text.startswith("link.") else text
+            ) from None
 
     @property
     def ft_sensor(self) -> FtSensorSettings | None:

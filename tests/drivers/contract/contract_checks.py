@@ -67,7 +67,7 @@ def check_not_armed(driver: Driver) -> None:
     state = next_state(driver)
     q = driver.nominal_q(state)
     with pytest.raises(WriteError):
-        driver.write_setpoint(_setpoint(state, q, q, (0.0,) * 6))
+        driver.write_setpoint(setpoint_of(state, q, q, (0.0,) * 6))
 
 
 def check_closed(driver: Driver) -> None:
@@ -133,7 +133,7 @@ def check_offset(case: Case, driver: Driver) -> None:
         return list(gap(bare, tcp_in_base(arm, peer.q, tool)))
 
     driver.arm(next_state(driver))
-    stream(driver, lambda state, q: _setpoint(state, q, q, OFFSET), 1.0)
+    stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), 1.0)
     assert moved() == pytest.approx(OFFSET, abs=2e-6)
     nominal = driver.nominal_q(next_state(driver))
     assert np.abs(nominal - peer.own_q).max() <= case.resolution + 2e-5
@@ -152,7 +152,7 @@ def check_joints(case: Case, driver: Driver) -> None:
 
     def setpoint(state: RobotState, _: np.ndarray) -> Setpoint:
         share = min((time.monotonic() - begun) * PACE / STEP, 1.0)
-        return _setpoint(state, start + share * (goal - start), start, (0.0,) * 6)
+        return setpoint_of(state, start + share * (goal - start), start, (0.0,) * 6)
 
     stream(
         driver, setpoint, 8.0, lambda: bool(np.abs(goal - peer.q).max() < case.resolution + 1e-4)
@@ -244,8 +244,9 @@ def _recovers(driver: Driver) -> None:
             return
 
 
-def _setpoint(
+def setpoint_of(
     state: RobotState, q: np.ndarray, nominal: np.ndarray, offset: tuple[float, ...]
 ) -> Setpoint:
+    """Return a setpoint as the limiter hands it on."""
     assert all(map(math.isfinite, q))
     return Setpoint(q, nominal, np.array(offset), state.timestamp, state.received)

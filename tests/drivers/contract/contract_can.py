@@ -1,0 +1,89 @@
+"""Cases of the contract: every CAN profile that is shipped, on every wire, and an invented one."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from contract_case import Case
+
+from drivers.can.driver import CanDriver
+from drivers.can.settings import CanSettings
+from drivers.driver import Driver
+from drivers.simulated.can.nodes import CanNodes
+from drivers.simulated.can.server import make_servers
+from drivers.simulated.peer_server import PeerServer
+
+INVENTED = Path(__file__).parents[1] / "can" / "invented.yaml"
+_ports = itertools.count(29600)
+THOUSANDTH = math.radians(0.001)
+
+
+class CanCase(Case):
+    """An arm on a bus: its profile, its wire, half a count of its joints, two sample frames."""
+
+    def __init__(
+        self,
+        profile: str,
+        interface: str,
+        resolution: float,
+        frames: tuple[int, int],
+        n: int = 6,
+        speed: float | None = 1e-3,
+        rate: float = 100.0,
+        gear: float | None = None,
+    ) -> None:
+        number = next(_ports)
+        channel = f"bus{number}"
+        if interface == "slcan":
+            channel = f"{tempfile.gettempdir()}/gapbridge-{os.getpid()}-{number}"
+        self.n, self.resolution, self.speed_resolution = n, resolution + 1e-9, speed
+        self._frames = frames
+        gears = None if gear is None else tuple(gear * (-1) ** i for i in range(n))
+        self.settings = CanSettings(
+            profile=profile, interface=interface, channel=channel, port=number, rate=rate,
+            state_timeout=self.state_timeout, foreign_quiet=0.2, gear=gears,
+        )  # fmt: skip
+        super().__init__()
+        self.settings = self.settings.model_copy(update={"host": self.host})
+
+    def make_servers(self) -> list[PeerServer]:
+        """Return the arm's nodes."""
+        return make_servers(self.settings, self.host, self.peer)
+
+    def driver(self) -> Driver:
+        """Return a CAN driver."""
+        return CanDriver(self.settings, self.model)
+
+    def tear(self) -> None:
+        """Have two samples lose a frame each, so that what is left looks like one."""
+        nodes = self.servers[0]
+        assert isinstance(nodes, CanNodes)
+        nodes.tear(*self._frames)
+
+
+def can_cases() -> dict[str, Callable[[], Case]]:
+    """Return a maker of each case by its name."""
+    half = 0.5 * THOUSANDTH
+    piper = (0x2A5, 0x2A6)
+    turn = 2.0 * math.pi
+    return {
+        "can piper, virtual": partial(CanCase, "piper", "virtual", half, piper),
+        "can piper, socketcand": partial(CanCase, "piper", "socketcand", half, piper, rate=200.0),
+        "can piper, slcan": partial(CanCase, "piper", "slcan", half, piper),
+        "can openarm, socketcand": partial(
+            CanCase, "openarm", "socketcand", 12.5 / 65535, (0x11, 0x12), n=7, speed=0.012
+        ),
+        "can odrive, virtual": partial(
+            CanCase, "odrive", "virtual", turn * 2e-7, (0x09, 0x29), gear=9.0
+        ),
+        "can, a map that no code knows": partial(
+            CanCase, str(INVENTED), "socketcand", 0.25 * THOUSANDTH, (0x18FF5010, 0x18FF5011),
+            speed=None,
+        ),
+    }  # fmt: skip
