@@ -1,0 +1,171 @@
+"""The Modbus driver where the contract does not go: refusals, the watchdog, wrong maps."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from contract_case import wait_for
+from contract_checks import OFFSET, next_state, setpoint_of, stream
+from contract_modbus import INVENTED, ModbusCase
+
+from bridge.cell import load_cell
+from core.errors import LinkError, WriteError
+from drivers.modbus import encode
+from drivers.modbus.driver import ModbusDriver
+from drivers.modbus.settings import SHIPPED
+from drivers.simulated.modbus.programs import MailboxProgram
+from drivers.simulated.modbus.server import ModbusServer
+
+
+@pytest.fixture
+def ur() -> Iterator[ModbusCase]:
+    with ModbusCase("ur") as found:
+        yield found
+
+
+def program_of(case: ModbusCase) -> MailboxProgram:
+    server = case.servers[0]
+    assert isinstance(server, ModbusServer)
+    assert isinstance(server.program, MailboxProgram)
+    return server.program
+
+
+def test_the_robot_takes_offsets_out_when_the_heartbeat_stops(ur: ModbusCase) -> None:
+    with ur.driver() as driver:
+        driver.arm(next_state(driver))
+        stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), 0.6)
+        assert max(map(abs, program_of(ur).applied)) > 1e-4
+        driver.transport.close()  # as if the process had died: nothing is released
+        wait_for(lambda: not any(program_of(ur).applied), 2.0, "the watchdog")
+
+
+def test_a_robot_without_its_program_is_not_armed(ur: ModbusCase) -> None:
+    program_of(ur).running = False
+    time.sleep(0.05)
+    with ur.driver() as driver, pytest.raises(WriteError, match="expected a running mailbox progr"):
+        driver.arm(next_state(driver))
+
+
+def test_a_program_that_ends_while_offsets_flow_is_noticed(ur: ModbusCase) -> None:
+    with ur.driver() as driver:
+        driver.arm(next_state(driver))
+        stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), 0.3)
+        program_of(ur).running = False
+        with pytest.raises(WriteError, match=r"offsets do not arrive.*absent"):
+            stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), 2.0)
+
+
+def test_a_mailbox_whose_checksum_is_wrong_is_not_applied(ur: ModbusCase) -> None:
+    with ur.driver() as driver:
+        next_state(driver)
+        words = encode.mailbox_words(5, [400] * 6, 9)
+        driver.transport.write("holding", 236, [*words[:-1], words[-1] ^ 1])
+        time.sleep(0.1)
+        assert not any(program_of(ur).applied)
+        assert driver._look().echo[1] == encode.REJECTED
+        driver.transport.write("holding", 236, words)
+        time.sleep(0.1)
+        assert any(program_of(ur).applied)
+
+
+def test_an_offset_that_registers_cannot_hold_is_refused(ur: ModbusCase) -> None:
+    with ur.driver() as driver:
+        driver.arm(next_state(driver))
+        state = next_state(driver)
+        q = driver.nominal_q(state)
+        with pytest.raises(
+            WriteError, match=r"found an offset of 0\.04 m, expected at most 0\.0327"
+        ):
+            driver.write_setpoint(setpoint_of(state, q, q, (0.04, 0.0, 0.0, 0.0, 0.0, 0.0)))
+
+
+def test_a_register_outside_the_allow_list_is_never_written(ur: ModbusCase) -> None:
+    with ur.driver() as driver:
+        for address in (128, 235, 245, 270):
+            with pytest.raises(WriteError, match="the profile does not allow"):
+                driver.transport.write("holding", address, [1])
+        with pytest.raises(WriteError, match="the profile does not allow"):
+            driver.transport.write("holding", 243, [1, 1, 1])
+        with pytest.raises(WriteError, match="the profile does not allow"):
+            driver.transport.write("coil", 236, [1])
+
+
+def test_a_stopped_robot_is_not_armed_and_says_why(ur: ModbusCase) -> None:
+    with ur.driver() as driver:
+        assert next_state(driver).safety_mode == 1
+        ur.peer.protective_stop()
+        wait_for(lambda: next_state(driver).safety_mode == 3, 1.0, "the stop")
+        with pytest.raises(
+            WriteError, match=r"security stopped \(holding 261\): found 1, expected"
+        ):
+            driver.arm(next_state(driver))
+        ur.peer.unlock()
+        ur.peer.emergency_stop()
+        wait_for(lambda: next_state(driver).safety_mode == 7, 1.0, "the button")
+
+
+def test_registers_too_coarse_for_the_offset_are_told_before_arming(tmp_path: Path) -> None:
+    path = tmp_path / "cell.yaml"
+    path.write_text(
+        "robot: {model: ur10e}\npayload: {mass: 5.0}\n"
+        f"compliance: {{axial: [{', '.join(['1.0e-6'] * 6)}]}}\n"
+    )
+    with ModbusCase("niryo") as case:
+        driver = ModbusDriver(case.settings, load_cell(path).model)
+        with driver:
+            before = np.array(case.peer.q)
+            with pytest.raises(
+                WriteError,
+                match=r"Niryo One's target registers are too coarse: one count \(1 mrad\) times "
+                r"the reach \(1\.\d+ m\) is 1\.\d+ mm, and the offset at hand is 0\.\d+ mm",
+            ):
+                driver.arm(next_state(driver))
+            assert np.abs(before - case.peer.q).max() < 1e-9
+        coarse = case.settings.model_copy(update={"coarsest": 0.005})
+        with ModbusDriver(coarse, load_cell(path).model) as driver:
+            driver.arm(next_state(driver))
+
+
+def test_a_target_that_the_robot_refuses_is_told() -> None:
+    with ModbusCase("niryo") as case, case.driver() as driver:
+        driver.arm(next_state(driver))
+        q = np.array([30.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        with pytest.raises(WriteError, match=r"last command .*found 2, expected 0 or 1"):
+            stream(driver, lambda state, _: setpoint_of(state, q, q, (0.0,) * 6), 2.0)
+
+
+def test_the_wrong_controller_is_told_when_connecting() -> None:
+    with ModbusCase(str(INVENTED)) as case:
+        server = case.servers[0]
+        assert isinstance(server, ModbusServer)
+        other = server.profile.identity[0].model_copy(update={"good": [2]})
+        server.profile = server.profile.model_copy(update={"identity": [other]})
+        time.sleep(0.05)
+        with pytest.raises(LinkError, match=r"map version \(holding 4\): found 2, expected 3: not"):
+            case.driver().connect()
+
+
+def test_a_map_with_the_wrong_word_order_is_told_when_connecting(tmp_path: Path) -> None:
+    path = tmp_path / "wrong.yaml"
+    text = (SHIPPED / "igus.yaml").read_text()
+    path.write_text(text.replace("type: i32, word_order: low_first", "type: i32", 1))
+    with ModbusCase("igus") as case:
+        wrong = case.settings.model_copy(update={"profile": str(path)})
+        with pytest.raises(LinkError, match=r"position \d: found -?\d+"):
+            ModbusDriver(wrong, case.model).connect()
+
+
+def test_a_register_that_is_not_there_is_told_when_connecting() -> None:
+    with ModbusCase("xarm") as case:
+        wide = ModbusDriver(case.settings, case.model)
+        wide.map = dataclasses.replace(
+            wide.map, fast=(dataclasses.replace(wide.map.fast[0], count=12),)
+        )
+        wide._decoder._map = wide.map
+        with pytest.raises(LinkError, match="the controller refuses: illegal address"):
+            wide.connect()

@@ -1,0 +1,69 @@
+"""Numbers there and back, whatever their type, word order and sign coding."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.modbus import encode
+from drivers.modbus.registers import CODES, Coding
+
+TYPES = sorted(CODES)
+
+
+@given(st.sampled_from(TYPES), st.sampled_from(["high_first", "low_first"]), st.data())
+def test_counts_come_back_from_their_registers(kind: str, order: str, data: st.DataObject) -> None:
+    coding = Coding(kind, order)  # type: ignore[arg-type]
+    low, high = (max(min(v, 2.0**52), -(2.0**52)) for v in coding.limits)
+    number = st.floats(low, high, width=32) if kind[0] == "f" else st.integers(int(low), int(high))
+    counts = data.draw(st.lists(number, min_size=1, max_size=8))
+    registers = coding.encode([float(c) for c in counts])
+    assert len(registers) == coding.words * len(counts)
+    assert all(0 <= r <= 0xFFFF for r in registers)
+    assert coding.decode(registers) == [float(c) for c in counts]
+
+
+@pytest.mark.parametrize(
+    ("kind", "order", "registers", "count"),
+    [
+        ("i16", "high_first", [0xFFFF], -1),
+        ("sm16", "high_first", [0x8001], -1),
+        ("sm16", "high_first", [0x8000], 0),
+        ("i32", "high_first", [0xFFFF, 0xFFFE], -2),
+        ("i32", "low_first", [0xFFFE, 0xFFFF], -2),
+        ("u32", "low_first", [0x0002, 0x0001], 0x10002),
+        ("u64", "low_first", [4, 3, 2, 1], 0x0001000200030004),
+        ("f32", "high_first", [0x4049, 0x0FDB], struct.unpack(">f", b"\x40\x49\x0f\xdb")[0]),
+    ],
+)
+def test_registers_read_as_manuals_say(
+    kind: str, order: str, registers: list[int], count: float
+) -> None:
+    assert Coding(kind, order).decode(registers) == [float(count)]  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("kind", "count"), [("i16", 32768), ("u16", -1), ("sm16", -32768)])
+def test_a_number_that_does_not_fit_is_refused(kind: str, count: float) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        Coding(kind).encode([count])  # type: ignore[arg-type]
+
+
+@given(st.lists(st.integers(0, 0xFFFF), min_size=8, max_size=8), st.integers(0, 7), st.data())
+def test_any_single_wrong_register_spoils_the_checksum(
+    words: list[int], at: int, data: st.DataObject
+) -> None:
+    other = data.draw(st.integers(0, 0xFFFF).filter(lambda v: v % 65521 != words[at] % 65521))
+    changed = [*words[:at], other, *words[at + 1 :]]
+    assert encode.checksum(changed) != encode.checksum(words)
+
+
+def test_sequence_numbers_never_come_to_zero() -> None:
+    number, seen = 0, set()
+    for _ in range(40000):
+        number = encode.next_number(number)
+        seen.add(number)
+    assert 0 not in seen
+    assert max(seen) == 0x7FFF
