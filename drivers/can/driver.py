@@ -51,6 +51,7 @@ class CanDriver(Driver):
         self._changed = 0.0  # s, monotonic: when the joints last changed
         self._q: Vector | None = None
         self._broken = 0  # samples dropped, as far as they were told
+        self._kept: Sample | None = None  # came before a dropped one was told
         self._listening = 0.0  # s, monotonic: since when other commanders would be heard
 
     # -- reading ----------------------------------------------------------------------------------
@@ -68,6 +69,7 @@ class CanDriver(Driver):
             self._ask()
             found = self.reader.listen(max(1.0 / self.rate, SLICE)) is not None or found
         self._changed = time.monotonic()
+        self._broken, self._kept = self.reader.assembler.broken, None
 
     def _nothing_heard(self, complete: bool) -> LinkError:
         """Return what was missed, and close: a link that is not there is not half open."""
@@ -103,21 +105,21 @@ class CanDriver(Driver):
         """Return the next sample of an arm that sends by itself; slower where we want fewer."""
         end = time.monotonic() + self.settings.state_timeout
         earliest = self._given + 1.0 / self.rate - 0.5 / self.profile.rate
-        sample = self.reader.newest()
+        sample, self._kept = self.reader.newest() or self._kept, None
+        self._check_torn(sample)
         while sample is None or sample.received < earliest:
             left = end - time.monotonic()
             if left <= 0.0:
                 raise self._stale()
             sample = self.reader.poll(min(left, SLICE)) or sample
-            if sample is None:
-                self._check_torn()
-        self._broken = self.reader.assembler.broken
+            self._check_torn(sample)
         return sample
 
-    def _check_torn(self) -> None:
-        """Tell, once, that frames have come which belong to no sample."""
+    def _check_torn(self, sample: Sample | None) -> None:
+        """Tell, once, that frames have come which make no sample; a good one is kept."""
         broken, self._broken = self._broken, self.reader.assembler.broken
         if self._broken > broken:
+            self._kept = sample
             told = ", ".join(f"{n} {why}" for why, n in self.reader.assembler.dropped.items())
             raise InvalidStateError(
                 f"{self.profile.name}: frames that make no sample were dropped (so far {told})"
@@ -185,6 +187,7 @@ class CanDriver(Driver):
         foreign = self.reader.foreign
         if foreign is not None and time.monotonic() - foreign.seen < quiet:
             raise self._commanded_by_another()
+        self._kept = None
         trouble, words = self.reader.trouble(writing=False)
         if trouble:
             raise WriteError(f"{self.profile.name}: {trouble}: {words}")
