@@ -15,9 +15,6 @@ from bridge.cli.progress import progress
 from bridge.output_file import require_writable
 from core.errors import ExcitationError
 from core.identification import Identification, identify_compliance
-from core.model import Array
-
-CRUMB = 1e-15  # rad/Nm: turns no joint by anything
 
 
 @click.command()
@@ -31,8 +28,10 @@ def fit(log: Path, cell: Path, out: Path) -> None:
 
     Least squares on measured TCP poses (measured_position, and measured_rotation where the log has
     it) under different payloads or pulls. Effects that are in the cell stay in it. Writes NEW_CELL:
-    the same cell with the flexibilities found. Declines, with the reason, where nothing in the log
-    excites the compliance.
+    the same cell with the flexibilities found; what the log does not show stays as it is in the
+    cell, and is told. Where the metrology is not registered, its frame and the tool point are
+    estimated along, before as well as after, and not written. Declines, with the reason, where
+    nothing in the log excites the compliance.
 
     Example: gapbridge fit log.csv --cell cell.yaml --out calibrated.yaml
     """
@@ -44,15 +43,10 @@ def fit(log: Path, cell: Path, out: Path) -> None:
             found = identify_compliance(given.model, rows, given.metrology)
     except ExcitationError as error:
         raise ExcitationError(f"{log}: {error}") from None
-    model = given.model.with_compliance(_rounded(found.axial), _rounded(found.radial))
-    save_cell(given, out, model)
+    # frame and tool point that were estimated along stay out of the cell
+    save_cell(given, out, given.model.with_compliance(found.axial, found.radial))
     tell(found)
     click.echo(f"{out}: written")
-
-
-def _rounded(flexibility: Array) -> list[float]:
-    """Return flexibilities (rad/Nm) without the crumbs that a bound of zero leaves behind."""
-    return [float(v) if abs(v) > CRUMB else 0.0 for v in flexibility]
 
 
 def tell(found: Identification) -> None:
@@ -69,16 +63,19 @@ def tell(found: Identification) -> None:
         )
     console = Console()
     console.print(table)
-    held_out = found.remaining_rms_held_out
-    carried = (
-        f", on poses left out of the fit {held_out * 1e3:.4f}" if np.isfinite(held_out) else ""
-    )
     click.echo(
-        f"gap per coordinate over {found.samples} poses, rms in mm: {found.gap_rms * 1e3:.4f} "
-        f"before, {found.remaining_rms * 1e3:.4f} after{carried}"
+        f"gap per coordinate over {found.samples} poses, rms in mm: "
+        f"{_change(found.gap_rms, found.remaining_rms)}"
     )
+    if np.isfinite(found.remaining_rms_held_out):
+        change = _change(found.gap_rms_held_out, found.remaining_rms_held_out)
+        click.echo(f"on poses left out of the fit: {change}")
     for line in (*found.notes, *found.combinations):
         click.echo(f"note: {line}")
+
+
+def _change(before: float, after: float) -> str:
+    return f"{before * 1e3:.4f} before, {after * 1e3:.4f} after"
 
 
 def _cells(value: float, std: float, shown: bool) -> tuple[str, str]:

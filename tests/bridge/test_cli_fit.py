@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from cli_runs import (
 )
 
 from bridge.cell import load_cell, save_cell
+from core.rotation import rotation_matrix
 
 
 def bent_cell(folder: Path) -> Path:
@@ -70,3 +72,31 @@ def test_what_a_fit_of_a_rigid_arm_leaves_can_be_read_again(tmp_path: Path) -> N
     axial, radial = load_cell(new).model.compliance()
     assert min(*axial, *radial) >= 0
     assert max(axial[1:3]) < 5e-7
+
+
+def test_a_fit_writes_no_tool_point_no_frame_and_exact_zeros(tmp_path: Path) -> None:
+    cell = cell_in(tmp_path)
+    assert "registered: true" in cell.read_text(encoding="utf-8")
+    loose = CELL.replace("registered: true", "registered: false")
+    cell.write_text(loose, encoding="utf-8")
+    q, loads = poses_and_loads(60)
+    bent = bent_model()
+    poses = bent.predict(q, loads)
+    target = poses.position + poses.rotation @ np.array([0.02, 0.01, 0.05])
+    seen = target @ rotation_matrix(np.array([0.3, 1.0, -2.0])).T + 2.0
+    seen += 2e-5 * np.random.default_rng(1).normal(size=seen.shape)
+    columns = {f"measured_position_{i}": seen[:, i] for i in range(3)}
+    log, new = log_in(tmp_path, columns_of(q, loads) | columns), tmp_path / "new.yaml"
+    answer = gapbridge("fit", log, "--cell", cell, "--out", new)
+    assert answer.code == 0, answer.err
+    assert new.read_text(encoding="utf-8").startswith(loose)
+    fitted = load_cell(new).model
+    np.testing.assert_array_equal(fitted.tool_in_flange, bent.tool_in_flange)
+    axial, radial = fitted.compliance()
+    told = re.findall(r"note: axial_compliance_(\d): not shown by these data, stays", answer.out)
+    assert all(axial[int(joint) - 1] == 0.0 for joint in told)
+    assert all(v == 0 or v > 1e-9 for v in (*axial, *radial))
+    assert "e-30" not in new.read_text(encoding="utf-8")
+    assert "-0.0" not in answer.out
+    before, after = re.findall(r"left out of the fit: (\S+) before, (\S+) after", answer.out)[0]
+    assert float(after) < 0.03 < 0.1 < float(before)  # mm
