@@ -92,6 +92,13 @@ def run_python(code: str, *arguments: object) -> dict[str, Any]:
     return found
 
 
+def recorded(folder: Path) -> list[dict[str, str]]:
+    """Return the rows of the one recording there."""
+    (recording,) = (folder / "recordings").glob("run-*.csv")
+    with recording.open(encoding="utf-8") as lines:
+        return list(csv.DictReader(lines))
+
+
 READ_BOTH = """
     import json, os, sys
     import numpy as np
@@ -146,9 +153,7 @@ def test_run_observes_and_records_the_sensors_wrench(tmp_path: Path, kind: str) 
             env=environment(), capture_output=True, text=True, timeout=60, check=False,
         )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
-    (recording,) = (tmp_path / "recordings").glob("run-*.csv")
-    with recording.open(encoding="utf-8") as lines:
-        rows = list(csv.DictReader(lines))
+    rows = recorded(tmp_path)
     assert len(rows) > 400
     raw = np.array([[float(r[f"ft_raw_wrench_{i}"]) for i in range(6)] for r in rows])
     bias = np.array(truth["sensor_bias"])
@@ -156,6 +161,26 @@ def test_run_observes_and_records_the_sensors_wrench(tmp_path: Path, kind: str) 
     assert np.linalg.norm(weight) == pytest.approx(MASS * 9.80665, abs=0.15)
     torque = raw.mean(axis=0)[3:] - bias[3:]
     assert torque == pytest.approx(np.cross(COG, weight), abs=0.02)
+
+
+def test_arm_and_sensor_share_one_can_bus(tmp_path: Path) -> None:
+    cell = cell_in(tmp_path, "robotous_rft")
+    text = cell.read_text(encoding="utf-8").replace(
+        "{driver: ur_rtde, ", "{driver: can, profile: piper, interface: socketcand, "
+    )
+    cell.write_text(text, encoding="utf-8")
+    with simulated(cell):
+        bias = np.array(json.loads(bench(cell, "truth"))["sensor_bias"])
+        done = subprocess.run(
+            [sys.executable, "-m", "bridge.cli", "run", str(cell), "--observe", "--duration", "2"],
+            env=environment(), capture_output=True, text=True, timeout=60, check=False,
+        )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = recorded(tmp_path)
+    assert len(rows) > 200
+    raw = np.array([[float(r[f"ft_raw_wrench_{i}"]) for i in range(3)] for r in rows])
+    weight = np.linalg.norm(raw.mean(axis=0) - bias[:3])
+    assert weight == pytest.approx(MASS * 9.80665, abs=0.15)
 
 
 def test_a_run_without_the_sensor_says_which_and_ends(tmp_path: Path) -> None:
