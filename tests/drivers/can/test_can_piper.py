@@ -1,0 +1,111 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from piper_sdk import C_PiperInterface_V2
+from piper_sdk.kinematics.piper_fk import C_PiperForwardKinematics
+
+from bridge.cell import load_cell
+from drivers.can.driver import CanDriver
+from drivers.can.settings import CanSettings
+from drivers.simulated.can.server import make_servers
+from drivers.simulated.peer import make_peer
+from drivers.simulated.peer_server import PeerThread
+from drivers.simulated.plant_arm import plant_arm
+from drivers.simulated.settings import simulated_arm
+
+CONFIG = Path(__file__).parents[3] / "config"
+CELL = CONFIG / "piper_can_simulated.yaml"
+START = (0.1, 1.2, -1.0, 0.2, 0.5, -0.3)
+
+
+def test_the_cells_arm_is_the_one_of_the_vendors_kinematics():
+    arm = load_cell(CELL).arm
+    for q in (START, (0.0,) * 6, (-1.0, 2.0, -2.5, 1.0, -1.0, 1.5)):
+        x, y, z, *_ = C_PiperForwardKinematics(1).CalFK(list(q))[-1]
+        ours = plant_arm(arm).flange(q).origin
+        assert ours == pytest.approx([x / 1e3, y / 1e3, z / 1e3], abs=1e-9)
+
+
+@pytest.fixture
+def served():
+    cell = load_cell(CELL)
+    peer = make_peer(*simulated_arm(cell.arm, seed=3, start_q=START), period=0.004)
+    link = CanSettings(profile="piper", interface="socketcand", host="127.0.0.2", port=29571)
+    with PeerThread(peer, make_servers(link, "127.0.0.2", peer), "127.0.0.2"):
+        yield peer, link, cell.model
+
+
+@pytest.fixture
+def vendor(served, monkeypatch):
+    _, link, _ = served
+    monkeypatch.setenv("CAN_CONFIG", json.dumps({"host": link.host, "port": link.port}))
+    sdk = C_PiperInterface_V2("can0", judge_flag=False, can_auto_init=False)
+    sdk.CreateCanBus("can0", bustype="socketcand", judge_flag=False)
+    sdk.ConnectPort()
+    yield sdk
+    sdk.DisconnectPort()
+
+
+def joints_of(sdk):
+    told = sdk.GetArmJointMsgs().joint_state
+    return np.radians([getattr(told, f"joint_{i}") * 1e-3 for i in range(1, 7)])
+
+
+def wait_for(true, seconds=5.0):
+    until = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
+def test_the_vendors_client_reads_and_commands_our_arm_and_we_notice_it(served, vendor):
+    peer, link, model = served
+    wait_for(lambda: np.abs(joints_of(vendor) - peer.q).max() < 1e-5)
+    with CanDriver(link, model) as driver:
+        assert driver.read_state().actual_q == pytest.approx(peer.q, abs=1e-5)
+        until = time.monotonic() + 5.0
+        while not vendor.EnablePiper():
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        goal = np.array(START) + 0.05
+        counts = [round(v) for v in np.degrees(goal) * 1e3]
+
+        def command():
+            vendor.MotionCtrl_2(0x01, 0x01, 100, 0x00)
+            vendor.JointCtrl(*counts)
+            driver.read_state()
+            return np.abs(goal - peer.q).max() < 1e-4
+
+        wait_for(command)
+        state = driver.read_state()
+        assert state.target_q == pytest.approx(goal, abs=1e-5)  # another's, but heard
+        assert vendor.GetArmStatus().arm_status.ctrl_mode == 1
+        assert np.abs(joints_of(vendor) - goal).max() < 1e-4
+
+
+def test_simulate_serves_the_cell_to_another_process(tmp_path):
+    cell = tmp_path / "cell.yaml"
+    text = CELL.read_text().replace("127.0.0.2", "127.0.0.9").replace("piper.urdf", "p.urdf")
+    cell.write_text(text)
+    (tmp_path / "p.urdf").write_text((CONFIG / "piper.urdf").read_text())
+    code = [sys.executable, "-m", "bridge.cli", "simulate", str(cell)]
+    with subprocess.Popen(code, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            assert server.stdout is not None
+            lines = [server.stdout.readline(), server.stdout.readline()]
+            assert "CAN (piper)" in lines[0]
+            assert lines[1] == "ready 127.0.0.9\n"
+            found = load_cell(cell)
+            with CanDriver(found.link, found.model) as driver:
+                q = [driver.read_state().actual_q for _ in range(50)][-1]
+            assert q == pytest.approx(found.file.simulation.start_q, abs=1e-4)
+        finally:
+            os.kill(server.pid, signal.SIGTERM)
+            server.wait(10)
