@@ -1,0 +1,90 @@
+"""A drive's EDS or DCF: what its object dictionary holds, read with the canopen library."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from drivers.can.bus import first_line
+from drivers.can.document import ProfileError
+from drivers.canopen.objects import Address
+
+SUFFIXES = (".eds", ".dcf")
+
+
+@dataclass(frozen=True, slots=True)
+class Variable:
+    """One number of the object dictionary."""
+
+    bits: int
+    signed: bool
+    readable: bool
+    writable: bool
+    mappable: bool
+
+
+@dataclass(frozen=True)
+class Eds:
+    """One EDS. ``dictionary`` makes a fresh canopen.ObjectDictionary for a node."""
+
+    path: Path
+
+    def dictionary(self, node: int) -> Any:
+        """Return the object dictionary of one node; raises ProfileError."""
+        return _import(self.path, node)
+
+    def variable(self, address: Address) -> Variable | None:
+        """Return what lies at an address, None where the EDS has no number there."""
+        import canopen.objectdictionary as library
+
+        found = _entry(_cached(self.path), address)
+        if found is None or found.data_type not in library.INTEGER_TYPES:
+            return None
+        signed = found.data_type in library.SIGNED_TYPES
+        return Variable(len(found), signed, found.readable, found.writable, found.pdo_mappable)
+
+    def has(self, address: Address) -> bool:
+        """Return whether the EDS has an object at an address."""
+        return _entry(_cached(self.path), address) is not None
+
+
+def read_eds(path: Path, node: int) -> Eds:
+    """Return an EDS that can be used. Raises ProfileError with a reason in one line."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise ProfileError(f"found {path.name}, expected a file ending in {' or '.join(SUFFIXES)}")
+    eds = Eds(path)
+    dictionary = eds.dictionary(node)
+    if 0x6041 not in dictionary:
+        raise ProfileError(f"{path}: found no Statusword (0x6041), expected the EDS of a drive")
+    return eds
+
+
+def _import(path: Path, node: int) -> Any:
+    import canopen
+
+    try:
+        return canopen.import_od(str(path), node)
+    except FileNotFoundError:
+        raise ProfileError(f"{path}: file not found, expected an EDS") from None
+    except OSError as error:
+        raise ProfileError(f"{path}: cannot be read: {first_line(error)}") from None
+    except Exception as error:  # configparser's, ValueError, KeyError: whatever a broken EDS brings
+        raise ProfileError(f"{path}: found a broken EDS: {first_line(error)}") from None
+
+
+@lru_cache(maxsize=8)
+def _cached(path: Path) -> Any:
+    return _import(path, 1)
+
+
+def _entry(dictionary: Any, address: Address) -> Any:
+    import canopen.objectdictionary as library
+
+    if address.index not in dictionary:
+        return None
+    found = dictionary[address.index]
+    if isinstance(found, library.ODVariable):
+        return found if address.subindex == 0 else None
+    return found.get(address.subindex)

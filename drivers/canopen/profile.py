@@ -1,0 +1,250 @@
+"""A CANopen profile out of its YAML and its EDS, checked before anything touches a bus."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from drivers.can.document import ProfileDocument, ProfileError, read_profile_document
+from drivers.canopen.eds import Eds, read_eds
+from drivers.canopen.objects import MODES, OBJECTS, Address
+from drivers.canopen.pdo import Entry, PdoLayout
+from drivers.canopen.schema import Heartbeat, Joint, ProfileFile
+
+Vector = NDArray[np.float64]
+Keys = tuple[str | int, ...]
+MOST_BITS = 64
+WINDOW = 0.7  # of the SYNC period: the last moment of a TPDO, where the profile says none
+
+
+@dataclass(frozen=True)
+class CanopenProfile:
+    """One arm's drives, checked. ``q = counts / counts_per_radian + zero``."""
+
+    name: str
+    path: Path
+    eds: Eds
+    file: ProfileFile
+    nodes: tuple[int, ...]
+    counts_per_radian: Vector  # (n,), with the direction's sign
+    zero: Vector  # (n,) rad, at count 0
+    tpdo: tuple[PdoLayout, ...]
+    rpdo: tuple[PdoLayout, ...]
+
+    @property
+    def n(self) -> int:
+        """Joints."""
+        return len(self.nodes)
+
+    @property
+    def mode_number(self) -> int:
+        """Return what Modes of operation must be."""
+        return MODES[self.file.mode][0]
+
+    @property
+    def target(self) -> str:
+        """Return the object that takes setpoints."""
+        return MODES[self.file.mode][1]
+
+    @property
+    def heartbeat(self) -> Heartbeat:
+        """Return who tells whom that they live."""
+        return self.file.heartbeat
+
+    @property
+    def rated_torque(self) -> Vector | None:
+        """Return (n,) Nm, None where a joint has none or no torque is mapped."""
+        values = [joint.rated_torque for joint in self.file.joints]
+        mapped = any(e.name == "Torque actual value" for pdo in self.tpdo for e in pdo.entries)
+        known = [value for value in values if value is not None]
+        return np.array(known) if mapped and len(known) == self.n else None
+
+    @property
+    def direction(self) -> Vector:
+        """Return (n,) of 1 and -1."""
+        return np.sign(self.counts_per_radian)
+
+    def angles(self, counts: Vector) -> Vector:
+        """Return joint angles (n,), rad."""
+        return counts / self.counts_per_radian + self.zero
+
+    def counts(self, q: Vector) -> Vector:
+        """Return the nearest whole position counts (n,) of joint angles, rad."""
+        return np.rint((q - self.zero) * self.counts_per_radian)
+
+
+def read_profile(path: Path, joints: int | None = None) -> CanopenProfile:
+    """Return the profile of a YAML file.
+
+    ``joints`` is the number that the arm has; None: any. Raises ProfileError, one line that names
+    file, line and key, what was found and what was expected.
+    """
+    document = read_profile_document(path)
+    try:
+        file = ProfileFile.model_validate(document.data)
+    except ValidationError as error:
+        raise _refusal(document, error) from None
+    if joints is not None and len(file.joints) != joints:
+        raise document.error(
+            ("joints",), f"found {len(file.joints)}, expected {joints}: the arm has those"
+        )
+    _check_nodes(document, file)
+    _check_times(document, file)
+    try:
+        eds = read_eds(path.parent / file.eds, file.joints[0].node)
+    except ProfileError as error:
+        raise document.error(("eds",), str(error)) from None
+    pdos = _Pdos(document, eds)
+    tpdo = pdos.layouts("tpdo", file.tpdo, ("Statusword", "Position actual value"))
+    rpdo = pdos.layouts("rpdo", file.rpdo, ("Controlword", MODES[file.mode][1]))
+    turn = 2.0 * np.pi
+    per_radian = [j.direction * j.counts_per_turn * j.gear / turn for j in file.joints]
+    return CanopenProfile(
+        file.name, path, eds, file, tuple(j.node for j in file.joints),
+        np.array(per_radian), np.array([j.zero for j in file.joints]), tpdo, rpdo,
+    )  # fmt: skip
+
+
+def _check_nodes(document: ProfileDocument, file: ProfileFile) -> None:
+    ours = file.heartbeat.our_node
+    seen: dict[int, int] = {}
+    for i, joint in enumerate(file.joints):
+        keys: Keys = ("joints", i, "node")
+        if joint.node in seen:
+            raise document.error(
+                keys, f"found {joint.node} again, expected one node per joint: joint "
+                f"{seen[joint.node] + 1} has it",
+            )  # fmt: skip
+        if joint.node == ours:
+            raise document.error(
+                keys, f"found {joint.node}, expected another than heartbeat.our_node"
+            )
+        seen[joint.node] = i
+
+
+def _check_times(document: ProfileDocument, file: ProfileFile) -> None:
+    beat = file.heartbeat
+    if file.sync_window is not None and file.sync_window >= file.sync_period:
+        raise document.error(
+            ("sync_window",),
+            f"found {file.sync_window:g} s, expected less than sync_period "
+            f"({file.sync_period:g} s)",
+        )
+    pairs = [("lost_after", beat.lost_after, "drives", beat.drives)]
+    if beat.drives_wait:
+        pairs.append(("drives_wait", beat.drives_wait, "ours", beat.ours))
+    for key, wait, other, period in pairs:
+        if wait < 1.5 * period:
+            raise document.error(
+                ("heartbeat", key),
+                f"found {wait:g} s, expected at least 1.5 times heartbeat.{other} ({period:g} s)",
+            )
+
+
+@dataclass(frozen=True)
+class _Pdos:
+    """The PDO maps of one profile, looked up in its EDS."""
+
+    document: ProfileDocument
+    eds: Eds
+
+    def layouts(
+        self, key: str, given: Mapping[int, Sequence[str | int]], wanted: tuple[str, ...]
+    ) -> tuple[PdoLayout, ...]:
+        """Return the layouts of a section; refuses what is missing, twice or too long."""
+        layouts: list[PdoLayout] = []
+        seen: dict[str, Keys] = {}
+        for number, names in sorted(given.items()):
+            entries = []
+            for i, name in enumerate(names):
+                keys: Keys = (key, number, i)
+                entry = self._entry(keys, name, key == "tpdo")
+                if entry.name in seen:
+                    line = self.document.line(seen[entry.name])
+                    raise self.document.error(
+                        keys, f"found {entry.name!r} again (line {line}), expected it once"
+                    )
+                seen[entry.name] = keys
+                entries.append(entry)
+            bits = sum(entry.bits for entry in entries)
+            if not 0 < bits <= MOST_BITS:
+                raise self.document.error(
+                    (key, number), f"found {bits} bits, expected 1 to {MOST_BITS}"
+                )
+            layouts.append(PdoLayout(number, tuple(entries), key == "tpdo"))
+        for name in wanted:
+            if name not in seen:
+                raise self.document.error((key,), f"found no {name!r}, expected it in a PDO")
+        return tuple(layouts)
+
+    def _entry(self, keys: Keys, name: str | int, transmitted: bool) -> Entry:
+        address = self._address(keys, name)
+        called = next((known for known, at in OBJECTS.items() if at == address), str(address))
+        found = self.eds.variable(address)
+        if found is None:
+            raise self.document.error(
+                keys, f"found {called!r}, expected an object of {self.eds.path.name} ({address})"
+            )
+        if not found.mappable or not (found.readable if transmitted else found.writable):
+            kind = "TPDO" if transmitted else "RPDO"
+            raise self.document.error(
+                keys, f"found {called!r}, which {self.eds.path.name} allows in no {kind}"
+            )
+        return Entry(called, address, found.bits, found.signed)
+
+    def _address(self, keys: Keys, name: str | int) -> Address:
+        if isinstance(name, str):
+            for known, address in OBJECTS.items():
+                if known.lower() == name.lower():
+                    return address
+        index, _, subindex = (hex(name) if isinstance(name, int) else name).partition(":")
+        try:
+            if not index.startswith("0x"):
+                raise ValueError
+            address = Address(int(index, 16), int(subindex or "0", 0))
+        except ValueError:
+            raise self.document.error(
+                keys, f"found {name!r}, expected an object's name{_near(str(name), OBJECTS)}, or "
+                "its address as 0x2001 or 0x2001:3",
+            ) from None  # fmt: skip
+        if not (0x1000 <= address.index <= 0xFFFF and 0 <= address.subindex <= 0xFF):
+            raise self.document.error(keys, f"found {name!r}, expected 0x1000 to 0xFFFF")
+        return address
+
+
+def _near(name: str, known: Mapping[str, object] | Sequence[str]) -> str:
+    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f" (did you mean {near[0]!r}?)" if near else ""
+
+
+def _refusal(document: ProfileDocument, error: ValidationError) -> ProfileError:
+    """Return one line out of what pydantic says; unknown keys come first."""
+    worst = min(error.errors(), key=lambda detail: detail["type"] != "extra_forbidden")
+    keys = tuple(key for key in worst["loc"] if key not in ("str", "int", "[key]"))
+    if worst["type"] == "extra_forbidden":
+        names = [name for model in (ProfileFile, Joint, Heartbeat) for name in _names(model)]
+        return document.error(keys, f"found an unknown key{_near(str(keys[-1]), names)}")
+    if worst["type"] == "missing":
+        return document.error(keys, "found nothing, expected this key")
+    return document.error(keys, f"found {_quoted(worst)}, {_expected(worst)}")
+
+
+def _names(model: type[BaseModel]) -> Sequence[str]:
+    return list(model.model_fields)
+
+
+def _quoted(detail: ErrorDetails) -> str:
+    text = " ".join(repr(detail["input"]).split())
+    return text if len(text) <= 60 else f"{text[:60]}..."
+
+
+def _expected(detail: ErrorDetails) -> str:
+    message = detail["msg"]
+    return "expected " + message.removeprefix("Input should be ")
