@@ -64,11 +64,14 @@ def grow(space: Space, state: State, new: int, score: float) -> State:
 
 def projected(space: Space, chosen: Sequence[int]) -> State:
     """Return the state of a whole set."""
-    rss = float(space.y @ space.y)
-    state = State((), space.X, space.y, rss, 0.0)
-    for c in chosen:
-        state = grow(space, state, c, 0.0)
-    return state
+    if not chosen:
+        return State((), space.X, space.y, float(space.y @ space.y), 0.0)
+    block = space.columns(chosen)
+    unit = np.sqrt(np.einsum("ij,ij->j", block, block)) + 1e-300
+    U, s, _ = np.linalg.svd(block / unit, full_matrices=False)
+    U = U[:, s > 1e-5]
+    r = space.y - U @ (U.T @ space.y)
+    return State(tuple(chosen), space.X - U @ (U.T @ space.X), r, float(r @ r), 0.0)
 
 
 def offspring(

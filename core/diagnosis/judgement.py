@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from core.diagnosis.bent import not_bent
 from core.diagnosis.held_out import HeldOut
 from core.diagnosis.leftover import dependence, structure_p_value
 from core.diagnosis.neighbours import rivals
@@ -32,7 +33,6 @@ HINT = 0.05  # probability from which a coordinate is suspect once structure is 
 TRACE = 0.01  # share of an unnamed function from which a coordinate has it
 TOUCH = 0.1  # share of a cause that acts on a coordinate: more than that touches it
 LEAST = 0.002  # share of the held-out gap that a cause has to take beside a leftover
-BENT = 10.8  # gain of a bent stiffness curve over a straight one that makes it one
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def judge(selection: Selection) -> Judgement:
     smooth = [c for c in found.chosen if not space.candidates[c].named]
     withdrawn: list[tuple[int, str]] = []
     believed = [c for c in found.chosen if space.candidates[c].named]
-    straight = _not_bent(selection)
+    straight = not_bent(selection.terms, selection.covariance)
     for position in straight:
         withdrawn.append((position, "its curve cannot be told from a straight line"))
         believed.remove(selection.term_index[position])
@@ -162,20 +162,6 @@ def pure_error(left: Array, groups: NDArray[np.int64]) -> tuple[float, int]:
             total += float(np.sum((part - part.mean(axis=0)) ** 2))
             freedom += (len(part) - 1) * left.shape[1]
     return total / max(freedom, 1), freedom
-
-
-def _not_bent(selection: Selection) -> list[int]:
-    """Return positions of stiffness curves that a straight line would fit as well."""
-    straight = []
-    for position, (term, covariance) in enumerate(
-        zip(selection.terms, selection.covariance, strict=True)
-    ):
-        if term.effect != "stiffness_nonlinearity":
-            continue
-        softening, deviation = term.values[1], float(np.sqrt(max(covariance[1, 1], 0)))
-        if softening <= 0 or softening < np.sqrt(BENT) * deviation:
-            straight.append(position)
-    return straight
 
 
 def _ties(

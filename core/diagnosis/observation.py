@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from core.effects import Term
 
 Array = NDArray[np.float64]
+Rivals = tuple[tuple[str, Array], ...]
 Predict = Callable[[Sequence[Term]], Array]
 
 
@@ -44,7 +45,7 @@ class Observation:
     rows: NDArray[np.int64]  # (N,) row of each sample in the log
     axes: tuple[str, ...]  # name of each coordinate
     joint_columns: Array | None = None  # (N, k, n) d prediction / d joint angle, where it has one
-    unnamed: tuple[tuple[str, Array], ...] = ()  # target, columns (N, k, d) of further rivals
+    unnamed: Callable[[], Rivals] = tuple  # target, columns (N, k, d) of further rivals
     tool_axes: Array | None = None  # (N, 3, 3) axes of the TCP in base, as columns
     axial_moment: Array | None = None  # (N, n) Nm about each joint's axis, where it is known
     order_in_time: bool = False  # True: neighbours in time are correlated (a moving log)
@@ -65,7 +66,7 @@ def thinned(observation: Observation, most: int) -> Observation:
     if count <= most:
         return observation
     take = np.unique(np.linspace(0, count - 1, most).astype(int))
-    whole = observation.predict
+    whole, unnamed = observation.predict, observation.unnamed
 
     def some(columns: Array | None) -> Array | None:
         return None if columns is None else columns[take]
@@ -79,7 +80,7 @@ def thinned(observation: Observation, most: int) -> Observation:
         groups=observation.groups[take],
         rows=observation.rows[take],
         joint_columns=some(observation.joint_columns),
-        unnamed=tuple((target, columns[take]) for target, columns in observation.unnamed),
+        unnamed=lambda: tuple((target, columns[take]) for target, columns in unnamed()),
         tool_axes=some(observation.tool_axes),
         axial_moment=some(observation.axial_moment),
         rebase=None,

@@ -89,7 +89,7 @@ def observe(
         axes=("x", "y", "z", "rx", "ry", "rz")[:k],
         joint_columns=form.jacobian[:, :k],
         axial_moment=np.einsum("nij,nji->ni", form.moment, form.jacobian[:, 3:]),
-        unnamed=unnamed_rivals(model, q, loads, k),
+        unnamed=lambda: unnamed_rivals(model, q, loads, k),
         tool_axes=poses.rotation,
         rebase=None if metrology.registered else rebase,
     )

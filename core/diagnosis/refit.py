@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arm import Arm
-from core.diagnosis.candidate import Candidate
+from core.diagnosis.candidate import Candidate, named_columns
 from core.diagnosis.space import Found, Space
 from core.diagnosis.work import Work, flat
 from core.effects import CATALOGUE, Term
@@ -131,6 +131,12 @@ def _freed(arm: Arm, candidate: Candidate) -> Candidate:
 
 def _slope(work: Work, candidate: Candidate, x: Array, others: tuple[Term, ...]) -> Array:
     """Return d prediction / d parameter (N, k, d) at the term's present values."""
+    J = work.observation.joint_columns
+    if candidate.family == "transmission_error" and J is not None:
+        return named_columns(work.observation, candidate, ())
+    if candidate.family == "joint_offset" and J is not None:
+        assert candidate.site.joint is not None
+        return np.asarray(J[:, :, candidate.site.joint - 1, None])
     columns = []
     for k, parameter in enumerate(candidate.parameters):
         h = np.zeros(len(x))

@@ -12,12 +12,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from core.diagnosis.bent import straightened
 from core.diagnosis.candidate import (
     Candidate,
     joint_quantity,
     named_candidates,
     named_columns,
 )
+from core.diagnosis.neighbours import pruned
 from core.diagnosis.noise import Noise, estimate_noise
 from core.diagnosis.observation import Observation
 from core.diagnosis.refit import refit
@@ -117,6 +119,10 @@ def select(
         except InputError:  # absurd flexibilities: the arm would buckle
             stiff = [c for c in best.chosen if space.candidates[c].family not in BENDING]
             best = fit(space, stiff)
+            terms, index, covariance, residual = refit(work, space, best)
+        straight = straightened(space, best.chosen, index, terms, covariance)
+        if straight is not None:
+            best = pruned(space, fit(space, straight))
             terms, index, covariance, residual = refit(work, space, best)
         same = terms_alike(terms, base) and turn > 0
         found = best

@@ -38,7 +38,7 @@ def smooth_candidates(observation: Observation, arm: Arm) -> list[Pair]:
                 found += _bumps(name, target, z, directions)
         if name == "timestamp":
             found += _steps(name, z, targets)
-    for target, columns in observation.unnamed:
+    for target, columns in observation.unnamed():
         found.append((_candidate("", target, columns.shape[-1]), columns))
     return found
 

@@ -63,7 +63,7 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
         rows=motion.rows,
         axes=AXES,
         order_in_time=motion.moving,
-        unnamed=unnamed_pulls(model, motion, "wrench"),
+        unnamed=lambda: unnamed_pulls(model, motion, "wrench"),
     )
 
 
