@@ -149,7 +149,8 @@ class Decoder:
             words: Sequence[int] = raw[field.indices[0] : field.indices[-1] + 1]
         else:
             words = [raw[i] for i in field.indices]
-        values = np.array(field.coding.decode(words)) * field.size
+        with np.errstate(all="ignore"):  # registers may hold any float; the bounds come next
+            values = np.array(field.coding.decode(words)) * field.size
         if field.turn_block is not None and field.turn_coding is not None:
             turns = registers[field.turn_block]
             counts = field.turn_coding.decode([turns[i] for i in field.turn_indices])

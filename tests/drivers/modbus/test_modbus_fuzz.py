@@ -1,0 +1,136 @@
+"""A million ruined answers into the decoder: no exception leaves it, nothing wrong is believed."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from contract_modbus import INVENTED
+from pymodbus.exceptions import ModbusException
+from pymodbus.framer import FramerSocket
+from pymodbus.pdu import DecodePDU
+from pymodbus.pdu.register_message import ReadHoldingRegistersResponse
+
+from core.errors import InvalidStateError
+from drivers.modbus.decode import Decoder, check_step
+from drivers.modbus.map import compile_map
+from drivers.modbus.profile import read_profile
+from drivers.modbus.settings import SHIPPED
+from drivers.modbus.transport import check_answer
+from drivers.simulated.modbus import image
+
+Q = (0.3, -1.2, 1.1, -0.4, 2.8, -3.0)
+GAP = 0.02  # s between two samples
+FASTEST = 3.0  # rad/s
+UR = read_profile(SHIPPED / "ur.yaml")
+
+
+def holding_of(profile) -> dict[int, int]:
+    found = image.blank(profile)["holding"]
+    values = {"position": Q, "velocity": (0.1,) * 6, "temperature": (25.0,) * 6,
+              "force": (1.0, 2.0, 3.0), "moment": (0.1, 0.2, 0.3)}  # fmt: skip
+    found.update(image.state_registers(profile, values)["holding"])
+    spots = image.condition_registers(profile.status, frozenset())
+    spots += image.clock_registers(profile, 12.0)
+    found.update({address: value for table, address, value in spots if table == "holding"})
+    return found
+
+
+@pytest.mark.slow
+def test_no_ruined_frame_is_taken_for_another_sample() -> None:
+    """Bytes of a good answer, mutated: what comes through is the sample itself, or is refused.
+
+    A flip inside the payload is what TCP's checksum guards; here it must at least be a sample that
+    decodes to what its bytes say and passes the same plausibility checks.
+    """
+    compiled = compile_map(UR)
+    block = compiled.fast[0]
+    decoder = Decoder(UR, compiled)
+    holding = holding_of(UR)
+    good = [holding.get(a, 0) for a in range(block.first, block.first + block.count)]
+    framer = FramerSocket(DecodePDU(False))
+    answer = ReadHoldingRegistersResponse(registers=good, dev_id=1, transaction_id=77)
+    frame = framer.buildFrame(answer)
+    assert np.abs(decoder.decode({block: good}).vectors["position"] - Q).max() <= 5e-4
+
+    random = np.random.default_rng(20)
+    total, taken, refused, until = 300_000, 0, 0, time.monotonic() + 100.0
+    while taken + refused < total and time.monotonic() < until:
+        for data in mutations(frame, random, 5000):
+            try:
+                _, pdu = framer.handleFrame(data, 1, 77)
+            except ModbusException:  # what the library refuses, the transport makes a LinkError
+                refused += 1
+                continue
+            except Exception:  # and its own mistakes an InvalidStateError
+                refused += 1
+                continue
+            try:
+                words = check_answer(pdu, 3, block.count, "fuzz")
+                sample = decoder.decode({block: words})
+                check_step(sample.vectors["position"], np.array(Q), GAP, FASTEST)
+            except InvalidStateError:
+                refused += 1
+                continue
+            taken += 1
+            away = np.abs(sample.vectors["position"] - Q)
+            assert (away <= FASTEST * GAP + 0.011).all()
+            assert all(np.isfinite(v).all() for v in sample.vectors.values())
+    assert taken + refused >= total, "too slow"
+    assert refused > taken
+
+
+def mutations(frame: bytes, random: np.random.Generator, count: int):
+    """Yield frames with flipped bits and bytes, cut short, or grown."""
+    size = len(frame)
+    kinds = random.integers(0, 4, count)
+    places = random.integers(0, size, (count, 3))
+    values = random.integers(0, 256, (count, 3))
+    heads = random.integers(0, 9, count)
+    for kind, place, value, head in zip(kinds, places, values, heads, strict=True):
+        data = bytearray(frame)
+        if kind == 0:
+            data[place[0]] ^= 1 << (value[0] % 8)
+        elif kind == 1:
+            data[head] = value[0]
+        elif kind == 2:
+            del data[place[0] :]
+        else:
+            for p, v in zip(place, value, strict=True):
+                data[p] = v
+        yield bytes(data)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", [*sorted(SHIPPED.glob("*.yaml")), INVENTED], ids=lambda p: p.stem)
+def test_random_registers_are_refused_or_plausible(path) -> None:
+    """Eighty thousand random and ruined samples a profile."""
+    profile = read_profile(path)
+    compiled = compile_map(profile)
+    decoder = Decoder(profile, compiled)
+    blocks = (*compiled.fast, *compiled.slow)
+    random = np.random.default_rng(8)
+    rounds = 80_000
+    widths = [b.count for b in blocks]
+    before = np.zeros(profile.joints)
+    held = decoded = 0
+    for start in range(0, rounds, 4000):
+        pool = random.integers(0, 0x10000, (4000, sum(widths)))
+        pool[random.random(pool.shape) < 0.5] = 0
+        for k, row in enumerate(pool.tolist()):
+            parts, at = {}, 0
+            for block, width in zip(blocks, widths, strict=True):
+                short = (start + k) % 97 == 0
+                top = 1 if block.table in ("coil", "discrete") else 0xFFFF
+                parts[block] = [min(v, top) for v in row[at : at + width - short]]
+                at += width
+            try:
+                sample = decoder.decode(parts)
+                decoded += 1
+                check_step(sample.vectors["position"], before, GAP, FASTEST)
+            except InvalidStateError:
+                continue
+            held += 1
+            assert np.abs(sample.vectors["position"]).max() <= FASTEST * GAP + 0.011
+    assert held <= decoded < rounds

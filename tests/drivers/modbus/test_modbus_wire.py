@@ -1,0 +1,221 @@
+"""Answers that are wrong, late or none; encrypted links and serial ones."""
+
+from __future__ import annotations
+
+import os
+import select
+import ssl
+import subprocess
+import threading
+import time
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from contract_checks import OFFSET, check_reads, next_state, read_on, setpoint_of, stream
+from contract_modbus import ModbusCase
+from evil_proxy import EvilProxy, Ruin
+
+from core.errors import InvalidStateError, LinkError, StaleStateError
+from drivers.modbus.driver import ModbusDriver
+from drivers.modbus.settings import ModbusSettings
+from drivers.simulated.modbus.server import ModbusServer
+from drivers.simulated.peer_server import PeerThread
+
+QUICK = {"timeout": 0.05, "state_timeout": 0.4}
+
+
+@pytest.fixture
+def case() -> Iterator[ModbusCase]:
+    with ModbusCase("ur") as found:
+        yield found
+
+
+@pytest.fixture
+def proxy(case: ModbusCase) -> Iterator[EvilProxy]:
+    assert case.settings.port is not None
+    with EvilProxy(case.host, case.settings.port) as found:
+        yield found
+
+
+def driver_through(case: ModbusCase, proxy: EvilProxy) -> ModbusDriver:
+    return ModbusDriver(case.settings.model_copy(update={"port": proxy.port, **QUICK}), case.model)
+
+
+def other_function(answer: bytes) -> bytes:
+    return answer[:7] + b"\x04" + answer[8:]
+
+
+def fewer_registers(answer: bytes) -> bytes:
+    return answer[:4] + b"\x00\x07" + answer[6:8] + b"\x04" + answer[9:13]
+
+
+def more_registers(answer: bytes) -> bytes:
+    count = answer[8] + 4
+    length = (count + 3).to_bytes(2, "big")
+    return answer[:4] + length + answer[6:8] + bytes([count]) + answer[9:] + b"\x12\x34\x56\x78"
+
+
+def refusal(answer: bytes) -> bytes:
+    return answer[:4] + b"\x00\x03" + answer[6:7] + bytes([answer[7] | 0x80, 6])
+
+
+RUINS: dict[str, Ruin] = {
+    "another function": other_function,
+    "too few registers": fewer_registers,
+    "too many registers": more_registers,
+    "an exception": refusal,
+    "transaction zero": lambda answer: b"\x00\x00" + answer[2:],
+    "another transaction": lambda answer: b"\x7f\xff" + answer[2:],
+    "another protocol": lambda answer: answer[:2] + b"\x00\x02" + answer[4:],
+    "another device": lambda answer: answer[:6] + b"\x63" + answer[7:],
+    "half an answer": lambda answer: answer[: len(answer) // 2],
+    "noise": lambda answer: bytes(range(7, 200)),
+}
+
+
+@pytest.mark.parametrize("name", RUINS)
+def test_a_ruined_answer_is_never_taken_and_the_link_recovers(
+    case: ModbusCase, proxy: EvilProxy, name: str
+) -> None:
+    with driver_through(case, proxy) as driver:
+        next_state(driver)
+        proxy.ruin = RUINS[name]
+        begun = time.monotonic()
+        for _ in range(3):
+            with pytest.raises((InvalidStateError, StaleStateError)):
+                driver.read_state()
+        assert time.monotonic() - begun < 3.0
+        proxy.ruin = lambda answer: answer
+        time.sleep(0.1)
+        state = next_state(driver)
+        assert np.abs(state.actual_q - case.peer.q).max() <= case.resolution
+
+
+def test_a_late_answer_is_never_taken_for_the_next_ones(case: ModbusCase, proxy: EvilProxy) -> None:
+    with driver_through(case, proxy) as driver:
+        next_state(driver)
+        proxy.wait = 0.08  # each comes when its request is given up
+        with pytest.raises(StaleStateError, match="no new sample for"):
+            driver.read_state()
+        proxy.wait = 0.0
+        goal = (case.peer.q[0] + 0.2, *case.peer.q[1:])
+        case.peer.move_own(goal)
+        time.sleep(1.5)
+        assert np.abs(next_state(driver).actual_q - goal).max() <= case.resolution
+
+
+def test_a_controller_that_hangs_up_each_time_is_a_link_error(
+    case: ModbusCase, proxy: EvilProxy
+) -> None:
+    with driver_through(case, proxy) as driver:
+        next_state(driver)
+        proxy.ruin = lambda answer: b""
+        with pytest.raises(LinkError):
+            driver.read_state()
+
+
+# -- encrypted ---------------------------------------------------------------------------------
+
+
+def openssl(folder: Path, *arguments: str) -> None:
+    subprocess.run(["openssl", *arguments], cwd=folder, check=True, capture_output=True)
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An authority, and keys of a controller and of ours that it has signed."""
+    folder = tmp_path_factory.mktemp("keys")
+    openssl(
+        folder, "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", "ca.key", "-out",
+        "ca.pem", "-days", "2", "-subj", "/CN=plant authority",
+    )  # fmt: skip
+    for name in ("server", "client"):
+        openssl(
+            folder, "req", "-newkey", "rsa:2048", "-nodes", "-keyout", f"{name}.key", "-out",
+            f"{name}.csr", "-subj", f"/CN={name}",
+        )  # fmt: skip
+        openssl(
+            folder, "x509", "-req", "-in", f"{name}.csr", "-CA", "ca.pem", "-CAkey", "ca.key",
+            "-CAcreateserial", "-out", f"{name}.pem", "-days", "2",
+        )  # fmt: skip
+    return folder
+
+
+def test_the_contract_holds_over_mutual_tls(keys: Path) -> None:
+    case = ModbusCase("ur")
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(keys / "server.pem", keys / "server.key")
+    context.load_verify_locations(keys / "ca.pem")
+    context.verify_mode = ssl.CERT_REQUIRED
+    server = ModbusServer(case.file, case.host, 15802, tls=context)
+    settings = ModbusSettings(
+        profile="ur", host=case.host, port=15802, transport="tls", rate=50.0,
+        authority=keys / "ca.pem", certificate=keys / "client.pem", key=keys / "client.key",
+    )  # fmt: skip
+    with PeerThread(case.peer, [server], case.host):
+        with ModbusDriver(settings, case.model) as driver:
+            check_reads(driver, case.model)
+            driver.arm(next_state(driver))
+            stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), 0.5)
+            driver.release()
+        nobody = settings.model_copy(update={"certificate": None, "key": None})
+        with pytest.raises(LinkError):
+            ModbusDriver(nobody, case.model).connect()
+        stranger = settings.model_copy(update={"authority": keys / "client.pem"})
+        with pytest.raises(LinkError, match="cannot be reached"):
+            ModbusDriver(stranger, case.model).connect()
+
+
+# -- serial ------------------------------------------------------------------------------------
+
+
+class Cable:
+    """Two pseudo terminals with a thread between them that hands bytes on."""
+
+    def __init__(self) -> None:
+        ends = [os.openpty() for _ in range(2)]
+        for pair in ends:
+            for number in pair:
+                tty.setraw(number)
+        self.ports = [os.ttyname(slave) for _, slave in ends]
+        self._masters = [master for master, _ in ends]
+        self._cut = threading.Event()
+        threading.Thread(target=self._carry, daemon=True).start()
+
+    def _carry(self) -> None:
+        one, other = self._masters
+        while not self._cut.is_set():
+            ready, _, _ = select.select([one, other], [], [], 0.05)
+            for number in ready:
+                os.write(other if number == one else one, os.read(number, 4096))
+
+    def cut(self) -> None:
+        """Hand nothing on any more."""
+        self._cut.set()
+
+
+def test_the_contract_holds_over_a_serial_line() -> None:
+    case, cable = ModbusCase("ur"), Cable()
+    ours, theirs = cable.ports
+    server = ModbusServer(case.file, case.host, 502, serial=theirs, baudrate=115200)
+    settings = ModbusSettings(
+        profile="ur", transport="rtu", serial=ours, baudrate=115200, rate=20.0, timeout=0.3
+    )
+    with PeerThread(case.peer, [server], case.host), ModbusDriver(settings, case.model) as driver:
+        check_reads(driver, case.model)
+        assert np.abs(next_state(driver).actual_q - case.peer.q).max() <= case.resolution
+        driver.arm(next_state(driver))
+        stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), 0.5)
+        driver.release()
+        cable.cut()
+        with pytest.raises(StaleStateError):
+            read_on(driver, 100)
+
+
+def test_a_serial_port_that_is_not_there_is_a_link_error() -> None:
+    settings = ModbusSettings(profile="ur", transport="rtu", serial="/dev/ttyNowhere")
+    with pytest.raises(LinkError, match=r"/dev/ttyNowhere device 1: cannot be reached"):
+        ModbusDriver(settings, ModbusCase("ur").model).connect()
