@@ -1,0 +1,64 @@
+"""A simulated PiPER on python-can's virtual bus, and frames as its manual has them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import can
+import numpy as np
+
+from core.arm import builtin_arm
+from core.model import Model
+from core.setpoint import Setpoint
+from drivers.can.driver import CanDriver
+from drivers.can.settings import CanSettings
+from drivers.simulated.can.nodes import CanNodes
+from drivers.simulated.can.server import make_servers
+from drivers.simulated.peer import Peer, make_peer
+from drivers.simulated.peer_server import PeerThread
+from drivers.simulated.settings import simulated_arm
+
+_channels = itertools.count()
+UNIT = math.radians(0.001)
+MODEL = Model(builtin_arm("ur10e"))
+
+
+class Served(NamedTuple):
+    peer: Peer
+    nodes: CanNodes
+    settings: CanSettings
+    driver: CanDriver
+
+
+@contextmanager
+def served_arm(profile: str = "piper", **keys: object) -> Iterator[Served]:
+    """Serve an arm and give a driver for it, not connected."""
+    channel = f"faults{next(_channels)}"
+    given = {"foreign_quiet": 0.2, "state_timeout": 0.3, **keys}
+    settings = CanSettings(profile=profile, interface="virtual", channel=channel, **given)
+    peer = make_peer(*simulated_arm(MODEL.arm, seed=5), period=0.004)
+    (nodes,) = make_servers(settings, "127.0.0.2", peer)
+    with PeerThread(peer, [nodes], "127.0.0.2"):
+        driver = CanDriver(settings, MODEL)
+        try:
+            yield Served(peer, nodes, settings, driver)
+        finally:
+            driver.close()
+
+
+def joints_frame(first: int, a: float, b: float) -> tuple[int, bytes]:
+    """Return a PiPER's joint feedback of two joints (rad), the first of them from 1."""
+    return 0x2A5 + (first - 1) // 2, struct.pack(">ii", round(a / UNIT), round(b / UNIT))
+
+
+def setpoint_of(q) -> Setpoint:
+    return Setpoint(q, q, np.zeros(6), 0.0, 0.0)
+
+
+def other_bus(settings: CanSettings) -> can.BusABC:
+    return can.Bus(interface="virtual", channel=settings.channel)
