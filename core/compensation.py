@@ -15,10 +15,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from core import kernel
-from core.kernel import JIT, Chain, Rows, Shape
+from core.kernel import JIT, Rows
 from core.loads import Loads
 from core.model import Model, Poses
-from core.rotation import rotation_vector
+from core.packed import chain_of, pack, row_of, shape_of
 
 Array = NDArray[np.float64]
 TOLERANCE = 1e-9  # m, and rad times the tool's lever: where the pose counts as reached
@@ -118,19 +118,80 @@ def newton_step(chain, rows, r, shape, position, rotation, lever, dq):  # type: 
     return next_offset(chain, rows, r, shape, position, rotation, lever, dq)
 
 
+@njit(**JIT)
+def _turned(A, B, out):  # type: ignore[no-untyped-def]
+    """Write the rotation vector of A B^T; accurate at zero, where it is needed."""
+    R = A @ B.T
+    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    twice_sine = np.sqrt(x * x + y * y + z * z)
+    angle = np.arctan2(twice_sine, R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
+    # offsets are small: half turns, where the sine alone says nothing, do not occur
+    scale = angle / twice_sine if twice_sine > 1e-12 else 0.5
+    out[0], out[1], out[2] = scale * x, scale * y, scale * z
+
+
+@njit(**JIT)
+def _rigid_pose(rigid, row, shape, q, position, rotation):  # type: ignore[no-untyped-def]
+    """Write the rigid arm's TCP pose at q (n,)."""
+    shape.bend[:, :] = 0.0  # nothing bends; and no row may spoil the next
+    row.q[0, :] = q
+    kernel.equilibrium(rigid, row, 0, shape)
+    position[:] = shape.tcp_position
+    rotation[:, :] = shape.tcp_rotation
+
+
+@njit(**JIT)
+def _want(rigid_block, row_block, shape_block, q, pose):  # type: ignore[no-untyped-def]
+    """Write the rigid pose (12,) at q, position first, from packed records."""
+    n = q.shape[0]
+    rotation = pose[3:].reshape((3, 3))
+    _rigid_pose(
+        chain_of(rigid_block, n), row_of(row_block, n), shape_of(shape_block, n), q, pose[:3],
+        rotation,
+    )  # fmt: skip
+
+
+@njit(**JIT)
+def _step(chain_block, row_block, shape_block, pose, offset):  # type: ignore[no-untyped-def]
+    """``next_offset`` of packed records."""
+    n = offset.shape[0]
+    return next_offset(
+        chain_of(chain_block, n), row_of(row_block, n), 0, shape_of(shape_block, n), pose[:3],
+        pose[3:].reshape((3, 3)), LEVER, offset,
+    )  # fmt: skip
+
+
+@njit(**JIT)
+def _moved(wanted, pose, offset, moved):  # type: ignore[no-untyped-def]
+    """Write how far (6,) a pose (12,) is from the wanted one; no offset, no motion."""
+    moved[:] = 0.0
+    if np.any(offset != 0.0):
+        moved[:3] = pose[:3] - wanted[:3]
+        _turned(pose[3:].reshape((3, 3)), wanted[3:].reshape((3, 3)), moved[3:])
+
+
 class Compensator:
     """Live compensation of one setpoint after the other, with buffers kept between them.
 
-    ``correct`` costs a few tens of microseconds. Not to be shared between threads.
+    ``correct`` costs some ten microseconds, one Newton step another ten. Not to be shared between
+    threads.
     """
 
     def __init__(self, model: Model) -> None:
         self.model = model
-        self._chain: Chain = model.chain()
-        self._rigid: Chain = model.without_terms().chain()
-        self._shape: Shape = kernel.new_shape(model.arm.n)
-        self._rigid_shape: Shape = kernel.new_shape(model.arm.n)
-        self._offset = np.zeros(model.arm.n)
+        self._n = n = model.arm.n
+        self._chain = pack(model.chain())
+        self._rigid = pack(model.without_terms().chain())
+        self._shape = pack(kernel.new_shape(n))
+        self._rigid_shape = pack(kernel.new_shape(n))
+        plain = Rows(
+            np.zeros((1, n)), np.ones((1, n)), np.zeros(1), np.zeros((1, 3)), np.zeros((1, 6))
+        )
+        self._row, self._rigid_row = pack(plain), pack(plain)
+        self._view: Rows = row_of.py_func(self._row, n)
+        self._conditions = model.conditions()
+        self._offset = np.zeros(n)
+        self._wanted, self._pose = np.zeros(12), np.zeros(12)
 
     def correct(self, nominal_q: Array, loads: Loads | None = None) -> Correction:
         """Return the corrected setpoint for ``nominal_q`` (n,); ``loads`` holds one row.
@@ -138,41 +199,38 @@ class Compensator:
         The wanted pose is the rigid, effect-free arm's at ``nominal_q``. A row that cannot be
         solved comes back with the distance left in ``residual`` (inf: no equilibrium).
         """
-        row = np.array(nominal_q, dtype=float, order="C")[None]
-        position, rotation = self._rigid_pose(self._plain(row))
-        shape, offset = self._shape, self._offset.copy()
-        best_q, best, steps = row, np.inf, 0
+        nominal = np.array(nominal_q, dtype=float)
+        _want(self._rigid, self._rigid_row, self._rigid_shape, nominal, self._wanted)
+        offset, best_q, best, steps = self._offset.copy(), nominal, np.inf, 0
+        loads = loads or Loads()
         for steps in range(1, MAX_STEPS + 1):  # noqa: B007
-            q = row + offset
-            rows = self.model.rows(q, loads)
-            distance = _next_offset(self._chain, rows, shape, position, rotation, offset)
+            q = nominal + offset
+            self._load(q, loads)
+            distance = _step(self._chain, self._row, self._shape, self._wanted, offset)
             if distance < 0:
                 break
             if distance < best:
                 best_q, best = q, distance
             if distance < TOLERANCE:
                 break
-        self._offset = (best_q - row)[0] if best < np.inf else np.zeros(row.shape[1])
-        pose = self._rigid_pose(self._plain(best_q))
-        moved = np.concatenate([pose[0] - position, rotation_vector(pose[1] @ rotation.T)])
-        return Correction(best_q[0], moved, np.asarray(best), np.asarray(steps))
+        self._offset[:] = best_q - nominal if best < np.inf else 0.0
+        _want(self._rigid, self._rigid_row, self._rigid_shape, best_q, self._pose)
+        moved = np.empty(6)
+        _moved(self._wanted, self._pose, self._offset, moved)
+        return Correction(best_q, moved, np.asarray(best), np.asarray(steps))
 
-    def _plain(self, q: Array) -> Rows:
-        n = q.shape[1]
-        return Rows(q, np.ones((1, n)), np.zeros(1), np.zeros((1, 3)), np.zeros((1, 6)))
-
-    def _rigid_pose(self, rows: Rows) -> tuple[Array, Array]:
-        shape = self._rigid_shape
-        shape.bend[:] = 0.0  # nothing bends; and no row may spoil the next
-        kernel.equilibrium(self._rigid, rows, 0, shape)
-        return shape.tcp_position.copy(), shape.tcp_rotation.copy()
-
-
-def _next_offset(
-    chain: Chain, rows: Rows, shape: Shape, position: Array, rotation: Array, offset: Array
-) -> float:
-    """Return the distance of row 0 from the wanted pose and write the next joint offset."""
-    return float(next_offset(chain, rows, 0, shape, position, rotation, LEVER, offset))
+    def _load(self, q: Array, loads: Loads) -> None:
+        """Write what acts at q (n,) into the row's own buffers."""
+        row, model = self._view, self.model
+        row.q[0] = q
+        given = loads.payload_mass
+        row.payload_mass[0] = model.payload_mass if given is None else given[0]
+        cog = loads.payload_cog
+        row.payload_cog[0] = model.payload_cog if cog is None else cog[0]
+        row.wrench[0] = 0.0 if loads.wrench is None else loads.wrench[0]
+        if self._conditions:
+            row.growth[0] = 1.0
+            model.condition(row, loads, q[None], self._conditions)
 
 
 def correct(model: Model, nominal_q: Array, loads: Loads | None = None) -> Correction:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from core import kernel
 from core.arm import Arm
 from core.effects import CATALOGUE, Site, Term
+from core.effects.effect import Effect
 from core.errors import InputError
 from core.kernel import Chain, Rows
 from core.loads import Loads
@@ -112,9 +113,20 @@ class Model:
             np.array(loads.wrench, dtype=float, order="C")
         )  # fmt: skip
         rows = Rows(np.array(q, dtype=float, order="C"), np.ones((count, n)), mass, cog, wrench)
-        for term in self.terms:
-            CATALOGUE[term.effect].condition(term, self.arm, rows, self._warmed(loads), q)
+        self.condition(rows, loads, q, self.conditions())
         return rows
+
+    def conditions(self) -> tuple[Term, ...]:
+        """Return the terms that change rows, not the chain alone."""
+        own = Effect.condition
+        return tuple(t for t in self.terms if type(CATALOGUE[t.effect]).condition is not own)
+
+    def condition(self, rows: Rows, loads: Loads, q: Array, terms: Sequence[Term]) -> None:
+        """Change ``rows`` in place by ``terms``; ``q`` is (N, n) encoder angles."""
+        if terms:
+            warmed = self._warmed(loads)
+            for term in terms:
+                CATALOGUE[term.effect].condition(term, self.arm, rows, warmed, q)
 
     def _warmed(self, loads: Loads) -> Loads:
         """Return loads whose temperatures count from the reference."""
