@@ -18,7 +18,7 @@ from bridge.controller_clock import ControllerClock
 from bridge.cycle_row import fill_row
 from bridge.daemon_settings import DaemonSettings
 from bridge.live_loads import LiveLoads
-from bridge.setpoint_source.source import Source, SourceDryError
+from bridge.setpoint_source.source import Source, SourceDryError, Told
 from bridge.setpoint_stream import SetpointStream
 from bridge.shared_page import Command, Page, Phase
 from bridge.state_watch import StateWatch
@@ -298,3 +298,13 @@ class Loop:
         row[7] = stream.clamped if setpoint is not None else 0
         row[8] = stream.residual
         page.publish()
+        self._source.tell(
+            Told(
+                self._supervisor.state,
+                nominal,
+                corrected,
+                offset,
+                setpoint is not None,
+                stream.clamped if setpoint is not None else 0,
+            )
+        )

@@ -80,13 +80,16 @@ class SetpointSettings(BaseModel):
 
     model_config = _FROZEN
 
-    source: Literal["target", "trajectory", "tcp"] = "target"
+    source: Literal["target", "trajectory", "tcp", "modbus"] = "target"
     arm: bool = Field(False, description="true: `run` writes setpoints; false: it only observes")
     file: Path | None = Field(None, description="trajectory: CSV of timestamp, target_q_i")
-    host: str = Field("127.0.0.1", description="tcp: address to listen on, loopback only")
-    port: int = Field(30310, ge=0, le=65535, description="tcp: port to listen on")
+    host: str = Field("127.0.0.1", description="tcp, modbus: address to listen on, loopback only")
+    port: int = Field(30310, ge=0, le=65535, description="tcp, modbus: port to listen on")
     timeout: float = Field(
-        0.2, gt=0.0, le=5.0, description="tcp: s without a line after which the source is dry"
+        0.2,
+        gt=0.0,
+        le=5.0,
+        description="tcp, modbus: s without a setpoint after which the source is dry",
     )
     start_tolerance: float = Field(
         0.02, gt=0.0, le=0.2, description="farthest the first setpoint may be from the arm, rad"

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 SOURCES: dict[str, str] = {
     "target": "bridge.setpoint_source.target:TargetSource",
     "trajectory": "bridge.setpoint_source.trajectory:TrajectorySource",
+    "modbus": "bridge.setpoint_source.modbus:ModbusSource",
     "tcp": "bridge.setpoint_source.tcp:TcpSource",
 }
 """Name in a cell file (setpoints.source) -> ``module:Class``, imported when it is used."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,18 @@ from bridge.settings import SetpointSettings
 from core.errors import RunError
 
 Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What the loop did in one cycle."""
+
+    state: int  # of the supervisor
+    nominal_q: Vector  # (n,) rad
+    corrected_q: Vector  # (n,) rad
+    offset_in_base: Vector  # (6,) m, rad
+    written: bool  # the corrected setpoint has left
+    clamped: int  # bits of the limiter
 
 
 class SourceDryError(RunError):
@@ -45,6 +58,9 @@ class Source(ABC):
     @abstractmethod
     def sample(self, timestamp: float, own_q: Vector) -> Vector:
         """Return the setpoint (n,) rad at controller time ``timestamp``. Raises SourceDryError."""
+
+    def tell(self, told: Told) -> None:
+        """Take note of what the loop did in this cycle, for whom it concerns. Never blocks."""
 
     @property
     def ended(self) -> bool:

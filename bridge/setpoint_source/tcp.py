@@ -11,20 +11,19 @@ import contextlib
 import json
 import math
 import socket
-import time
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.setpoint_source.source import Source, SourceDryError
+from bridge.setpoint_source.glide import Glide
+from bridge.setpoint_source.source import Source
 from bridge.settings import SetpointSettings
 from core.errors import RunError
 
 Vector = NDArray[np.float64]
 LONGEST_LINE = 4096  # bytes
 MOST_BYTES = 65536  # read in one cycle
-LONGEST_GLIDE = 0.1  # s
 
 
 class TcpSource(Source):
@@ -35,11 +34,7 @@ class TcpSource(Source):
         self._listener: socket.socket | None = None
         self._planner: socket.socket | None = None
         self._buffer = b""
-        self._newest: Vector | None = None
-        self._heard = 0.0  # s, monotonic, of the newest line
-        self._from: Vector | None = None
-        self._glide = 0.0  # s
-        self._now: Vector | None = None
+        self._glide = Glide(settings.timeout, "line")
         self.bad_lines = 0
 
     @property
@@ -73,32 +68,17 @@ class TcpSource(Source):
     def first(self, own_q: Vector) -> Vector | None:
         """Return the newest setpoint where one has come lately."""
         self._receive()
-        if self._newest is None or time.monotonic() - self._heard > self.settings.timeout:
-            return None
-        return self._newest
+        return self._glide.first()
 
     def begin(self, timestamp: float, own_q: Vector) -> None:
         """Start from where the arm stands."""
-        self._now = own_q.copy()
-        self._turn()
+        self._glide.begin(own_q)
 
     def sample(self, timestamp: float, own_q: Vector) -> Vector:
         """Return the setpoint of this moment. Raises SourceDryError where no line came in time."""
         if self._receive():
-            self._turn()
-        silent = time.monotonic() - self._heard
-        if self._newest is None or silent > self.settings.timeout:
-            raise SourceDryError(f"setpoints: found no line for {silent:.3f} s")
-        share = min(silent / self._glide, 1.0) if self._glide > 0.0 else 1.0
-        if share >= 1.0 or self._from is None:
-            self._now = self._newest
-        else:
-            self._now = self._from + share * (self._newest - self._from)
-        return self._now
-
-    def _turn(self) -> None:
-        """Glide to the newest setpoint from where the stream is."""
-        self._from = self._now if self._now is not None else self._newest
+            self._glide.turn()
+        return self._glide.sample()
 
     def _receive(self) -> bool:
         """Take what has arrived; returns whether there is a new setpoint."""
@@ -153,9 +133,7 @@ class TcpSource(Source):
         if len(values) != self.n or not all(map(math.isfinite, values)):
             self._refuse(f"found {len(values)} numbers, expected {self.n} finite ones, rad")
             return False
-        now = time.monotonic()
-        self._glide = min(now - self._heard, LONGEST_GLIDE) if self._newest is not None else 0.0
-        self._newest, self._heard = np.array(values), now
+        self._glide.take(np.array(values))
         return True
 
     def _refuse(self, words: str) -> None:

@@ -1,0 +1,106 @@
+"""Setpoints from a PLC over Modbus TCP; the registers stand in modbus_server.py."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.setpoint_source.glide import Glide
+from bridge.setpoint_source.modbus_page import MOST_JOINTS, PlcPage
+from bridge.setpoint_source.source import Source, Told
+from bridge.settings import SetpointSettings
+from core.errors import InputError, RunError
+
+Vector = NDArray[np.float64]
+WRITTEN, LIMITED = 1, 2  # flags
+
+
+class ModbusSource(Source):
+    """Listens, in a process of its own, for a PLC; tells it what became of its setpoints.
+
+    Raises InputError for an arm with more joints than the registers hold.
+    """
+
+    def __init__(self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path) -> None:
+        super().__init__(settings, n, moves_arm, folder)
+        if n > MOST_JOINTS:
+            raise InputError(f"setpoints.source modbus: found {n} joints, expected {MOST_JOINTS}")
+        self._glide = Glide(settings.timeout, "new sequence number")
+        self._page: PlcPage | None = None
+        self._server: subprocess.Popen[str] | None = None
+        self._sequence: int | None = None
+        self._cycle = 0
+        self.port = 0
+
+    def open(self) -> None:
+        """Start the server. Raises RunError where the address is taken."""
+        page = self._page = PlcPage(self.n)
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+        server = self._server = subprocess.Popen(
+            [sys.executable, "-m", "bridge.setpoint_source.modbus_server"],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment,
+            pass_fds=(page.fd,),
+        )  # fmt: skip
+        assert server.stdin is not None
+        assert server.stdout is not None
+        order = {"host": self.settings.host, "port": self.settings.port, "n": self.n}
+        server.stdin.write(json.dumps({**order, "page": page.fd}) + "\n")
+        server.stdin.flush()
+        said = json.loads(server.stdout.readline() or '{"failure": "its server ended"}')
+        if "failure" in said:
+            self.close()
+            raise RunError(f"setpoints: {said['failure']}")
+        self.port = int(said["port"])
+
+    def close(self) -> None:
+        """End the server."""
+        server, self._server = self._server, None
+        if server is not None:
+            server.kill()
+            server.wait()
+            for stream in (server.stdin, server.stdout):
+                if stream is not None:
+                    stream.close()
+        page, self._page = self._page, None
+        if page is not None:
+            page.close()
+
+    def first(self, own_q: Vector) -> Vector | None:
+        """Return the newest setpoint where one has come lately."""
+        self._receive()
+        return self._glide.first()
+
+    def begin(self, timestamp: float, own_q: Vector) -> None:
+        """Start from where the arm stands."""
+        self._glide.begin(own_q)
+
+    def sample(self, timestamp: float, own_q: Vector) -> Vector:
+        """Return the setpoint of this moment. Raises SourceDryError where the PLC fell silent."""
+        if self._receive():
+            self._glide.turn()
+        return self._glide.sample()
+
+    def _receive(self) -> bool:
+        found = None if self._page is None else self._page.setpoint()
+        if found is None or found[0] == self._sequence:
+            return False
+        self._sequence = found[0]
+        self._glide.take(found[1])
+        return True
+
+    def tell(self, told: Told) -> None:
+        """Hand state, corrected and nominal joints on to the PLC."""
+        if self._page is None:
+            return
+        self._cycle += 1
+        flags = (WRITTEN if told.written else 0) | (LIMITED if told.clamped else 0)
+        self._page.put_status(
+            (int(told.state), self._sequence or 0, self._cycle, flags),
+            np.concatenate([told.corrected_q, told.nominal_q, told.offset_in_base]),
+        )

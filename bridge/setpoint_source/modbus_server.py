@@ -1,0 +1,127 @@
+"""The Modbus TCP server that a PLC talks to: ``python -m bridge.setpoint_source.modbus_server``.
+
+A process of its own, so that a client's traffic never delays the loop. Numbers are signed 32 bit,
+high word first, in 1e-6 rad or 1e-6 m.
+
+=================  ==============================================================================
+holding 0          sequence: any change hands the joints below over; write all with one request
+holding 2 to 2n+1  nominal joints
+input 0, 1         version of this map (1); number of joints
+input 2            what the loop is doing: 0 disconnected, 1 observing, 2 armed, 3 compensating,
+                   4 holding, 5 fault
+input 3            sequence taken last
+input 4            cycle counter: it moves as long as the loop is alive
+input 5            bit 0: the corrected setpoint was sent to the robot; bit 1: it was limited
+input 10 on        corrected joints
+input 30 on        nominal joints that they belong to
+input 50 to 61     offset of the TCP in base: x, y, z, rotation vector
+=================  ==============================================================================
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import os
+import sys
+import threading
+from typing import Any
+
+import numpy as np
+from pymodbus.server import ModbusTcpServer
+from pymodbus.simulator import DataType, SimData, SimDevice
+
+from bridge.setpoint_source.modbus_page import PlcPage
+from drivers.modbus.registers import Coding
+
+VERSION = 1
+UNIT = 1e-6  # rad or m a count
+CORRECTED, NOMINAL, OFFSET, INPUTS = 10, 30, 50, 62
+JOINTS = 2  # holding register of the first joint
+CODING = Coding("i32")
+LIMIT = 2147.0  # rad or m: what a number can hold
+
+
+class PlcServer:
+    """Holds the registers; answers from the newest record of the loop."""
+
+    def __init__(self, page: PlcPage) -> None:
+        self._page = page
+        self._holding = [0] * (JOINTS + 2 * page.n)
+
+    def device(self) -> SimDevice:
+        """Return the library's device: any unit id, two tables."""
+        inputs = SimData(0, count=INPUTS, datatype=DataType.REGISTERS)
+        holding = SimData(0, count=len(self._holding), datatype=DataType.REGISTERS)
+        nothing = SimData(0, values=[False] * 16, datatype=DataType.BITS)
+        return SimDevice(id=0, simdata=([nothing], [nothing], [holding], [inputs]),
+                         action=self._answer)  # fmt: skip
+
+    async def _answer(
+        self, function: int, start: int, address: int, count: int, registers: list[int],
+        values: list[int] | list[bool] | None,
+    ) -> None:  # fmt: skip
+        if function == 4:
+            registers[:INPUTS] = self._inputs()
+        elif values is not None and function in (6, 16, 22, 23):
+            self._take(address, [int(v) for v in values])
+
+    def _take(self, address: int, values: list[int]) -> None:
+        before = self._holding[0]
+        self._holding[address : address + len(values)] = values
+        if self._holding[0] != before:
+            counts = CODING.decode(self._holding[JOINTS:])
+            self._page.put_setpoint(self._holding[0], np.array(counts) * UNIT)
+
+    def _inputs(self) -> list[int]:
+        found = [0] * INPUTS
+        n = self._page.n
+        found[0], found[1] = VERSION, n
+        told = self._page.status()
+        if told is None:
+            return found
+        (state, sequence, cycle, flags), values = told
+        found[2:6] = [state, sequence, cycle & 0xFFFF, flags]
+        numbers = np.nan_to_num(values, nan=0.0, posinf=LIMIT, neginf=-LIMIT)
+        words = CODING.encode((np.clip(numbers, -LIMIT, LIMIT) / UNIT).tolist())
+        found[CORRECTED : CORRECTED + 2 * n] = words[: 2 * n]
+        found[NOMINAL : NOMINAL + 2 * n] = words[2 * n : 4 * n]
+        found[OFFSET:INPUTS] = words[4 * n :]
+        return found
+
+
+async def serve(page: PlcPage, host: str, port: int) -> None:
+    """Serve until the process ends; tells the port, or the reason, in a line on stdout."""
+    server = ModbusTcpServer(PlcServer(page).device(), address=(host, port))
+    try:
+        await server.serve_forever(background=True)
+    except (RuntimeError, OSError):
+        _say({"failure": f"cannot listen on {host}:{port}"})
+        return
+    transport: Any = server.transport
+    _say({"port": transport.sockets[0].getsockname()[1]})
+    await server.serving
+
+
+def _say(what: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(what) + "\n")
+    sys.stdout.flush()
+
+
+def _end_with_parent() -> None:
+    """End when the loop's process is gone: it holds the other end of stdin."""
+    sys.stdin.read()
+    os._exit(0)
+
+
+def main() -> None:
+    """Serve as one line of JSON on stdin says: host, port, n, page."""
+    logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
+    order = json.loads(sys.stdin.readline())
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    asyncio.run(serve(PlcPage(order["n"], order["page"]), order["host"], order["port"]))
+
+
+if __name__ == "__main__":
+    main()
