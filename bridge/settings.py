@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, TypeAdapter, field_validator
 
 from drivers.can.settings import CanSettings
+from drivers.canopen.settings import CanopenSettings
 from drivers.modbus.settings import ModbusSettings
 from drivers.ur_rtde.settings import UrRtdeSettings
 
@@ -27,7 +28,8 @@ def _driver_of(link: Any) -> Any:
 LinkSettings = Annotated[
     Annotated[UrRtdeSettings, Tag("ur_rtde")]
     | Annotated[ModbusSettings, Tag("modbus")]
-    | Annotated[CanSettings, Tag("can")],
+    | Annotated[CanSettings, Tag("can")]
+    | Annotated[CanopenSettings, Tag("canopen")],
     Discriminator(_driver_of),
 ]
 """Section ``link``: the settings of the driver that it names (left out: ur_rtde)."""

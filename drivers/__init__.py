@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 DRIVERS: dict[str, str] = {
     "can": "drivers.can.driver:CanDriver",
+    "canopen": "drivers.canopen.driver:CanopenDriver",
     "modbus": "drivers.modbus.driver:ModbusDriver",
     "ur_rtde": "drivers.ur_rtde.driver:UrRtdeDriver",
 }

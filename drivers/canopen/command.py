@@ -1,0 +1,102 @@
+"""Setpoint -> RPDOs: all of them before a SYNC makes them count, or none."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import LinkError, WriteError
+from drivers.canopen.master import Master
+from drivers.canopen.profile import CanopenProfile
+
+Vector = NDArray[np.float64]
+Frames = list[tuple[int, bytes, str]]
+OURS = ("Controlword",)  # beside the mode's own target
+
+
+class RpdoWriter:
+    """Sends RPDOs of transmission type 1: drives act on them at the next SYNC, all at once.
+
+    A set of which only a part got out is followed by the set before; where not even that gets out,
+    no SYNC may leave, so that the part never counts.
+    """
+
+    def __init__(self, master: Master, profile: CanopenProfile) -> None:
+        self._master, self._profile = master, profile
+        self._image: list[dict[str, int]] = [{} for _ in profile.nodes]
+        self._last: Frames = []
+        self.partial = False  # a part of a set stands in the drives, waiting for a SYNC
+        self.mended = 0  # sets of which a part had to be taken back
+        self.target: Vector | None = None  # (n,) rad, of the last whole set
+
+    def load(self) -> None:
+        """Fill objects that we do not command with what the drives hold. Raises LinkError."""
+        self.forget()
+        for joint, node in enumerate(self._profile.nodes):
+            for layout in self._profile.rpdo:
+                for entry in layout.entries:
+                    if entry.name not in (*OURS, self._profile.target):
+                        held = self._master.read(node, entry.address)
+                        self._image[joint][entry.name] = held
+
+    def forget(self) -> None:
+        """Forget what was sent: the drives' own state holds."""
+        self._last, self.partial, self.target = [], False, None
+
+    def send(self, controlwords: Sequence[int], q: Vector) -> None:
+        """Send Controlwords and joint targets (n,), rad; they count at the next SYNC.
+
+        Raises WriteError where not all got out; then none of them will count.
+        """
+        frames = self._encode(controlwords, q)
+        for sent, (cob_id, data, name) in enumerate(frames):
+            try:
+                self._master.send(cob_id, data, name)
+            except LinkError as error:
+                self.partial = self.partial or sent > 0
+                done = "" if not sent else f" ({sent} of {len(frames)} out; {self._mend()})"
+                raise WriteError(f"{error}{done}") from None
+        self._last, self.partial, self.target = frames, False, q.copy()
+
+    def _encode(self, controlwords: Sequence[int], q: Vector) -> Frames:
+        """Return all frames before any is sent. Raises WriteError."""
+        profile = self._profile
+        if q.shape != (profile.n,) or not np.isfinite(q).all():
+            raise WriteError(f"{self._master.where}: found {q}, expected {profile.n} finite joints")
+        frames: Frames = []
+        counts = profile.counts(q)
+        for joint, node in enumerate(profile.nodes):
+            self._image[joint]["Controlword"] = controlwords[joint]
+            self._image[joint][profile.target] = int(counts[joint])
+            for layout in profile.rpdo:
+                try:
+                    data = layout.encode(self._image[joint])
+                except ValueError as error:
+                    raise WriteError(f"{self._master.where}: node {node}: {error}") from None
+                frames.append((layout.cob_id(node), data, f"{layout.name} of node {node}"))
+        return frames
+
+    def _mend(self) -> str:
+        """Take back a set of which a part is out; returns what was done."""
+        self.mended += 1
+        if not self._last:
+            return "no SYNC will follow"
+        try:
+            for cob_id, data, name in self._last:
+                self._master.send(cob_id, data, name)
+        except LinkError:
+            return "no SYNC will follow"
+        self.partial = False
+        return "the set before was sent again"
+
+    def make_whole(self) -> None:
+        """Make sure that a SYNC may leave. Raises LinkError where a part still stands."""
+        if self.partial:
+            done = self._mend()
+            if self.partial:
+                raise LinkError(
+                    f"{self._master.where}: a setpoint is out in part: {done}; the drives stop "
+                    "when our heartbeat ends"
+                )

@@ -1,0 +1,285 @@
+"""The CANopen driver: one arm of CiA 402 drives, moved by SYNC and PDOs."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
+from core.model import Model
+from core.setpoint import Setpoint
+from core.state import RobotState
+from drivers.canopen.command import RpdoWriter
+from drivers.canopen.configure import check_identity, check_units, interpolation_period, set_up
+from drivers.canopen.listening import Emergency, Foreign
+from drivers.canopen.master import Master
+from drivers.canopen.power import Power
+from drivers.canopen.profile import WINDOW, read_profile
+from drivers.canopen.settings import CanopenSettings
+from drivers.canopen.state import StateBuilder, not_following, positions, states
+from drivers.canopen.sync_set import SyncSet
+from drivers.driver import Driver
+
+Vector = NDArray[np.float64]
+log = logging.getLogger("drivers.canopen")
+
+STARTING = 2.0  # s in which drives must be OPERATIONAL and answer a SYNC
+
+
+class CanopenDriver(Driver):
+    """One arm of CiA 402 drives, of which we are the only master.
+
+    Each ``read_state`` sends one SYNC; setpoints count at the SYNC after them. Nothing is enabled
+    before ``arm``.
+    """
+
+    def __init__(self, settings: CanopenSettings, model: Model) -> None:
+        self.profile = read_profile(settings.profile_path, model.arm.n)
+        super().__init__(min(settings.rate, 1.0 / self.profile.file.sync_period), model.arm.n)
+        interpolation_period(1.0 / self.rate)  # raises InputError
+        self.settings = settings
+        self.master = Master(settings, self.profile)
+        self.writer = RpdoWriter(self.master, self.profile)
+        self.power = Power(self.master, self.profile, self.writer, self._exchange)
+        self._arm, self._builder = model.arm, StateBuilder(self.profile, model.arm)
+        self._period = 1.0 / self.rate
+        self._window = self.profile.file.sync_window or WINDOW * self._period
+        self._due = 0.0  # s, monotonic: of the next SYNC
+        self._torn = False  # the last set was not whole
+        self._sample: SyncSet | None = None  # the last that was whole
+        self._fresh_at = 0.0  # s, monotonic: of that one
+        self._connected_at = 0.0
+        self._armed_at: float | None = None  # s, monotonic
+        self._moved_at = 0.0  # s, monotonic: when the joints last changed, or were not sent away
+        self._told: Emergency | None = None  # that was written to the log last
+
+    # -- connecting -------------------------------------------------------------------------------
+
+    def connect(self) -> None:
+        """Listen, set the drives' PDOs up and start their communication. Enables nothing."""
+        master = self.master
+        master.open()
+        try:
+            time.sleep(self.settings.listen)
+            if self.foreign is not None:
+                raise LinkError(self._two_masters(self.foreign))
+            for node in self.profile.nodes:
+                check_identity(master, self.profile, node)
+                master.command(node, "PRE-OPERATIONAL")
+                set_up(master, self.profile, node, self._period)
+            check_units(master, self.profile, self._arm)
+            assert master.life is not None
+            master.life.started()
+            for node in self.profile.nodes:
+                master.command(node, "OPERATIONAL")
+            self._first_sample()
+        except LinkError:
+            master.close()
+            raise
+        self._connected_at = time.monotonic()
+        self._armed_at = None
+        self._builder.forget()
+
+    def _first_sample(self) -> None:
+        """Wait until all drives answer a SYNC. Raises LinkError."""
+        end = time.monotonic() + min(STARTING, self.settings.connect_timeout)
+        while (found := self._exchange()) is None:
+            if time.monotonic() > end:
+                raise LinkError(f"{self.master.where}: {self.master.collector.why()} after a SYNC")
+        try:
+            self._builder.build(found, None, False)
+        except InvalidStateError as error:
+            raise LinkError(f"{self.settings.where()}: {error}") from None
+        self._fresh_at = found.received
+
+    # -- reading ----------------------------------------------------------------------------------
+
+    def _exchange(self) -> SyncSet | None:
+        """Send one SYNC when it is due and return its TPDOs, None where they are torn.
+
+        After a torn set one SYNC is left out, so that what comes late is not taken for the next.
+        """
+        now = time.monotonic()
+        self._due += (2 if self._torn else 1) * self._period
+        if self._due < now - 0.5 * self._period:
+            self._due = now  # too late for the slot: no burst
+        if self._due > now:
+            time.sleep(self._due - now)
+        self.writer.make_whole()
+        collector = self.master.collector
+        collector.stray = ""
+        synced = self.master.sync()
+        found = collector.wait(synced + self._window)
+        self._torn = found is None
+        if found is not None:
+            self._sample = found
+        return found
+
+    def read_state(self) -> RobotState:
+        """Send one SYNC and return what all drives told at it; see Driver.read_state.
+
+        Raises InvalidStateError where a set is torn, LinkError where a drive has restarted.
+        """
+        while True:
+            stray = self.master.collector.stray
+            found = self._exchange()
+            self._check_lives()
+            if found is not None and not stray:
+                self._fresh_at = found.received
+                return self._believe(found)
+            why = self.master.collector.why() if found is None else f"{stray} came without a SYNC"
+            now = time.monotonic()
+            if now - self._fresh_at > self.settings.state_timeout:
+                raise StaleStateError(
+                    f"{self.master.where}: no whole sample for {now - self._fresh_at:.3f} s: {why}"
+                )
+            if stray or not self.master.collector.empty:
+                raise InvalidStateError(f"{self.master.where}: torn sample: {why}")
+
+    def _check_lives(self) -> None:
+        """Raise where a drive's heartbeat has ended, or where it has restarted."""
+        life = self.master.life
+        assert life is not None
+        if life.log and life.log[-1] is not self._told:
+            self._told = life.log[-1]
+            log.warning("%s: %s", self.master.where, self._told)
+        node = life.not_operational()
+        if node is not None:
+            why = "has restarted" if node in life.restarted else f"NMT state {life.nmt[node]}"
+            raise LinkError(f"{self.master.where}: node {node}: {why}, expected OPERATIONAL")
+        node = life.lost()
+        if node is not None:
+            raise StaleStateError(
+                f"{self.master.where}: node {node}: no heartbeat for "
+                f"{self.profile.heartbeat.lost_after:g} s{self.power.complaint(node)}"
+            )
+
+    def _believe(self, found: SyncSet) -> RobotState:
+        armed = self._armed_at is not None
+        before = self._builder.last_q
+        state = self._builder.build(found, self.writer.target if armed else None, armed)
+        self._check_frozen(state, before)
+        return state
+
+    def _check_frozen(self, state: RobotState, before: Vector | None) -> None:
+        """Refuse joints that stand still count by count though they were sent elsewhere."""
+        now, q = state.received, state.actual_q
+        away = float(np.abs(state.target_q - q).max())
+        moved = before is None or (q != before).any()
+        if self._armed_at is None or moved or away < self.settings.frozen_distance:
+            self._moved_at = now
+        elif now - self._moved_at > self.settings.frozen_after:
+            raise StaleStateError(
+                f"{self.profile.name}: joints have stood still for {now - self._moved_at:.2f} s, "
+                f"commanded {away:.3f} rad away"
+            )
+
+    # -- writing ----------------------------------------------------------------------------------
+
+    @property
+    def foreign(self) -> Foreign | None:
+        """Return the last frame of another master; None: there was none."""
+        return self.master.listener.foreign if self.master.listener is not None else None
+
+    def _two_masters(self, foreign: Foreign) -> str:
+        return (
+            f"{self.master.where}: another master sent {foreign.what} "
+            f"{time.monotonic() - foreign.seen:.2f} s ago: found two masters, expected one"
+        )
+
+    def arm(self, state: RobotState) -> None:
+        """Enable the drives where they stand. Raises WriteError, and then none is enabled."""
+        if self._armed_at is not None:
+            return
+        try:
+            found = self._quiet_sample()
+            for joint, told in enumerate(states(found)):
+                if told.startswith("FAULT") and not self.settings.clear_faults:
+                    node = self.profile.nodes[joint]
+                    raise WriteError(
+                        f"{self.master.where}: node {node}: found {told}"
+                        f"{self.power.complaint(node)}, expected none; link.clear_faults resets it"
+                    )
+            self._enable(found)
+        except WriteError:
+            raise
+        except LinkError as error:
+            raise WriteError(str(error)) from None
+
+    def _quiet_sample(self) -> SyncSet:
+        """Return a sample after a while without another master. Raises LinkError."""
+        begun = time.monotonic()
+        quiet = self.settings.foreign_quiet
+        while True:
+            foreign, now = self.foreign, time.monotonic()
+            if foreign is not None and (foreign.seen > begun or now - foreign.seen < quiet):
+                raise WriteError(self._two_masters(foreign))
+            found = self._exchange()
+            self._check_lives()
+            if found is not None and now - self._connected_at >= quiet:
+                return found
+            if found is None and now - self._fresh_at > quiet + self.settings.state_timeout:
+                raise StaleStateError(f"{self.master.where}: {self.master.collector.why()}")
+
+    def _enable(self, found: SyncSet) -> None:
+        start = positions(self.profile, found)
+        try:
+            self.power.prepare()
+            hold = self.power.enable(found, self.settings.arming_time, self.settings.clear_faults)
+            assert self._sample is not None
+            gave = float(np.abs(positions(self.profile, self._sample) - start).max())
+            if gave > self.settings.arming_distance:
+                raise WriteError(f"{self.profile.name}: the arm gave {gave:.3f} rad when enabled")
+            self.writer.send([self.power.following] * self.n, hold)
+        except LinkError:
+            with contextlib.suppress(LinkError):
+                self.power.disable()
+                self.power.restore()
+            raise
+        self._armed_at = self._moved_at = self._fresh_at = time.monotonic()
+        self._builder.forget()
+
+    def write_setpoint(self, setpoint: Setpoint) -> None:
+        """Send one setpoint, which counts at the next SYNC; needs ``arm`` before."""
+        if self._armed_at is None or self._sample is None:
+            raise WriteError(f"{self.master.where}: found a setpoint, expected arm() first")
+        foreign = self.foreign
+        if foreign is not None and foreign.seen > self._armed_at:
+            raise WriteError(self._two_masters(foreign))
+        joint = not_following(self.profile, self._sample)
+        if joint is not None:
+            node = self.profile.nodes[joint]
+            raise WriteError(
+                f"{self.master.where}: node {node}: found {states(self._sample)[joint]}, expected "
+                f"a drive that follows setpoints{self.power.complaint(node)}"
+            )
+        self.writer.send([self.power.following] * self.n, setpoint.q)
+
+    def release(self) -> None:
+        """Quick stop, then switch the drives off and give them back their mode."""
+        if self._armed_at is None:
+            return
+        self._armed_at = None
+        try:
+            self.power.disable()
+            self.power.restore()
+        except WriteError:
+            raise
+        except LinkError as error:
+            raise WriteError(str(error)) from None
+        finally:
+            self._builder.forget()
+            self._fresh_at = time.monotonic()
+
+    def close(self) -> None:
+        """Release where the link lives, end the drives' PDOs and leave the bus."""
+        with contextlib.suppress(LinkError):
+            self.release()
+        with contextlib.suppress(LinkError):
+            for node in self.profile.nodes:
+                self.master.command(node, "PRE-OPERATIONAL")
+        self.master.close()

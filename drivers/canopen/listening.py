@@ -1,0 +1,142 @@
+"""What is heard on the bus: our TPDOs, lives, emergencies, and who else commands our drives."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+from canopen.network import MessageListener, Network
+
+from drivers.canopen.objects import (
+    HEARTBEAT_BASE,
+    NMT,
+    PDO_COUNT,
+    PDO_STEP,
+    RPDO_BASE,
+    SDO_REQUEST_BASE,
+    SYNC,
+)
+from drivers.canopen.profile import CanopenProfile
+from drivers.canopen.sync_set import SyncCollector
+
+KEPT = 64  # emergencies remembered
+OPERATIONAL = 5  # NMT state
+
+
+@dataclass(frozen=True, slots=True)
+class Foreign:
+    """A frame that only a master sends, and that we did not send."""
+
+    what: str
+    seen: float  # s, monotonic
+
+
+@dataclass(frozen=True, slots=True)
+class Emergency:
+    """One EMCY of a drive."""
+
+    node: int
+    code: int
+    register: int
+    seen: float  # s, monotonic
+
+    def __str__(self) -> str:
+        return f"node {self.node}: EMCY 0x{self.code:04X}"
+
+
+class BusListener(MessageListener):
+    """Feeds the collector and the canopen library; a bus never gives us back our own frames."""
+
+    def __init__(self, network: Network, profile: CanopenProfile, collector: SyncCollector) -> None:
+        super().__init__(network)
+        self._collector = collector
+        self._commands = _commands(profile)
+        self.foreign: Foreign | None = None
+        self.error_frames = 0
+
+    def on_message_received(self, msg: Any) -> None:
+        """Take one frame, from the notifier's thread."""
+        if msg.is_error_frame:
+            self.error_frames += 1
+            return
+        if msg.is_remote_frame or msg.is_extended_id or msg.is_fd or not msg.is_rx:
+            return
+        now, cob_id = time.monotonic(), int(msg.arbitration_id)
+        what = self._commands.get(cob_id)
+        if what is not None:
+            self.foreign = Foreign(what, now)
+            return
+        self._collector.take(cob_id, bytes(msg.data), now)
+        super().on_message_received(msg)  # type: ignore[no-untyped-call]
+
+
+def _commands(profile: CanopenProfile) -> dict[int, str]:
+    """Return the identifiers that a master of our drives uses, and how messages call them."""
+    found = {SYNC: "SYNC", NMT: "NMT command"}
+    found[HEARTBEAT_BASE + profile.heartbeat.our_node] = "heartbeat with our node id"
+    for node in profile.nodes:
+        found[SDO_REQUEST_BASE + node] = f"SDO request to node {node}"
+        for number in range(PDO_COUNT):
+            found[RPDO_BASE + PDO_STEP * number + node] = f"RPDO{number + 1} of node {node}"
+    return found
+
+
+class Life:
+    """When each drive was last heard, in which NMT state, and what it complained of."""
+
+    def __init__(self, network: Network, profile: CanopenProfile) -> None:
+        self._profile = profile
+        self.heard: dict[int, float] = {}  # node -> s, monotonic
+        self.nmt: dict[int, int] = {}  # node -> NMT state that it told last
+        self.restarted: set[int] = set()
+        self.active: dict[int, Emergency] = {}
+        self.log: deque[Emergency] = deque(maxlen=KEPT)
+        for node in profile.nodes:
+            remote: Any = network[node]
+            remote.nmt.add_heartbeat_callback(self._heartbeat_of(node))
+            remote.emcy.add_callback(self._emergency_of(node, remote.emcy))
+
+    def _heartbeat_of(self, node: int) -> Any:
+        def note(state: int) -> None:
+            self.heard[node] = time.monotonic()
+            if state == 0:
+                self.restarted.add(node)
+            self.nmt[node] = state
+
+        return note
+
+    def _emergency_of(self, node: int, consumer: Any) -> Any:
+        def note(error: Any) -> None:
+            found = Emergency(node, error.code, error.register, time.monotonic())
+            self.log.append(found)
+            if error.code & 0xFF00:
+                self.active[node] = found
+            else:
+                self.active.pop(node, None)
+            if len(consumer.log) > KEPT:  # the library's own log has no end
+                consumer.reset()
+
+        return note
+
+    def started(self) -> None:
+        """Forget restarts: the drives have just been set up; count their lives from now."""
+        self.restarted.clear()
+        now = time.monotonic()
+        self.heard = dict.fromkeys(self._profile.nodes, now)
+
+    def lost(self) -> int | None:
+        """Return a node whose heartbeats have ceased; None: none."""
+        now = time.monotonic()
+        for node in self._profile.nodes:
+            if now - self.heard.get(node, 0.0) > self._profile.heartbeat.lost_after:
+                return node
+        return None
+
+    def not_operational(self) -> int | None:
+        """Return a node that has restarted or left NMT's OPERATIONAL; None: none."""
+        for node in self._profile.nodes:
+            if node in self.restarted or self.nmt.get(node, OPERATIONAL) != OPERATIONAL:
+                return node
+        return None

@@ -1,0 +1,161 @@
+"""Enabling and disabling the drives by their CiA 402 state machines, SYNC by SYNC."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import LinkError, WriteError
+from drivers.canopen.command import RpdoWriter
+from drivers.canopen.master import Master
+from drivers.canopen.objects import (
+    DISABLE_VOLTAGE,
+    ENABLE_INTERPOLATION,
+    ENABLE_OPERATION,
+    FAULT_RESET,
+    QUICK_STOP,
+    TOWARDS_ENABLED,
+    Address,
+    State,
+)
+from drivers.canopen.profile import CanopenProfile
+from drivers.canopen.state import not_following, positions, states
+from drivers.canopen.sync_set import SyncSet
+
+Vector = NDArray[np.float64]
+MODES_OF_OPERATION, CONSUMER_HEARTBEAT = Address(0x6060, 0), Address(0x1016, 1)
+ABORT_CONNECTION = Address(0x6007, 0)
+STOP_AT_LOSS = 3  # Abort connection option code: quick stop
+STOPPING = 3.0  # s that a quick stop and disabling may take
+STANDING = 3  # SYNCs without a change of any count: the arm stands
+OFF: tuple[State, ...] = (
+    "SWITCH ON DISABLED", "READY TO SWITCH ON", "NOT READY TO SWITCH ON", "FAULT",
+)  # fmt: skip
+
+
+class Power:
+    """Leads all drives of one arm to OPERATION ENABLED and back."""
+
+    def __init__(
+        self,
+        master: Master,
+        profile: CanopenProfile,
+        writer: RpdoWriter,
+        exchange: Callable[[], SyncSet | None],
+    ) -> None:
+        self._master, self._profile, self._writer = master, profile, writer
+        self._exchange = exchange
+        self._modes: dict[int, int] = {}  # node -> Modes of operation before
+        self._watched: list[int] = []  # nodes that watch our heartbeat
+
+    @property
+    def following(self) -> int:
+        """Return the Controlword of a drive that follows setpoints."""
+        interpolated = self._profile.file.mode == "interpolated position"
+        return ENABLE_OPERATION | (ENABLE_INTERPOLATION if interpolated else 0)
+
+    def prepare(self) -> None:
+        """Choose the mode, and have the drives watch our heartbeat. Raises LinkError."""
+        master, profile, beat = self._master, self._profile, self._profile.heartbeat
+        for node in profile.nodes:
+            master.beat()
+            if node not in self._modes:
+                self._modes[node] = master.read(node, MODES_OF_OPERATION)
+            master.write(node, MODES_OF_OPERATION, profile.mode_number)
+            if beat.drives_wait:
+                master.write_where_present(node, ABORT_CONNECTION, STOP_AT_LOSS)
+                watched = beat.our_node << 16 | round(1e3 * beat.drives_wait)
+                if not master.write_where_present(node, CONSUMER_HEARTBEAT, watched):
+                    raise LinkError(
+                        f"{master.where}: node {node} cannot watch our heartbeat (no 0x1016): it "
+                        "would go on when we are gone; heartbeat.drives_wait 0 accepts that"
+                    )
+                self._watched.append(node)
+        self._writer.load()
+
+    def restore(self) -> None:
+        """Put back what ``prepare`` changed. Raises LinkError."""
+        while self._watched:
+            self._master.beat()
+            self._master.write(self._watched.pop(), CONSUMER_HEARTBEAT, 0)
+        for node, mode in list(self._modes.items()):
+            self._master.write(node, MODES_OF_OPERATION, mode)
+            del self._modes[node]
+
+    def enable(self, found: SyncSet, within: float, clear_faults: bool) -> Vector:
+        """Enable all drives where they stand; returns the joints (n,) that they hold, rad.
+
+        ``found`` is the newest sample. Raises WriteError where one does not get there.
+        """
+        hold: Vector | None = None
+        resetting = False
+        end = time.monotonic() + within
+        while True:
+            told = states(found)
+            enabled = all(state == "OPERATION ENABLED" for state in told)
+            if hold is None and enabled:
+                hold = positions(self._profile, found)
+            if hold is not None and enabled and not_following(self._profile, found) is None:
+                return hold
+            if time.monotonic() > end:
+                raise self._not_there(found)
+            resetting = not resetting and clear_faults
+            words = [self._towards(state, enabled, resetting) for state in told]
+            self._writer.send(words, positions(self._profile, found) if hold is None else hold)
+            found = self._exchange() or found
+
+    def _towards(self, state: State, all_enabled: bool, resetting: bool) -> int:
+        """Return the next Controlword; a fault is reset by a rising edge."""
+        if state == "FAULT":
+            return FAULT_RESET if resetting else DISABLE_VOLTAGE
+        if state == "OPERATION ENABLED" and all_enabled:
+            return self.following
+        return TOWARDS_ENABLED.get(state, DISABLE_VOLTAGE)
+
+    def _not_there(self, found: SyncSet) -> WriteError:
+        joint = not_following(self._profile, found) or 0
+        counts, node = found.counts[joint], self._profile.nodes[joint]
+        mode = counts.get("Modes of operation display", self._profile.mode_number)
+        return WriteError(
+            f"{self._master.where}: node {node} does not follow setpoints: found "
+            f"{states(found)[joint]}, Statusword 0x{counts['Statusword']:04X}, mode {mode}, "
+            f"expected OPERATION ENABLED in mode {self._profile.mode_number}{self.complaint(node)}"
+        )
+
+    def complaint(self, node: int) -> str:
+        """Return what a node complained of last, for messages."""
+        life = self._master.life
+        emergency = life.active.get(node) if life is not None else None
+        return f" ({emergency})" if emergency is not None else ""
+
+    def disable(self) -> None:
+        """Stop by quick stop, wait until the arm stands, and switch off. Raises LinkError.
+
+        Drives that answer no more are told so too; they have at least our last word.
+        """
+        profile, end = self._profile, time.monotonic() + STOPPING
+        told: list[State] = ["OPERATION ENABLED"] * profile.n
+        q, still = self._writer.target, 0
+        while True:
+            if q is not None:
+                late = time.monotonic() > end - 0.5 * STOPPING
+                word = DISABLE_VOLTAGE if still >= STANDING or late else QUICK_STOP
+                moving = "OPERATION ENABLED"
+                words = [QUICK_STOP if s == moving and not late else word for s in told]
+                self._writer.send(words, q)
+            found = self._exchange()
+            if found is not None:
+                told, now = states(found), positions(profile, found)
+                still = still + 1 if q is not None and (now == q).all() else 0
+                q = now
+                if all(state in OFF for state in told):
+                    self._writer.forget()
+                    return
+            if time.monotonic() > end:
+                raise WriteError(
+                    f"{self._master.where}: not all drives have told that they are off "
+                    f"{STOPPING:g} s after the quick stop"
+                )

@@ -1,0 +1,131 @@
+"""One SYNC's TPDOs -> RobotState, or the reason why they cannot be believed."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arm import Arm
+from core.errors import InvalidStateError
+from core.state import RobotState
+from drivers.can.state import BEYOND, FASTEST, IDLE, JITTER, RUNNING, SAFETY
+from drivers.canopen.objects import MODE_ACTIVE, State, state_of
+from drivers.canopen.profile import CanopenProfile
+from drivers.canopen.sync_set import SyncSet
+
+Vector = NDArray[np.float64]
+
+
+def states(found: SyncSet) -> list[State]:
+    """Return the drives' states, per joint."""
+    return [state_of(counts["Statusword"]) for counts in found.counts]
+
+
+def positions(profile: CanopenProfile, found: SyncSet) -> Vector:
+    """Return the joint angles (n,), rad."""
+    return profile.angles(np.array([c["Position actual value"] for c in found.counts], float))
+
+
+def not_following(profile: CanopenProfile, found: SyncSet) -> int | None:
+    """Return a joint (from 0) whose drive does not act on setpoints; None: all do."""
+    for joint, (counts, state) in enumerate(zip(found.counts, states(found), strict=True)):
+        mode = counts.get("Modes of operation display", profile.mode_number)
+        active = counts["Statusword"] & MODE_ACTIVE or not profile.file.confirms_mode
+        if state != "OPERATION ENABLED" or mode != profile.mode_number or not active:
+            return joint
+    return None
+
+
+class StateBuilder:
+    """Makes states; remembers the sample before, for plausibility and for velocities."""
+
+    def __init__(self, profile: CanopenProfile, arm: Arm) -> None:
+        self._profile = profile
+        self._lower, self._upper = arm.limits.lower - BEYOND, arm.limits.upper + BEYOND
+        self._rated = profile.rated_torque
+        self._before: tuple[float, Vector] | None = None  # s of the SYNC, rad
+        self._qd = np.zeros(profile.n)
+
+    @property
+    def last_q(self) -> Vector | None:
+        """Return the joints (n,) of the sample before, rad."""
+        return None if self._before is None else self._before[1]
+
+    def forget(self) -> None:
+        """Take the next sample without comparing it."""
+        self._before = None
+
+    def build(self, found: SyncSet, target: Vector | None, armed: bool) -> RobotState:
+        """Return the state. Raises InvalidStateError.
+
+        ``target`` (n,) is what the drives were last told, rad. The time of the sample is that of
+        its SYNC, at which all drives latched their positions.
+        """
+        q = positions(self._profile, found)
+        before, self._before = self._before, None
+        self._check(q)
+        if before is not None:
+            self._check_step(q - before[1], found.synced - before[0])
+        qd = self._velocity(found, q, before)
+        self._before = (found.synced, q)
+        trouble = self._trouble(found, armed)
+        safety, bits = SAFETY[trouble]
+        return RobotState(
+            timestamp=found.synced,
+            received=found.received,
+            actual_q=q,
+            actual_qd=qd,
+            target_q=q if target is None else target,
+            actual_TCP_force=np.zeros(6),
+            actual_current_as_torque=self._torque(found),
+            robot_mode=IDLE if trouble == "not_ready" else RUNNING,
+            safety_mode=safety,
+            safety_status_bits=bits,
+        )
+
+    def _trouble(self, found: SyncSet, armed: bool) -> str:
+        told = states(found)
+        if "FAULT" in told or "FAULT REACTION ACTIVE" in told:
+            return "fault"
+        if not armed:
+            return ""
+        if "QUICK STOP ACTIVE" in told:
+            return "protective_stop"
+        return "" if not_following(self._profile, found) is None else "not_ready"
+
+    def _check(self, q: Vector) -> None:
+        outside = ~((q >= self._lower) & (q <= self._upper))
+        if outside.any():
+            joint = int(np.argmax(outside))
+            raise self._invalid(
+                f"joint {joint + 1}: found {q[joint]:.4f} rad, far outside the arm's limits: "
+                "another arm, another zero, or other units"
+            )
+
+    def _check_step(self, step: Vector, gap: float) -> None:
+        way = np.abs(step)
+        if (way > FASTEST * gap + JITTER).any():
+            joint = int(np.argmax(way))
+            raise self._invalid(
+                f"joint {joint + 1}: found a step of {way[joint]:.4f} rad in {gap:.4f} s"
+            )
+
+    def _velocity(self, found: SyncSet, q: Vector, before: tuple[float, Vector] | None) -> Vector:
+        """Return (n,) rad/s: the drives' own where the profile knows its unit."""
+        scale = self._profile.file.velocity_scale
+        told = [counts.get("Velocity actual value") for counts in found.counts]
+        if scale is not None and None not in told:
+            return np.array(told, float) * scale / self._profile.counts_per_radian
+        if before is not None and 1e-4 < found.synced - before[0] < 1.0:
+            self._qd = (q - before[1]) / (found.synced - before[0])
+        return self._qd
+
+    def _torque(self, found: SyncSet) -> Vector | None:
+        """Return (n,) Nm: Torque actual value is in thousandths of the rated torque."""
+        if self._rated is None:
+            return None
+        told = np.array([counts["Torque actual value"] for counts in found.counts], float)
+        return told * 1e-3 * self._rated * self._profile.direction
+
+    def _invalid(self, words: str) -> InvalidStateError:
+        return InvalidStateError(f"{self._profile.name}: {words}")
