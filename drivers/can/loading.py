@@ -188,13 +188,18 @@ class _Loading:
         found: dict[Key, Incoming] = {}
         counted = [*self.file.sample.messages] if self.file.sample.counter else []
         for name in dict.fromkeys([*readings, *checks, *enabled, *counted]):
-            message, key = self.names.message(name, ("sample", "messages"))
+            message, key = self.names.message(name, self._place(name))
             found[key] = Incoming(
                 name, key, message.length, message, tuple(readings.get(name, ())),
                 tuple(checks.get(name, ())), tuple(enabled.get(name, ())),
                 self._counter(message),
             )  # fmt: skip
         return found
+
+    def _place(self, name: str) -> Keys:
+        """Return where the profile names a message of its sample."""
+        names = self.file.sample.messages
+        return ("sample", "messages", names.index(name)) if name in names else ("feedback",)
 
     def _counter(self, message: Any) -> str | None:
         counter = self.file.sample.counter

@@ -43,9 +43,9 @@ class StateBuilder:
         ``target`` (n,) is what the arm was last told, where anyone told it.
         """
         q = sample.position
-        before, self._before = self._before, None
+        before = self._before
         self._check(q, sample.others)
-        if before is not None:
+        if before is not None:  # a refused sample does not replace it: the next is compared too
             self._check_step(q - before.position, sample.received - before.received)
         qd = sample.others.get("velocity")
         if qd is None or not np.isfinite(qd).all():

@@ -1,0 +1,185 @@
+import struct
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from can_arm import UNIT, joints_frame
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from core.arm import builtin_arm
+from core.errors import InvalidStateError
+from drivers.can.loading import load_profile
+from drivers.can.sample import Assembler
+from drivers.can.state import StateBuilder
+
+PIPER = load_profile("piper")
+PERIOD = 0.005  # s
+INVENTED = Path(__file__).with_name("invented.yaml")
+IDS = (0x2A5, 0x2A6, 0x2A7)
+
+
+def cycle(k):
+    """The three joint frames of cycle k: every joint says k, so that a mixture shows."""
+    return [(IDS[i], struct.pack(">ii", 100 * k, 100 * k)) for i in range(3)]
+
+
+def taken(frames):
+    """Feed (id, data, stamp) and return what came out as counts of the wire."""
+    assembler, found = Assembler(PIPER), []
+    for identifier, data, stamp in frames:
+        sample = assembler.take((identifier, False), data, stamp, stamp)
+        if sample is not None:
+            found.append(np.round(sample.position / UNIT).astype(int).tolist())
+    return found, assembler
+
+
+def test_a_stream_of_whole_samples_comes_through_one_by_one():
+    frames = [(i, d, k * PERIOD + n * 1e-4) for k in range(20) for n, (i, d) in enumerate(cycle(k))]
+    found, assembler = taken(frames)
+    assert found == [[100 * k] * 6 for k in range(20)]
+    assert assembler.broken == 0
+
+
+def test_frames_farther_apart_than_the_window_make_no_sample():
+    (a, b, c) = cycle(1)
+    found, assembler = taken([(*a, 0.0), (*b, 0.001), (*c, 0.0026)])
+    assert found == []
+    assert assembler.dropped["torn"] == 1
+
+
+def test_a_clock_that_goes_back_makes_no_sample():
+    (a, b, c) = cycle(1)
+    assert taken([(*a, 1.0), (*b, 0.9), (*c, 1.001)])[0] == []
+
+
+edits = st.lists(
+    st.tuples(st.sampled_from(("lose", "twice", "swap", "late")), st.integers(0, 59)), max_size=25
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(edits)
+def test_whatever_gets_lost_doubled_swapped_or_late_no_two_cycles_mix(edits):
+    frames = [[i, d, k * PERIOD + n * 1e-4] for k in range(20) for n, (i, d) in enumerate(cycle(k))]
+    for what, where in edits:
+        at = where % len(frames)
+        if what == "lose":
+            del frames[at]
+        elif what == "twice":
+            frames.insert(at, list(frames[at]))
+        elif what == "late":
+            frames[at][2] += 0.004
+        elif at:
+            frames[at - 1], frames[at] = frames[at], frames[at - 1]
+    found, _ = taken(frames)
+    for joints in found:
+        assert len(set(joints)) == 1, joints
+    firsts = [joints[0] for joints in found]
+    assert firsts == sorted(set(firsts))
+
+
+def test_equal_counts_tie_frames_together_and_a_repeated_sample_is_none():
+    profile = load_profile(str(INVENTED))
+    shoulder, hand = profile.sample
+    assembler = Assembler(profile)
+
+    def frame(count, angle):
+        return (count | (angle & 0xFFFFF) << 4 | (angle & 0xFFFFF) << 24).to_bytes(8, "little")
+
+    assert assembler.take(shoulder, frame(1, 100), 0.0, 0.0) is None
+    assert assembler.take(hand, frame(2, 200), 0.001, 0.001) is None
+    assert assembler.dropped["torn"] == 1
+    assert assembler.take(shoulder, frame(2, 100), 0.0015, 0.0015) is not None
+    assembler.take(shoulder, frame(2, 100), 0.004, 0.004)
+    assert assembler.take(hand, frame(2, 200), 0.0041, 0.0041) is None
+    assert assembler.dropped["repeated"] == 1
+
+
+def wild_frames(random, number):
+    """Random and mutated frames around the identifiers that the profile reads."""
+    known = sorted(identifier for identifier, _ in PIPER.incoming)
+    lengths = random.choice([0, 1, 7, 8, 8, 8, 8, 8, 8, 8], number)
+    picks = random.integers(0, len(known), number)
+    strange = random.random(number) < 0.2
+    others = random.integers(0, 1 << 29, number)
+    data = random.integers(0, 256, (number, 8), dtype=np.uint8)
+    small = random.random(number) < 0.5
+    data[small, 0] = data[small, 4] = 0
+    for k in range(number):
+        identifier = int(others[k]) if strange[k] else known[picks[k]]
+        extended = identifier > 0x7FF or bool(others[k] & 1 and strange[k])
+        yield (identifier, extended), data[k, : lengths[k]].tobytes()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(120)
+def test_a_million_wild_frames_raise_nothing_and_no_wrong_sample_is_taken_for_good():
+    """Wild frames among a true stream whose every cycle says its own number in all joints.
+
+    A wild frame that stands in for a true one can only be told by what an arm can do between two
+    samples; one beside the true one makes a sample torn.
+    """
+    random = np.random.default_rng(7)
+    assembler, builder = Assembler(PIPER), StateBuilder(PIPER, builtin_arm("ur10e"))
+    stream = wild_frames(random, 1_000_000)
+    good = wrong = refused = k = 0
+    begun = time.monotonic()
+    wild = next(stream, None)
+    while wild is not None:
+        k += 1
+        now = k * PERIOD
+        number = abs((k + 500) % 1000 - 500)
+        true = cycle(number) if k % 4 else []  # every fourth cycle is all wild
+        places = random.integers(0, 4, 4)
+        frames = [((i, False), d) for i, d in true]
+        for place in sorted(places.tolist(), reverse=True):
+            if wild is None:
+                break
+            frames.insert(place, wild)
+            wild = next(stream, None)
+        for n, (key, data) in enumerate(frames):
+            sample = assembler.take(key, data, now + n * 1e-4, now + n * 1e-4)
+            if sample is None:
+                continue
+            try:
+                state = builder.build(sample, None, "", ready=True)
+            except InvalidStateError:
+                refused += 1
+                continue
+            is_true = np.abs(state.actual_q - 100 * number * UNIT).max() < UNIT
+            good, wrong = good + is_true, wrong + (not is_true)
+    print(f"{good} true, {refused} refused, {wrong} wrong, {time.monotonic() - begun:.1f} s")
+    assert time.monotonic() - begun < 60.0
+    assert good > 20_000
+    assert wrong == 0
+
+
+@pytest.mark.parametrize("name", ["piper", "openarm", "odrive", "invented"])
+def test_no_frame_of_any_length_and_content_raises_an_exception(name):
+    profile = load_profile(name if name != "invented" else str(INVENTED))
+    assembler, random = Assembler(profile), np.random.default_rng(3)
+    keys = list(profile.incoming)
+    for k in range(20_000):
+        key = keys[int(random.integers(len(keys)))]
+        data = random.bytes(int(random.choice([0, 2, 4, 7, 8, 8, 8, 8])))
+        sample = assembler.take(key, data, k * 1e-4, k * 1e-4)
+        assert sample is None or sample.position.shape == (profile.n,)
+    assert assembler.dropped["malformed"] > 1000
+
+
+def test_joints_that_no_arm_can_come_to_between_two_samples_are_refused():
+    builder = StateBuilder(PIPER, builtin_arm("ur10e"))
+
+    def state_of(q, at):
+        assembler = Assembler(PIPER)
+        for first in (1, 3, 5):
+            key, data = joints_frame(first, q, q)
+            sample = assembler.take((key, False), data, at, at)
+        return builder.build(sample, None, "", ready=True)
+
+    state_of(0.5, 1.0)
+    with pytest.raises(InvalidStateError, match=r"found a step of 0\.5000 rad in 0\.0050 s"):
+        state_of(1.0, 1.005)
+    assert state_of(0.5, 1.01).actual_q == pytest.approx([0.5] * 6, abs=UNIT)
