@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import WriteError
+from core.errors import StaleStateError, WriteError
 from core.model import Model
 from core.setpoint import Setpoint
 from core.state import RobotState
@@ -144,7 +144,12 @@ class MailboxWriter:
         return encode.mailbox_words(self._sequence, self._counts, self._heartbeat)
 
     def _send(self, words: list[int]) -> None:
-        self._transport.write("holding", self._box.address, words)
+        """Write a mailbox; a lost one once more, which does no harm: the number is the same."""
+        try:
+            self._transport.write("holding", self._box.address, words)
+        except StaleStateError:
+            self._transport.open()
+            self._transport.write("holding", self._box.address, words)
 
     def _check_echo(self, sample: Sample) -> None:
         """Raise WriteError where an offset has not come back in time, or nobody applies it."""

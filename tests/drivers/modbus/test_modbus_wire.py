@@ -107,6 +107,25 @@ def test_a_late_answer_is_never_taken_for_the_next_ones(case: ModbusCase, proxy:
         assert np.abs(next_state(driver).actual_q - goal).max() <= case.resolution
 
 
+def test_an_offset_whose_answer_is_lost_once_is_sent_once_more(
+    case: ModbusCase, proxy: EvilProxy
+) -> None:
+    lost: list[bytes] = []
+
+    def lose_one(answer: bytes) -> bytes:
+        if answer[7] != 16 or lost:
+            return answer
+        lost.append(answer)
+        return answer[:3]
+
+    with driver_through(case, proxy) as driver:
+        driver.arm(next_state(driver))
+        proxy.ruin = lose_one
+        stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), 1.0)
+        assert lost
+        assert max(map(abs, case.peer.joint_offset)) > 1e-5
+
+
 def test_a_controller_that_hangs_up_each_time_is_a_link_error(
     case: ModbusCase, proxy: EvilProxy
 ) -> None:
