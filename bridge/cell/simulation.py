@@ -33,6 +33,7 @@ PERIOD = 0.004  # s, of a Peer's cycle
 
 SIMULATORS: dict[str, str] = {
     "can": "drivers.simulated.can.server:make_servers",
+    "canopen": "drivers.simulated.canopen.server:make_servers",
     "modbus": "drivers.simulated.modbus.server:make_servers",
 }
 """link.driver -> ``module:function(link, host, peer) -> list[PeerServer]``, imported on use."""

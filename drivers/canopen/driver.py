@@ -15,7 +15,7 @@ from core.setpoint import Setpoint
 from core.state import RobotState
 from drivers.canopen.command import RpdoWriter
 from drivers.canopen.configure import check_identity, check_units, interpolation_period, set_up
-from drivers.canopen.listening import Emergency, Foreign
+from drivers.canopen.listening import OPERATIONAL, Emergency, Foreign
 from drivers.canopen.master import Master
 from drivers.canopen.power import Power
 from drivers.canopen.profile import WINDOW, read_profile
@@ -74,6 +74,7 @@ class CanopenDriver(Driver):
             check_units(master, self.profile, self._arm)
             assert master.life is not None
             master.life.started()
+            master.collector.stray = ""
             for node in self.profile.nodes:
                 master.command(node, "OPERATIONAL")
             self._first_sample()
@@ -85,11 +86,17 @@ class CanopenDriver(Driver):
         self._builder.forget()
 
     def _first_sample(self) -> None:
-        """Wait until all drives answer a SYNC. Raises LinkError."""
+        """Wait until all drives are OPERATIONAL and answer a SYNC. Raises LinkError."""
+        life = self.master.life
+        assert life is not None
         end = time.monotonic() + min(STARTING, self.settings.connect_timeout)
-        while (found := self._exchange()) is None:
+        while (found := self._exchange()) is None or not life.all_operational:
             if time.monotonic() > end:
-                raise LinkError(f"{self.master.where}: {self.master.collector.why()} after a SYNC")
+                why = self.master.collector.why() + " after a SYNC"
+                if found is not None:
+                    silent = [n for n in self.profile.nodes if life.nmt.get(n) != OPERATIONAL]
+                    why = f"found no heartbeat in OPERATIONAL of nodes {silent}"
+                raise LinkError(f"{self.master.where}: {why}")
         try:
             self._builder.build(found, None, False)
         except InvalidStateError as error:

@@ -123,8 +123,14 @@ class Life:
     def started(self) -> None:
         """Forget restarts: the drives have just been set up; count their lives from now."""
         self.restarted.clear()
+        self.nmt.clear()
         now = time.monotonic()
         self.heard = dict.fromkeys(self._profile.nodes, now)
+
+    @property
+    def all_operational(self) -> bool:
+        """Return whether every node's heartbeat has told that it is OPERATIONAL."""
+        return all(self.nmt.get(node) == OPERATIONAL for node in self._profile.nodes)
 
     def lost(self) -> int | None:
         """Return a node whose heartbeats have ceased; None: none."""

@@ -1,0 +1,1 @@
+"""Simulated CiA 402 drives over CANopen."""

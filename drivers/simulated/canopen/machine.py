@@ -1,0 +1,92 @@
+"""The state machine of one drive, as CiA 402 draws it: Controlword in, Statusword out."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+
+class Phase(Enum):
+    """State -> the bits of the Statusword that tell it."""
+
+    NOT_READY = 0x0000
+    SWITCH_ON_DISABLED = 0x0040
+    READY = 0x0021
+    SWITCHED_ON = 0x0023
+    ENABLED = 0x0027
+    QUICK_STOP = 0x0007
+    REACTION = 0x000F
+    FAULT = 0x0008
+
+
+VOLTAGE = 0x0010  # Statusword: there is supply
+REMOTE = 0x0200  # Statusword: the Controlword is obeyed
+
+
+class Machine:
+    """One drive's power state. ``quick_stop_stays``: option codes 5 to 8 of 0x605A."""
+
+    def __init__(self) -> None:
+        self.phase = Phase.SWITCH_ON_DISABLED
+        self.word = 0  # the last Controlword
+        self.quick_stop_stays = False
+
+    def control(self, word: int) -> bool:
+        """Obey a Controlword; returns whether it resets a fault."""
+        rising = word & ~self.word
+        self.word = word
+        if self.phase in (Phase.FAULT, Phase.REACTION):
+            if self.phase is Phase.FAULT and rising & 0x80:
+                self.phase = Phase.SWITCH_ON_DISABLED
+                return True
+            return False
+        if not word & 0x02:
+            self._disable_voltage()
+        elif not word & 0x04:
+            self._quick_stop()
+        elif not word & 0x01:
+            self._shut_down()
+        else:
+            self._switch_on(bool(word & 0x08))
+        return False
+
+    def _disable_voltage(self) -> None:
+        if self.phase is not Phase.NOT_READY:
+            self.phase = Phase.SWITCH_ON_DISABLED
+
+    def _quick_stop(self) -> None:
+        if self.phase is Phase.ENABLED:
+            self.phase = Phase.QUICK_STOP
+        elif self.phase in (Phase.READY, Phase.SWITCHED_ON):
+            self.phase = Phase.SWITCH_ON_DISABLED
+
+    def _shut_down(self) -> None:
+        if self.phase in (Phase.SWITCH_ON_DISABLED, Phase.SWITCHED_ON, Phase.ENABLED):
+            self.phase = Phase.READY
+
+    def _switch_on(self, enable: bool) -> None:
+        """Take one step a Controlword: a drive does not jump over a state."""
+        if self.phase is Phase.READY:
+            self.phase = Phase.SWITCHED_ON
+        elif self.phase is Phase.SWITCHED_ON and enable:
+            self.phase = Phase.ENABLED
+        elif self.phase is Phase.ENABLED and not enable:
+            self.phase = Phase.SWITCHED_ON
+        elif self.phase is Phase.QUICK_STOP and enable and self.quick_stop_stays:
+            self.phase = Phase.ENABLED
+
+    def fault(self) -> None:
+        """Go to FAULT, by way of its reaction where the drive was moving."""
+        moving = self.phase in (Phase.ENABLED, Phase.QUICK_STOP)
+        self.phase = Phase.REACTION if moving else Phase.FAULT
+
+    def come_to_rest(self) -> None:
+        """Note that a quick stop or a fault reaction has ended: the axis stands."""
+        if self.phase is Phase.REACTION:
+            self.phase = Phase.FAULT
+        elif self.phase is Phase.QUICK_STOP and not self.quick_stop_stays:
+            self.phase = Phase.SWITCH_ON_DISABLED
+
+    @property
+    def statusword(self) -> int:
+        """Return the Statusword without what the mode adds."""
+        return self.phase.value | VOLTAGE | REMOTE

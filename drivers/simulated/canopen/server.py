@@ -1,0 +1,298 @@
+"""An arm of simulated CiA 402 drives on one bus, for any CANopen profile."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Mapping
+from typing import Any
+
+import canopen
+from canopen.network import MessageListener
+
+from core.errors import InputError, LinkError
+from drivers.can.bus import BusSettings, close_bus, open_bus
+from drivers.canopen.profile import CanopenProfile, read_profile
+from drivers.canopen.settings import CanopenSettings
+from drivers.simulated.bench import Command
+from drivers.simulated.can.hub import Hub
+from drivers.simulated.canopen.drive import COMMUNICATION, Drive, Units
+from drivers.simulated.canopen.faults import bench_commands
+from drivers.simulated.canopen.machine import Phase
+from drivers.simulated.peer import Peer
+from drivers.simulated.peer_server import PeerServer
+
+SYNC = 0x80
+HEARTBEAT = 0x700
+BLOCKED, EMERGENCY, FOLLOWING_ERROR, HEARTBEAT_ERROR = 0x7121, 0x5441, 0x8611, 0x8130
+LATE_BY = 0.05  # rad that a TPDO held back is off: who takes it for a new one is found out
+
+
+class _Network(canopen.Network):
+    """The drives' side of the bus: silent nodes send nothing."""
+
+    NOTIFIER_CYCLE = 0.05
+    NOTIFIER_SHUTDOWN_TIMEOUT = 1.0
+
+    def __init__(self, bus: Any) -> None:
+        super().__init__(bus)
+        self.silent: set[int] = set()
+        self.mute = False
+
+    def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:
+        if not self.mute and can_id & 0x7F not in self.silent:
+            with contextlib.suppress(Exception):  # the bus has gone: the server's cycle tells
+                super().send_message(can_id, data, remote)
+
+
+class _Listener(MessageListener):
+    """Gives each frame to the server, one at a time."""
+
+    def __init__(self, server: CanopenServer, network: Any) -> None:
+        super().__init__(network)
+        self._server = server
+
+    def on_message_received(self, msg: Any) -> None:
+        if msg.is_error_frame or msg.is_remote_frame or msg.is_extended_id:
+            return
+        with self._server.lock:
+            super().on_message_received(msg)  # type: ignore[no-untyped-call]
+            self._server.heard(int(msg.arbitration_id), bytes(msg.data))
+
+
+class CanopenServer(PeerServer):
+    """All drives of one arm.
+
+    With socketcand the bus is served here; on virtual and socketcan the drives join what is there.
+    """
+
+    def __init__(self, link: CanopenSettings, host: str, peer: Peer) -> None:
+        self.profile: CanopenProfile = read_profile(link.profile_path, peer.n)
+        self.name = f"CANopen ({self.profile.name})"
+        self._link: BusSettings = link.model_copy(update={"host": host})
+        self.lock = threading.RLock()
+        self._hub: Hub | None = None
+        self._network: Any = None
+        self._peer = peer
+        self._late: dict[int, int] = {}  # node -> SYNCs that its TPDOs are still held back for
+        self._held: list[tuple[int, bytes]] = []
+        self._beaten: dict[int, float] = {}  # node -> s, of its last heartbeat
+        self._was_able = True
+        self.drives = tuple(self._drive(joint) for joint in range(peer.n))
+
+    def _drive(self, joint: int) -> Drive:
+        profile, peer = self.profile, self._peer
+        per_radian = float(profile.counts_per_radian[joint])
+        rated = profile.file.joints[joint].rated_torque
+        sign = 1.0 if per_radian > 0.0 else -1.0
+        units = Units(
+            per_radian, float(profile.zero[joint]), 1.0 / (profile.file.velocity_scale or 1.0),
+            0.0 if rated is None else 1000.0 * sign / rated,
+        )  # fmt: skip
+        node = profile.nodes[joint]
+        return Drive(node, profile.eds.dictionary(node), units, peer.q[joint])
+
+    # -- the bus ----------------------------------------------------------------------------------
+
+    def open(self, peer: Peer) -> None:
+        """Serve or join the bus, and start the drives. Raises LinkError, OSError, InputError."""
+        link = self._link
+        if link.interface == "socketcand":
+            self._hub = Hub(link.host, link.port)
+            self._hub.start()
+            link = link.model_copy(update={"port": self._hub.port})
+        elif link.interface not in ("virtual", "socketcan"):
+            raise InputError(
+                f"link.interface: found {link.interface!r}, which cannot be simulated, expected "
+                "socketcand, virtual or socketcan"
+            )
+        network: Any = _Network(open_bus(link))
+        network.listeners[:] = [_Listener(self, network)]
+        with self.lock:
+            self._network = network
+            for drive in self.drives:
+                network.add_node(drive)
+            network.connect()
+            for joint in range(peer.n):
+                self._boot(joint)
+
+    def _boot(self, joint: int) -> None:
+        arm = self._peer.plant.arm
+        drive = self.drives[joint]
+        drive.q = self._peer.q[joint]
+        drive.boot(arm.lower[joint], arm.upper[joint])
+
+    @property
+    def port(self) -> int:
+        """Return the TCP port of the bus that is served here; 0 where none is."""
+        return self._hub.port if self._hub else 0
+
+    def close(self) -> None:
+        """Leave the bus, and end it where it is served here."""
+        with self.lock:
+            network, self._network = self._network, None
+        if network is not None:
+            bus = network.bus
+            with contextlib.suppress(Exception):
+                network.disconnect()
+            close_bus(bus)
+            for drive in self.drives:
+                drive.remove_network()
+        hub, self._hub = self._hub, None
+        if hub is not None:
+            hub.close()
+
+    # -- frames -----------------------------------------------------------------------------------
+
+    def heard(self, cob_id: int, data: bytes) -> None:
+        """Act on one frame, after the library has; from the notifier's thread."""
+        if self._network is None or self._peer.stalled:
+            return
+        if cob_id == 0:
+            for joint, drive in enumerate(self.drives):
+                if drive.nmt.state == "INITIALISING":
+                    self._boot(joint)
+        elif cob_id == SYNC:
+            self._answer_sync()
+        elif cob_id & 0x780 == HEARTBEAT:
+            for drive in self.drives:
+                if drive.number(0x1016, 1) >> 16 & 0x7F == cob_id & 0x7F:
+                    drive.watched[cob_id & 0x7F] = self._peer.running
+        else:
+            for drive in self.drives:
+                if drive.operational and drive.node not in self._network.silent:
+                    drive.receive(cob_id, data)
+
+    def _answer_sync(self) -> None:
+        """Send every drive's TPDOs, then let the setpoints that came before this SYNC count."""
+        held, self._held = self._held, []
+        for cob_id, data in held:
+            self._network.send_message(cob_id, data)
+        for drive in self.drives:
+            if not drive.operational:
+                continue
+            late = self._late.pop(drive.node, 0)
+            if late:
+                drive.q += LATE_BY
+                self._held += drive.samples()
+                drive.q -= LATE_BY
+                if late > 1:
+                    self._late[drive.node] = late - 1
+                continue
+            for cob_id, data in drive.samples():
+                self._network.send_message(cob_id, data)
+        for drive in self.drives:
+            heard = drive.operational and drive.node not in self._network.silent
+            if heard and not drive.take_setpoints():
+                drive.fail(FOLLOWING_ERROR)
+
+    def hold_back(self, node: int, count: int = 1) -> None:
+        """Have the next TPDOs of a node come only after the SYNC that follows theirs."""
+        with self.lock:
+            self._late[node] = count
+
+    # -- the cycle --------------------------------------------------------------------------------
+
+    def cycle(self, peer: Peer) -> None:
+        """Move the axes, watch and send heartbeats."""
+        with self.lock:
+            if self._network is None:
+                return
+            self._network.mute = peer.stalled
+            self._follow_stops(peer)
+            self._watch_heartbeats(peer)
+            self._move(peer)
+            if not peer.frozen:
+                self._feel(peer)
+            self._beat(peer)
+            try:
+                self._network.check()
+            except Exception as error:
+                raise LinkError(f"simulated drives: {error}") from None
+
+    def _follow_stops(self, peer: Peer) -> None:
+        """Fail every drive at a stop of the arm; a fault that is reset ends a protective stop."""
+        able, self._was_able = self._was_able, peer.can_move
+        for drive in self.drives:
+            healthy = drive.axis.machine.phase not in (Phase.FAULT, Phase.REACTION)
+            if not peer.can_move and able and healthy:
+                drive.fail(EMERGENCY if peer.emergency else BLOCKED)
+            elif peer.emergency and healthy:
+                drive.fail(EMERGENCY)
+            elif peer.protective and healthy:
+                peer.unlock()
+
+    def _watch_heartbeats(self, peer: Peer) -> None:
+        for drive in self.drives:
+            limit = 1e-3 * (drive.number(0x1016, 1) & 0xFFFF)
+            for node, heard in list(drive.watched.items()):
+                if limit and peer.running - heard > limit:
+                    del drive.watched[node]
+                    drive.emcy.send(HEARTBEAT_ERROR, COMMUNICATION)
+                    self._abort_connection(drive)
+
+    @staticmethod
+    def _abort_connection(drive: Drive) -> None:
+        """Do what 0x6007 says of a master that has gone."""
+        option = drive.number(0x6007)
+        if option == 1:
+            drive.fail(HEARTBEAT_ERROR, COMMUNICATION)
+        elif option in (2, 3):
+            drive.axis.machine.control(0x00 if option == 2 else 0x02)
+
+    def _move(self, peer: Peer) -> None:
+        goal = list(peer.target_q)
+        holding = False
+        for joint, drive in enumerate(self.drives):
+            axis = drive.axis
+            axis.step(peer.period, drive.interpolation_period, goal[joint])
+            if axis.holds:
+                holding, goal[joint] = True, axis.demand
+        if holding:
+            peer.command(goal)
+        elif peer.commanded:
+            peer.let_go()
+
+    def _feel(self, peer: Peer) -> None:
+        torque = peer.joint_torque
+        for joint, drive in enumerate(self.drives):
+            drive.q, drive.qd, drive.torque = peer.q[joint], peer.qd[joint], torque[joint]
+
+    def _beat(self, peer: Peer) -> None:
+        for drive in self.drives:
+            period = drive.nmt.period
+            if period and peer.running - self._beaten.get(drive.node, -1.0) >= period:
+                self._beaten[drive.node] = peer.running
+                state = {"OPERATIONAL": 5, "STOPPED": 4}.get(drive.nmt.state, 127)
+                self._network.send_message(HEARTBEAT + drive.node, [state])
+
+    # -- the bench --------------------------------------------------------------------------------
+
+    def silence(self, node: int) -> None:
+        """Have a node send nothing, as one whose plug is pulled."""
+        with self.lock:
+            self._network.silent.add(node)
+
+    def speak(self) -> None:
+        """Have all nodes send again."""
+        with self.lock:
+            self._network.silent.clear()
+
+    def restart(self, node: int) -> None:
+        """Have a node start anew, as after a dip of its supply."""
+        with self.lock:
+            self._boot(self.profile.nodes.index(node))
+
+    def fail(self, node: int, code: int) -> None:
+        """Have a drive fail with an error code."""
+        with self.lock:
+            self.drives[self.profile.nodes.index(node)].fail(code)
+
+    def commands(self, peer: Peer) -> Mapping[str, Command]:
+        """Return the bench commands of drives."""
+        return bench_commands(self)
+
+
+def make_servers(link: CanopenSettings, host: str, peer: Peer) -> list[PeerServer]:
+    """Return the drives of an arm, not yet on a bus. Raises InputError where they do not fit."""
+    return [CanopenServer(link, host, peer)]
