@@ -143,10 +143,12 @@ def builtin_arm(name: str, calibration: Mapping[str, Sequence[float]] | None = N
     """Return a built-in arm, with its factory calibration where one is given.
 
     ``calibration`` holds UR's ``delta_theta``, ``delta_a``, ``delta_d``, ``delta_alpha`` (n each),
-    the entries of the controller's calibration.conf, which are added to the DH rows.
+    the entries of the controller's calibration.conf, which are added to the DH rows. Joints sit
+    where the metal is all the same (``_on_own_axes``).
     """
     table = builtin_rows(name)
     rows = table["dh"]
+    plain = arm_from_dh(rows, name)
     for delta, key in (("theta", "offset"), ("a", "a"), ("d", "d"), ("alpha", "alpha")):
         values = (calibration or {}).get(f"delta_{delta}")
         if values is None:
@@ -160,4 +162,36 @@ def builtin_arm(name: str, calibration: Mapping[str, Sequence[float]] | None = N
     limits = table["limits"]
     columns = {key: np.array([float(row[key]) for row in limits]) for key in limits[0]}
     arm = arm_from_dh(rows, name, JointLimits(**columns))
+    if calibration:
+        arm = _on_own_axes(arm, plain)
     return replace(arm, payload=float(table["payload"]))
+
+
+def _on_own_axes(arm: Arm, plain: Arm) -> Arm:
+    """Return ``arm`` with each joint frame slid along its own axis to where ``plain`` has it.
+
+    On axes that are parallel but for a calibration, DH rows meet far out: real calibrations hold d
+    of hundreds of metres that cancel from joint 2 to 3, and angles that cancel likewise. Turning
+    about an axis and sliding along it commute, so that every pose stays what it is; but joints
+    bend at their origins, and weights hang in the frames of their links. The links' masses stay
+    where they are in base with all joints at zero. Frames keep their direction.
+    """
+    found, wanted = _at_zero(arm), _at_zero(plain)
+    links, cog = arm.link_in_link.copy(), arm.cog.copy()
+    for i in range(arm.n):
+        slide = np.eye(4)
+        slide[2, 3] = (wanted[i, :3, 3] - found[i, :3, 3]) @ found[i, :3, 2]
+        links[i] = links[i] @ slide
+        slide[2, 3] *= -1
+        links[i + 1] = slide @ links[i + 1]
+        at_zero = wanted[i, :3, :3] @ plain.cog[i] + wanted[i, :3, 3]
+        cog[i] = (at_zero - found[i, :3, 3]) @ found[i, :3, :3] + slide[:3, 3]
+    return replace(arm, link_in_link=links, cog=cog)
+
+
+def _at_zero(arm: Arm) -> Array:
+    """Return the frames of the joints in base (n, 4, 4), all joints at zero."""
+    frames = [arm.link_in_link[0]]
+    for i in range(1, arm.n):
+        frames.append(frames[-1] @ arm.link_in_link[i])
+    return np.array(frames)

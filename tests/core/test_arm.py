@@ -1,7 +1,11 @@
 """Arms from DH rows and from the built-in tables: their numbers, and every mistake in one line."""
 
+import itertools
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from oracle import rigid
 from scipy.spatial.transform import Rotation
 
@@ -77,6 +81,111 @@ def test_factory_calibration_is_added_to_the_rows():
             poses.position[r], rigid.flange_pose(peer, q[r]).translation, atol=1e-12
         )
     assert np.abs(poses.position - Model(builtin_arm("ur5e")).rigid_pose(q).position).max() > 1e-3
+
+
+SMALL, FAR = st.floats(-2e-3, 2e-3), st.floats(-500, 500)
+
+
+@given(
+    deltas=st.lists(SMALL, min_size=24, max_size=24), far=FAR, further=FAR,
+    turn=st.floats(-3, 3), seed=st.integers(0, 1000),
+)  # fmt: skip
+@settings(max_examples=100, deadline=None)
+def test_a_calibration_with_far_origins_that_cancel_leaves_every_pose_as_it_is(
+    deltas, far, further, turn, seed
+):
+    theta, a, d, alpha = np.reshape(deltas, (4, 6))
+    # as on real arms: origins of joints 3 and 4 far out along the parallel axes, and turned
+    d[1:4] += far, further - far, -further
+    theta[1:3] += turn, -turn
+    rows = [
+        row | {"a": row["a"] + a[i], "d": row["d"] + d[i], "alpha": row["alpha"] + alpha[i],
+               "offset": theta[i]}
+        for i, row in enumerate(builtin_rows("ur10e")["dh"])
+    ]  # fmt: skip
+    delta = dict(zip(("delta_theta", "delta_a", "delta_d", "delta_alpha"), (theta, a, d, alpha),
+                     strict=True))  # fmt: skip
+    q = np.random.default_rng(seed).uniform(-3, 3, (5, 6))
+    slid, as_given = Model(builtin_arm("ur10e", delta)), Model(arm_from_dh(rows))
+    one, other = slid.rigid_pose(q), as_given.rigid_pose(q)
+    np.testing.assert_allclose(one.position, other.position, atol=1e-9)
+    np.testing.assert_allclose(one.rotation, other.rotation, atol=1e-9)
+
+
+def test_joints_of_a_calibrated_arm_bend_where_the_metal_is():
+    # lines of joints 2 and 3, twisted so that they meet 300 m out; the calibration of no other row
+    twist, far = 1e-6, 300.0
+    delta = {"delta_d": [0, far, -far, 0, 0, 0], "delta_alpha": [0, twist, -twist, 0, 0, 0]}
+    plain, found = builtin_arm("ur10e"), builtin_arm("ur10e", delta)
+    assert np.abs(found.link_in_link[:, :3, 3]).max() < 1
+    np.testing.assert_allclose(
+        found.link_in_link[:, :3, 3], plain.link_in_link[:, :3, 3], atol=2e-3
+    )
+    np.testing.assert_allclose(found.cog, plain.cog, atol=2e-3)
+    q = np.random.default_rng(1).uniform(-2, 2, (20, 6))
+    bends = [
+        bent.predict(q).position - bent.rigid_pose(q).position
+        for bent in (Model(arm).with_compliance([1e-5] * 6, [5e-6] * 6) for arm in (plain, found))
+    ]
+    assert np.abs(bends[0]).max() > 1e-4
+    np.testing.assert_allclose(bends[1], bends[0], atol=1e-2 * np.abs(bends[0]).max())
+
+
+def calibration_of(axes):
+    """Return delta_* of a UR10e whose axes 2 to 4 (point, direction) are these at zero.
+
+    DH rows by common normals, as a controller's own calibration writes them.
+    """
+    rows = builtin_rows("ur10e")["dh"]
+    frames = [np.eye(4), *(transform_of(arm_from_dh(rows), k + 1) for k in range(1, 6))]
+    x, at = [frames[1][:3, 0]], [frames[1][:3, 3]]  # of DH frames 1, 2, 3, 4
+    for (p, z), (r, w) in itertools.pairwise(axes):
+        normal = np.cross(z, w)
+        normal /= np.linalg.norm(normal) * np.sign(normal @ frames[1][:3, 0])
+        # where the common normal meets the second axis: p + s z + t normal = r + u w
+        u = np.linalg.solve(np.column_stack([z, normal, -w]), r - p)[2]
+        x.append(normal)
+        at.append(r + u * w)
+    x.append(frames[4][:3, 0])
+    at.append(frames[4][:3, 3])
+    z = [axis[1] for axis in axes] + [frames[4][:3, 2]]
+    delta = {f"delta_{key}": np.zeros(6) for key in ("theta", "a", "d", "alpha")}
+    for k in range(3):  # rows 2, 3, 4
+        way, row = at[k + 1] - at[k], rows[k + 1]
+        turn = np.arctan2(np.cross(x[k], x[k + 1]) @ z[k], x[k] @ x[k + 1])
+        twist = np.arctan2(np.cross(z[k], z[k + 1]) @ x[k + 1], z[k] @ z[k + 1])
+        delta["delta_theta"][k + 1] = turn
+        delta["delta_d"][k + 1] = way @ z[k] - row["d"]
+        delta["delta_a"][k + 1] = way @ x[k + 1] - row["a"]
+        delta["delta_alpha"][k + 1] = twist - row["alpha"]
+    return delta
+
+
+def test_a_controllers_own_calibration_bends_like_the_arm_that_it_describes():
+    plain = builtin_arm("ur10e")
+    axes = [(f[:3, 3], f[:3, 2]) for f in (transform_of(plain, k) for k in (2, 3, 4))]
+    tilted = Rotation.from_rotvec([1.5e-3, 0, 1e-3]).apply(axes[1][1])  # the elbow's, a little
+    delta = calibration_of([axes[0], (axes[1][0], tilted), axes[2]])
+    assert np.abs(delta["delta_d"]).max() > 100  # m
+    assert np.abs(delta["delta_theta"]).max() > 0.3
+    found = builtin_arm("ur10e", delta)
+    for k in range(1, 7):
+        frame, nominal = transform_of(found, k), transform_of(plain, k)
+        np.testing.assert_allclose(frame[:3, 3], nominal[:3, 3], atol=3e-3)
+        centre = frame @ np.append(found.cog[k - 1], 1)
+        np.testing.assert_allclose(centre, nominal @ np.append(plain.cog[k - 1], 1), atol=1e-9)
+    q = np.random.default_rng(1).uniform(-2, 2, (20, 6))
+    bends = [
+        bent.predict(q).position - bent.rigid_pose(q).position
+        for bent in (Model(arm).with_compliance([1e-5] * 6, [5e-6] * 6) for arm in (plain, found))
+    ]
+    assert np.abs(bends[0]).max() > 1e-4
+    np.testing.assert_allclose(bends[1], bends[0], atol=2e-2 * np.abs(bends[0]).max())
+
+
+def transform_of(arm, joints):
+    """Return the frame of the last of ``joints`` joints in base, all at zero."""
+    return np.linalg.multi_dot([np.eye(4), *arm.link_in_link[:joints]])
 
 
 def test_factory_calibration_of_another_length_is_told():
