@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from core import kernel
 from core.kernel import JIT, Rows
+from core.least_offset import LARGEST_OFFSET as LARGEST_OFFSET
+from core.least_offset import smallest_offset
 from core.loads import Loads
 from core.model import Model, Poses
 from core.packed import chain_of, pack, row_of, shape_of
@@ -23,8 +25,8 @@ from core.packed import chain_of, pack, row_of, shape_of
 Array = NDArray[np.float64]
 TOLERANCE = 1e-9  # m, and rad times the tool's lever: where the pose counts as reached
 MAX_STEPS = 12
+NOTHING = Loads()
 LEVER = 0.5  # m: weighs a rotation against a shift
-LARGEST_OFFSET = 0.1  # rad: joint offset (norm) beyond which the correction is damped
 
 
 @dataclass(frozen=True)
@@ -35,35 +37,6 @@ class Correction:
     offset_in_base: Array  # (N, 6) m, rad: rigid TCP pose at q minus that at nominal_q
     residual: Array  # (N,) m: distance of the predicted pose from the wanted one (rotation x lever)
     steps: NDArray[np.int64]  # (N,) Newton steps taken
-
-
-@njit(**JIT)
-def _smallest_offset(J, wanted, offset):  # type: ignore[no-untyped-def]
-    """Write the least-squares solution of J offset = wanted, damped to LARGEST_OFFSET.
-
-    Rows of J and wanted are weighted by the lever already. Of many solutions (more than six
-    joints, singular poses) the shortest one. Undamped wherever that is short enough, so that the
-    wanted pose is met exactly right up to a singularity.
-    """
-    n = J.shape[1]
-    wide = n > 6
-    # the smaller, regular one of J J^T and J^T J; s holds the squared singular values
-    G = J @ J.T if wide else J.T @ J
-    s, V = np.linalg.eigh(G)
-    y = V.T @ wanted if wide else V.T @ (J.T @ wanted)
-    damping = 1e-14 * max(s[-1], 1e-12)
-    for _ in range(60):
-        square = 0.0
-        for i in range(s.shape[0]):
-            part = y[i] / (max(s[i], 0.0) + damping)
-            square += part * part * (max(s[i], 0.0) if wide else 1.0)
-        if square <= LARGEST_OFFSET * LARGEST_OFFSET:
-            break
-        damping *= 3.0
-    for i in range(s.shape[0]):
-        y[i] /= max(s[i], 0.0) + damping
-    solution = V @ y
-    offset[:] = J.T @ solution if wide else solution
 
 
 @njit(**JIT)
@@ -103,8 +76,12 @@ def next_offset(chain, rows, r, shape, position, rotation, lever, offset):  # ty
     if not np.isfinite(distance):
         return -1.0
     kernel.jacobian(shape, J)
-    J[3:] *= lever
-    _smallest_offset(J, error + J @ offset, offset)
+    for k in range(6):
+        for i in range(n):
+            if k > 2:
+                J[k, i] *= lever
+            error[k] += J[k, i] * offset[i]
+    smallest_offset(J, error, offset)
     return distance
 
 
@@ -131,23 +108,79 @@ def _turned(A, B, out):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
-def _rigid_pose(rigid, row, shape, q, position, rotation):  # type: ignore[no-untyped-def]
-    """Write the rigid arm's TCP pose at q (n,)."""
-    shape.bend[:, :] = 0.0  # nothing bends; and no row may spoil the next
+def _moved(wanted, pose, offset, moved):  # type: ignore[no-untyped-def]
+    """Write how far (6,) a pose (12,) is from the wanted one; no offset, no motion."""
+    moved[:] = 0.0
+    if np.any(offset != 0.0):
+        moved[:3] = pose[:3] - wanted[:3]
+        _turned(pose[3:].reshape((3, 3)), wanted[3:].reshape((3, 3)), moved[3:])
+
+
+@njit(**JIT)
+def _rigid_pose(rigid, row, shape, q, pose):  # type: ignore[no-untyped-def]
+    """Write the rigid TCP pose (12,) at q (n,), position first; nothing in ``shape`` bends."""
     row.q[0, :] = q
-    kernel.equilibrium(rigid, row, 0, shape)
-    position[:] = shape.tcp_position
-    rotation[:, :] = shape.tcp_rotation
+    A, B, tilt = np.empty((3, 3)), np.empty((3, 3)), np.zeros(3)
+    kernel.place(rigid, row, 0, shape, tilt, A, B)
+    pose[:3] = shape.tcp_position
+    for i in range(3):
+        pose[3 + 3 * i : 6 + 3 * i] = shape.tcp_rotation[i]
+
+
+@njit(**JIT)
+def _solve(chain, row, shape, pose, nominal, offset, q):  # type: ignore[no-untyped-def]
+    """Write the best joint angles q (n,); returns the distance (m) left and the steps taken."""
+    n = nominal.shape[0]
+    best, steps = np.inf, 0
+    q[:] = nominal
+    for _ in range(MAX_STEPS):
+        steps += 1
+        for i in range(n):
+            row.q[0, i] = nominal[i] + offset[i]
+        distance = next_offset(
+            chain, row, 0, shape, pose[:3], pose[3:].reshape((3, 3)), LEVER, offset
+        )
+        if distance < 0:
+            break
+        if distance < best:
+            q[:], best = row.q[0], distance
+        if distance < TOLERANCE:
+            break
+    return best, steps
+
+
+@njit(**JIT)
+def _correct(  # type: ignore[no-untyped-def]
+    block, rigid_block, row_block, rigid_row_block, shape_block, rigid_shape_block, wanted,
+    nominal, offset, q, moved,
+):  # fmt: skip
+    """Write the corrected setpoint q (n,), its offset and the motion; returns distance, steps.
+
+    For rows of which nothing but the joint angles changes from step to step.
+    """
+    n = nominal.shape[0]
+    rigid, rigid_row = chain_of(rigid_block, n), row_of(rigid_row_block, n)
+    rigid_shape = shape_of(rigid_shape_block, n)
+    _rigid_pose(rigid, rigid_row, rigid_shape, nominal, wanted)
+    best, steps = _solve(
+        chain_of(block, n), row_of(row_block, n), shape_of(shape_block, n), wanted, nominal, offset,
+        q,
+    )  # fmt: skip
+    for i in range(n):
+        # where nothing was found, nothing (nor a joint angle that is no number) may go on
+        offset[i] = q[i] - nominal[i] if best < np.inf else 0.0
+    pose = np.empty(12)
+    _rigid_pose(rigid, rigid_row, rigid_shape, q, pose)
+    _moved(wanted, pose, offset, moved)
+    return best, steps
 
 
 @njit(**JIT)
 def _want(rigid_block, row_block, shape_block, q, pose):  # type: ignore[no-untyped-def]
-    """Write the rigid pose (12,) at q, position first, from packed records."""
+    """``_rigid_pose`` of packed records."""
     n = q.shape[0]
-    rotation = pose[3:].reshape((3, 3))
     _rigid_pose(
-        chain_of(rigid_block, n), row_of(row_block, n), shape_of(shape_block, n), q, pose[:3],
-        rotation,
+        chain_of(rigid_block, n), row_of(row_block, n), shape_of(shape_block, n), q, pose
     )  # fmt: skip
 
 
@@ -159,15 +192,6 @@ def _step(chain_block, row_block, shape_block, pose, offset):  # type: ignore[no
         chain_of(chain_block, n), row_of(row_block, n), 0, shape_of(shape_block, n), pose[:3],
         pose[3:].reshape((3, 3)), LEVER, offset,
     )  # fmt: skip
-
-
-@njit(**JIT)
-def _moved(wanted, pose, offset, moved):  # type: ignore[no-untyped-def]
-    """Write how far (6,) a pose (12,) is from the wanted one; no offset, no motion."""
-    moved[:] = 0.0
-    if np.any(offset != 0.0):
-        moved[:3] = pose[:3] - wanted[:3]
-        _turned(pose[3:].reshape((3, 3)), wanted[3:].reshape((3, 3)), moved[3:])
 
 
 class Compensator:
@@ -200,37 +224,48 @@ class Compensator:
         solved comes back with the distance left in ``residual`` (inf: no equilibrium).
         """
         nominal = np.array(nominal_q, dtype=float)
-        _want(self._rigid, self._rigid_row, self._rigid_shape, nominal, self._wanted)
-        offset, best_q, best, steps = self._offset.copy(), nominal, np.inf, 0
-        loads = loads or Loads()
+        q, moved = np.empty(self._n), np.empty(6)
+        loads, rigid = loads or NOTHING, self._rigid
+        self._load(loads)
+        if self._conditions:
+            _want(rigid, self._rigid_row, self._rigid_shape, nominal, self._wanted)
+            best, steps = self._solve_conditioned(nominal, loads, q)
+            self._offset[:] = q - nominal if best < np.inf else 0.0
+            _want(rigid, self._rigid_row, self._rigid_shape, q, self._pose)
+            _moved(self._wanted, self._pose, self._offset, moved)
+        else:
+            best, steps = _correct(
+                self._chain, rigid, self._row, self._rigid_row, self._shape, self._rigid_shape,
+                self._wanted, nominal, self._offset, q, moved,
+            )  # fmt: skip
+        return Correction(q, moved, np.asarray(best), np.asarray(steps))
+
+    def _solve_conditioned(self, nominal: Array, loads: Loads, q: Array) -> tuple[float, int]:
+        """Solve where effects in the model look at the joint angles anew in each step."""
+        best, steps, row, offset = np.inf, 0, self._view, self._offset
+        q[:] = nominal
         for steps in range(1, MAX_STEPS + 1):  # noqa: B007
-            q = nominal + offset
-            self._load(q, loads)
+            tried = nominal + offset
+            self._load(loads)
+            row.q[0], row.growth[0] = tried, 1.0
+            self.model.condition(row, loads, tried[None], self._conditions)
             distance = _step(self._chain, self._row, self._shape, self._wanted, offset)
             if distance < 0:
                 break
             if distance < best:
-                best_q, best = q, distance
+                q[:], best = tried, distance
             if distance < TOLERANCE:
                 break
-        self._offset[:] = best_q - nominal if best < np.inf else 0.0
-        _want(self._rigid, self._rigid_row, self._rigid_shape, best_q, self._pose)
-        moved = np.empty(6)
-        _moved(self._wanted, self._pose, self._offset, moved)
-        return Correction(best_q, moved, np.asarray(best), np.asarray(steps))
+        return best, steps
 
-    def _load(self, q: Array, loads: Loads) -> None:
-        """Write what acts at q (n,) into the row's own buffers."""
+    def _load(self, loads: Loads) -> None:
+        """Write what acts into the row's own buffers."""
         row, model = self._view, self.model
-        row.q[0] = q
         given = loads.payload_mass
         row.payload_mass[0] = model.payload_mass if given is None else given[0]
         cog = loads.payload_cog
         row.payload_cog[0] = model.payload_cog if cog is None else cog[0]
         row.wrench[0] = 0.0 if loads.wrench is None else loads.wrench[0]
-        if self._conditions:
-            row.growth[0] = 1.0
-            model.condition(row, loads, q[None], self._conditions)
 
 
 def correct(model: Model, nominal_q: Array, loads: Loads | None = None) -> Correction:

@@ -96,7 +96,7 @@ def _turn(x, y, z, out):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
-def _place(chain, rows, r, shape, tilt, A, B):  # type: ignore[no-untyped-def]
+def place(chain, rows, r, shape, tilt, A, B):  # type: ignore[no-untyped-def]
     """Place all frames for the present bending (exact finite rotations)."""
     n = chain.mass.shape[0]
     _turn(tilt[0], tilt[1], tilt[2], A)
@@ -245,7 +245,7 @@ def equilibrium(chain, rows, r, shape):  # type: ignore[no-untyped-def]
     A, B = np.empty((3, 3)), np.empty((3, 3))
     tilt, total = np.zeros(3), np.empty(6)
     for step in range(MAX_ITERATIONS):
-        _place(chain, rows, r, shape, tilt, A, B)
+        place(chain, rows, r, shape, tilt, A, B)
         change = _load(chain, rows, r, shape, tilt, total)
         # a change that is not a number would pass for none
         if change < TOLERANCE and np.isfinite(total.sum()):

@@ -1,5 +1,7 @@
 """The corrected setpoint's predicted real pose is the wanted one; what cannot be met is told."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -17,6 +19,8 @@ from core.compensation import (
     correct,
     wanted_pose,
 )
+from core.effects import Site, Term
+from core.least_offset import smallest_offset
 from core.loads import Loads
 from core.model import Model
 from core.rotation import rotation_matrix, rotation_vector
@@ -255,3 +259,58 @@ def test_live_correction_along_a_path_is_smooth_and_what_it_is_from_a_cold_start
         np.testing.assert_allclose(real[0], real[1], atol=1e-8)
     # smooth: the offset's slope does not jump between neighbours
     assert np.abs(np.diff(path - q, 2, axis=0)).max() < 5e-5
+
+
+@pytest.mark.parametrize("n", [6, 7])
+def test_effects_that_look_at_the_joint_angles_take_another_way_to_the_same_setpoint(n):
+    rng = np.random.default_rng(8)
+    model = model_of(n, rng)
+    still = model.with_terms([Term("joint_offset", Site(2), (0.0,))])  # an effect that does nothing
+    plain, conditioned = Compensator(model), Compensator(still)
+    assert still.conditions()
+    for q in np.linspace(np.full(n, 0.4), np.full(n, 1.6), 40):
+        loads = loads_of(rng)
+        one, other = plain.correct(q, loads), conditioned.correct(q, loads)
+        np.testing.assert_allclose(one.q, other.q, atol=1e-12)
+        np.testing.assert_allclose(one.offset_in_base, other.offset_in_base, atol=1e-12)
+        assert one.steps == other.steps
+        assert one.residual == pytest.approx(other.residual, abs=1e-12)
+
+
+def test_effects_that_look_at_the_joint_angles_are_corrected():
+    rng = np.random.default_rng(9)
+    model = model_of(6, rng).with_terms(
+        [Term("joint_offset", Site(2), (2e-3,)), Term("backlash", Site(3), (1e-3,))]
+    )
+    q = np.array([[0.3, -1.2, 1.4, -0.5, 0.8, 0.2]])
+    loads = replace(loads_of(rng), approach=np.array([[1.0, -1, 1, -1, 1, 1]]))
+    found = correct(model, q, loads)
+    assert found.residual[0] < 1e-8
+    assert distance(model, found.q, q, loads)[0] < 1e-8
+    assert abs(found.q[0, 1] - q[0, 1]) > 1e-3
+
+
+def test_a_correction_stays_what_it_was_when_the_next_one_is_made():
+    live, q = Compensator(SIX), np.array([0.3, -1.2, 1.4, -0.5, 0.8, 0.2])
+    first = live.correct(q)
+    kept = first.q.copy(), first.offset_in_base.copy()
+    live.correct(q + 0.1, Loads(payload_mass=np.array([1.0])))
+    np.testing.assert_array_equal(first.q, kept[0])
+    np.testing.assert_array_equal(first.offset_in_base, kept[1])
+    # and nothing of the other payload is left
+    np.testing.assert_allclose(live.correct(q).q, first.q, atol=1e-9)
+
+
+@pytest.mark.parametrize("n", [5, 6, 7])
+@given(seed=st.integers(0, 2**31))
+@settings(max_examples=60, deadline=None)
+def test_the_smallest_offset_is_least_squares(n, seed):
+    rng = np.random.default_rng(seed)
+    J, wanted, offset = rng.normal(size=(6, n)), 1e-3 * rng.normal(size=6), np.empty(n)
+    smallest_offset(J, wanted, offset)
+    expected = np.linalg.lstsq(J, wanted, rcond=1e-12)[0]
+    if np.linalg.norm(expected) < LARGEST_OFFSET:
+        condition = np.linalg.cond(J) ** 2
+        np.testing.assert_allclose(offset, expected, atol=1e-15 * condition + 1e-13)
+    else:
+        assert np.linalg.norm(offset) <= LARGEST_OFFSET * (1 + 1e-9)
