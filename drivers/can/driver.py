@@ -69,7 +69,12 @@ class CanDriver(Driver):
             self._ask()
             found = self.reader.listen(max(1.0 / self.rate, SLICE)) is not None or found
         self._changed = time.monotonic()
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        """Let what came while nobody asked for states be, torn or not."""
         self._broken, self._kept = self.reader.assembler.broken, None
+        self._builder.forget()
 
     def _nothing_heard(self, complete: bool) -> LinkError:
         """Return what was missed, and close: a link that is not there is not half open."""
@@ -204,7 +209,7 @@ class CanDriver(Driver):
         if self.writer.target is None:
             self.writer.write(self._present())
         self._armed_at = self._changed = time.monotonic()
-        self._builder.forget()
+        self._begin_anew()
 
     def _present(self) -> Vector:
         if self._q is None:
@@ -255,7 +260,7 @@ class CanDriver(Driver):
             self._run_release(self._present if target is None else lambda: target)
         finally:
             self.writer.forget()
-            self._builder.forget()
+            self._begin_anew()
 
     def _run_release(self, hold: object) -> None:
         assert callable(hold)

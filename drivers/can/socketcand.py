@@ -5,12 +5,16 @@ python-can 4.6's own spins at full load, without an exception, once the server i
 
 from __future__ import annotations
 
+import logging
 import socket
 import time
 from typing import Any
 
 import can
 from can.interfaces.socketcand.socketcand import SocketCanDaemonBus
+
+# It warns of every message that comes in two pieces, which is what a stream does.
+logging.getLogger("can.interfaces.socketcand.socketcand").setLevel(logging.ERROR)
 
 
 class SocketcandBus(SocketCanDaemonBus):

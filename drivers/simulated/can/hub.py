@@ -37,6 +37,7 @@ class Hub:
         self._wake_in, self._wake_out = -1, -1
         self._terminals: list[int] = []
         self._stopping = False
+        self._lock = threading.RLock()  # the thread's ports against frames from this process
 
     def start(self) -> Hub:
         """Listen, and serve in a thread. Raises OSError where the port is taken."""
@@ -59,6 +60,24 @@ class Hub:
         self._add(SerialPort(ours))
         self._poke()
         return path
+
+    def send(self, frame: Frame, source: Port | None = None) -> None:
+        """Put one frame on the bus from this process; it goes to every connection but ``source``.
+
+        It leaves in the caller's own time: no other thread has to wake up first.
+        """
+        with self._lock:
+            self._spread(frame, source)
+
+    def attach(self, port: Port) -> None:
+        """Have a port of this process, without a line of its own, receive what others send."""
+        with self._lock:
+            self._ports[port.fd] = port
+
+    def detach(self, port: Port) -> None:
+        """Take such a port off the bus; may be repeated."""
+        with self._lock:
+            self._ports.pop(port.fd, None)
 
     def close(self) -> None:
         """Cut every connection; may be repeated."""
@@ -100,7 +119,8 @@ class Hub:
                 elif key.fd == self._wake_out:
                     os.read(self._wake_out, 64)
                 elif (port := self._ports.get(key.fd)) is not None:
-                    self._attend(port, events)
+                    with self._lock:
+                        self._attend(port, events)
 
     def _accept(self) -> None:
         assert self._listener is not None
@@ -116,8 +136,9 @@ class Hub:
         self._add(SocketcandPort(link))
 
     def _add(self, port: Port) -> None:
-        self._ports[port.fd] = port
-        self._selector.register(port.fd, self._wanted(port))
+        with self._lock:
+            self._ports[port.fd] = port
+            self._selector.register(port.fd, self._wanted(port))
 
     def _attend(self, port: Port, events: int) -> None:
         try:
@@ -130,7 +151,7 @@ class Hub:
         for frame in frames:
             self._spread(frame, port)
 
-    def _spread(self, frame: Frame, source: Port) -> None:
+    def _spread(self, frame: Frame, source: Port | None) -> None:
         self.frames += 1
         stamp = time.time()
         for port in list(self._ports.values()):
@@ -155,6 +176,7 @@ class Hub:
     def _drop(self, port: Port) -> None:
         if self._ports.pop(port.fd, None) is None:
             return
-        with contextlib.suppress(OSError, KeyError, ValueError):
-            self._selector.unregister(port.fd)
+        if port.fd >= 0:
+            with contextlib.suppress(OSError, KeyError, ValueError):
+                self._selector.unregister(port.fd)
         port.close()

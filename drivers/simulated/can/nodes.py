@@ -15,7 +15,9 @@ from core.errors import InputError, LinkError
 from drivers.can.bus import BusSettings, close_bus, open_bus
 from drivers.can.settings import CanSettings
 from drivers.simulated.bench import Command
+from drivers.simulated.can.frame import Frame
 from drivers.simulated.can.hub import Hub
+from drivers.simulated.can.port import InnerPort
 from drivers.simulated.kinematics import Joints
 from drivers.simulated.peer import Peer
 from drivers.simulated.peer_server import PeerServer
@@ -40,6 +42,7 @@ class CanNodes(PeerServer):
         self._gear: Sequence[float] = link.gear or (1.0,) * n
         self._bus: Any = None
         self._hub: Hub | None = None
+        self._inner = InnerPort()
         self._symbol: Path | None = None
         self.withheld: set[int] = set()  # identifiers that are not sent now
         self._kept: Joints = peer.q
@@ -58,8 +61,10 @@ class CanNodes(PeerServer):
             self._hub.start()
             if link.interface == "slcan":
                 self._put_terminal(Path(link.channel))
-            link = BusSettings(interface="socketcand", host=self._hub.host, port=self._hub.port)
-        elif link.interface not in ("virtual", "socketcan"):
+            self._inner = InnerPort()
+            self._hub.attach(self._inner)
+            return
+        if link.interface not in ("virtual", "socketcan"):
             raise InputError(
                 f"link.interface: found {link.interface!r}, which cannot be simulated, expected "
                 "socketcand, slcan, virtual or socketcan"
@@ -96,21 +101,33 @@ class CanNodes(PeerServer):
 
     def cycle(self, peer: Peer) -> None:
         """Take the frames that have come, then send the arm's own."""
-        if self._bus is None:
+        if self._bus is None and self._hub is None:
             return
         for _ in range(BACKLOG):
-            try:
-                frame = self._bus.recv(0.0)
-            except (can.CanError, OSError) as error:
-                raise LinkError(f"simulated arm: {error}") from None
+            frame = self._receive()
             if frame is None:
                 break
-            if not peer.stalled and not frame.is_remote_frame and not frame.is_error_frame:
-                self.take(int(frame.arbitration_id), bytes(frame.data), peer)
+            if not peer.stalled:
+                self.take(frame.id, frame.data, peer)
         if not peer.stalled:
             if not peer.frozen:
                 self._kept = peer.q
             self.publish(peer)
+
+    def _receive(self) -> Frame | None:
+        """Return the next data frame that has come. Raises LinkError where the bus has gone."""
+        if self._hub is not None:
+            return self._inner.frames.popleft() if self._inner.frames else None
+        while True:
+            try:
+                found = self._bus.recv(0.0)
+            except (can.CanError, OSError) as error:
+                raise LinkError(f"simulated arm: {error}") from None
+            if found is None:
+                return None
+            if not found.is_remote_frame and not found.is_error_frame:
+                extended = bool(found.is_extended_id)
+                return Frame(int(found.arbitration_id), bytes(found.data), extended)
 
     def tear(self, first: int, second: int) -> None:
         """Lose frame ``second`` of the next sample, ``first`` of the one after; the first is off.
@@ -130,7 +147,11 @@ class CanNodes(PeerServer):
         """Send one frame, unless it is withheld."""
         if identifier in self.withheld or identifier in self._lost:
             return
-        frame = can.Message(arbitration_id=identifier, is_extended_id=identifier > 0x7FF, data=data)
+        extended = identifier > 0x7FF
+        if self._hub is not None:
+            self._hub.send(Frame(identifier, data, extended), self._inner)
+            return
+        frame = can.Message(arbitration_id=identifier, is_extended_id=extended, data=data)
         with contextlib.suppress(can.CanError, OSError):
             self._bus.send(frame)
 

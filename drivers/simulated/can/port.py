@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import os
 import socket
 import termios
 from abc import ABC, abstractmethod
+from collections import deque
 
 from drivers.simulated.can.frame import Frame
 
@@ -186,3 +188,29 @@ def _typed(text: str) -> Frame | None:
         return Frame(int(text[1:head], 16), content, extended)
     except ValueError:
         return None
+
+
+_numbers = itertools.count(2)
+
+
+class InnerPort(Port):
+    """A participant in the hub's own process: frames wait in a bounded queue until they are taken.
+
+    Its ``fd`` is a negative number, which is no descriptor.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(-next(_numbers))
+        self.frames: deque[Frame] = deque(maxlen=10_000)
+
+    def receive(self) -> list[Frame]:
+        """Return nothing: it has no line."""
+        return []
+
+    def deliver(self, frame: Frame, stamp: float) -> None:
+        """Keep the frame."""
+        self.frames.append(frame)
+
+    def close(self) -> None:
+        """Forget what waits."""
+        self.frames.clear()

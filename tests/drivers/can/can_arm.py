@@ -6,15 +6,17 @@ import itertools
 import math
 import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import NamedTuple
 
 import can
 import numpy as np
 
 from core.arm import builtin_arm
+from core.errors import InvalidStateError
 from core.model import Model
 from core.setpoint import Setpoint
+from core.state import RobotState
 from drivers.can.driver import CanDriver
 from drivers.can.settings import CanSettings
 from drivers.simulated.can.nodes import CanNodes
@@ -49,6 +51,14 @@ def served_arm(profile: str = "piper", **keys: object) -> Iterator[Served]:
             yield Served(peer, nodes, settings, driver)
         finally:
             driver.close()
+
+
+def next_state(driver: CanDriver) -> RobotState:
+    """Return the next sample; a busy machine tears one now and then."""
+    for _ in range(20):
+        with suppress(InvalidStateError):
+            return driver.read_state()
+    return driver.read_state()
 
 
 def joints_frame(first: int, a: float, b: float) -> tuple[int, bytes]:

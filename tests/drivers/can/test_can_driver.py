@@ -1,11 +1,10 @@
-import contextlib
 import struct
 import time
 
 import can
 import numpy as np
 import pytest
-from can_arm import MODEL, UNIT, other_bus, served_arm, setpoint_of
+from can_arm import MODEL, UNIT, next_state, other_bus, served_arm, setpoint_of
 
 from core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
 from drivers.can.driver import CanDriver
@@ -22,14 +21,6 @@ def served():
 def armed(served):
     served.driver.arm(next_state(served.driver))
     return next_state(served.driver)
-
-
-def next_state(driver):
-    """Return the next sample; a busy machine tears one now and then."""
-    for _ in range(20):
-        with contextlib.suppress(InvalidStateError):
-            return driver.read_state()
-    return driver.read_state()
 
 
 def for_three_samples(driver):

@@ -1,4 +1,4 @@
-"""An arm that no code knows: its firmware below is written after its 'manual', not after our map."""
+"""An arm that no code knows: its firmware is written after its manual, not after our map."""
 
 import math
 import threading
@@ -8,9 +8,8 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
-from can_arm import MODEL, setpoint_of
+from can_arm import MODEL, next_state, setpoint_of
 
-from core.errors import InvalidStateError
 from drivers.can.driver import CanDriver
 from drivers.can.settings import CanSettings
 
@@ -76,15 +75,6 @@ def firmware():
     found.ended = True
     found.join(2.0)
     found.bus.shutdown()
-
-
-def next_state(driver):
-    for _ in range(20):
-        try:
-            return driver.read_state()
-        except InvalidStateError:
-            continue
-    return driver.read_state()
 
 
 def test_an_arm_that_no_code_knows_is_read_armed_and_moved_from_data_alone(firmware):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from can_arm import next_state
 from piper_sdk import C_PiperInterface_V2
 from piper_sdk.kinematics.piper_fk import C_PiperForwardKinematics
 
@@ -37,7 +38,9 @@ def test_the_cells_arm_is_the_one_of_the_vendors_kinematics():
 def served():
     cell = load_cell(CELL)
     peer = make_peer(*simulated_arm(cell.arm, seed=3, start_q=START), period=0.004)
-    link = CanSettings(profile="piper", interface="socketcand", host="127.0.0.2", port=29571)
+    link = CanSettings(
+        profile="piper", interface="socketcand", host="127.0.0.2", port=29571, state_timeout=0.5
+    )
     with PeerThread(peer, make_servers(link, "127.0.0.2", peer), "127.0.0.2"):
         yield peer, link, cell.model
 
@@ -69,7 +72,7 @@ def test_the_vendors_client_reads_and_commands_our_arm_and_we_notice_it(served, 
     peer, link, model = served
     wait_for(lambda: np.abs(joints_of(vendor) - peer.q).max() < 1e-5)
     with CanDriver(link, model) as driver:
-        assert driver.read_state().actual_q == pytest.approx(peer.q, abs=1e-5)
+        assert next_state(driver).actual_q == pytest.approx(peer.q, abs=1e-5)
         until = time.monotonic() + 5.0
         while not vendor.EnablePiper():
             assert time.monotonic() < until
@@ -80,11 +83,11 @@ def test_the_vendors_client_reads_and_commands_our_arm_and_we_notice_it(served, 
         def command():
             vendor.MotionCtrl_2(0x01, 0x01, 100, 0x00)
             vendor.JointCtrl(*counts)
-            driver.read_state()
+            next_state(driver)
             return np.abs(goal - peer.q).max() < 1e-4
 
         wait_for(command)
-        state = driver.read_state()
+        state = next_state(driver)
         assert state.target_q == pytest.approx(goal, abs=1e-5)  # another's, but heard
         assert vendor.GetArmStatus().arm_status.ctrl_mode == 1
         assert np.abs(joints_of(vendor) - goal).max() < 1e-4
@@ -104,7 +107,7 @@ def test_simulate_serves_the_cell_to_another_process(tmp_path):
             assert lines[1] == "ready 127.0.0.9\n"
             found = load_cell(cell)
             with CanDriver(found.link, found.model) as driver:
-                q = [driver.read_state().actual_q for _ in range(50)][-1]
+                q = [next_state(driver).actual_q for _ in range(50)][-1]
             assert q == pytest.approx(found.file.simulation.start_q, abs=1e-4)
         finally:
             os.kill(server.pid, signal.SIGTERM)
