@@ -23,6 +23,7 @@ BOUNDS = {
     "force": 1e5, "moment": 1e5,
 }  # fmt: skip
 """Largest plausible magnitudes, SI."""
+TURN = 2.0 * math.pi
 JITTER = 0.01  # rad beyond what the fastest joint can have come
 
 
@@ -149,20 +150,20 @@ class Decoder:
             words: Sequence[int] = raw[field.indices[0] : field.indices[-1] + 1]
         else:
             words = [raw[i] for i in field.indices]
-        with np.errstate(all="ignore"):  # registers may hold any float; the bounds come next
-            values = np.array(field.coding.decode(words)) * field.size
+        size = field.size
+        values = [count * size for count in field.coding.decode(words)]
         if field.turn_block is not None and field.turn_coding is not None:
             turns = registers[field.turn_block]
             counts = field.turn_coding.decode([turns[i] for i in field.turn_indices])
-            values += 2.0 * math.pi * np.array(counts)
+            values = [v + TURN * t for v, t in zip(values, counts, strict=True)]
         bound = BOUNDS[field.name]
-        if not (np.abs(values) <= bound).all():  # NaN fails too
-            bad = int(np.argmax(~(np.abs(values) <= bound)))
+        if not all(-bound <= v <= bound for v in values):  # NaN fails too
+            bad = next(i for i, v in enumerate(values) if not -bound <= v <= bound)
             raise InvalidStateError(
                 f"{field.name} {bad + 1}: found {values[bad]:g}, expected a finite number within "
                 f"+-{bound:g}"
             )
-        return values
+        return np.array(values)
 
     def _echo_of(self, registers: Registers) -> tuple[int, ...] | None:
         if self._echo is None:

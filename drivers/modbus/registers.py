@@ -68,17 +68,19 @@ class Coding:
             return -(2.0 ** (bits - 1)), 2.0 ** (bits - 1) - 1
         return 0.0, 2.0**bits - 1
 
-    def decode(self, registers: Sequence[int]) -> list[float]:
+    def decode(self, registers: Sequence[int]) -> Sequence[float]:
         """Return the numbers in registers (words a number), as counts."""
+        if self.type in ("bit", "u16"):  # most registers are these: no packing for them
+            return registers
+        if self.type == "i16":
+            return [v - 0x10000 if v & 0x8000 else v for v in registers]
         words, count = self.words, len(registers) // self.words
-        if self.type == "bit":
-            return [float(v) for v in registers]
         data = struct.pack(f">{len(registers)}H", *self._ordered(registers))
         found = struct.unpack(f">{count}{CODES[self.type]}", data)
         if self.type.startswith("sm"):
             top = 1 << (16 * words - 1)
-            return [float(-(v & ~top) if v & top else v) for v in found]
-        return [float(v) for v in found]
+            return [-(v & ~top) if v & top else v for v in found]
+        return found
 
     def encode(self, counts: Sequence[float]) -> list[int]:
         """Return the registers of numbers given as counts; integers are rounded.
