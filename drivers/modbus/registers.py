@@ -80,7 +80,7 @@ class Coding:
         if self.type.startswith("sm"):
             top = 1 << (16 * words - 1)
             return [-(v & ~top) if v & top else v for v in found]
-        return found
+        return list(found)
 
     def encode(self, counts: Sequence[float]) -> list[int]:
         """Return the registers of numbers given as counts; integers are rounded.

@@ -23,7 +23,7 @@ def test_counts_come_back_from_their_registers(kind: str, order: str, data: st.D
     registers = coding.encode([float(c) for c in counts])
     assert len(registers) == coding.words * len(counts)
     assert all(0 <= r <= 0xFFFF for r in registers)
-    assert coding.decode(registers) == [float(c) for c in counts]
+    assert list(coding.decode(registers)) == counts
 
 
 @pytest.mark.parametrize(
@@ -42,7 +42,7 @@ def test_counts_come_back_from_their_registers(kind: str, order: str, data: st.D
 def test_registers_read_as_manuals_say(
     kind: str, order: str, registers: list[int], count: float
 ) -> None:
-    assert Coding(kind, order).decode(registers) == [float(count)]  # type: ignore[arg-type]
+    assert list(Coding(kind, order).decode(registers)) == [count]  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("kind", "count"), [("i16", 32768), ("u16", -1), ("sm16", -32768)])
