@@ -20,7 +20,7 @@ from core.least_offset import LARGEST_OFFSET as LARGEST_OFFSET
 from core.least_offset import smallest_offset
 from core.loads import Loads
 from core.model import Model, Poses
-from core.packed import chain_of, pack, row_of, shape_of
+from core.packed import chain_of, pack, row_of, shape_of, view_row
 
 Array = NDArray[np.float64]
 TOLERANCE = 1e-9  # m, and rad times the tool's lever: where the pose counts as reached
@@ -212,7 +212,7 @@ class Compensator:
             np.zeros((1, n)), np.ones((1, n)), np.zeros(1), np.zeros((1, 3)), np.zeros((1, 6))
         )
         self._row, self._rigid_row = pack(plain), pack(plain)
-        self._view: Rows = row_of.py_func(self._row, n)
+        self._view = view_row(self._row, n)
         self._conditions = model.conditions()
         self._offset = np.zeros(n)
         self._wanted, self._pose = np.zeros(12), np.zeros(12)

@@ -45,8 +45,7 @@ def chain_of(block, n):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(**JIT)
-def row_of(block, n):  # type: ignore[no-untyped-def]
+def view_row(block: Array, n: int) -> Rows:
     """Return one row for n joints whose arrays are views of ``block``."""
     m = 2 * n
     return Rows(
@@ -56,6 +55,9 @@ def row_of(block, n):  # type: ignore[no-untyped-def]
         block[m + 1 : m + 4].reshape((1, 3)),
         block[m + 4 : m + 10].reshape((1, 6)),
     )
+
+
+row_of = njit(**JIT)(view_row)
 
 
 @njit(**JIT)
