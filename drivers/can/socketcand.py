@@ -28,10 +28,25 @@ class SocketcandBus(SocketCanDaemonBus):
             raise can.CanOperationError("the socketcand server has closed the connection")
         return message, filtered
 
+    def _expect_msg(self, msg: str) -> None:
+        """Read one answer of the handshake and no more: frames may follow at once."""
+        wanted, answer = msg.encode("ascii"), b""
+        while len(answer) < len(wanted):
+            more = self._link.recv(len(wanted) - len(answer))
+            if not more:
+                break
+            answer += more
+        if answer != wanted:
+            raise can.CanInitializationError(f"expected {msg!r}, found {answer!r}")
+
+    @property
+    def _link(self) -> Any:
+        """Return the library's socket; there is no public way to it."""
+        return getattr(self, "_SocketCanDaemonBus__socket")  # noqa: B009
+
     def _ended(self) -> bool:
-        link: Any = getattr(self, "_SocketCanDaemonBus__socket")  # noqa: B009 - no public way to it
         try:
-            return bool(link.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b"")
+            return bool(self._link.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b"")
         except BlockingIOError:
             return False
         except OSError:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import errno
 import itertools
+import math
 import os
 import socket
 import termios
+import time
 from abc import ABC, abstractmethod
 from collections import deque
 
@@ -14,6 +16,7 @@ from drivers.simulated.can.frame import Frame
 
 BACKLOG = 1 << 20  # bytes that a client may leave unread before it is cut off
 LONGEST = 200  # bytes of one message
+QUIET = 0.02  # s after the handshake without a frame
 
 
 class Port(ABC):
@@ -67,13 +70,14 @@ class Port(ABC):
 class SocketcandPort(Port):
     """A client of the socketcand protocol: ``< open can0 >``, ``< rawmode >``, ``< send ... >``.
 
-    The greeting and each answer leave in one piece of their own, as python-can expects.
+    The greeting and each answer leave in one piece of their own, and no frame follows the last one
+    at once, as python-can expects.
     """
 
     def __init__(self, link: socket.socket) -> None:
         super().__init__(link.fileno())
         self._link = link
-        self._raw = False
+        self._raw_from = math.inf  # s, monotonic
         self._write(b"< hi >")
 
     def receive(self) -> list[Frame]:
@@ -93,7 +97,7 @@ class SocketcandPort(Port):
             case ["open", _]:
                 self._write(b"< ok >")
             case ["rawmode"]:
-                self._raw = True
+                self._raw_from = time.monotonic() + QUIET
                 self._write(b"< ok >")
             case ["echo"]:
                 self._write(b"< echo >")
@@ -108,7 +112,7 @@ class SocketcandPort(Port):
 
     def deliver(self, frame: Frame, stamp: float) -> None:
         """Send ``< frame id seconds.microseconds data >``."""
-        if self._raw:
+        if time.monotonic() >= self._raw_from:
             name = f"{frame.id:08X}" if frame.extended else f"{frame.id:03X}"
             self._write(f"< frame {name} {stamp:.6f} {frame.data.hex().upper()} >".encode())
 

@@ -1,4 +1,5 @@
 import socket
+import threading
 import time
 
 import can
@@ -7,6 +8,7 @@ from pydantic import ValidationError
 
 from core.errors import LinkError
 from drivers.can.bus import BusSettings, close_bus, open_bus
+from drivers.simulated.can.frame import Frame
 from drivers.simulated.can.hub import Hub
 
 
@@ -20,13 +22,20 @@ def settings_of(hub, **more):
     return BusSettings(interface="socketcand", channel="can0", host=hub.host, port=hub.port, **more)
 
 
+def joined(hub, number):
+    """Return buses that hear every frame from now on."""
+    buses = [open_bus(settings_of(hub)) for _ in range(number)]
+    time.sleep(0.05)
+    return buses
+
+
 def frames_of(bus, number, timeout=2.0):
     found = [bus.recv(timeout) for _ in range(number)]
     return [(f.arbitration_id, bytes(f.data), f.is_extended_id) for f in found if f]
 
 
 def test_a_frame_on_the_hub_reaches_every_other_connection_and_not_its_sender(hub):
-    buses = [open_bus(settings_of(hub)) for _ in range(3)]
+    buses = joined(hub, 3)
     buses[0].send(can.Message(arbitration_id=0x155, data=[1, 2, 3], is_extended_id=False))
     buses[0].send(can.Message(arbitration_id=0x1ABCDEF0, data=[], is_extended_id=True))
     wanted = [(0x155, b"\1\2\3", False), (0x1ABCDEF0, b"", True)]
@@ -39,7 +48,7 @@ def test_a_frame_on_the_hub_reaches_every_other_connection_and_not_its_sender(hu
 
 def test_a_serial_adapter_and_a_socketcand_client_share_the_bus(hub):
     serial = open_bus(BusSettings(interface="slcan", channel=hub.add_terminal()))
-    tcp = open_bus(settings_of(hub))
+    (tcp,) = joined(hub, 1)
     serial.send(can.Message(arbitration_id=0x2A5, data=range(8), is_extended_id=False))
     assert frames_of(tcp, 1) == [(0x2A5, bytes(range(8)), False)]
     tcp.send(can.Message(arbitration_id=0x12345, data=[9], is_extended_id=True))
@@ -49,7 +58,7 @@ def test_a_serial_adapter_and_a_socketcand_client_share_the_bus(hub):
 
 
 def test_thousands_of_frames_arrive_once_and_in_order(hub):
-    sender, receiver = open_bus(settings_of(hub)), open_bus(settings_of(hub))
+    sender, receiver = joined(hub, 2)
     for i in range(3000):
         sender.send(can.Message(arbitration_id=i % 0x7FF, data=i.to_bytes(4, "big")))
     got = frames_of(receiver, 3000)
@@ -77,8 +86,27 @@ def test_a_hub_that_nobody_serves_is_one_line_and_soon():
     assert time.monotonic() - start < 3.0
 
 
+def test_joining_a_busy_bus_takes_no_luck(hub):
+    ended = threading.Event()
+
+    def chatter():
+        while not ended.wait(0.0005):
+            hub.send(Frame(0x2A5, bytes(8)))
+
+    thread = threading.Thread(target=chatter)
+    thread.start()
+    try:
+        for _ in range(30):
+            bus = open_bus(settings_of(hub))
+            assert frames_of(bus, 1) == [(0x2A5, bytes(8), False)]
+            close_bus(bus)
+    finally:
+        ended.set()
+        thread.join()
+
+
 def test_garbage_from_a_client_harms_nobody_else(hub):
-    bus, other = open_bus(settings_of(hub)), open_bus(settings_of(hub))
+    bus, other = joined(hub, 2)
     with socket.create_connection((hub.host, hub.port)) as wild:
         wild.sendall(b"< send zzz 8 1 >< send 155 2 1 ><send 155 1 100 >< nonsense >" + b"x" * 500)
         bus.send(can.Message(arbitration_id=1, data=[1], is_extended_id=False))
