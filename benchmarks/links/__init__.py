@@ -1,0 +1,1 @@
+"""What a cycle costs on each link, beside the bare library."""
