@@ -18,11 +18,21 @@ class ProfileError(InputError):
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML 1.1 with the floats of YAML 1.2: PyYAML alone reads 2e-3 as a text."""
+    """YAML 1.1 with the floats and booleans of YAML 1.2.
+
+    PyYAML alone reads 2e-3 as a text, and a signal called ``on`` as true.
+    """
+
+    yaml_implicit_resolvers = {  # noqa: RUF012 - PyYAML's own way, copied when it is extended
+        first: [(tag, found) for tag, found in resolvers if tag != "tag:yaml.org,2002:bool"]
+        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
 
 
+_BOOLEAN = re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$")
 _FLOAT = re.compile(r"^[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)[eE][-+]?[0-9]+$")
 _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789."))
+_Loader.add_implicit_resolver("tag:yaml.org,2002:bool", _BOOLEAN, list("tTfF"))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,56 @@
+"""docs/porting.md, the CAN part: its map works as it stands there."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from can_arm import MODEL, next_state, setpoint_of
+
+from drivers.can.driver import CanDriver
+from drivers.can.settings import CanSettings
+from drivers.driver import DriverSettings
+from drivers.simulated.can.server import make_servers
+from drivers.simulated.peer import make_peer
+from drivers.simulated.peer_server import PeerThread
+from drivers.simulated.settings import simulated_arm
+
+PAGE = Path(__file__).parents[3] / "docs" / "porting.md"
+HALF = np.radians(0.005)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    part = PAGE.read_text().split("## CAN: a new arm from data alone")[1].split("\n## ")[0]
+    (dbc,) = re.findall(r"```text\n(VERSION.*?)```", part, re.DOTALL)
+    (profile,) = re.findall(r"```yaml\n(name: .*?)```", part, re.DOTALL)
+    (tmp_path / "my_can_arm.dbc").write_text(dbc)
+    (tmp_path / "my_can_arm.yaml").write_text(profile)
+    return tmp_path
+
+
+def test_the_page_s_arm_is_read_armed_and_moved(folder):
+    settings = CanSettings(
+        profile="my_can_arm.yaml", interface="socketcand", host="127.0.0.2", port=29577,
+        state_timeout=0.5, foreign_quiet=0.1,
+    ).located(folder)  # fmt: skip
+    peer = make_peer(*simulated_arm(MODEL.arm, seed=2), period=0.004)
+    servers = make_servers(settings, "127.0.0.2", peer)
+    with PeerThread(peer, servers, "127.0.0.2"), CanDriver(settings, MODEL) as driver:
+        assert driver.rate == 100.0
+        state = next_state(driver)
+        assert state.actual_q == pytest.approx(peer.q, abs=HALF * 1.01)
+        driver.arm(state)
+        goal = state.actual_q + np.linspace(0.01, -0.01, 6)
+        driver.write_setpoint(setpoint_of(goal))
+        for _ in range(30):
+            state = next_state(driver)
+        assert np.abs(goal - peer.q).max() < 1.1 * HALF
+        assert state.actual_q == pytest.approx(goal, abs=2.1 * HALF)
+
+
+def test_the_page_names_every_key_of_the_link_that_can_has_more_than_others():
+    text = PAGE.read_text()
+    own = set(CanSettings.model_fields) - set(DriverSettings.model_fields) - {"driver"}
+    missing = {name for name in own if f"`{name}`" not in text and f"{name}: " not in text}
+    assert missing == {"arming_distance"}
