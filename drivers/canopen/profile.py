@@ -164,7 +164,7 @@ class _Pdos:
         for number, names in sorted(given.items()):
             entries = []
             for i, name in enumerate(names):
-                keys: Keys = (key, number, i)
+                keys: Keys = (key, str(number), i)
                 entry = self._entry(keys, name, key == "tpdo")
                 if entry.name in seen:
                     line = self.document.line(seen[entry.name])
@@ -176,7 +176,7 @@ class _Pdos:
             bits = sum(entry.bits for entry in entries)
             if not 0 < bits <= MOST_BITS:
                 raise self.document.error(
-                    (key, number), f"found {bits} bits, expected 1 to {MOST_BITS}"
+                    (key, str(number)), f"found {bits} bits, expected 1 to {MOST_BITS}"
                 )
             layouts.append(PdoLayout(number, tuple(entries), key == "tpdo"))
         for name in wanted:
@@ -227,7 +227,9 @@ def _near(name: str, known: Mapping[str, object] | Sequence[str]) -> str:
 def _refusal(document: ProfileDocument, error: ValidationError) -> ProfileError:
     """Return one line out of what pydantic says; unknown keys come first."""
     worst = min(error.errors(), key=lambda detail: detail["type"] != "extra_forbidden")
-    keys = tuple(key for key in worst["loc"] if key not in ("str", "int", "[key]"))
+    keys: Keys = tuple(key for key in worst["loc"] if key not in ("str", "int", "[key]"))
+    if keys and keys[0] in ("tpdo", "rpdo"):
+        keys = (keys[0], *(str(key) for key in keys[1:2]), *keys[2:])  # a PDO's number counts as is
     if worst["type"] == "extra_forbidden":
         names = [name for model in (ProfileFile, Joint, Heartbeat) for name in _names(model)]
         return document.error(keys, f"found an unknown key{_near(str(keys[-1]), names)}")

@@ -1,0 +1,100 @@
+"""An arm of simulated CiA 402 drives on a bus in this process, and drivers for it."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import can
+import numpy as np
+
+from core.arm import builtin_arm
+from core.errors import LinkError
+from core.model import Model
+from core.setpoint import Setpoint
+from core.state import RobotState
+from drivers.canopen.driver import CanopenDriver
+from drivers.canopen.settings import CanopenSettings
+from drivers.simulated.canopen.server import CanopenServer
+from drivers.simulated.peer import Peer, make_peer
+from drivers.simulated.peer_server import PeerThread
+from drivers.simulated.settings import simulated_arm
+
+HOST = "127.0.0.1"
+_numbers = itertools.count()
+
+
+class DriveArm:
+    """Six drives behind a profile, on python-can's virtual bus."""
+
+    def __init__(self, profile: str = "cia402", **keys: Any) -> None:
+        chosen = {
+            "interface": "virtual", "channel": f"drives{next(_numbers)}", "rate": 100.0,
+            "state_timeout": 0.3, "listen": 0.05, "foreign_quiet": 0.1,
+        }  # fmt: skip
+        self.settings = CanopenSettings(profile=profile, **{**chosen, **keys})
+        self.model = Model(builtin_arm("ur10e"))
+        self.peer: Peer = make_peer(*simulated_arm(self.model.arm, seed=3), period=0.004)
+        self.server = CanopenServer(self.settings, HOST, self.peer)
+        self.thread = PeerThread(self.peer, [self.server], HOST)
+
+    def driver(self, **keys: Any) -> CanopenDriver:
+        """Return a driver, not connected."""
+        return CanopenDriver(self.settings.model_copy(update=keys), self.model)
+
+    @contextmanager
+    def other_bus(self) -> Iterator[can.BusABC]:
+        """Yield somebody else's access to the bus."""
+        bus = can.Bus(interface="virtual", channel=self.settings.channel)
+        try:
+            yield bus
+        finally:
+            bus.shutdown()
+
+
+@contextmanager
+def served(profile: str = "cia402", **keys: Any) -> Iterator[DriveArm]:
+    """Serve an arm while the block lasts."""
+    arm = DriveArm(profile, **keys)
+    with arm.thread:
+        yield arm
+
+
+def settled(driver: CanopenDriver, seconds: float = 1.0) -> RobotState:
+    """Return a state; a machine that is busy may tear a set or two."""
+    until = time.monotonic() + seconds
+    while True:
+        try:
+            return driver.read_state()
+        except LinkError:
+            if time.monotonic() > until:
+                raise
+
+
+def setpoint(q: np.ndarray, state: RobotState) -> Setpoint:
+    """Return a setpoint as the limiter hands it on."""
+    return Setpoint(q, q, np.zeros(6), state.timestamp, state.received)
+
+
+def follow(
+    driver: CanopenDriver, goal: np.ndarray, peer: Peer, within: float = 1e-4, seconds: float = 4.0
+) -> None:
+    """Lead the arm to joints at 0.2 rad/s."""
+    start, begun = np.array(peer.q), time.monotonic()
+    way = float(np.abs(goal - start).max())
+    while np.abs(goal - peer.q).max() > within:
+        assert time.monotonic() - begun < seconds, f"not there: {goal - peer.q}"
+        state = settled(driver)
+        share = min((time.monotonic() - begun) * 0.2 / way, 1.0)
+        driver.write_setpoint(setpoint(start + share * (goal - start), state))
+
+
+def wait_for(true: Callable[[], bool], seconds: float, what: str) -> None:
+    """Wait until something is so; fail with its name where it does not come."""
+    until = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < until, f"{what}: not within {seconds:g} s"
+        time.sleep(0.005)
