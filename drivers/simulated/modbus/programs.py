@@ -11,7 +11,7 @@ from drivers.modbus.profile import ECHO_WORDS, MAILBOX_WORDS, addresses
 from drivers.modbus.registers import UNITS, Table
 from drivers.modbus.schema import Condition, Mailbox, ProfileFile, TargetTrigger
 from drivers.simulated.bench import BenchError
-from drivers.simulated.kinematics import offset_frame, solve, tcp_in_base
+from drivers.simulated.kinematics import Joints, offset_frame, solve, tcp_in_base
 from drivers.simulated.modbus.image import bad
 from drivers.simulated.motion import Hold, Stop
 from drivers.simulated.offset_program import NOTHING, approach
@@ -67,13 +67,16 @@ class MailboxProgram:
         self._wanted: Vector6 = NOTHING
         self.applied: Vector6 = NOTHING
         self._state = encode.EXPIRED
+        self._solved: tuple[Joints, Vector6] | None = None  # what joint offsets were found for
 
     def wrote(self, peer: Peer, table: Table, address: int, values: Sequence[int]) -> None:
         """Do nothing: the program polls its registers."""
 
     def cycle(self, peer: Peer, read: Read) -> None:
         """Read the mailbox, and move the applied offset towards the one wanted."""
-        if self.running:
+        if not peer.can_move:  # a stop ends the program's part: the arm stays where it is
+            self._wanted = self.applied = NOTHING
+        elif self.running:
             self._take(read(self._box.table, self._box.address, MAILBOX_WORDS), peer.period)
         else:
             self._wanted = NOTHING
@@ -100,8 +103,12 @@ class MailboxProgram:
         if self.applied == NOTHING:
             if any(peer.joint_offset):
                 peer.offset_by((0.0,) * peer.n)
+            self._solved = None
+            return
+        if (peer.own_q, self.applied) == self._solved:
             return
         arm, tool = peer.plant.arm, peer.declared.tool
+        self._solved = (peer.own_q, self.applied)
         wanted = offset_frame(tcp_in_base(arm, peer.own_q, tool), self.applied)
         near = tuple(a + b for a, b in zip(peer.own_q, peer.joint_offset, strict=True))
         found = solve(arm, wanted, near, tool, steps=20)
