@@ -21,7 +21,13 @@ def model() -> Model:
     return Model(builtin_arm("ur5e"))
 
 
-KEYS: dict[str, dict[str, Any]] = {"modbus": {"profile": "ur"}}
+KEYS: dict[str, dict[str, Any]] = {
+    "can": {"profile": "piper", "interface": "socketcand", "channel": "can0", "port": 29536},
+    "canopen": {
+        "profile": "lwa4p", "interface": "socketcand", "channel": "can0", "port": 29536,
+    },
+    "modbus": {"profile": "ur"},
+}  # fmt: skip
 """What a link of a driver must say beside its name and its host."""
 
 
