@@ -22,6 +22,7 @@ from drivers.canopen.profile import CanopenProfile
 from drivers.canopen.sync_set import SyncCollector
 
 KEPT = 64  # emergencies remembered
+PAUSE = 0.02  # s between two readings of a bus that has gone
 OPERATIONAL = 5  # NMT state
 
 
@@ -70,6 +71,13 @@ class BusListener(MessageListener):
             return
         self._collector.take(cob_id, bytes(msg.data), now)
         super().on_message_received(msg)  # type: ignore[no-untyped-call]
+
+    def on_error(self, exc: Exception) -> None:
+        """Keep the notifier's thread from a traceback; ``Network.check`` tells what ended the bus.
+
+        The thread goes on until it is stopped, so that it must not spin.
+        """
+        time.sleep(PAUSE)
 
 
 def _commands(profile: CanopenProfile) -> dict[int, str]:

@@ -29,7 +29,7 @@ Vector = NDArray[np.float64]
 MODES_OF_OPERATION, CONSUMER_HEARTBEAT = Address(0x6060, 0), Address(0x1016, 1)
 ABORT_CONNECTION = Address(0x6007, 0)
 STOP_AT_LOSS = 3  # Abort connection option code: quick stop
-STOPPING = 3.0  # s that a quick stop and disabling may take
+STOPPING = 2.0  # s that a quick stop and disabling may take
 STANDING = 3  # SYNCs without a change of any count: the arm stands
 OFF: tuple[State, ...] = (
     "SWITCH ON DISABLED", "READY TO SWITCH ON", "NOT READY TO SWITCH ON", "FAULT",

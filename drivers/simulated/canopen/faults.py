@@ -30,7 +30,7 @@ class Faulty(Protocol):
         """Have a drive fail."""
         ...
 
-    def hold_back(self, node: int, count: int = 1) -> None:
+    def hold_back(self, node: int, delay: float, count: int = 1) -> None:
         """Have TPDOs of a node come late."""
         ...
 
@@ -61,7 +61,7 @@ def bench_commands(drives: Faulty) -> Mapping[str, Command]:
         return "ok"
 
     def late(numbers: list[float]) -> str:
-        drives.hold_back(node_of(numbers[0]))
+        drives.hold_back(node_of(numbers[0]), max(numbers[1], 0.0))
         return "ok"
 
     return {
@@ -69,5 +69,5 @@ def bench_commands(drives: Faulty) -> Mapping[str, Command]:
         "speak": (0, speak, "all drives send again"),
         "restart": (1, restart, "NODE: this drive starts anew"),
         "fail": (2, fail, "NODE CODE: this drive goes to FAULT with an error code"),
-        "late": (1, late, "NODE: its next TPDOs come after the SYNC that follows"),
+        "late": (2, late, "NODE SECONDS: its next TPDOs come so late"),
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -25,7 +26,8 @@ from drivers.simulated.peer_server import PeerServer
 SYNC = 0x80
 HEARTBEAT = 0x700
 BLOCKED, EMERGENCY, FOLLOWING_ERROR, HEARTBEAT_ERROR = 0x7121, 0x5441, 0x8611, 0x8130
-LATE_BY = 0.05  # rad that a TPDO held back is off: who takes it for a new one is found out
+OFF_BY = 0.05  # rad that a TPDO held back is off: who takes it for a new one is found out
+PAUSE = 0.02  # s
 
 
 class _Network(canopen.Network):
@@ -59,6 +61,9 @@ class _Listener(MessageListener):
             super().on_message_received(msg)  # type: ignore[no-untyped-call]
             self._server.heard(int(msg.arbitration_id), bytes(msg.data))
 
+    def on_error(self, exc: Exception) -> None:
+        time.sleep(PAUSE)  # the bus has gone: the server's cycle tells
+
 
 class CanopenServer(PeerServer):
     """All drives of one arm.
@@ -74,8 +79,8 @@ class CanopenServer(PeerServer):
         self._hub: Hub | None = None
         self._network: Any = None
         self._peer = peer
-        self._late: dict[int, int] = {}  # node -> SYNCs that its TPDOs are still held back for
-        self._held: list[tuple[int, bytes]] = []
+        self._late: dict[int, tuple[int, float]] = {}  # node -> SYNCs still, s of delay
+        self._held: list[tuple[float, int, bytes]] = []  # s of peer.running, COB-ID, data
         self._beaten: dict[int, float] = {}  # node -> s, of its last heartbeat
         self._was_able = True
         self.drives = tuple(self._drive(joint) for joint in range(peer.n))
@@ -165,19 +170,11 @@ class CanopenServer(PeerServer):
 
     def _answer_sync(self) -> None:
         """Send every drive's TPDOs, then let the setpoints that came before this SYNC count."""
-        held, self._held = self._held, []
-        for cob_id, data in held:
-            self._network.send_message(cob_id, data)
         for drive in self.drives:
             if not drive.operational:
                 continue
-            late = self._late.pop(drive.node, 0)
-            if late:
-                drive.q += LATE_BY
-                self._held += drive.samples()
-                drive.q -= LATE_BY
-                if late > 1:
-                    self._late[drive.node] = late - 1
+            if drive.node in self._late:
+                self._hold(drive)
                 continue
             for cob_id, data in drive.samples():
                 self._network.send_message(cob_id, data)
@@ -186,10 +183,25 @@ class CanopenServer(PeerServer):
             if heard and not drive.take_setpoints():
                 drive.fail(FOLLOWING_ERROR)
 
-    def hold_back(self, node: int, count: int = 1) -> None:
-        """Have the next TPDOs of a node come only after the SYNC that follows theirs."""
+    def _hold(self, drive: Drive) -> None:
+        count, delay = self._late.pop(drive.node)
+        if count > 1:
+            self._late[drive.node] = (count - 1, delay)
+        drive.q += OFF_BY
+        due = self._peer.running + delay
+        self._held += [(due, cob_id, data) for cob_id, data in drive.samples()]
+        drive.q -= OFF_BY
+
+    def _send_held(self, now: float) -> None:
+        due = [frame for frame in self._held if frame[0] <= now]
+        self._held = [frame for frame in self._held if frame[0] > now]
+        for _, cob_id, data in due:
+            self._network.send_message(cob_id, data)
+
+    def hold_back(self, node: int, delay: float, count: int = 1) -> None:
+        """Have a node's TPDOs come ``delay`` s late, at the next ``count`` SYNCs."""
         with self.lock:
-            self._late[node] = count
+            self._late[node] = (count, delay)
 
     # -- the cycle --------------------------------------------------------------------------------
 
@@ -200,6 +212,7 @@ class CanopenServer(PeerServer):
                 return
             self._network.mute = peer.stalled
             self._follow_stops(peer)
+            self._send_held(peer.running)
             self._watch_heartbeats(peer)
             self._move(peer)
             if not peer.frozen:

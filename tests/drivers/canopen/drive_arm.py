@@ -5,14 +5,14 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import can
 import numpy as np
 
 from core.arm import builtin_arm
-from core.errors import LinkError
+from core.errors import InvalidStateError, LinkError
 from core.model import Model
 from core.setpoint import Setpoint
 from core.state import RobotState
@@ -72,6 +72,14 @@ def settled(driver: CanopenDriver, seconds: float = 1.0) -> RobotState:
         except LinkError:
             if time.monotonic() > until:
                 raise
+
+
+def read_on(driver: CanopenDriver, seconds: float = 2.0) -> None:
+    """Read for a while, past torn samples; raises what the driver raises otherwise."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        with suppress(InvalidStateError):
+            driver.read_state()
 
 
 def setpoint(q: np.ndarray, state: RobotState) -> Setpoint:

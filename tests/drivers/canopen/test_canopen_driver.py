@@ -1,0 +1,401 @@
+"""The driver against simulated drives: what is read, what is written, and what goes wrong."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+
+import can
+import numpy as np
+import pytest
+from drive_arm import DriveArm, follow, read_on, served, setpoint, settled, wait_for
+
+from core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
+from drivers.canopen.driver import CanopenDriver
+from drivers.simulated.canopen.machine import Phase
+
+
+@pytest.fixture(params=["cia402", "lwa4p"])
+def arm(request: pytest.FixtureRequest) -> Iterator[DriveArm]:
+    with served(request.param) as found:
+        yield found
+
+
+@pytest.fixture
+def generic() -> Iterator[DriveArm]:
+    with served("cia402") as found:
+        yield found
+
+
+@pytest.fixture
+def driver(generic: DriveArm) -> Iterator[CanopenDriver]:
+    with generic.driver() as found:
+        yield found
+
+
+def phases(arm: DriveArm) -> set[Phase]:
+    return {drive.axis.machine.phase for drive in arm.server.drives}
+
+
+def node_of(arm: DriveArm, joint: int) -> int:
+    return arm.server.profile.nodes[joint]
+
+
+# -- reading and writing --------------------------------------------------------------------------
+
+
+def test_setpoints_in_both_modes_bring_the_plant_there_and_release_leaves_it(
+    arm: DriveArm,
+) -> None:
+    with arm.driver() as driver:
+        before = [drive.number(0x6060) for drive in arm.server.drives]
+        driver.arm(settled(driver))
+        assert phases(arm) == {Phase.ENABLED}
+        goal = np.array(arm.peer.q) + 0.05 * np.array([1, -1, 1, -1, 1, -1])
+        follow(driver, goal, arm.peer)
+        assert settled(driver).robot_mode == 7
+        driver.release()
+        assert phases(arm) == {Phase.SWITCH_ON_DISABLED}
+        assert np.abs(goal - arm.peer.q).max() < 2e-4
+        assert [drive.number(0x6060) for drive in arm.server.drives] == before
+        assert all(drive.number(0x1016, 1) == 0 for drive in arm.server.drives)
+
+
+def test_connecting_reading_and_closing_enable_nothing_and_move_nothing(arm: DriveArm) -> None:
+    start = arm.peer.q
+    with arm.driver() as driver:
+        for _ in range(10):
+            settled(driver)
+        assert phases(arm) == {Phase.SWITCH_ON_DISABLED}
+    assert arm.peer.q == start
+    assert all(drive.nmt.state == "PRE-OPERATIONAL" for drive in arm.server.drives)
+
+
+def test_arming_holds_the_arm_where_it_stands(arm: DriveArm) -> None:
+    with arm.driver() as driver:
+        start = np.array(arm.peer.q)
+        driver.arm(settled(driver))
+        for _ in range(20):
+            settled(driver)
+        assert np.abs(start - arm.peer.q).max() < 2e-5
+
+
+def test_it_can_be_armed_released_and_armed_again(generic: DriveArm, driver: CanopenDriver) -> None:
+    for _ in range(3):
+        driver.arm(settled(driver))
+        assert phases(generic) == {Phase.ENABLED}
+        driver.release()
+        assert phases(generic) == {Phase.SWITCH_ON_DISABLED}
+
+
+def test_torque_is_in_newton_metres_with_the_joints_sign(
+    generic: DriveArm, driver: CanopenDriver
+) -> None:
+    wanted = np.mean([generic.peer.joint_torque for _ in range(1)], axis=0)
+    found = np.mean([settled(driver).actual_current_as_torque for _ in range(20)], axis=0)
+    assert found == pytest.approx(wanted, abs=1.5)
+    assert np.abs(found).max() > 5.0
+
+
+def test_setpoints_take_effect_together_at_the_next_sync(
+    generic: DriveArm, driver: CanopenDriver
+) -> None:
+    driver.arm(settled(driver))
+    state = settled(driver)
+    goal = state.actual_q + 0.01
+    driver.write_setpoint(setpoint(goal, state))
+    time.sleep(0.05)
+    assert np.abs(goal - generic.peer.q).min() > 0.009, "a setpoint counted without a SYNC"
+    settled(driver)
+    wait_for(lambda: bool(np.abs(goal - generic.peer.q).max() < 1e-4), 1.0, "the setpoint")
+
+
+class _Failing:
+    """A bus whose n-th frame and ``broken`` after it do not get out."""
+
+    def __init__(self, bus: can.BusABC, after: int, broken: int) -> None:
+        self._bus, self.left, self.broken = bus, after, broken
+
+    def send(self, message: can.Message, timeout: float | None = None) -> None:
+        self.left -= 1
+        if self.left < 0 and self.broken > 0:
+            self.broken -= 1
+            raise can.CanOperationError("no buffer space")
+        self._bus.send(message, timeout)
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._bus, name)
+
+
+@pytest.mark.parametrize("broken", [1, 6])
+def test_a_part_of_a_setpoint_never_takes_effect(
+    generic: DriveArm, driver: CanopenDriver, broken: int
+) -> None:
+    driver.arm(settled(driver))
+    state = settled(driver)
+    hold = np.array(generic.peer.q)
+    network = driver.master.network
+    real, network.bus = network.bus, _Failing(network.bus, 3, broken)
+    with pytest.raises(WriteError, match=r"no buffer space.*3 of 6 out"):
+        driver.write_setpoint(setpoint(hold + 0.02, state))
+    for _ in range(6):
+        with suppress(LinkError):
+            driver.read_state()
+    network.bus = real
+    for _ in range(5):
+        settled(driver)
+    assert np.abs(hold - generic.peer.q).max() < 1e-5
+    assert driver.writer.mended > 0
+    driver.write_setpoint(setpoint(hold + 0.001, settled(driver)))
+
+
+def test_a_setpoint_that_is_not_finite_or_leaves_the_counts_is_refused(
+    generic: DriveArm, driver: CanopenDriver
+) -> None:
+    driver.arm(settled(driver))
+    state = settled(driver)
+    for wrong in (np.full(6, np.nan), np.full(6, 1e6), np.zeros(5)):
+        with pytest.raises(WriteError):
+            driver.write_setpoint(setpoint(wrong, state))
+    assert np.abs(state.actual_q - generic.peer.q).max() < 1e-4
+
+
+# -- samples --------------------------------------------------------------------------------------
+
+
+def test_a_set_without_one_drives_pdo_is_torn(generic: DriveArm, driver: CanopenDriver) -> None:
+    settled(driver)
+    generic.server.silence(node_of(generic, 3))
+    with pytest.raises(InvalidStateError, match=r"10 of 12 TPDOs, without TPDO1 of node 4"):
+        driver.read_state()
+    generic.server.speak()
+    settled(driver)
+
+
+@pytest.mark.parametrize(("delay", "count"), [(0.009, 4), (0.012, 4), (0.016, 4), (0.024, 1)])
+def test_a_pdo_of_the_sync_before_is_never_taken_for_this_ones(
+    generic: DriveArm, driver: CanopenDriver, delay: float, count: int
+) -> None:
+    torn = 0
+    for _ in range(5):
+        settled(driver)
+        generic.server.hold_back(node_of(generic, 2), delay, count)
+        for _ in range(6):
+            try:
+                state = driver.read_state()
+            except InvalidStateError:
+                torn += 1
+            else:
+                assert np.abs(state.actual_q - generic.peer.q).max() < 1e-3
+    assert torn >= 5
+
+
+def test_a_pdo_that_no_sync_asked_for_is_told(generic: DriveArm, driver: CanopenDriver) -> None:
+    settled(driver)
+    with generic.other_bus() as bus:
+        bus.send(can.Message(arbitration_id=0x181, data=bytes(6), is_extended_id=False))
+        time.sleep(0.02)
+    with pytest.raises(InvalidStateError, match=r"TPDO1 of node 1 came without a SYNC"):
+        driver.read_state()
+    settled(driver)
+
+
+@pytest.mark.parametrize("extended", [True, False])
+def test_frames_of_others_are_no_samples(
+    generic: DriveArm, driver: CanopenDriver, extended: bool
+) -> None:
+    with generic.other_bus() as bus:
+        for identifier in (0x181, 0x205) if extended else (0x1F0, 0x190):
+            bus.send(can.Message(arbitration_id=identifier, data=bytes(8), is_extended_id=extended))
+    state = settled(driver)
+    assert np.abs(state.actual_q - generic.peer.q).max() < 1e-3
+    assert driver.foreign is None
+
+
+# -- losses and faults ----------------------------------------------------------------------------
+
+
+def test_a_lost_node_is_stale_and_named(generic: DriveArm, driver: CanopenDriver) -> None:
+    settled(driver)
+    generic.server.silence(node_of(generic, 4))
+    begun = time.monotonic()
+    with pytest.raises(StaleStateError, match="node 5"):
+        read_on(driver)
+    assert time.monotonic() - begun < 1.0
+
+
+def test_a_missing_heartbeat_is_stale_though_pdos_come(
+    generic: DriveArm, driver: CanopenDriver
+) -> None:
+    settled(driver)
+    generic.server.drives[1].nmt.stop_heartbeat()
+    with pytest.raises(StaleStateError, match=r"node 2: no heartbeat for 0\.3 s"):
+        read_on(driver)
+
+
+def test_a_drive_that_restarts_is_a_lost_link(generic: DriveArm, driver: CanopenDriver) -> None:
+    driver.arm(settled(driver))
+    generic.server.restart(node_of(generic, 0))
+    with pytest.raises(LinkError, match="node 1: has restarted"):
+        read_on(driver)
+    driver.close()
+    assert Phase.ENABLED not in phases(generic)
+
+
+def test_an_emergency_is_a_fault_that_stops_writing_and_is_named(
+    generic: DriveArm, driver: CanopenDriver
+) -> None:
+    driver.arm(settled(driver))
+    generic.server.fail(node_of(generic, 2), 0x2310)
+    wait_for(lambda: settled(driver).safety_mode == 9, 1.0, "safety_mode fault")
+    state = settled(driver)
+    with pytest.raises(WriteError, match=r"node 3: found FAULT.*EMCY 0x2310"):
+        driver.write_setpoint(setpoint(state.actual_q, state))
+    driver.release()
+    with pytest.raises(WriteError, match=r"found FAULT.*clear_faults"):
+        driver.arm(settled(driver))
+    assert Phase.ENABLED not in phases(generic)
+
+
+def test_faults_are_reset_where_the_cell_says_so(generic: DriveArm) -> None:
+    with generic.driver(clear_faults=True) as driver:
+        generic.server.fail(node_of(generic, 2), 0x2310)
+        wait_for(lambda: settled(driver).safety_mode == 9, 1.0, "safety_mode fault")
+        driver.arm(settled(driver))
+        assert settled(driver).safety_mode == 1
+        assert phases(generic) == {Phase.ENABLED}
+
+
+def test_a_drive_that_cannot_be_enabled_leaves_none_enabled(generic: DriveArm) -> None:
+    with generic.driver(arming_time=0.3, clear_faults=True) as driver:
+        generic.peer.emergency_stop()
+        state = settled(driver)
+        with pytest.raises(WriteError, match="does not follow setpoints"):
+            driver.arm(state)
+        assert Phase.ENABLED not in phases(generic)
+
+
+def test_drives_stop_by_themselves_when_we_fall_silent(
+    generic: DriveArm, driver: CanopenDriver
+) -> None:
+    driver.arm(settled(driver))
+    state = settled(driver)
+    driver.write_setpoint(setpoint(state.actual_q + 0.001, state))
+    settled(driver)
+    time.sleep(0.6)  # as a process that hangs, or was killed
+    assert Phase.ENABLED not in phases(generic)
+    rest = generic.peer.q
+    time.sleep(0.1)
+    assert generic.peer.q == rest
+
+
+def test_a_bus_that_dies_is_a_lost_link() -> None:
+    with served("cia402", interface="socketcand", port=29811) as arm, arm.driver() as driver:
+        settled(driver)
+        arm.thread.stop()
+        with pytest.raises(LinkError):
+            read_on(driver)
+        driver.close()
+        arm.thread.start()
+        with arm.driver() as again:
+            settled(again)
+
+
+# -- another master -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("identifier", "data", "words"),
+    [
+        (0x080, b"", "SYNC"),
+        (0x000, b"\x01\x05", "NMT command"),
+        (0x204, bytes(6), "RPDO1 of node 4"),
+        (0x603, b"\x40\x41\x60\x00\x00\x00\x00\x00", "SDO request to node 3"),
+        (0x77F, b"\x05", "heartbeat with our node id"),
+    ],
+)
+def test_another_master_is_noticed_and_writing_refused(
+    generic: DriveArm, driver: CanopenDriver, identifier: int, data: bytes, words: str
+) -> None:
+    driver.arm(settled(driver))
+    with generic.other_bus() as bus:
+        bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+        wait_for(lambda: driver.foreign is not None, 1.0, "the other master's frame")
+    state = settled(driver)
+    with pytest.raises(WriteError, match=f"another master sent {words}"):
+        driver.write_setpoint(setpoint(state.actual_q, state))
+    driver.release()
+
+
+def test_arming_waits_until_another_master_has_been_quiet(generic: DriveArm) -> None:
+    with generic.driver(foreign_quiet=0.4) as driver, generic.other_bus() as bus:
+        time.sleep(0.4)
+        bus.send(can.Message(arbitration_id=0x204, data=bytes(6), is_extended_id=False))
+        wait_for(lambda: driver.foreign is not None, 1.0, "the other master's frame")
+        with pytest.raises(WriteError, match="found two masters"):
+            driver.arm(settled(driver))
+        assert Phase.ENABLED not in phases(generic)
+        time.sleep(0.4)
+        driver.arm(settled(driver))
+
+
+def test_a_bus_with_a_master_on_it_is_not_joined(generic: DriveArm) -> None:
+    with generic.other_bus() as bus:
+        task = bus.send_periodic(can.Message(arbitration_id=0x80, is_extended_id=False), 0.01)
+        with pytest.raises(LinkError, match="another master sent SYNC"):
+            generic.driver().connect()
+        task.stop()
+
+
+# -- connecting -----------------------------------------------------------------------------------
+
+
+def test_a_node_that_is_not_there_is_named() -> None:
+    with served("cia402") as arm:
+        arm.server.silence(6)
+        with pytest.raises(LinkError, match="node 6 does not answer"):
+            arm.driver(sdo_timeout=0.1).connect()
+
+
+def test_a_bus_that_is_not_served_is_told_soon() -> None:
+    arm = DriveArm("cia402", interface="socketcand", port=29812)
+    with pytest.raises(LinkError, match="cannot be reached"):
+        arm.driver().connect()
+
+
+def test_units_that_cannot_be_are_refused_when_connecting(generic: DriveArm) -> None:
+    driver = generic.driver()
+    driver.profile.counts_per_radian[2] *= 20.0
+    with pytest.raises(LinkError, match=r"node 3: found software position limits .*joint 3"):
+        driver.connect()
+
+
+def test_a_device_that_is_no_drive_is_refused(generic: DriveArm) -> None:
+    generic.server.drives[0].data_store[0x1000] = {0: (401).to_bytes(4, "little")}
+    with pytest.raises(LinkError, match="node 1: found device profile 401, expected 402"):
+        generic.driver().connect()
+
+
+def test_a_mode_that_a_drive_lacks_is_refused(generic: DriveArm) -> None:
+    generic.server.drives[5].data_store[0x6502] = {0: (1).to_bytes(4, "little")}
+    with pytest.raises(LinkError, match="node 6: found supported drive modes 0x1"):
+        generic.driver().connect()
+
+
+def test_fixed_pdos_that_are_others_are_refused(generic: DriveArm) -> None:
+    driver = generic.driver()
+    object.__setattr__(driver.profile.file, "pdo_setup", "check")
+    with pytest.raises(LinkError, match=r"node 1: TPDO1 maps 0x6041, expected 0x6041, 0x6064"):
+        driver.connect()
+
+
+def test_closing_an_armed_driver_switches_the_drives_off(generic: DriveArm) -> None:
+    driver = generic.driver()
+    driver.connect()
+    driver.arm(settled(driver))
+    driver.close()
+    driver.close()
+    assert phases(generic) == {Phase.SWITCH_ON_DISABLED}
+    with pytest.raises(LinkError):
+        driver.read_state()
