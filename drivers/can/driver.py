@@ -152,11 +152,11 @@ class CanDriver(Driver):
         raise self._stale()
 
     def _stale(self) -> StaleStateError:
+        silent = f"for {time.monotonic() - self._given:.3f} s" if self._given > 0.0 else "yet"
+        errors = self.reader.error_frames
+        told = f" ({errors} error frames so far)" if errors else ""
         return StaleStateError(
-            f"{self.settings.where()}: {self.profile.name}: no complete sample for "
-            f"{time.monotonic() - max(self._given, 0.0):.3f} s"
-            if self._given > 0.0
-            else f"{self.settings.where()}: {self.profile.name}: no complete sample yet"
+            f"{self.settings.where()}: {self.profile.name}: no complete sample {silent}{told}"
         )
 
     def _check_frozen(self, sample: Sample) -> None:

@@ -1,4 +1,5 @@
 import struct
+import threading
 import time
 
 import can
@@ -260,6 +261,29 @@ def test_old_samples_are_left_for_the_newest(served):
     assert time.monotonic() - begun < 0.1
     assert time.monotonic() - state.received < 0.05
     assert next_state(served.driver).received - state.received < 0.05
+
+
+def test_a_backlog_full_of_others_frames_does_not_keep_old_samples_alive(served):
+    stranger = other_bus(served.settings)
+    ended = threading.Event()
+
+    def chatter():
+        while not ended.wait(0.001):
+            stranger.send(can.Message(arbitration_id=0x2A2, data=bytes(8), is_extended_id=False))
+
+    thread = threading.Thread(target=chatter)
+    thread.start()
+    try:
+        served.peer.move_own(tuple(q + 0.3 for q in served.peer.q))
+        for _ in range(10):  # slower than the arm sends
+            time.sleep(0.05)
+            before = np.array(served.peer.q)
+            state = next_state(served.driver)
+            assert np.abs(state.actual_q - before).max() < 0.012  # 24 ms at 0.5 rad/s
+    finally:
+        ended.set()
+        thread.join()
+        stranger.shutdown()
 
 
 def test_velocity_torque_and_temperature_are_the_plants(served):
