@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from drivers.can.names import Keys, Names
@@ -60,7 +61,7 @@ class OutgoingLoading:
         frame = Outgoing(message.name, key, message, dict(entry.signals), None, joints)
         if not joints:
             try:
-                frame.encode()
+                return replace(frame, data=frame.encode())
             except ValueError as error:
                 raise self.names.error((*keys, "signals"), str(error)) from None
         return frame

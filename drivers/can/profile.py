@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -73,14 +74,13 @@ class Outgoing:
     data: bytes | None = None
     joints: tuple[tuple[str, int], ...] = ()  # signal, joint
 
-    def encode(self, wire: Vector | None = None) -> bytes:
-        """Return the bytes, joints filled from ``wire`` (n,). Raises ValueError."""
+    def encode(self, wire: Sequence[float] = ()) -> bytes:
+        """Return the bytes, joints filled from ``wire`` (n). Raises ValueError."""
         if self.data is not None:
             return self.data
         values = dict(self.constants)
-        if wire is not None:
-            for signal, joint in self.joints:
-                values[signal] = float(wire[joint])
+        for signal, joint in self.joints:
+            values[signal] = wire[joint]
         try:
             return bytes(self.message.encode(values, strict=True))
         except Exception as error:  # cantools, bitstruct and struct each raise their own

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +16,7 @@ from drivers.can.sample import Sample
 Vector = NDArray[np.float64]
 FASTEST = 20.0  # rad/s: joints that move faster between two samples are a mistake
 JITTER = 0.01  # rad
+LARGEST_ANGLE = 1e4  # rad
 BEYOND = 0.35  # rad past a joint limit: another arm, or another zero
 LARGEST = {"velocity": 60.0, "torque": 1e4, "temperature": 300.0}
 RUNNING, IDLE = 7, 5  # RTDE robot_mode
@@ -29,7 +32,8 @@ class StateBuilder:
 
     def __init__(self, profile: CanProfile, arm: Arm) -> None:
         self._profile = profile
-        self._lower, self._upper = arm.limits.lower - BEYOND, arm.limits.upper + BEYOND
+        self._lower: list[float] = (arm.limits.lower - BEYOND).tolist()
+        self._upper: list[float] = (arm.limits.upper + BEYOND).tolist()
         self._before: Sample | None = None
         self._qd = np.zeros(profile.n)
 
@@ -47,8 +51,8 @@ class StateBuilder:
         self._check(q, sample.others)
         if before is not None:  # a refused sample does not replace it: the next is compared too
             self._check_step(q - before.position, sample.received - before.received)
-        qd = sample.others.get("velocity")
-        if qd is None or not np.isfinite(qd).all():
+        qd = _told(sample.others.get("velocity"))
+        if qd is None:
             qd = self._differences(sample, before)
         self._before = sample
         safety, bits = SAFETY[trouble]
@@ -68,29 +72,27 @@ class StateBuilder:
         )
 
     def _check(self, q: Vector, others: dict[str, Vector]) -> None:
-        if not np.isfinite(q).all():
-            joint = int(np.argmin(np.isfinite(q)))
-            raise self._invalid(f"joint {joint + 1}: found {q[joint]:g}, expected a finite angle")
-        outside = ~((q >= self._lower) & (q <= self._upper))
-        if outside.any():
-            joint = int(np.argmax(outside))
-            raise self._invalid(
-                f"joint {joint + 1}: found {q[joint]:.4f} rad, far outside the arm's limits: "
-                "another arm, or another zero"
-            )
+        """Refuse what no such arm can say; plain numbers, since arrays of six cost more."""
+        for i, angle in enumerate(q.tolist()):
+            if not -LARGEST_ANGLE <= angle <= LARGEST_ANGLE:  # NaN is not either
+                raise self._invalid(f"joint {i + 1}: found {angle:g}, expected a finite angle")
+            if not self._lower[i] <= angle <= self._upper[i]:
+                raise self._invalid(
+                    f"joint {i + 1}: found {angle:.4f} rad, far outside the arm's limits: another "
+                    "arm, or another zero"
+                )
         for name, most in LARGEST.items():
-            value = others.get(name)
-            if value is not None and (np.abs(value) > most).any():
-                joint = int(np.nanargmax(np.abs(value)))
-                raise self._invalid(f"{name} of joint {joint + 1}: found {value[joint]:g}")
+            for i, value in enumerate(others[name].tolist() if name in others else ()):
+                if abs(value) > most:
+                    raise self._invalid(f"{name} of joint {i + 1}: found {value:g}")
 
     def _check_step(self, step: Vector, gap: float) -> None:
-        way = np.abs(step)
-        if (way > FASTEST * gap + JITTER).any():
-            joint = int(np.argmax(way))
-            raise self._invalid(
-                f"joint {joint + 1}: found a step of {way[joint]:.4f} rad in {gap:.4f} s"
-            )
+        most = FASTEST * gap + JITTER
+        for i, way in enumerate(step.tolist()):
+            if abs(way) > most:
+                raise self._invalid(
+                    f"joint {i + 1}: found a step of {abs(way):.4f} rad in {gap:.4f} s"
+                )
 
     def _differences(self, sample: Sample, before: Sample | None) -> Vector:
         """Return velocities (n,) from two positions, rad/s; the bus's clock where it moves."""
@@ -108,4 +110,6 @@ class StateBuilder:
 
 def _told(value: Vector | None) -> Vector | None:
     """Return a quantity that every joint has told, else None."""
-    return value if value is not None and np.isfinite(value).all() else None
+    if value is None or not all(map(math.isfinite, value.tolist())):
+        return None
+    return value

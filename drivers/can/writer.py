@@ -71,7 +71,7 @@ class FrameWriter:
         """Return all frames before any is sent. Raises WriteError."""
         if q.shape != (self._profile.n,) or not np.isfinite(q).all():
             raise WriteError(f"{self._profile.name}: found {q}, expected finite joints")
-        wire = self._profile.joints.to_wire(q)
+        wire: list[float] = self._profile.joints.to_wire(q).tolist()
         try:
             return [(f.key, f.encode(wire)) for f in self._profile.setpoint]
         except ValueError as error:
