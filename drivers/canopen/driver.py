@@ -27,6 +27,7 @@ from drivers.driver import Driver
 Vector = NDArray[np.float64]
 log = logging.getLogger("drivers.canopen")
 
+MOST_LEFT_OUT = 3  # SYNCs after a torn set
 STARTING = 2.0  # s in which drives must be OPERATIONAL and answer a SYNC
 
 
@@ -106,16 +107,10 @@ class CanopenDriver(Driver):
     # -- reading ----------------------------------------------------------------------------------
 
     def _exchange(self) -> SyncSet | None:
-        """Send one SYNC when it is due and return its TPDOs, None where they are torn.
-
-        After a torn set one SYNC is left out, so that what comes late is not taken for the next.
-        """
-        now = time.monotonic()
-        self._due += (2 if self._torn else 1) * self._period
-        if self._due < now - 0.5 * self._period:
-            self._due = now  # too late for the slot: no burst
-        if self._due > now:
-            time.sleep(self._due - now)
+        """Send one SYNC when it is due and return its TPDOs, None where they are torn."""
+        if self._torn:
+            self._let_late_ones_come()
+        self._wait_for_slot()
         self.writer.make_whole()
         collector = self.master.collector
         collector.stray = ""
@@ -125,6 +120,25 @@ class CanopenDriver(Driver):
         if found is not None:
             self._sample = found
         return found
+
+    def _wait_for_slot(self) -> None:
+        now = time.monotonic()
+        self._due += self._period
+        if self._due < now - 0.5 * self._period:
+            self._due = now  # too late for the slot: no burst
+        if self._due > now:
+            time.sleep(self._due - now)
+
+    def _let_late_ones_come(self) -> None:
+        """Leave SYNCs out after a torn set: one, and up to three while TPDOs are missing.
+
+        Else what comes late would be taken for the next SYNC's.
+        """
+        for _ in range(MOST_LEFT_OUT):
+            self._wait_for_slot()
+            self.master.beat()
+            if not self.master.collector.owed:
+                return
 
     def read_state(self) -> RobotState:
         """Send one SYNC and return what all drives told at it; see Driver.read_state.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +16,7 @@ from drivers.canopen.profile import CanopenProfile
 from drivers.canopen.sync_set import SyncSet
 
 Vector = NDArray[np.float64]
+SPAN, OLDEST = 5, 0.1  # samples, s: what a velocity is reckoned from where drives tell none
 
 
 def states(found: SyncSet) -> list[State]:
@@ -43,17 +46,16 @@ class StateBuilder:
         self._profile = profile
         self._lower, self._upper = arm.limits.lower - BEYOND, arm.limits.upper + BEYOND
         self._rated = profile.rated_torque
-        self._before: tuple[float, Vector] | None = None  # s of the SYNC, rad
-        self._qd = np.zeros(profile.n)
+        self._last: deque[tuple[float, Vector]] = deque(maxlen=SPAN)  # s of the SYNC, rad
 
     @property
     def last_q(self) -> Vector | None:
         """Return the joints (n,) of the sample before, rad."""
-        return None if self._before is None else self._before[1]
+        return self._last[-1][1] if self._last else None
 
     def forget(self) -> None:
         """Take the next sample without comparing it."""
-        self._before = None
+        self._last.clear()
 
     def build(self, found: SyncSet, target: Vector | None, armed: bool) -> RobotState:
         """Return the state. Raises InvalidStateError.
@@ -62,12 +64,16 @@ class StateBuilder:
         its SYNC, at which all drives latched their positions.
         """
         q = positions(self._profile, found)
-        before, self._before = self._before, None
         self._check(q)
-        if before is not None:
-            self._check_step(q - before[1], found.synced - before[0])
-        qd = self._velocity(found, q, before)
-        self._before = (found.synced, q)
+        if self._last:
+            synced, before = self._last[-1]
+            try:
+                self._check_step(q - before, found.synced - synced)
+            except InvalidStateError:
+                self.forget()
+                raise
+        qd = self._velocity(found, q)
+        self._last.append((found.synced, q))
         trouble = self._trouble(found, armed)
         safety, bits = SAFETY[trouble]
         return RobotState(
@@ -110,15 +116,21 @@ class StateBuilder:
                 f"joint {joint + 1}: found a step of {way[joint]:.4f} rad in {gap:.4f} s"
             )
 
-    def _velocity(self, found: SyncSet, q: Vector, before: tuple[float, Vector] | None) -> Vector:
-        """Return (n,) rad/s: the drives' own where the profile knows its unit."""
+    def _velocity(self, found: SyncSet, q: Vector) -> Vector:
+        """Return (n,) rad/s: the drives' own where the profile knows its unit.
+
+        Else out of the last samples: one step alone would tell the SYNC's jitter.
+        """
         scale = self._profile.file.velocity_scale
         told = [counts.get("Velocity actual value") for counts in found.counts]
         if scale is not None and None not in told:
             return np.array(told, float) * scale / self._profile.counts_per_radian
-        if before is not None and 1e-4 < found.synced - before[0] < 1.0:
-            self._qd = (q - before[1]) / (found.synced - before[0])
-        return self._qd
+        while self._last and found.synced - self._last[0][0] > OLDEST:
+            self._last.popleft()
+        if not self._last:
+            return np.zeros(self._profile.n)
+        synced, before = self._last[0]
+        return np.asarray((q - before) / max(found.synced - synced, 1e-4))
 
     def _torque(self, found: SyncSet) -> Vector | None:
         """Return (n,) Nm: Torque actual value is in thousandths of the rated torque."""

@@ -80,7 +80,7 @@ class CanopenServer(PeerServer):
         self._network: Any = None
         self._peer = peer
         self._late: dict[int, tuple[int, float]] = {}  # node -> SYNCs still, s of delay
-        self._held: list[tuple[float, int, bytes]] = []  # s of peer.running, COB-ID, data
+        self._held: list[tuple[float, int, bytes]] = []  # s (monotonic), COB-ID, data
         self._beaten: dict[int, float] = {}  # node -> s, of its last heartbeat
         self._was_able = True
         self.drives = tuple(self._drive(joint) for joint in range(peer.n))
@@ -188,7 +188,7 @@ class CanopenServer(PeerServer):
         if count > 1:
             self._late[drive.node] = (count - 1, delay)
         drive.q += OFF_BY
-        due = self._peer.running + delay
+        due = time.monotonic() + delay
         self._held += [(due, cob_id, data) for cob_id, data in drive.samples()]
         drive.q -= OFF_BY
 
@@ -212,7 +212,7 @@ class CanopenServer(PeerServer):
                 return
             self._network.mute = peer.stalled
             self._follow_stops(peer)
-            self._send_held(peer.running)
+            self._send_held(time.monotonic())
             self._watch_heartbeats(peer)
             self._move(peer)
             if not peer.frozen:

@@ -1,0 +1,58 @@
+"""Cases of the contract: every CANopen profile that is shipped, over its wires."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from functools import partial
+
+from contract_case import Case
+
+from drivers.canopen.driver import CanopenDriver
+from drivers.canopen.settings import CanopenSettings
+from drivers.driver import Driver
+from drivers.simulated.canopen.server import CanopenServer, make_servers
+from drivers.simulated.peer_server import PeerServer
+
+LATE = 0.012  # s that a torn sample's PDO is late: it comes after the next SYNC's slot
+_ports = itertools.count(29900)
+
+
+class CanopenCase(Case):
+    """Drives on a bus: their profile, their wire, half a count of the coarsest joint."""
+
+    def __init__(self, profile: str, interface: str, resolution: float, speed: float) -> None:
+        number = next(_ports)
+        self.resolution, self.speed_resolution = resolution + 1e-9, speed
+        self.settings = CanopenSettings(
+            profile=profile, interface=interface, channel=f"drives{number}", port=number,
+            rate=100.0, state_timeout=self.state_timeout, listen=0.05, foreign_quiet=0.2,
+        )  # fmt: skip
+        super().__init__()
+        self.settings = self.settings.model_copy(update={"host": self.host})
+
+    def make_servers(self) -> list[PeerServer]:
+        """Return the drives."""
+        return make_servers(self.settings, self.host, self.peer)
+
+    def driver(self) -> Driver:
+        """Return a CANopen driver."""
+        return CanopenDriver(self.settings, self.model)
+
+    def tear(self) -> None:
+        """Have one drive's PDOs, off by 0.05 rad, come so late that they meet the next SYNC's."""
+        server = self.servers[0]
+        assert isinstance(server, CanopenServer)
+        server.hold_back(server.profile.nodes[1], LATE, 2)
+
+
+def canopen_cases() -> dict[str, Callable[[], Case]]:
+    """Return a maker of each case by its name."""
+    thousandth = 0.5 * math.radians(0.001)
+    fine = math.pi / (131072 * 51)
+    return {
+        "canopen cia402, virtual": partial(CanopenCase, "cia402", "virtual", fine, 1e-3),
+        "canopen lwa4p, virtual": partial(CanopenCase, "lwa4p", "virtual", thousandth, 0.05),
+        "canopen lwa4p, socketcand": partial(CanopenCase, "lwa4p", "socketcand", thousandth, 0.05),
+    }
