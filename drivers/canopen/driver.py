@@ -19,6 +19,7 @@ from drivers.canopen.listening import OPERATIONAL, Emergency, Foreign
 from drivers.canopen.master import Master
 from drivers.canopen.power import Power
 from drivers.canopen.profile import WINDOW, read_profile
+from drivers.canopen.rhythm import Rhythm
 from drivers.canopen.settings import CanopenSettings
 from drivers.canopen.state import StateBuilder, not_following, positions, states
 from drivers.canopen.sync_set import SyncSet
@@ -27,7 +28,6 @@ from drivers.driver import Driver
 Vector = NDArray[np.float64]
 log = logging.getLogger("drivers.canopen")
 
-MOST_LEFT_OUT = 3  # SYNCs after a torn set
 STARTING = 2.0  # s in which drives must be OPERATIONAL and answer a SYNC
 
 
@@ -45,14 +45,12 @@ class CanopenDriver(Driver):
         self.settings = settings
         self.master = Master(settings, self.profile)
         self.writer = RpdoWriter(self.master, self.profile)
-        self.power = Power(self.master, self.profile, self.writer, self._exchange)
-        self._arm, self._builder = model.arm, StateBuilder(self.profile, model.arm)
         self._period = 1.0 / self.rate
-        self._window = self.profile.file.sync_window or WINDOW * self._period
-        self._due = 0.0  # s, monotonic: of the next SYNC
-        self._torn = False  # the last set was not whole
-        self._sample: SyncSet | None = None  # the last that was whole
-        self._fresh_at = 0.0  # s, monotonic: of that one
+        window = self.profile.file.sync_window or WINDOW * self._period
+        self.rhythm = Rhythm(self.master, self.writer, self._period, window)
+        self.power = Power(self.master, self.profile, self.writer, self.rhythm.exchange)
+        self._arm, self._builder = model.arm, StateBuilder(self.profile, model.arm)
+        self._fresh_at = 0.0  # s, monotonic: of the last whole sample
         self._connected_at = 0.0
         self._armed_at: float | None = None  # s, monotonic
         self._moved_at = 0.0  # s, monotonic: when the joints last changed, or were not sent away
@@ -91,7 +89,7 @@ class CanopenDriver(Driver):
         life = self.master.life
         assert life is not None
         end = time.monotonic() + min(STARTING, self.settings.connect_timeout)
-        while (found := self._exchange()) is None or not life.all_operational:
+        while (found := self.rhythm.exchange()) is None or not life.all_operational:
             if time.monotonic() > end:
                 why = self.master.collector.why() + " after a SYNC"
                 if found is not None:
@@ -106,40 +104,6 @@ class CanopenDriver(Driver):
 
     # -- reading ----------------------------------------------------------------------------------
 
-    def _exchange(self) -> SyncSet | None:
-        """Send one SYNC when it is due and return its TPDOs, None where they are torn."""
-        if self._torn:
-            self._let_late_ones_come()
-        self._wait_for_slot()
-        self.writer.make_whole()
-        collector = self.master.collector
-        collector.stray = ""
-        synced = self.master.sync()
-        found = collector.wait(synced + self._window)
-        self._torn = found is None
-        if found is not None:
-            self._sample = found
-        return found
-
-    def _wait_for_slot(self) -> None:
-        now = time.monotonic()
-        self._due += self._period
-        if self._due < now - 0.5 * self._period:
-            self._due = now  # too late for the slot: no burst
-        if self._due > now:
-            time.sleep(self._due - now)
-
-    def _let_late_ones_come(self) -> None:
-        """Leave SYNCs out after a torn set: one, and up to three while TPDOs are missing.
-
-        Else what comes late would be taken for the next SYNC's.
-        """
-        for _ in range(MOST_LEFT_OUT):
-            self._wait_for_slot()
-            self.master.beat()
-            if not self.master.collector.owed:
-                return
-
     def read_state(self) -> RobotState:
         """Send one SYNC and return what all drives told at it; see Driver.read_state.
 
@@ -147,7 +111,7 @@ class CanopenDriver(Driver):
         """
         while True:
             stray = self.master.collector.stray
-            found = self._exchange()
+            found = self.rhythm.exchange()
             self._check_lives()
             if found is not None and not stray:
                 self._fresh_at = found.received
@@ -239,7 +203,7 @@ class CanopenDriver(Driver):
             foreign, now = self.foreign, time.monotonic()
             if foreign is not None and (foreign.seen > begun or now - foreign.seen < quiet):
                 raise WriteError(self._two_masters(foreign))
-            found = self._exchange()
+            found = self.rhythm.exchange()
             self._check_lives()
             if found is not None and now - self._connected_at >= quiet:
                 return found
@@ -251,8 +215,8 @@ class CanopenDriver(Driver):
         try:
             self.power.prepare()
             hold = self.power.enable(found, self.settings.arming_time, self.settings.clear_faults)
-            assert self._sample is not None
-            gave = float(np.abs(positions(self.profile, self._sample) - start).max())
+            assert self.rhythm.sample is not None
+            gave = float(np.abs(positions(self.profile, self.rhythm.sample) - start).max())
             if gave > self.settings.arming_distance:
                 raise WriteError(f"{self.profile.name}: the arm gave {gave:.3f} rad when enabled")
             self.writer.send([self.power.following] * self.n, hold)
@@ -266,16 +230,17 @@ class CanopenDriver(Driver):
 
     def write_setpoint(self, setpoint: Setpoint) -> None:
         """Send one setpoint, which counts at the next SYNC; needs ``arm`` before."""
-        if self._armed_at is None or self._sample is None:
+        sample = self.rhythm.sample
+        if self._armed_at is None or sample is None:
             raise WriteError(f"{self.master.where}: found a setpoint, expected arm() first")
         foreign = self.foreign
         if foreign is not None and foreign.seen > self._armed_at:
             raise WriteError(self._two_masters(foreign))
-        joint = not_following(self.profile, self._sample)
+        joint = not_following(self.profile, sample)
         if joint is not None:
             node = self.profile.nodes[joint]
             raise WriteError(
-                f"{self.master.where}: node {node}: found {states(self._sample)[joint]}, expected "
+                f"{self.master.where}: node {node}: found {states(sample)[joint]}, expected "
                 f"a drive that follows setpoints{self.power.complaint(node)}"
             )
         self.writer.send([self.power.following] * self.n, setpoint.q)
