@@ -16,6 +16,8 @@ DEPTH = 9
 PATIENCE = 2  # depths without a better set before the beam stops
 SMOOTH_TERMS = 2  # more unnamed functions than that tell nothing more
 LINES = 4  # periodic lines a joint may have
+MORE_LINES = 8  # where the log is as large as this
+MANY_ROWS = 1500  # rows of the sample space
 
 
 @dataclass
@@ -32,7 +34,7 @@ class State:
 def clash(space: Space, chosen: Sequence[int], new: int) -> bool:
     """Return whether a candidate stands instead of, not beside, one that is chosen."""
     b = space.candidates[new]
-    lines = 0
+    lines, allowed = 0, LINES if len(space.y) < MANY_ROWS else MORE_LINES
     if not b.named and sum(not space.candidates[c].named for c in chosen) >= SMOOTH_TERMS:
         return True
     for c in chosen:
@@ -41,7 +43,7 @@ def clash(space: Space, chosen: Sequence[int], new: int) -> bool:
             continue
         if a.family == b.family == "transmission_error":
             lines += 1
-            if abs((a.site.order or 0) - (b.site.order or 0)) < 0.75 or lines >= LINES:
+            if abs((a.site.order or 0) - (b.site.order or 0)) < 0.75 or lines >= allowed:
                 return True
         elif a.family == b.family or {a.family, b.family} == {
             "axial_compliance",

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.growing import DEPTH, children, clash, grow, offspring, projected
+from core.diagnosis.growing import children, clash, grow, offspring, projected
 from core.diagnosis.space import Found, Space, fit, gains
 
 Array = NDArray[np.float64]
 MERGED = 9  # terms up to which every pair is tried against one
+GROWTH = 30  # terms added to a set at most
 BY_ANGLE = ("joint_offset", "transmission_error")  # what a joint does by its own angle alone
 
 
@@ -97,11 +98,11 @@ def joined_sets(space: Space, found: Found) -> list[Found]:
     return sets
 
 
-def grown(space: Space, found: Found) -> Found:
+def grown(space: Space, found: Found, named_only: bool = False) -> Found:
     """Return the set with the best terms added one by one as long as that pays."""
     state = projected(space, found.chosen)
-    for _ in range(DEPTH):
-        nearest = offspring(space, state, 1)
+    for _ in range(GROWTH):
+        nearest = offspring(space, state, 1, named_only)
         if not nearest or nearest[0][0] >= found.score:
             break
         better = fit(space, (*found.chosen, nearest[0][1]))

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.diagnosis.candidate import Candidate
-from core.diagnosis.growing import DEPTH, beam_search, projected
-from core.diagnosis.neighbours import improve, joined_sets, packed, pruned, unpack
+from core.diagnosis.growing import DEPTH, beam_search, children, projected
+from core.diagnosis.neighbours import grown, improve, joined_sets, packed, pruned, unpack
 from core.diagnosis.space import USUAL_ORDERS, Found, Space, fit, gains
 
 BEST_LINES = 10  # lines of a joint that a search looks at
@@ -43,7 +43,7 @@ def search(space: Space, depth: int = DEPTH, base: Sequence[int] = ()) -> Found:
     causes at once, does not stand in their way.
     """
     if len(space.y) >= LARGE:
-        return _deep_search(space)
+        return _deep_search(space, base)
     named = improve(space, beam_search(space, depth, named_only=True)[0], named_only=True)
     if base:
         again = improve(space, fit(space, tuple(base)), named_only=True)
@@ -53,8 +53,8 @@ def search(space: Space, depth: int = DEPTH, base: Sequence[int] = ()) -> Found:
     if _counted(simplest, named) >= named.score:
         return named
     whole = improve(space, unpack(space, beam_search(space, depth)[0]))
-    grown = improve(space, simplest)
-    return min([named, whole, grown, simplest], key=lambda f: _counted(f, named))
+    better = improve(space, simplest)
+    return min([named, whole, better, simplest], key=lambda f: _counted(f, named))
 
 
 def _counted(found: Found, named: Found) -> float:
@@ -62,7 +62,7 @@ def _counted(found: Found, named: Found) -> float:
     return found.score - (UNITED if len(found.chosen) <= len(named.chosen) - 2 else 0.0)
 
 
-def _deep_search(space: Space) -> Found:
+def _deep_search(space: Space, base: Sequence[int]) -> Found:
     """Return the best set of a large log: many causes at once, each cheap to tell apart.
 
     Terms are added one by one and dropped again where later ones make them needless; an unnamed
@@ -70,6 +70,13 @@ def _deep_search(space: Space) -> Found:
     """
     found = beam_search(space, DEEP, beam=1, named_only=True)[0]
     found = pruned(space, found)
+    if base:
+        again = grown(space, pruned(space, fit(space, tuple(base))), named_only=True)
+        found = min([found, pruned(space, again)], key=lambda f: f.score)
+    beside = [fit(space, (*found.chosen, c)) for _, c in children(space, found.chosen, 4)]
+    nearest = min(beside, key=lambda f: f.score)
+    if nearest.score < found.score:
+        return nearest  # no named cause goes for an unknown beside them
     sets = [found, *joined_sets(space, found), *packed(space, found)]
     return min(sets, key=lambda f: _counted(f, found))
 

@@ -23,7 +23,7 @@ from core.diagnosis.neighbours import pruned
 from core.diagnosis.noise import Noise, estimate_noise
 from core.diagnosis.observation import Observation
 from core.diagnosis.refit import refit
-from core.diagnosis.search import screened_search
+from core.diagnosis.search import LARGE, screened_search
 from core.diagnosis.smooth import smooth_candidates
 from core.diagnosis.space import Found, Space, fit
 from core.diagnosis.wild import look_again, look_for_wild, with_wild_explained
@@ -132,6 +132,11 @@ def select(
             break
         base = terms
     assert space is not None and found is not None
+    if len(space.y) >= LARGE and any(not space.candidates[c].named for c in found.chosen):
+        work.kept, work.noise = counted.copy(), whitened_by
+        # what goes into a model has to predict without the unnamed function beside it
+        alone = fit(space, [c for c in found.chosen if space.candidates[c].named])
+        terms, index, covariance, residual = refit(work, space, alone)
     return Selection(
         work.observation, space, found, terms, index, covariance, counted, whitened_by,
         residual, base, raw, nuisance, target,
@@ -150,9 +155,13 @@ def _bounded(candidate: Candidate, model: Model) -> Candidate:
 
 
 def _has_what_it_needs(candidate: Candidate, observation: Observation) -> bool:
+    if candidate.family == "transmission_error":  # of a joint that moves at all
+        assert candidate.site.joint is not None
+        return joint_quantity(observation, candidate.site.joint - 1) in observation.quantities
     return all(
         any(q == need or q.startswith(f"{need}_") for q in observation.quantities)
         for need in CATALOGUE[candidate.family].needs
+        if need != "approach"  # without reversals play is an offset: a tie to be told
     )
 
 

@@ -16,6 +16,7 @@ from core.effects import Term
 
 Array = NDArray[np.float64]
 DEAD = 1e-7  # share of a column that the nuisance leaves: below, nothing is left
+UNSEEN = 3.0
 KNOWN_SHARE = 0.7  # a stated repeatability is an average: less than this share of it is not assumed
 
 
@@ -60,11 +61,22 @@ def sample_space(
     whole, left = (np.sqrt(np.einsum("ij,ij->j", A, A)) for A in (raw, X))
     X[:, left < DEAD * whole] = 0.0  # the frame takes it up wholly; the rest is rounding
     freedom = float(len(target) - Q.shape[1])
+    price = prices(candidates, freedom) + np.array([_unseen(c, observation) for c in candidates])
     space = Space(
-        y, X, start, tuple(candidates), prices(candidates, freedom), freedom,
+        y, X, start, tuple(candidates), price, freedom,
         KNOWN_SHARE if observation.sigma_is_whole else work.noise.floor_share,
     )  # fmt: skip
     return space, raw, nuisance, target
+
+
+def _unseen(candidate: Candidate, observation: Observation) -> float:
+    """Return what an effect pays more whose motion the log does not show: play without reversals.
+
+    It then stands behind the plain offset that it equals, as a tie.
+    """
+    if candidate.family != "backlash" or candidate.site.joint is None:
+        return 0.0
+    return 0.0 if f"approach_{candidate.site.joint - 1}" in observation.quantities else UNSEEN
 
 
 def locate(candidates: list[Candidate], term: Term) -> tuple[int, Array]:
