@@ -9,7 +9,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
+from core.errors import InputError, InvalidStateError, LinkError, StaleStateError, WriteError
 from core.model import Model
 from core.setpoint import Setpoint
 from core.state import RobotState
@@ -40,8 +40,14 @@ class CanopenDriver(Driver):
 
     def __init__(self, settings: CanopenSettings, model: Model) -> None:
         self.profile = read_profile(settings.profile_path, model.arm.n)
-        super().__init__(min(settings.rate, 1.0 / self.profile.file.sync_period), model.arm.n)
-        interpolation_period(1.0 / self.rate)  # raises InputError
+        super().__init__(settings.rate, model.arm.n)
+        fastest = 1.0 / self.profile.file.sync_period
+        if settings.rate > fastest * (1.0 + 1e-9):
+            raise InputError(
+                f"link.rate: found {settings.rate:g}, expected at most {fastest:g} SYNCs per "
+                f"second (sync_period of {self.profile.path.name})"
+            )
+        interpolation_period(1.0 / settings.rate)  # raises InputError
         self.settings = settings
         self.master = Master(settings, self.profile)
         self.writer = RpdoWriter(self.master, self.profile)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from drive_arm import DriveArm, follow, read_on, served, setpoint, settled, wait_for
 
-from core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
+from core.errors import InputError, InvalidStateError, LinkError, StaleStateError, WriteError
 from drivers.canopen.driver import CanopenDriver
 from drivers.simulated.canopen.machine import Phase
 
@@ -388,6 +388,12 @@ def test_fixed_pdos_that_are_others_are_refused(generic: DriveArm) -> None:
     object.__setattr__(driver.profile.file, "pdo_setup", "check")
     with pytest.raises(LinkError, match=r"node 1: TPDO1 maps 0x6041, expected 0x6041, 0x6064"):
         driver.connect()
+
+
+@pytest.mark.parametrize(("rate", "words"), [(500.0, "at most 250"), (93.0, "whole ms")])
+def test_a_rate_that_the_drives_cannot_keep_is_refused(rate: float, words: str) -> None:
+    with pytest.raises(InputError, match=rf"link\.rate: found {rate:g}.*{words}"):
+        DriveArm("cia402").driver(rate=rate)
 
 
 def test_closing_an_armed_driver_switches_the_drives_off(generic: DriveArm) -> None:
