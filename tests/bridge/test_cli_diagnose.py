@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from cli_runs import (
     CELL,
+    Array,
     cell_in,
     columns_of,
     gapbridge,
@@ -141,3 +143,107 @@ def test_a_simulators_log_reaches_the_diagnosis_row_by_row(
     np.testing.assert_array_equal(
         seen[0].require("measured_position"), SOFT.predict(q, loads).position
     )
+
+
+def spoilt(table: dict[str, Array], name: str, change: Callable[[Array], Array]) -> None:
+    """Change the column, or the columns ``name_0..``, in place."""
+    for key in [k for k in table if k == name or k.rpartition("_")[0] == name]:
+        table[key] = change(table[key])
+
+
+def hole(column: Array) -> Array:
+    return np.where(np.arange(len(column)) == 5, np.nan, column)
+
+
+SPOILT: dict[str, tuple[str, Callable[[Array], Array], list[str]]] = {
+    "an angle that is no number": ("actual_q", hole, ["row 7, column actual_q_0", "found nan"]),
+    "a payload that is no number": ("payload", hole, ["row 7, column payload", "found nan"]),
+    "an endless force": (
+        "actual_TCP_force", lambda v: hole(v) * np.inf, ["actual_TCP_force_0", "finite"],
+    ),
+    "degrees": ("actual_q", np.degrees, ["actual_q_*", "look like degrees, expected rad"]),
+    "millimetres": (
+        "measured_position", lambda v: 1e3 * v, ["measured_position_*", "look like millimetres"],
+    ),
+    "grams": ("payload", lambda v: 1e3 * v, ["column payload:", "looks like grams, expected kg"]),
+    "a centre in mm": ("payload_cog", lambda v: 1e3 * v, ["payload_cog_*", "looks like mm"]),
+    "kelvin": (
+        "joint_temperatures", lambda v: v + 273.15, ["joint_temperatures_*", "look like kelvin"],
+    ),
+    "rotations in degrees": (
+        "measured_rotation", np.degrees, ["measured_rotation_*", "look like degrees"],
+    ),
+    "a payload below zero": ("payload", lambda v: v - 1, ["column payload", "expected 0 or more"]),
+}  # fmt: skip
+
+
+def full_table(rows: int = 40) -> dict[str, Array]:
+    q, loads = poses_and_loads(rows)
+    table = columns_of(q, loads) | measured(SOFT, q, loads, noise=2e-5)
+    turned = SOFT.predict(q, loads).rotation_vector
+    table |= {f"measured_rotation_{i}": turned[:, i] for i in range(3)}
+    return table | {f"joint_temperatures_{i}": np.linspace(25, 30, rows) for i in range(6)}
+
+
+@pytest.mark.parametrize("mistake", SPOILT)
+def test_unusable_values_are_refused_by_name(tmp_path: Path, mistake: str) -> None:
+    name, change, words = SPOILT[mistake]
+    table = full_table()
+    spoilt(table, name, change)
+    line = refused("diagnose", log_in(tmp_path, table), "--cell", cell_in(tmp_path))
+    for word in ["log.csv", *words]:
+        assert word in line
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", ["found an empty file"]),
+        ("actual_q_0,payload\n", ["found no data rows"]),
+        ("actual_q_0,payload\n1,2\n1\n", ["row 3", "found 1 cells, expected 2"]),
+        ("actual_q_0,payload\n1,two\n", ["row 2, column payload", "found 'two'"]),
+        ("actual_q_0,actual_q_1\n0,0\n", ["actual_q_2: not found, expected 6 columns"]),
+        ("payload,payload\n0,0\n", ["column payload: found twice"]),
+        ("acutal_q_0,posn\n0,0\n", ["found 'acutal_q_0', did you mean 'actual_q'?"]),
+        ("\x00\xff\n", ["log.csv"]),
+    ],
+)
+def test_files_that_are_no_log_are_refused(tmp_path: Path, text: str, words: list[str]) -> None:
+    log = tmp_path / "log.csv"
+    log.write_bytes(text.encode("latin-1"))
+    line = refused("diagnose", log, "--cell", cell_in(tmp_path))
+    for word in ["log.csv", *words]:
+        assert word in line
+
+
+def test_a_measured_axis_that_is_missing_is_named(tmp_path: Path) -> None:
+    table = full_table()
+    del table["measured_position_2"]
+    line = refused("diagnose", log_in(tmp_path, table), "--cell", cell_in(tmp_path))
+    assert "column measured_position_2: not found" in line
+
+
+def test_odd_rows_and_names_are_told_where_work_is_still_possible(tmp_path: Path) -> None:
+    table = full_table()
+    spoilt(table, "measured_position", hole)
+    table = {k.replace("joint_temperatures", "joint_temperature"): v for k, v in table.items()}
+    table["timestamp"] = np.repeat(np.arange(20), 2) * 10.0
+    answer = gapbridge("diagnose", log_in(tmp_path, table), "--cell", cell_in(tmp_path))
+    assert answer.code == 0, answer.err
+    assert "axial_compliance of joint 2" in answer.out
+    for words in (
+        "note: 20 timestamp(s) are repeated",
+        "note: 1 row(s) have no measured position and were left out",
+        "did you mean joint_temperatures_0?",
+    ):
+        assert words in answer.out
+
+
+def test_five_poses_for_forty_parameters_end_without_a_traceback(tmp_path: Path) -> None:
+    cell = cell_in(tmp_path, CELL.replace("true", "false"))
+    table = {k: v[:5] for k, v in full_table().items() if "rotation" not in k}
+    answer = gapbridge("diagnose", log_in(tmp_path, table), "--cell", cell)
+    assert answer.code in (0, 2)
+    assert "Traceback" not in answer.err
+    few = {k: v[:3] for k, v in table.items()}
+    assert "more rows" in refused("diagnose", log_in(tmp_path, few), "--cell", cell)
