@@ -1,0 +1,178 @@
+"""What to measure next: inside the limits, and where the open explanations differ."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import small_arm as small
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from benchmarks.blind.mechanics import Session, stand
+from benchmarks.blind.session import Plan
+from core.arm import JointLimits
+from core.diagnosis.diagnosis import diagnose
+from core.diagnosis.separation import next_measurements
+from core.log import Log
+from core.metrology import Metrology
+
+PLAY = 9e-4  # rad
+OFFSET = small.turned(2, lambda s, q: np.full(len(q), -PLAY / 2))  # all come from below
+ONE_SIDED = Plan(poses=60, both_sides=False)
+
+
+def session_at(q, payload: float, approach) -> Session:
+    q = np.atleast_2d(np.array(q))
+    return Session(
+        time=np.zeros(1), q=q, payload_mass=np.array([payload]), payload_cog=np.zeros((1, 3)),
+        tcp_wrench=np.zeros((1, 6)), temperature=np.full((1, 3), 25.0),
+        approach=np.atleast_2d(np.array(approach, dtype=float)),
+        from_where=q - 0.05 * np.array(approach),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def tied():
+    """A joint that always comes from one side: its play looks like an offset."""
+    session = small.session_of(3, ONE_SIDED)
+    position = small.readings(OFFSET, session, 3)
+    log = small.log_of(session, position)
+    return diagnose(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
+
+
+def test_a_tie_is_told_and_asked(tied):
+    (cause,) = tied.channels[0].causes
+    names = {cause.effect, *cause.indistinguishable_from}
+    assert {"joint_offset", "backlash"} <= names
+    asked = [m for m in tied.next_measurements if set(m.separates) == {"joint_offset", "backlash"}]
+    assert asked
+
+
+def test_proposed_poses_stand_within_the_joint_limits_and_the_rated_load(tied):
+    for told in tied.next_measurements:
+        assert np.all(np.array(told.q) >= small.LIMITS.lower)
+        assert np.all(np.array(told.q) <= small.LIMITS.upper)
+        assert 0 <= told.payload <= small.KIND.rated * 1.05
+
+
+def test_at_a_proposed_pose_the_tied_pair_really_differs(tied):
+    """The two real arms that the tie holds stand apart there by what was promised."""
+    play = small.turned(2, lambda s, q: s.approach[:, 1] * -PLAY / 2)
+    seen = small.session_of(3, ONE_SIDED)
+    assert np.allclose(stand(OFFSET, seen).tcp, stand(play, seen).tcp, atol=1e-9)  # on the log
+    for told in tied.next_measurements:
+        if set(told.separates) != {"joint_offset", "backlash"}:
+            continue
+        assert told.approach is not None
+        there = session_at(told.q, told.payload, told.approach)
+        apart = np.linalg.norm(stand(OFFSET, there).tcp - stand(play, there).tcp)
+        assert apart / small.FLOOR == pytest.approx(told.expected_gain, rel=0.25)
+        assert apart > 5 * small.FLOOR
+
+
+def test_proposals_of_one_question_differ(tied):
+    for names in {m.separates for m in tied.next_measurements}:
+        poses = [np.array(m.q) for m in tied.next_measurements if m.separates == names]
+        assert all(np.abs(a - b).max() > 0.1 for a in poses for b in poses if a is not b)
+
+
+def test_what_a_frame_takes_up_is_never_asked():
+    """Joint 1 and the frame of an unregistered instrument are the same at every pose."""
+    found = small.diagnosed("none", 0, False)
+    asked = {e for m in found.next_measurements for e in m.separates}
+    assert "joint_offset" not in asked
+
+
+def test_the_same_question_gets_the_same_answer(tied):
+    model, log = small.model_of(), small.log_of(small.session_of(3, ONE_SIDED), np.zeros((60, 3)))
+    again = [next_measurements(model, log, tied.channels, seed=4) for _ in range(2)]
+    assert again[0] == again[1]
+    assert again[0] != next_measurements(model, log, tied.channels, seed=5)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    low=st.floats(-9, 3), width=st.floats(0.05, 9), open_below=st.booleans(), seed=st.integers(0, 9)
+)
+def test_any_limits_are_kept(tied, low, width, open_below, seed):
+    limits = JointLimits(
+        np.array([-np.inf if open_below else low, -2.0, -np.inf]),
+        np.array([low + width, 2.0, np.inf]),
+        np.full(3, np.inf), np.full(3, np.inf),
+    )  # fmt: skip
+    model = small.model_of()
+    model = replace(model, arm=replace(model.arm, limits=limits))
+    log = small.log_of(small.session_of(3, ONE_SIDED), np.zeros((60, 3)))
+    for told in next_measurements(model, log, tied.channels, seed):
+        q = np.array(told.q)
+        assert np.all((limits.lower <= q) & (q <= limits.upper))
+        assert np.ptp(q) < 20
+
+
+COG = np.array([0.03, -0.02, 0.08])
+GAIN = np.array([0.05, -0.04, 0.03, 0.06, -0.05, 0.04])
+NOISE = np.repeat([0.2, 0.01], 3)  # N, Nm
+
+
+def flange_reading(q, payload):
+    """Return what a payload at rest does to the flange (N, 6), flange axes."""
+    hand = stand(small.NOMINAL, small_session(q)).flange_rotation
+    weight = np.einsum("nji,j->ni", hand, small.NOMINAL.gravity) * np.reshape(payload, (-1, 1))
+    return np.hstack([weight, np.cross(COG, weight)])
+
+
+def small_session(q) -> Session:
+    return session_at(np.atleast_2d(q), 0.0, np.zeros_like(np.atleast_2d(q)))
+
+
+@pytest.fixture(scope="module")
+def one_attitude():
+    """Only joint 1 turns, about the vertical: the sensor carries the same in every pose."""
+    rng = np.random.default_rng(0)
+    q = np.column_stack([rng.uniform(-2, 2, 60), np.full(60, 0.7), np.full(60, -1.1)])
+    wrench = flange_reading(q, 4.0) * (1 + GAIN) + rng.normal(0, 1, (60, 6)) * NOISE
+    columns = {
+        "timestamp": np.arange(60) * 20.0, "actual_q": q, "payload": np.full(60, 4.0),
+        "payload_cog": np.tile(COG, (60, 1)), "ft_raw_wrench": wrench,
+    }  # fmt: skip
+    return diagnose(small.model_of(), Log("small.csv", columns, 3))
+
+
+def test_a_tie_of_the_flange_sensor_is_asked(one_attitude):
+    (channel,) = one_attitude.channels
+    (cause,) = channel.causes
+    pair = {"ft_bias", "ft_gain"}
+    assert pair <= {cause.effect, *cause.indistinguishable_from}
+    asked = [m for m in one_attitude.next_measurements if set(m.separates) == pair]
+    assert asked
+    bias = (flange_reading([0.0, 0.7, -1.1], 4.0) * GAIN)[0]
+    for told in asked:
+        q = np.array(told.q)
+        assert np.all((small.LIMITS.lower <= q) & (q <= small.LIMITS.upper))
+        apart = flange_reading(q, told.payload)[0] * GAIN - bias
+        promised = np.linalg.norm(apart * (0.2 / NOISE)) / channel.noise_floor_rms
+        assert promised == pytest.approx(told.expected_gain, rel=0.35)
+        assert promised > 3
+
+
+def test_no_pose_is_proposed_for_what_no_pose_decides(one_attitude):
+    """A drift needs time, whatever the pose."""
+    assert not any(m.separates == ("ft_drift",) for m in one_attitude.next_measurements)
+    assert all(m.expected_gain >= 1 for m in one_attitude.next_measurements)
+
+
+def test_an_effect_the_log_cannot_show_is_asked_for_where_it_shows():
+    """Few nearly equal poses show nothing of the gravity's direction; others would."""
+    near = small.session_of(4, Plan(poses=60, span=0.03, blocks=1, pulled=0.0))
+    model = small.model_of(small.COMPLIANT)
+    read = small.readings(small.COMPLIANT, near, 4, registered=False)
+    found = diagnose(model, small.log_of(near, read), Metrology(sigma=small.SIGMA))
+    silent = {c.effect for c in found.channels[0].considered if not c.excited}
+    assert "gravity_direction" in silent
+    asked = [m for m in found.next_measurements if m.separates == ("gravity_direction",)]
+    assert asked
+    assert {e for m in found.next_measurements for e in m.separates} <= silent
+    spread = np.abs(np.array([m.q for m in asked]) - near.q.mean(axis=0)).max(axis=1)
+    assert np.all(spread > 0.5)
