@@ -10,12 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from core.arm import builtin_arm
+from core.errors import InvalidStateError
 from drivers.canopen.objects import Address
 from drivers.canopen.pdo import Entry, PdoLayout
 from drivers.canopen.profile import read_profile
 from drivers.canopen.settings import SHIPPED
-from drivers.canopen.state import positions
-from drivers.canopen.sync_set import SyncCollector
+from drivers.canopen.state import StateBuilder, positions
+from drivers.canopen.sync_set import SyncCollector, SyncSet
 
 PROFILE = read_profile(SHIPPED / "cia402.yaml")
 COB_IDS = [layout.cob_id(node) for node in PROFILE.nodes for layout in PROFILE.tpdo]
@@ -124,6 +126,29 @@ def test_a_layout_agrees_with_the_canopen_library() -> None:
         for variable, entry in zip(pdo.map, layout.entries, strict=True):
             variable.raw = counts[entry.name]
         assert bytes(pdo.data) == layout.encode(counts)
+
+
+@pytest.mark.parametrize("name", ["lwa4p", "cia402"])
+def test_speeds_are_the_drives_own_or_come_from_positions(name: str) -> None:
+    profile = read_profile(SHIPPED / f"{name}.yaml")
+    builder = StateBuilder(profile, builtin_arm("ur10e"))
+    speed = np.array([0.5, -0.5, 0.2, 0.0, -0.3, 1.0])
+    told = np.rint(speed * profile.counts_per_radian)
+    for step in range(8):
+        synced = 0.01 * step + (0.0005 if step % 2 else 0.0)  # a SYNC that is not punctual
+        counts = profile.counts(speed * synced)
+        rows = [
+            {"Statusword": 0x0250, "Position actual value": int(q), "Velocity actual value": int(v),
+             "Torque actual value": 0}
+            for q, v in zip(counts, told, strict=True)
+        ]  # fmt: skip
+        state = builder.build(SyncSet(tuple(rows), synced, synced + 0.001), None, False)
+    assert state.actual_qd == pytest.approx(speed, abs=1e-3)
+    assert state.timestamp == synced
+    jumped = profile.counts(speed * synced + 1.0)
+    leap = [{**row, "Position actual value": int(q)} for row, q in zip(rows, jumped, strict=True)]
+    with pytest.raises(InvalidStateError, match="found a step of"):
+        builder.build(SyncSet(tuple(leap), synced + 0.01, synced + 0.011), None, False)
 
 
 def test_layouts_compare_by_what_they_hold() -> None:
