@@ -14,7 +14,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import savgol_coeffs, savgol_filter
 
 Array = NDArray[np.float64]
 HALF_WIDTHS = (3, 4, 6, 9, 13, 19, 28, 42, 63)  # samples either side
@@ -79,12 +78,16 @@ def _polynomial(order: int) -> int:
 
 
 def _coefficients(half: int, order: int, step: float) -> Array:
+    from scipy.signal import savgol_coeffs  # half a second that logs of poses need not wait for
+
     return np.asarray(
         savgol_coeffs(2 * half + 1, _polynomial(order), deriv=order, delta=step), dtype=float
     )
 
 
 def _filtered(signal: Array, half: int, order: int, step: float) -> Array:
+    from scipy.signal import savgol_filter
+
     return np.asarray(
         savgol_filter(signal, 2 * half + 1, _polynomial(order), deriv=order, delta=step, axis=0)
     )

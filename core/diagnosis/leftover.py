@@ -7,7 +7,7 @@ up in it where each alone would drown in the number of hypotheses tried.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -46,12 +46,11 @@ def structure_p_value(
         nuisance = nuisance[rows]
     fitted = basis_of(np.hstack([nuisance, space.columns(chosen)]))
     r = space.y - fitted @ (fitted.T @ space.y)
-    spread = _families(space, fitted)
     rng = np.random.default_rng(seed)
     noise = rng.normal(size=(len(r), DRAWS))
     noise -= fitted @ (fitted.T @ noise)
     worst = []
-    for family in spread:
+    for family in _families(space, fitted):
         # sums of squares along the family's directions, as a share of everything left
         seen = np.sum((family.T @ r) ** 2) / (r @ r)
         drawn = np.sum((family.T @ noise) ** 2, axis=0) / np.sum(noise**2, axis=0)
@@ -62,13 +61,12 @@ def structure_p_value(
     return float((1 + np.sum(top[1:] >= top[0])) / (1 + DRAWS))
 
 
-def _families(space: Space, fitted: Array) -> list[Array]:
-    """Return for every family of candidates its columns (m, K), cleaned and of equal size."""
+def _families(space: Space, fitted: Array) -> Iterator[Array]:
+    """Yield for every family of candidates its columns (m, K), cleaned and of equal size."""
     groups: dict[str, list[int]] = {}
     for c, candidate in enumerate(space.candidates):
         key = candidate.family if candidate.named else f"{candidate.family} {candidate.target}"
         groups.setdefault(key, []).append(c)
-    found = []
     for members in groups.values():
         columns = space.columns(members)
         columns = columns - fitted @ (fitted.T @ columns)
@@ -76,8 +74,7 @@ def _families(space: Space, fitted: Array) -> list[Array]:
         whole = np.sqrt(np.einsum("ij,ij->j", space.columns(members), space.columns(members)))
         alive = size > 1e-4 * whole
         if alive.any():
-            found.append(columns[:, alive] / size[alive])
-    return found
+            yield columns[:, alive] / size[alive]
 
 
 def dependence(

@@ -46,9 +46,11 @@ def sample_space(
     """Return the sample space at the model found so far, and its raw columns, nuisance, target."""
     observation = work.observation
     candidates = [*work.candidates, *(c for c, _ in smooth)]
-    raw = np.hstack([flat(c, work) for c in [*columns, *(s for _, s in smooth)]])
     size = np.array([len(c.parameters) for c in candidates])
     start = np.concatenate([[0], np.cumsum(size)])
+    raw = np.empty((int(work.kept.sum()) * observation.measured.shape[1], int(start[-1])))
+    for c, block in enumerate([*columns, *(s for _, s in smooth)]):
+        raw[:, start[c] : start[c + 1]] = flat(block, work)
     gap = (observation.measured - observation.predict(base))[..., None]
     # what the terms already in the model explain is put back, in the linear form at hand
     for term in base:
@@ -57,7 +59,8 @@ def sample_space(
     target = flat(gap, work)[:, 0]
     nuisance = flat(observation.nuisance, work)
     Q = np.linalg.qr(nuisance)[0] if nuisance.shape[1] else nuisance
-    X, y = raw - Q @ (Q.T @ raw), target - Q @ (Q.T @ target)
+    X, y = Q @ (Q.T @ raw), target - Q @ (Q.T @ target)
+    np.subtract(raw, X, out=X)
     whole, left = (np.sqrt(np.einsum("ij,ij->j", A, A)) for A in (raw, X))
     X[:, left < DEAD * whole] = 0.0  # the frame takes it up wholly; the rest is rounding
     freedom = float(len(target) - Q.shape[1])
