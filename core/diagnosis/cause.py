@@ -18,6 +18,7 @@ from core.effects import CATALOGUE, Reported, Term
 
 Array = NDArray[np.float64]
 SHOWN = 3.0  # whitened length of an effect of usual size from which it counts as excited
+OPEN = 30.0  # usual sizes of a parameter: with a wider spread nothing is known of it
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ def _cause(
         value, deviation = np.array(term.values), np.sqrt(np.maximum(np.diag(covariance), 0))
         size = np.abs(value[: len(deviation)])
         relative.append(float(np.min(deviation / np.maximum(size, 1e-300))))
-        notes += _at_bounds(effect, term, arm)
+        notes += _at_bounds(effect, term, arm) + _not_shown(effect, term, deviation, arm)
     joints = sorted({t.site.joint for t in (selection.terms[p] for p in positions)
                      if t.site.joint is not None})  # fmt: skip
     ties = tuple(dict.fromkeys(n for p in positions for n in judgement.ties.get(p, ())))
@@ -99,6 +100,18 @@ def _at_bounds(effect: str, term: Term, arm: Arm) -> list[str]:
         if value in (parameter.lower, parameter.upper):
             name = CATALOGUE[effect].label(term.site, parameter)
             notes.append(f"{name} stands on its bound ({value:g} {parameter.unit})")
+    return notes
+
+
+def _not_shown(effect: str, term: Term, deviation: Array, arm: Arm) -> list[str]:
+    """Return a note on each parameter that these data leave open (CONTRACT: told, not hidden)."""
+    notes = []
+    for parameter, spread in zip(
+        CATALOGUE[effect].parameters(arm, term.site), deviation, strict=False
+    ):
+        if spread == 0 or spread > OPEN * parameter.scale:
+            name = CATALOGUE[effect].label(term.site, parameter)
+            notes.append(f"{name} is not shown by these data: others can stand in for it")
     return notes
 
 

@@ -45,7 +45,8 @@ def refit(
         nuisance = flat(observation.nuisance, work)
         A = np.hstack([*blocks, extra, nuisance])
         b = flat(gap[..., None], work)[:, 0]
-        unit = 1 / np.sqrt(np.einsum("ij,ij->j", A, A) + 1e-300)
+        size = np.sqrt(np.einsum("ij,ij->j", A, A))
+        unit = np.where(size > 1e-150, 1 / np.maximum(size, 1e-150), 0.0)  # 0: moves nothing
         pull, towards = _pull(freed, index, x, A.shape[1])
         step = np.linalg.lstsq(
             np.vstack([A, pull]) * unit, np.concatenate([b, towards]), rcond=1e-9
