@@ -1,0 +1,124 @@
+"""Held-out figures: no sample is judged by a fit that saw its pose."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import small_arm as small
+
+from core.diagnosis.held_out import FOLDS, HeldOut
+
+JOLT = 3.0  # whitened
+
+
+@pytest.fixture(scope="module")
+def selection():
+    return small.diagnosed("backlash").channels[0].selection
+
+
+def jolted(selection, sample: int, size: float = JOLT):
+    """Return the selection with one kept sample's reading moved."""
+    target = selection.raw_target.copy()
+    target[3 * sample : 3 * sample + 3] += size
+    return replace(selection, raw_target=target)
+
+
+def paired(selection):
+    """Return the selection whose poses stand for each other two by two, as if repeated."""
+    groups = np.arange(len(selection.observation.rows)) // 2
+    return replace(selection, observation=replace(selection.observation, groups=groups))
+
+
+def left_of(selection, chosen) -> np.ndarray:
+    """Return the whitened held-out residual (N, 3) of each sample."""
+    return HeldOut(selection)._left(tuple(sorted(chosen))).reshape(-1, 3)
+
+
+def test_a_sample_never_helps_to_predict_itself(selection):
+    """Moving one reading moves its own held-out residual by just as much, and others' by less."""
+    chosen = selection.found.chosen
+    before = left_of(selection, chosen)
+    for sample in range(0, len(before), 7):
+        after = left_of(jolted(selection, sample), chosen)
+        assert np.allclose(after[sample] - before[sample], JOLT, atol=1e-8)
+        others = np.delete(after - before, sample, axis=0)
+        assert 0 < np.abs(others).max() < JOLT / 2
+
+
+def test_repeats_of_a_pose_leave_together(selection):
+    twins, chosen = paired(selection), selection.found.chosen
+    before = left_of(twins, chosen)
+    for sample in range(0, len(before) - 1, 6):
+        mate = sample + 1 if sample % 2 == 0 else sample - 1
+        after = left_of(jolted(twins, sample), chosen)
+        assert np.allclose(after[mate], before[mate], atol=1e-9)
+
+
+def test_each_sample_is_held_out_with_a_tenth_of_the_others(selection):
+    before = left_of(selection, ())
+    alike = [
+        int(np.sum(np.abs(left_of(jolted(selection, s), selection.found.chosen)
+                          - left_of(selection, selection.found.chosen)).max(axis=1) < 1e-9))
+        for s in range(0, len(before), 9)
+    ]  # fmt: skip
+    # besides itself, those of its own fold do not feel it
+    assert np.allclose(alike, len(before) / FOLDS - 1, atol=1.01)
+
+
+def test_held_out_figures_are_those_of_a_cross_validation_by_hand(selection):
+    chosen = selection.found.chosen
+    held = HeldOut(selection)
+    assert held.possible
+    # noise-free exact linear data: nothing is left, whatever pose was out
+    space = selection.space
+    block = selection.raw[:, space.start[chosen[0]] : space.start[chosen[0] + 1]]
+    exact = replace(selection, raw_target=block @ np.ones(block.shape[1]))
+    assert HeldOut(exact).rms(chosen) < 1e-9 * HeldOut(exact).rms(())
+    assert held.rms(chosen) == pytest.approx(np.sqrt(np.mean(held.squares(chosen))))
+    assert held.rms(chosen) == pytest.approx(small.FLOOR, rel=0.2)
+
+
+def test_a_needless_cause_does_not_shrink_the_held_out_gap(selection):
+    space, chosen = selection.space, selection.found.chosen
+    needless = next(c for c, k in enumerate(space.candidates) if k.family == "link_geometry")
+    held = HeldOut(selection)
+    more = held.shrink((*chosen, needless), chosen)
+    assert more.shrink < 0.02
+    assert more.interval[0] < 0
+    fitted = held.shrink(chosen, ())
+    assert fitted.shrink > 0.7
+    assert fitted.interval[0] > 0.6
+
+
+def test_a_shrink_is_one_less_the_ratio_of_its_gaps_and_repeats(selection):
+    chosen = selection.found.chosen
+    told, again = (HeldOut(selection).shrink(chosen, ()) for _ in range(2))
+    assert told == again
+    assert told.shrink == pytest.approx(1 - told.gap_with / told.gap_without)
+    assert told.interval[0] <= told.shrink <= told.interval[1]
+    nothing = HeldOut(selection).shrink(chosen, chosen)
+    assert (nothing.shrink, nothing.interval) == (0.0, (0.0, 0.0))
+    other = HeldOut(selection, seed=9).shrink(chosen, ())
+    assert other != told
+    assert other.shrink == pytest.approx(told.shrink, abs=0.05)
+
+
+def test_the_told_figure_is_the_held_out_one():
+    (channel,) = small.diagnosed("backlash").channels
+    chosen = channel.selection.found.chosen
+    held = HeldOut(channel.selection)
+    assert channel.remaining_rms_held_out == held.rms(chosen)
+    assert channel.causes[0].shrink.gap_with == held.rms(chosen)
+    assert channel.held_out == pytest.approx(np.sqrt(held.squares(chosen)))
+
+
+def test_two_conditions_are_needed(selection):
+    one = replace(
+        selection,
+        observation=replace(
+            selection.observation, groups=np.zeros(len(selection.kept), dtype=np.int64)
+        ),
+    )
+    assert not HeldOut(one).possible

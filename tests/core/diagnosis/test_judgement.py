@@ -1,0 +1,163 @@
+"""The judgement: ties are told, weak accusations withdrawn, causes and losers accounted for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import small_arm as small
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from benchmarks.blind.session import Plan
+from core.diagnosis.cause import causes_of, considered_of, probability
+from core.diagnosis.diagnosis import diagnose
+from core.diagnosis.held_out import HeldOut
+from core.diagnosis.judgement import holding, judge, pure_error
+from core.effects import CATALOGUE
+from core.metrology import Metrology
+
+LOGS = ("none", "backlash", "tool_frame", "cross_coupling", "thermal_drift")
+
+
+def channel_of(effect: str):
+    return small.diagnosed(effect).channels[0]
+
+
+@pytest.mark.parametrize("effect", LOGS)
+def test_every_effect_of_the_catalogue_is_a_cause_or_told_why_not(effect):
+    channel = channel_of(effect)
+    accused = {c.effect for c in channel.causes}
+    considered = [c.effect for c in channel.considered]
+    assert len(considered) == len(set(considered))
+    assert accused.isdisjoint(considered)
+    of_the_channel = {k for k, e in CATALOGUE.items() if "position" in e.channels}
+    assert accused | set(considered) == of_the_channel
+    assert all(c.reason for c in channel.considered)
+    assert all(0 <= c.probability <= 1 for c in channel.considered)
+
+
+@pytest.mark.parametrize("effect", LOGS)
+def test_every_term_is_accused_or_withdrawn(effect):
+    channel = channel_of(effect)
+    withdrawn = {position for position, _ in channel.judgement.withdrawn}
+    accused = set(channel.judgement.accused)
+    assert accused.isdisjoint(withdrawn)
+    assert accused | withdrawn == set(range(len(channel.selection.terms)))
+    named = sorted(t.effect for c in channel.causes for t in c.terms)
+    assert named == sorted(channel.selection.terms[p].effect for p in accused)
+
+
+def test_an_accusation_beside_a_leftover_is_withdrawn_and_said_so():
+    found = small.diagnosed("cross_coupling")
+    (channel,) = found.channels
+    assert channel.judgement.structured
+    assert channel.judgement.accused == ()
+    for position, reason in channel.judgement.withdrawn:
+        effect = channel.selection.terms[position].effect
+        assert any(effect in told and reason in told for told in found.findings)
+        assert next(c for c in channel.considered if c.effect == effect).reason == reason
+    assert found.model.terms == small.model_of().terms  # nothing withdrawn reaches the model
+
+
+def test_more_left_than_the_stated_noise_is_structure():
+    session = small.session_of(0)
+    log = small.log_of(session, small.readings(small.NOMINAL, session))
+    stated = np.sqrt(small.FLOOR**2 - small.SIGMA**2)
+    verdicts = [
+        diagnose(
+            small.model_of(), log,
+            Metrology(registered=True, sigma=sigma, repeatability=repeatability),
+        ).verdict
+        for sigma, repeatability in ((small.SIGMA, stated), (5e-6, 5e-6))
+    ]  # fmt: skip
+    assert verdicts == ["no_gap", "unexplained"]
+
+
+def test_what_does_not_hold_on_unseen_samples_is_withdrawn():
+    channel = channel_of("backlash")
+    selection = channel.selection
+    rng = np.random.default_rng(0)
+    noise = replace(selection, raw_target=rng.normal(size=len(selection.raw_target)))
+    believed = replace(judge(selection), structured=True)
+    assert believed.accused
+    left = holding(noise, believed, HeldOut(noise))
+    assert left.accused == ()
+    assert {p for p, _ in left.withdrawn} >= set(believed.accused)
+    kept = holding(selection, believed, HeldOut(selection))
+    assert kept.accused == believed.accused
+    sure = replace(believed, structured=False)
+    assert holding(noise, sure, HeldOut(noise)) is sure
+
+
+def test_a_tie_names_the_other_and_leaves_the_strangers_out():
+    one_sided = small.session_of(3, Plan(poses=60, both_sides=False))
+    real = small.turned(2, lambda s, q: np.full(len(q), -4.5e-4))
+    log = small.log_of(one_sided, small.readings(real, one_sided, 3))
+    found = diagnose(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
+    (cause,) = found.channels[0].causes
+    assert {cause.effect, *cause.indistinguishable_from} >= {"joint_offset", "backlash"}
+    assert cause.effect not in cause.indistinguishable_from
+    assert "thermal_drift" not in cause.indistinguishable_from
+    for clear in ("backlash", "tool_frame", "thermal_drift"):
+        assert channel_of(clear).causes[0].indistinguishable_from == ()
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 999), sigma=st.floats(1e-6, 1e-2), pairs=st.integers(30, 60))
+def test_repeats_tell_the_noise_whatever_the_poses_are_off_by(seed, sigma, pairs):
+    rng = np.random.default_rng(seed)
+    groups = np.repeat(np.arange(pairs), 3)
+    noise = rng.normal(0, sigma, (3 * pairs, 3))
+    poses = rng.normal(0, 1, (pairs, 3))[groups]
+    variance, freedom = pure_error(noise + poses, groups)
+    assert freedom == 6 * pairs
+    assert np.sqrt(variance) == pytest.approx(sigma, rel=0.25)
+    assert pure_error(poses, groups)[0] == pytest.approx(0, abs=1e-20)
+    assert pure_error(noise, np.arange(3 * pairs)) == (0.0, 0)
+
+
+@pytest.mark.parametrize("effect", ["backlash", "tool_frame", "thermal_drift"])
+def test_a_cause_that_is_needed_is_more_probable_than_not(effect):
+    channel = channel_of(effect)
+    assert 0.99 < channel.causes[0].probability <= 1
+    own = set(channel.selection.found.chosen)
+    assert probability(channel.selection, own) == channel.causes[0].probability
+
+
+def test_a_loser_that_scores_well_alone_is_not_probable_beside_the_cause():
+    channel = channel_of("backlash")
+    alone = {c.effect: c for c in channel.considered}
+    assert max(c.shrink_alone or 0 for c in alone.values()) < channel.causes[0].shrink_alone
+    assert all(c.probability < 0.5 for c in alone.values())
+
+
+def test_a_parameter_on_its_bound_is_told():
+    channel = channel_of("backlash")
+    selection = channel.selection
+    (term,) = selection.terms
+    flat = replace(selection, terms=(term.with_values(np.zeros(1)),))
+    for chosen, words in ((selection, []), (flat, ["backlash_2 stands on its bound (0 rad)"])):
+        (cause,) = causes_of(chosen, channel.judgement, HeldOut(chosen), small.model_of().arm)
+        assert list(cause.notes) == words
+
+
+def test_what_a_log_cannot_show_says_what_it_needs():
+    rigid = {c.effect: c for c in channel_of("none").considered}
+    payload = rigid["payload"]  # positions of a rigid model do not show it
+    assert (payload.excited, payload.probability, payload.shrink_alone) == (False, 0.0, None)
+    assert payload.reason.startswith("not excited; needs ")
+    assert rigid["joint_offset"].excited
+    channel = channel_of("none")
+    held = HeldOut(channel.selection)
+    arm = small.model_of().arm
+    told = considered_of(channel.selection, channel.judgement, held, arm, ("payload",))
+    assert "payload" not in {c.effect for c in told}
+    cold = small.session_of(0)
+    without = small.log_of(
+        cold, small.readings(small.NOMINAL, cold), joint_temperatures=None, approach=None
+    )
+    found = diagnose(small.model_of(), without, Metrology(registered=True, sigma=small.SIGMA))
+    thermal = {c.effect: c for c in found.channels[0].considered}["thermal_drift"]
+    assert (thermal.excited, thermal.shrink_alone) == (False, None)

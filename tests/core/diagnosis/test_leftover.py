@@ -1,0 +1,119 @@
+"""The leftover: noise has no structure, structure is seen, and what it follows is named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import toy_space as toy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from core.diagnosis.leftover import basis_of, dependence, structure_p_value
+
+ROWS = 90
+CANDIDATES = [
+    *(toy.named("joint_offset", 1, j) for j in range(1, 4)),
+    *(toy.smooth(f"actual_q_{j}", f"joint_{j + 1}", 4) for j in range(3)),
+    toy.smooth("timestamp", size=4), toy.smooth("joint_temperatures_0", size=2),
+    toy.smooth("joint_temperatures_1", size=2),
+]  # fmt: skip
+TIME = 6
+FRAME = np.linalg.qr(np.random.default_rng(9).normal(size=(ROWS, 6)))[0]
+GROUPS = np.repeat(np.arange(ROWS // 3), 3)
+
+
+def space(seed: int, planted=(), size: float = 1.0):
+    return toy.random_space(seed, CANDIDATES, ROWS, planted, size)
+
+
+def test_noise_has_no_structure_as_often_as_the_probability_says():
+    drawn = np.array([structure_p_value(space(s), FRAME, ()) for s in range(100)])
+    for level in (0.05, 0.2, 0.5, 0.8):
+        spread = np.sqrt(level * (1 - level) / len(drawn))
+        assert abs(np.mean(drawn < level) - level) < 4 * spread
+
+
+@pytest.mark.parametrize("planted", [3, TIME])
+def test_what_a_family_can_make_is_structure_until_it_is_in_the_model(planted):
+    structured = space(1, (planted,))
+    assert structure_p_value(structured, FRAME, ()) < 0.002
+    assert structure_p_value(structured, FRAME, (planted,)) > 0.01
+
+
+@settings(max_examples=5, deadline=None)
+@given(share=st.floats(1e-6, 1e6))
+def test_the_unit_of_the_gap_does_not_matter(share):
+    one = space(2, (0,), 0.4)
+    other = replace(one, y=one.y * share)
+    assert structure_p_value(other, FRAME, ()) == structure_p_value(one, FRAME, ())
+
+
+def test_what_the_frame_takes_up_is_no_structure():
+    clean = space(3)
+    tilted = replace(clean, y=clean.y + FRAME @ np.full(6, 50.0))
+    assert structure_p_value(tilted, FRAME, ()) == pytest.approx(
+        structure_p_value(clean, FRAME, ())
+    )
+
+
+def test_structure_in_some_rows_shows_in_those_alone():
+    mixed = space(4)
+    odd = np.arange(ROWS) % 2 == 1
+    y = mixed.y + np.where(odd, mixed.columns([TIME]) @ np.full(4, 1.5), 0.0)
+    mixed = replace(mixed, y=y)
+    none = np.zeros((ROWS, 0))
+    assert structure_p_value(mixed, none, (), rows=odd) < 0.002
+    assert structure_p_value(mixed, none, (), rows=~odd) > 0.02
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 999), planted=st.sampled_from([3, 4, 5, TIME]))
+def test_what_the_leftover_follows_comes_first(seed, planted):
+    told = dependence(space(seed, (planted,)), FRAME, (), GROUPS)
+    name, share = told[0]
+    assert name == CANDIDATES[planted].quantity
+    assert 0.4 < share < 1
+    shares = [s for _, s in told]
+    assert shares == sorted(shares, reverse=True)
+    assert len({n for n, _ in told}) == len(told)
+
+
+def test_noise_follows_nothing():
+    shares = [dependence(space(s), FRAME, (), GROUPS)[0][1] for s in range(20)]
+    assert np.median(shares) < 0.05
+
+
+def test_what_is_in_the_model_is_not_followed_any_more():
+    both = space(5, (3, TIME))
+    told = dict(dependence(both, FRAME, (3,), GROUPS))
+    assert max(told, key=lambda n: told[n]) == "timestamp"
+    assert told["actual_q_0"] < 0.1
+
+
+def test_a_function_is_judged_on_conditions_that_it_was_not_fitted_to():
+    """Each pose has its own level: within a pose it can be foretold, of another pose it cannot."""
+    levels = np.repeat(np.random.default_rng(0).normal(size=ROWS // 3) * 5, 3)
+    one = toy.space_of(
+        [toy.smooth("actual_q_0", size=30)], levels, np.kron(np.eye(30), np.ones((3, 1)))
+    )
+    together = dict(dependence(one, np.zeros((ROWS, 0)), (), GROUPS))
+    apart = dict(dependence(one, np.zeros((ROWS, 0)), (), np.arange(ROWS)))
+    assert together["actual_q_0"] < 0.05
+    assert apart["actual_q_0"] > 0.9
+
+
+def test_joint_temperatures_rise_together_and_are_told_once():
+    names = [n for n, _ in dependence(space(6, (7,)), FRAME, (), GROUPS)]
+    assert sum(n.startswith("joint_temperatures_") for n in names) == 1
+    assert names[0] == "joint_temperatures_0"
+
+
+def test_a_basis_is_orthonormal_and_spans_what_it_was_made_of():
+    columns = np.random.default_rng(1).normal(size=(20, 3))
+    twice = np.hstack([columns, columns @ np.ones((3, 1))])
+    basis = basis_of(twice)
+    assert basis.shape == (20, 3)
+    assert np.allclose(basis.T @ basis, np.eye(3))
+    assert np.allclose(basis @ (basis.T @ twice), twice)
