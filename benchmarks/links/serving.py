@@ -1,0 +1,48 @@
+"""A cell's simulated controller in a process of its own, as ``gapbridge simulate`` serves it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from bridge.cell import load_cell
+from bridge.cell.cell import Cell
+
+ARM = """\
+robot: {model: ur10e}
+payload: {mass: 5.0, cog: [0.0, 0.0, 0.06]}
+compliance: {axial: [3.0e-6, 4.0e-6, 5.0e-6, 9.0e-6, 1.2e-5, 1.5e-5]}
+"""
+"""The same arm on every link: what compensation costs is not what differs."""
+
+
+@contextmanager
+def written(link: str) -> Iterator[Path]:
+    """Yield the path of a cell with this link section."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "cell.yaml"
+        path.write_text(ARM + link, encoding="utf-8")
+        yield path
+
+
+@contextmanager
+def served_cell(link: str) -> Iterator[Cell]:
+    """Serve a cell in another process while the block lasts; yields it loaded."""
+    with written(link) as path:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "bridge.cli", "simulate", str(path)],
+            stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        try:
+            assert process.stdout is not None
+            while not process.stdout.readline().startswith("ready"):
+                if process.poll() is not None:
+                    raise SystemExit("the simulated controller did not start")
+            yield load_cell(path)
+        finally:
+            process.terminate()
+            process.wait(5.0)

@@ -1,0 +1,50 @@
+"""The links that are measured, and a line of the table for each."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from benchmarks.links.can_piper import PiperHubCase, PiperVirtualCase
+from benchmarks.links.canopen_drives import DrivesHubCase, DrivesVirtualCase
+from benchmarks.links.case import LinkCase
+from benchmarks.links.modbus_tcp import ModbusTcpCase
+from benchmarks.links.ur_rtde import UrOffsetCase, UrServoCase
+
+CASES: tuple[LinkCase, ...] = (
+    UrOffsetCase(),
+    UrServoCase(),
+    ModbusTcpCase(),
+    PiperHubCase(),
+    PiperVirtualCase(),
+    DrivesHubCase(),
+    DrivesVirtualCase(),
+)
+
+
+def title() -> str:
+    """Return the head of the table, Markdown."""
+    return (
+        "| link | beside | CPU us: ours | library | ratio | without compensation | wall us: ours "
+        "| library | ratio | ours: read + compensate + write |\n" + "| --- " * 10 + "|"
+    )
+
+
+def line(found: dict[str, Any]) -> str:
+    """Return one link's line, Markdown: medians with quartiles."""
+    ours, library, ratio = found["ours"], found["library"], found["ratio"]
+    parts = " + ".join(f"{us:.0f}" for us in ours["parts_us"].values())
+    cells = [
+        found["link"], found["compared_with"],
+        _spread(ours["cpu_us"]), _spread(library["cpu_us"]), _ratio(ratio["cpu"]),
+        _ratio(ratio["cpu_link"]),
+        _spread(ours["wall_us"]), _spread(library["wall_us"]), _ratio(ratio["wall"]), parts,
+    ]  # fmt: skip
+    return "| " + " | ".join(cells) + " |"
+
+
+def _spread(us: dict[str, float]) -> str:
+    return f"{us['p50']:.0f} ({us['p25']:.0f}-{us['p75']:.0f})"
+
+
+def _ratio(found: dict[str, float]) -> str:
+    return f"{found['median']:.2f} ({found['pairs_p25']:.2f}-{found['pairs_p75']:.2f})"
