@@ -30,7 +30,7 @@ def title() -> str:
 
 
 def line(found: dict[str, Any]) -> str:
-    """Return one link's line, Markdown: medians with quartiles."""
+    """Return one link's line, Markdown: medians (quartiles; ratios: and of minima)."""
     ours, library, ratio = found["ours"], found["library"], found["ratio"]
     parts = " + ".join(f"{us:.0f}" for us in ours["parts_us"].values())
     cells = [
@@ -47,4 +47,5 @@ def _spread(us: dict[str, float]) -> str:
 
 
 def _ratio(found: dict[str, float]) -> str:
-    return f"{found['median']:.2f} ({found['pairs_p25']:.2f}-{found['pairs_p75']:.2f})"
+    spread = f"{found['pairs_p25']:.2f}-{found['pairs_p75']:.2f}"
+    return f"{found['median']:.2f} ({spread}; {found['min']:.2f})"

@@ -18,15 +18,16 @@ from drivers.simulated.settings import ServerSettings
 Array = NDArray[np.float64]
 READINGS_PERIOD = 0.01  # s between two readings of the tracker
 LONGEST_MOVE = 20.0  # s
-STANDING = 2e-4  # m between two looks, half a second apart
+LOOK = 0.25  # s between two looks at whether the arm stands
+STANDING = 1.5e-4  # m between two looks
 
 
 class Bench:
     """One connection to the bench port, for one thread."""
 
-    def __init__(self, settings: ServerSettings) -> None:
-        self._settings = settings
-        self._socket = socket.create_connection((settings.host, settings.bench_port), timeout=10)
+    def __init__(self, host: str, port: int) -> None:
+        self._host = host
+        self._socket = socket.create_connection((host, port), timeout=10)
         self._lines = self._socket.makefile("r")
 
     def ask(self, line: str) -> str:
@@ -35,40 +36,75 @@ class Bench:
             self._socket.sendall(line.encode() + b"\n")
             answer = self._lines.readline().strip()
         except OSError as error:
-            raise LinkError(f"bench of {self._settings.host}: {error}") from error
+            raise LinkError(f"bench of {self._host}: {error}") from error
         if not answer or answer.startswith("error"):
-            raise LinkError(
-                f"bench of {self._settings.host}: {line}: found {answer or 'nothing'!r}"
-            )
+            raise LinkError(f"bench of {self._host}: {line}: found {answer or 'nothing'!r}")
         return answer
 
     def measure(self) -> Array:
-        """Return one reading (7,): controller time (s), position (m), rotation vector (rad)."""
+        """Return one reading (7,): time (s), position (m), rotation vector (rad).
+
+        The time is that of the run's states: this machine's, where a controller sends none.
+        """
+        reading = self._reading()
+        reading[0] = time.monotonic()
+        return reading
+
+    def _reading(self) -> Array:
+        """Return one reading (7,) with the controller's own time."""
         return np.array([float(v) for v in self.ask("measure").split(",")])
 
     def hang(self, load: Load) -> None:
-        """Hang a load on the flange, let go of the tool or pull at it, and tell the controller."""
+        """Hang a load on the flange, and let go of the tool or pull at it."""
         numbers = " ".join(f"{v:.9g}" for v in (load.mass, *load.cog))
         self.ask(f"payload {numbers}")
         self.ask("wrench " + " ".join(f"{v:.9g}" for v in load.wrench))
-        cog = ",".join(f"{v:.9g}" for v in load.cog)
-        self._pendant(f"def hang():\n  set_payload({load.mass:.9g}, [{cog}])\nend\n")
 
     def go(self, q: Array) -> None:
-        """Move the arm to ``q`` (6,) from the pendant, and wait until it stands there.
+        """Move the arm to ``q`` (n,) by its own program, and wait until it stands there.
 
         Raises LinkError where it does not come to rest in time.
         """
-        numbers = ",".join(f"{v:.9g}" for v in q)
-        self._pendant(f"def go():\n  movej([{numbers}], a=1.0, v=0.7)\nend\n")
+        self._start(q)
         latest, before = time.monotonic() + LONGEST_MOVE, self.measure()
         while time.monotonic() < latest:
-            time.sleep(0.5)
+            time.sleep(LOOK)
             now = self.measure()
             if np.linalg.norm(now[1:4] - before[1:4]) < STANDING:
                 return
             before = now
         raise LinkError(f"the arm did not come to rest within {LONGEST_MOVE:g} s")
+
+    def _start(self, q: Array) -> None:
+        """Have the robot's own program move to ``q`` (n,)."""
+        self.ask("move " + " ".join(f"{v:.9g}" for v in q))
+
+    def close(self) -> None:
+        """Leave the bench."""
+        self._lines.close()
+        self._socket.close()
+
+
+class UrBench(Bench):
+    """The bench of a UR controller: people use its pendant, and its clock is everyone's."""
+
+    def __init__(self, settings: ServerSettings) -> None:
+        super().__init__(settings.host, settings.bench_port)
+        self._settings = settings
+
+    def measure(self) -> Array:
+        """Return one reading (7,), its time the controller's; see Bench.measure."""
+        return self._reading()
+
+    def hang(self, load: Load) -> None:
+        """Hang a load as on any bench, and tell the controller."""
+        super().hang(load)
+        cog = ",".join(f"{v:.9g}" for v in load.cog)
+        self._pendant(f"def hang():\n  set_payload({load.mass:.9g}, [{cog}])\nend\n")
+
+    def _start(self, q: Array) -> None:
+        numbers = ",".join(f"{v:.9g}" for v in q)
+        self._pendant(f"def go():\n  movej([{numbers}], a=1.0, v=0.7)\nend\n")
 
     def _pendant(self, program: str) -> None:
         """Run a short program, as a person at the pendant would."""
@@ -77,18 +113,13 @@ class Bench:
             script.sendall(program.encode())
             time.sleep(0.1)
 
-    def close(self) -> None:
-        """Leave the bench."""
-        self._lines.close()
-        self._socket.close()
-
 
 class Tracker(threading.Thread):
     """Reads the tracker a hundred times a second while the ``with`` block lasts."""
 
-    def __init__(self, settings: ServerSettings) -> None:
+    def __init__(self, bench: Bench) -> None:
         super().__init__(name="tracker", daemon=True)
-        self._bench = Bench(settings)
+        self._bench = bench
         self._ending = threading.Event()
         self._readings: list[Array] = []
         self._error: LinkError | None = None

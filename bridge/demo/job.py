@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import socket
 import time
 from dataclasses import dataclass, field
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -14,34 +12,25 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from bridge.cell import Cell, load_cell, save_cell
-from bridge.cell.simulation import server_settings
 from bridge.demo.diagnosing import Diagnosing
+from bridge.demo.links import DemoLink, demo_link
+from bridge.demo.links.link import free_address as _free_address
+from bridge.demo.links.ur_rtde import UrRtdeLink
 from bridge.demo.page import page
 from bridge.demo.picture import picture
-from bridge.demo.poses import CALIBRATION_LOADS, TEST_LOADS, Load, Plan, plan
+from bridge.demo.poses import Load, Plan, plan
 from bridge.demo.rests import Rests, joined, write_log
 from bridge.demo.result import Result
 from bridge.demo.session import Session
 from bridge.demo.terminal import show
 from bridge.output_file import write_text
 from bridge.warm_up import warm_up
-from core.errors import InputError, RunError
+from core.errors import RunError
 from core.identification import identify_compliance
 from core.log import read_log
-from drivers.simulated.process import SimulatedController
-from drivers.simulated.settings import (
-    BENCH_PORT,
-    DASHBOARD_PORT,
-    RTDE_PORT,
-    SCRIPT_PORT,
-    ServerSettings,
-)
 
 Array = NDArray[np.float64]
-VISITS = 3  # of each test pose: what differs between them is the arm's repeatability
-LINKS = ("ur_rtde",)
-PORTS = (RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, BENCH_PORT)
-LAST_HOST = 60  # 127.0.0.2 to this are tried
+PORTS = UrRtdeLink.ports
 
 
 @dataclass
@@ -60,17 +49,15 @@ def run_demo(seed: int, out: Path, link: str = "ur_rtde", console: Console | Non
     fit, and the diagnosis of the calibration log. Raises InputError for an unknown link, RunError
     where the job fails.
     """
-    if link not in LINKS:
-        raise InputError(f"--link: found {link!r}, expected one of {', '.join(LINKS)}")
+    kind = demo_link(link)
     console = console or Console()
     begun = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
-    cell = _write_cell(out, link)
-    settings = server_settings(cell, seed=seed)
+    shown = kind(out, seed)
     warm_up()
-    console.print(f"simulated {settings.arm.name} at {settings.host}, its flexibilities hidden")
-    with SimulatedController(settings):
-        result = _job(cell, settings, seed, out, console, begun)
+    console.print(f"simulated {shown.cell.arm.name} at {shown.host}, its flexibilities hidden")
+    with shown.served():
+        result = _job(shown, seed, out, console, begun)
     _write(result[0], result[1], out)
     show(result[0], console)
     console.print(f"results in {out}: report.html, summary.json", highlight=False)
@@ -79,12 +66,12 @@ def run_demo(seed: int, out: Path, link: str = "ur_rtde", console: Console | Non
 
 
 def _job(
-    cell: Cell, settings: ServerSettings, seed: int, out: Path, console: Console, begun: float
+    link: DemoLink, seed: int, out: Path, console: Console, begun: float
 ) -> tuple[Result, str]:
-    home = np.array(settings.start_q)
-    session = Session(settings, home, out, console.print)
-    planned = plan(cell.model, home, seed)
-    log = _calibrate(cell, session, planned, out, console)
+    cell, scene = link.cell, link.scene
+    session = Session(link, out, console.print)
+    planned = plan(cell.model, link.home, seed, scene)
+    log = _calibrate(link, session, planned, out, console)
     found = identify_compliance(cell.model, read_log(log, cell.arm.n), cell.metrology)
     save_cell(cell, out / "calibrated.yaml", found.model)
     calibrated = load_cell(out / "calibrated.yaml")
@@ -94,27 +81,30 @@ def _job(
     )
     seen = _Visits()
     with Diagnosing(log, cell.path, out / "diagnosis") as diagnosing:
-        for load, poses in zip(TEST_LOADS, planned.test, strict=True):
-            visits = np.tile(poses, (VISITS, 1))
+        for load, poses in zip(scene.test_loads, planned.test, strict=True):
+            visits = np.tile(poses, (scene.visits, 1))
             _check(cell, calibrated, session, load, visits, seen, console)
         console.print("diagnosing the calibration log")
         diagnosis = diagnosing.answer()
     result = Result(
-        link=cell.link.driver if cell.link else "", seed=seed, identification=found,
+        link=link.name, seed=seed, identification=found,
         model=calibrated.model, without=joined(seen.without), compensated=joined(seen.compensated),
         loads=tuple(seen.loads), setpoints_written=session.written, loop=session.figures(),
-        duration=time.monotonic() - begun,
+        duration=time.monotonic() - begun, resolution=link.resolution(),
+        test_loads=scene.test_loads,
     )  # fmt: skip
     return result, diagnosis
 
 
-def _calibrate(cell: Cell, session: Session, planned: Plan, out: Path, console: Console) -> Path:
+def _calibrate(
+    link: DemoLink, session: Session, planned: Plan, out: Path, console: Console
+) -> Path:
     """Measure poses under each calibration load; returns the log."""
     parts = []
-    for load, poses in zip(CALIBRATION_LOADS, planned.calibration, strict=True):
+    for load, poses in zip(link.scene.calibration_loads, planned.calibration, strict=True):
         console.print(f"measuring {len(poses)} poses with {load.name}")
-        parts.append(session.visit(cell, load, poses))
-    write_log(out / "calibration.csv", joined(parts))
+        parts.append(session.visit(link.cell, load, poses))
+    write_log(out / "calibration.csv", joined(parts), link.tells_joints)
     return out / "calibration.csv"
 
 
@@ -130,30 +120,9 @@ def _check(
     seen.loads += [load.name] * len(poses)
 
 
-def _write_cell(out: Path, link: str) -> Cell:
-    text = resources.files("bridge.demo").joinpath("cell.yaml").read_text(encoding="utf-8")
-    path = out / "cell.yaml"
-    write_text(path, text.replace("LINK", link).replace("HOST", free_address()))
-    return load_cell(path)
-
-
 def free_address() -> str:
-    """Return a loopback address on which none of a controller's ports is taken."""
-    for last in range(2, LAST_HOST + 1):
-        host = f"127.0.0.{last}"
-        if all(_is_free(host, port) for port in PORTS):
-            return host
-    raise RunError(f"found every address from 127.0.0.2 to 127.0.0.{LAST_HOST} taken")
-
-
-def _is_free(host: str, port: int) -> bool:
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, port))
-        except OSError:
-            return False
-    return True
+    """Return a loopback address on which none of a UR controller's ports is taken."""
+    return _free_address(PORTS)
 
 
 def _write(result: Result, diagnosis: str, out: Path) -> None:

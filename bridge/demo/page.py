@@ -31,7 +31,7 @@ def page(result: Result, diagnosis: str) -> str:
         '<html lang="en"><head><meta charset="utf-8"><title>Gapbridge demo</title>',
         f"<style>{STYLE}</style>",
         f"<script>{get_plotlyjs()}</script></head><body>",
-        "<h1>The whole job on a simulated UR10e</h1>",
+        f"<h1>The whole job on a simulated {escape(result.model.arm.name)}</h1>",
         _lead(result),
         picture(result),
         "<h2>Every visit</h2>", charts[0],
@@ -133,6 +133,10 @@ def _flexibility_table(result: Result) -> str:
     )
 
 
+def _count(length: float) -> str:
+    return f"{length * 1e3:.3g} mm" if length else "64-bit floats"
+
+
 def _figures(result: Result) -> str:
     figures, loop = result.summary(), result.loop
     lines = (
@@ -142,6 +146,8 @@ def _figures(result: Result) -> str:
         ("rate of the loop", f"{loop.rate:.1f} Hz"),
         ("cycles missed", f"{loop.missed} of {loop.cycles}"),
         ("age of the state behind a setpoint, p99", f"{loop.p99:.0f} us"),
+        ("one count of what is written, at the TCP", _count(result.resolution.written)),
+        ("one count of the joints as read, at the TCP", _count(result.resolution.read)),
         ("whole demo", f"{result.duration:.0f} s"),
     )
     rows = "".join(f"<tr><td>{escape(k)}</td><td>{escape(v)}</td></tr>" for k, v in lines)

@@ -7,7 +7,7 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.demo.poses import TEST_LOADS, Load
+from bridge.demo.poses import Load
 from bridge.demo.result import Result, visits_of_poses
 from core import kernel
 from core.loads import Loads
@@ -54,7 +54,7 @@ def _arm(result: Result) -> str:
     """Draw the arm at the test visit with the largest error, seen from its side."""
     visit = int(np.argmax(result.error_without))
     q = result.without.nominal_q[visit]
-    load = next(known for known in TEST_LOADS if known.name == result.loads[visit])
+    load = next(known for known in result.test_loads if known.name == result.loads[visit])
     rigid = skeleton(result.model.without_terms(), q, load)
     bent = rigid + MAGNIFIED * (skeleton(result.model, q, load) - rigid)
     ahead = rigid[-1, :2] / np.linalg.norm(rigid[-1, :2])

@@ -13,14 +13,19 @@ from core.model import Model
 
 Array = NDArray[np.float64]
 
-# around elbow-up poses with the tool pointing down, rad
-LOWER = np.array([-0.5, -2.1, 0.8, -2.6, -2.1, -0.7])
-UPPER = np.array([0.5, -0.9, 2.1, -0.9, -1.0, 0.7])
 CANDIDATES = 400
-LOWEST = 0.15  # m: nothing of the arm comes closer to the table
-NEAREST = 0.35  # m: the tool stays at least this far from the base's axis
-FAR = 0.6  # m: test poses reach out as far as this, where arms bend
-REGULAR = 0.05  # smallest singular value of the Jacobian (rotations times the lever)
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Where an arm may go."""
+
+    lower: tuple[float, ...]  # rad
+    upper: tuple[float, ...]  # rad
+    lowest: float  # m: the tool comes no closer to the table
+    nearest: float  # m: the tool stays at least this far from the base's axis
+    far: float  # m: test poses reach out as far as this, where arms bend
+    regular: float  # smallest singular value of the Jacobian (rotations times the lever)
 
 
 @dataclass(frozen=True)
@@ -52,15 +57,40 @@ TEST_LOADS = (
 )
 
 
-def candidates(model: Model, seed: int) -> Array:
+@dataclass(frozen=True)
+class Scene:
+    """What is shown on one arm."""
+
+    workspace: Workspace
+    calibration_loads: tuple[Load, ...]
+    test_loads: tuple[Load, ...]
+    calibrate: int = 11  # poses per calibration load
+    test: int = 4  # poses per test load
+    visits: int = 3  # of each test pose: what differs between them is the arm's repeatability
+
+
+UR10E = Scene(
+    # around elbow-up poses with the tool pointing down
+    Workspace(
+        lower=(-0.5, -2.1, 0.8, -2.6, -2.1, -0.7), upper=(0.5, -0.9, 2.1, -0.9, -1.0, 0.7),
+        lowest=0.15, nearest=0.35, far=0.6, regular=0.05,
+    ),
+    CALIBRATION_LOADS,
+    TEST_LOADS,
+)  # fmt: skip
+
+
+def candidates(model: Model, seed: int, workspace: Workspace = UR10E.workspace) -> Array:
     """Return free, regular poses (N, 6) drawn from the seed."""
-    q = np.random.default_rng((seed, 11)).uniform(LOWER, UPPER, (CANDIDATES, len(LOWER)))
+    bounds = np.array(workspace.lower), np.array(workspace.upper)
+    q = np.random.default_rng((seed, 11)).uniform(*bounds, (CANDIDATES, model.arm.n))
     position = model.rigid_pose(q).position
     jacobian = model.without_terms().linear_form(q).jacobian.copy()
     jacobian[:, 3:] *= LEVER
     smallest = np.linalg.svd(jacobian, compute_uv=False)[:, -1]
-    free = (position[:, 2] > LOWEST) & (np.hypot(position[:, 0], position[:, 1]) > NEAREST)
-    return q[free & (smallest > REGULAR)]
+    away = np.hypot(position[:, 0], position[:, 1])
+    free = (position[:, 2] > workspace.lowest) & (away > workspace.nearest)
+    return q[free & (smallest > workspace.regular)]
 
 
 def telling(model: Model, q: Array, load: Load, count: int, known: Array) -> Array:
@@ -101,22 +131,22 @@ class Plan:
     test: tuple[Array, ...]  # per test load (M, 6), none of them in the calibration
 
 
-def plan(model: Model, home: Array, seed: int, calibrate: int = 11, test: int = 4) -> Plan:
-    """Return telling poses per calibration load and random ones per test load (so many each)."""
-    free = candidates(model, seed)
+def plan(model: Model, home: Array, seed: int, scene: Scene = UR10E) -> Plan:
+    """Return telling poses per calibration load and random ones per test load."""
+    free = candidates(model, seed, scene.workspace)
     n = model.arm.n
     known = np.eye(2 * n) * 1e-2
     used: set[int] = set()
     calibration = []
-    for load in CALIBRATION_LOADS:
-        chosen = telling(model, free, load, calibrate, known)
+    for load in scene.calibration_loads:
+        chosen = telling(model, free, load, scene.calibrate, known)
         used |= set(chosen.tolist())
         calibration.append(free[chosen][tour(free[chosen], home)])
     position = model.rigid_pose(free).position
-    far = np.flatnonzero(np.hypot(position[:, 0], position[:, 1]) > FAR)
+    far = np.flatnonzero(np.hypot(position[:, 0], position[:, 1]) > scene.workspace.far)
     rest = free[[i for i in far if i not in used]]
     tests = []
-    for k in range(len(TEST_LOADS)):
-        chosen_poses = rest[k * test : (k + 1) * test]
+    for k in range(len(scene.test_loads)):
+        chosen_poses = rest[k * scene.test : (k + 1) * scene.test]
         tests.append(chosen_poses[tour(chosen_poses, home)])
     return Plan(tuple(calibration), tuple(tests))

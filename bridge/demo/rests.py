@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bridge.demo.poses import Load
 from bridge.output_file import write_table
 from core.errors import RunError
 from core.rotation import rotation_matrix, rotation_vector
@@ -38,29 +39,47 @@ class Rests:
         return len(self.timestamp)
 
 
-def rests(recording: Mapping[str, Array], readings: Array, visited: Array) -> Rests:
+def rests(
+    recording: Mapping[str, Array],
+    readings: Array,
+    visited: Array,
+    load: Load | None = None,
+    settling: float = SETTLING,
+) -> Rests:
     """Return the rests at the ``visited`` poses (M, n), in their order.
 
-    ``recording`` holds columns by RTDE name, ``readings`` (K, 7) is the tracker's. Raises RunError
-    where a visit is missing or the tracker saw too little of it.
+    ``recording`` holds columns by RTDE name, ``readings`` (K, 7) is the tracker's; ``load`` is what
+    the arm carried, where the controller does not tell it. Raises RunError where a visit is missing
+    or the tracker saw too little of it.
     """
-    spans = _spans(recording)
+    if load is not None and "payload" not in recording:
+        recording = {**recording, **_told(load, len(recording["timestamp"]))}
+    spans = _spans(recording, settling)
     rows: list[tuple[Array, ...]] = []
     for number, pose in enumerate(visited):
         span = _next_span(recording, spans, pose)
         if span is None:
             raise RunError(f"visit {number + 1} of {len(visited)}: the arm never rested there")
-        rows.append(_rest(recording, readings, span, pose, number))
+        rows.append(_rest(recording, readings, span, pose, number, settling))
     return Rests(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
-def _spans(recording: Mapping[str, Array]) -> list[slice]:
+def _told(load: Load, count: int) -> dict[str, Array]:
+    """Return the columns of a load that stayed the same for ``count`` rows."""
+    return {
+        "payload": np.full(count, load.mass),
+        "payload_cog": np.tile(load.cog, (count, 1)),
+        "actual_TCP_force": np.tile(load.wrench, (count, 1)),
+    }
+
+
+def _spans(recording: Mapping[str, Array], settling: float) -> list[slice]:
     """Return the stretches in which the arm stood still for longer than it takes to settle."""
     t = recording["timestamp"]
     still = np.abs(recording["actual_qd"]).max(axis=1) < STILL
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
     pairs = zip(edges[::2], edges[1::2] - 1, strict=True)
-    return [slice(a, b + 1) for a, b in pairs if t[b] - t[a] > SETTLING + LEAVING]
+    return [slice(a, b + 1) for a, b in pairs if t[b] - t[a] > settling + LEAVING]
 
 
 def _next_span(recording: Mapping[str, Array], spans: list[slice], pose: Array) -> slice | None:
@@ -73,10 +92,11 @@ def _next_span(recording: Mapping[str, Array], spans: list[slice], pose: Array) 
 
 
 def _rest(
-    recording: Mapping[str, Array], readings: Array, span: slice, pose: Array, number: int
-) -> tuple[Array, ...]:
+    recording: Mapping[str, Array], readings: Array, span: slice, pose: Array, number: int,
+    settling: float,
+) -> tuple[Array, ...]:  # fmt: skip
     t = recording["timestamp"][span]
-    begin, end = t[0] + SETTLING, t[-1] - LEAVING
+    begin, end = t[0] + settling, t[-1] - LEAVING
     seen = readings[(readings[:, 0] >= begin) & (readings[:, 0] <= end)]
     if len(seen) < FEWEST:
         raise RunError(
@@ -107,8 +127,8 @@ def joined(parts: list[Rests]) -> Rests:
     return Rests(*(np.concatenate([getattr(part, name) for part in parts]) for name in fields))
 
 
-def write_log(path: Path, rests: Rests) -> None:
-    """Write rests as a log in the contract's columns."""
+def write_log(path: Path, rests: Rests, joints: bool = True) -> None:
+    """Write rests as a log in the contract's columns, with or without the joints as read."""
     columns = {
         "timestamp": rests.timestamp,
         "target_q": rests.nominal_q,
@@ -119,6 +139,8 @@ def write_log(path: Path, rests: Rests) -> None:
         "measured_position": rests.position,
         "measured_rotation": rests.rotation,
     }
+    if not joints:
+        del columns["actual_q"]
     names: list[str] = []
     for name, values in columns.items():
         names += [name] if values.ndim == 1 else [f"{name}_{i}" for i in range(values.shape[1])]

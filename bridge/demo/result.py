@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bridge.demo.poses import TEST_LOADS, Load
 from bridge.demo.rests import Rests
 from core.identification import Identification
 from core.model import Model
@@ -26,6 +27,14 @@ class LoopFigures:
 
 
 @dataclass(frozen=True)
+class Resolution:
+    """What one count on the wire comes to at the TCP, m: the finest that a link can say."""
+
+    written: float  # of an offset, or of a joint setpoint times the reach
+    read: float  # of the joints as read, times the reach
+
+
+@dataclass(frozen=True)
 class Result:
     """The whole demo."""
 
@@ -39,6 +48,8 @@ class Result:
     setpoints_written: int
     loop: LoopFigures
     duration: float  # s
+    resolution: Resolution = Resolution(0.0, 0.0)
+    test_loads: tuple[Load, ...] = TEST_LOADS
 
     @property
     def error_without(self) -> Array:
@@ -66,6 +77,8 @@ class Result:
                 "with": millimetres(self.error_with),
             },
             "repeatability_mm": self.repeatability * 1e3,
+            "resolution_mm": self.resolution.written * 1e3,
+            "reading_resolution_mm": self.resolution.read * 1e3,
             "setpoints_written": self.setpoints_written,
             "loop": {
                 "rate_hz": self.loop.rate,
@@ -75,6 +88,12 @@ class Result:
             },
             "duration_s": self.duration,
         }
+
+
+def reach(model: Model) -> float:
+    """Return the length of the stretched arm with its tool, m."""
+    links = np.linalg.norm(model.arm.link_in_link[:, :3, 3], axis=1)
+    return float(links.sum() + np.linalg.norm(model.tool_in_flange[:3, 3]))
 
 
 def tcp_error(model: Model, rests: Rests) -> Array:

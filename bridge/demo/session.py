@@ -12,16 +12,15 @@ from numpy.typing import NDArray
 
 from bridge.cell import Cell
 from bridge.daemon import Daemon, settings_of
-from bridge.demo.bench import Bench, Tracker
+from bridge.demo.bench import Tracker
+from bridge.demo.links.link import DemoLink
 from bridge.demo.poses import Load
 from bridge.demo.rests import Rests, rests
 from bridge.demo.result import LoopFigures
-from bridge.demo.trajectory import visits, write_trajectory
 from bridge.summary import RunSummary
 from bridge.supervisor import State
 from core.errors import LinkError, RunError
 from core.log import read_log
-from drivers.simulated.settings import ServerSettings
 
 Array = NDArray[np.float64]
 ATTEMPTS = 3
@@ -31,11 +30,8 @@ MARGIN = 60.0  # s to connect, arm and end, on top of the trajectory
 class Session:
     """Runs of the daemon on one simulated cell, one after the other."""
 
-    def __init__(
-        self, settings: ServerSettings, home: Array, folder: Path, tell: Callable[[str], None]
-    ) -> None:
-        self._settings = settings
-        self._home = home
+    def __init__(self, link: DemoLink, folder: Path, tell: Callable[[str], None]) -> None:
+        self._link = link
         self._folder = folder
         self._tell = tell
         self._runs: list[RunSummary] = []
@@ -47,15 +43,16 @@ class Session:
         one without compensation. A run that breaks off is told and repeated from home. Raises
         RunError where that does not help.
         """
-        longest = write_trajectory(self._folder / "trajectory.csv", visits(self._home, poses))
-        bench = Bench(self._settings)
+        cell = self._link.declared(cell, load)
+        longest = self._link.prepare(self._folder, poses)
+        bench = self._link.bench()
         try:
             bench.hang(load)
             for attempt in range(ATTEMPTS):
                 if attempt:
-                    bench.go(self._home)
+                    bench.go(self._link.home)
                 try:
-                    return self._run(cell, poses, longest)
+                    return self._run(cell, load, poses, longest)
                 except (RunError, LinkError) as error:
                     if attempt == ATTEMPTS - 1:
                         raise
@@ -64,13 +61,13 @@ class Session:
         finally:
             bench.close()
 
-    def _run(self, cell: Cell, poses: Array, longest: float) -> Rests:
+    def _run(self, cell: Cell, load: Load, poses: Array, longest: float) -> Rests:
         daemon = Daemon(settings_of(cell), may_write=True)
         over = threading.Event()
         watch = threading.Thread(target=_watch, args=(daemon, over, longest + MARGIN), daemon=True)
         watch.start()
         try:
-            with Tracker(self._settings) as tracker:
+            with Tracker(self._link.bench()) as tracker, self._link.motion(daemon, poses):
                 summary = daemon.run(arm=True)
         finally:
             over.set()
@@ -78,7 +75,7 @@ class Session:
         if summary.faults or summary.recording is None:
             raise RunError(summary.faults[0] if summary.faults else "nothing was recorded")
         recording = read_log(summary.recording, cell.arm.n)
-        return rests(recording.columns, tracker.readings(), poses)
+        return rests(recording.columns, tracker.readings(), poses, load, self._link.settling)
 
     @property
     def written(self) -> int:

@@ -43,6 +43,11 @@ def show(result: Result, console: Console | None = None) -> None:
         f"with compensation: {ratio:.0f} times smaller; the arm repeats to "
         f"{figures['repeatability_mm']:.3f} mm"
     )
+    if result.resolution.written:
+        console.print(
+            f"one count on the wire is {figures['resolution_mm']:.3g} mm at the TCP as written, "
+            f"{figures['reading_resolution_mm']:.3g} mm as joints are read: no finer than that"
+        )
     console.print(
         f"fitted on {figures['samples']} measured poses; {figures['setpoints_written']} setpoints "
         f"written at {loop['rate_hz']:.1f} Hz, {loop['missed']} of {loop['cycles']} cycles missed, "

@@ -38,6 +38,7 @@ class FrameReader:
         self.error_frames = 0
         self.identifiers: set[int] = set()  # heard at all, for messages
         self._targets = {f.key: f for f in profile.setpoint if f.joints}
+        self._motors = sum(len(incoming.enabled) for incoming in profile.incoming.values())
         self._foreign_wire = np.full(profile.n, np.nan)
 
     def open(self) -> None:
@@ -100,7 +101,7 @@ class FrameReader:
         if frame.is_remote_frame or frame.is_fd or not frame.is_rx:
             return None
         now = time.monotonic()
-        key = (int(frame.arbitration_id), bool(frame.is_extended_id))
+        key = (frame.arbitration_id, frame.is_extended_id)
         self.identifiers.add(key[0])
         if key in self._profile.control:
             self.foreign = Foreign(key, now)
@@ -135,8 +136,7 @@ class FrameReader:
     def enabled(self) -> bool:
         """Return whether every motor has said that it is enabled."""
         told = self.assembler.enabled
-        wanted = sum(len(incoming.enabled) for incoming in self._profile.incoming.values())
-        return len(told) == wanted and all(told.values())
+        return len(told) == self._motors and all(told.values())
 
     @property
     def disabled(self) -> bool:
@@ -146,6 +146,8 @@ class FrameReader:
 
     def trouble(self, writing: bool) -> tuple[str, str]:
         """Return what is wrong with the arm and the words for it; empty where nothing is."""
+        if not self.assembler.troubled:
+            return "", ""
         for (key, signal), (value, trouble, only_writing) in self.assembler.status.items():
             if trouble and (writing or not only_writing):
                 name = self._profile.incoming[key].name
@@ -154,7 +156,11 @@ class FrameReader:
 
     def silent_status(self) -> str:
         """Return the name of a status message that has not come for too long; empty: none."""
-        now = time.monotonic()
+        now, all_heard = time.monotonic(), self.assembler.heard
+        oldest = min(all_heard.values(), default=0.0)
+        complete = len(all_heard) == len(self._profile.incoming)
+        if complete and now - oldest <= self._profile.status_timeout:
+            return ""
         for key, incoming in self._profile.incoming.items():
             heard = self.assembler.heard.get(key)
             if heard is None or now - heard > self._profile.status_timeout:

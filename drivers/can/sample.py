@@ -6,6 +6,7 @@ says so, and with the same count where they carry one. Everything else is droppe
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass
 
@@ -43,6 +44,8 @@ class Assembler:
         self.status: dict[tuple[Key, str], tuple[float, str, bool]] = {}
         self.enabled: dict[tuple[Key, str], bool] = {}
         self.heard: dict[Key, float] = {}  # s, monotonic, of each message that we read
+        self.troubled: set[tuple[Key, str]] = set()  # members of ``status`` that tell of trouble
+        self._seen: dict[Key, bytes] = {}  # last bytes of messages beside the sample
 
     @property
     def broken(self) -> int:
@@ -68,24 +71,34 @@ class Assembler:
         incoming = self._profile.incoming.get(key)
         if incoming is None:
             return None
+        if self._seen.get(key) == data:  # the same bytes say the same: most of an arm's status
+            self.heard[key] = received
+            return None
         try:
             values = incoming.decode(data)
         except ValueError:
             self.dropped["malformed"] += 1
             return None
         self.heard[key] = received
-        self._note(incoming, values)
-        if key not in self._members:
-            self._read(incoming, values)
-            return None
-        return self._collect(incoming, values, stamp, received)
+        if incoming.checks or incoming.enabled:
+            self._note(incoming, values)
+        if key in self._members:
+            return self._collect(incoming, values, stamp, received)
+        self._seen[key] = data
+        self._read(incoming, values)
+        return None
 
     def _note(self, incoming: Incoming, values: dict[str, float]) -> None:
         """Remember what a message says about the arm's health."""
         for check in incoming.checks:
             value = values[check.signal]
-            trouble = check.trouble(int(value)) if np.isfinite(value) else check.otherwise
-            self.status[incoming.key, check.signal] = (value, trouble, check.while_writing)
+            trouble = check.trouble(int(value)) if math.isfinite(value) else check.otherwise
+            place = (incoming.key, check.signal)
+            self.status[place] = (value, trouble, check.while_writing)
+            if trouble:
+                self.troubled.add(place)
+            else:
+                self.troubled.discard(place)
         for signal in incoming.enabled:
             self.enabled[incoming.key, signal] = values[signal] in self._profile.enabled_values
 

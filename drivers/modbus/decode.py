@@ -187,9 +187,11 @@ def check_step(q: Array, before: Array, gap: float, fastest: Array | float) -> N
 
     ``fastest`` is in rad/s, one number or (n,). Raises InvalidStateError.
     """
-    way = np.abs(q - before)
-    if (way > fastest * gap + JITTER).any():
-        joint = int(np.argmax(way))
+    # plain numbers: six of them cost an array more
+    most = [fastest] * len(q) if isinstance(fastest, float | int) else fastest.tolist()
+    way = [abs(now - then) for now, then in zip(q.tolist(), before.tolist(), strict=True)]
+    if any(step > speed * gap + JITTER for step, speed in zip(way, most, strict=True)):
+        joint = way.index(max(way))
         raise InvalidStateError(
             f"position {joint + 1}: found a step of {way[joint]:.4f} rad in {gap:.3f} s"
         )

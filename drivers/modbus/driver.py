@@ -172,8 +172,11 @@ class ModbusDriver(Driver):
             velocity = (q - self._q) / gap if self._q is not None and gap > 0.0 else 0.0 * q
         sent = self._writer.target()
         target = found.get("target", q if sent is None else sent)
-        nothing = np.zeros(3)
-        force = np.concatenate([found.get("force", nothing), found.get("moment", nothing)])
+        force = np.zeros(6)
+        if "force" in found:
+            force[:3] = found["force"]
+        if "moment" in found:
+            force[3:] = found["moment"]
         robot_mode, safety_mode = 7, 1
         for trouble, _ in sample.troubles:
             mode, safety = MODES[trouble]

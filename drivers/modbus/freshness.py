@@ -35,7 +35,8 @@ class Freshness:
         """Return whether a sample with this clock count is not the one before."""
         if self._clock is not None:
             return count != self._count
-        if self._q is None or qd is None or not (np.abs(qd) > MOVING).any():
+        # plain numbers: six of them cost an array more
+        if self._q is None or qd is None or max(map(abs, qd.tolist())) <= MOVING:
             return True
         return not np.array_equal(q, self._q)
 

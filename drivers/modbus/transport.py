@@ -37,11 +37,13 @@ class Transport:
     def __init__(self, settings: ModbusSettings, port: int, device_id: int) -> None:
         self._settings, self._port, self._device = settings, port, device_id
         self._writable: frozenset[tuple[Table, int]] = frozenset()
+        self._allowed: set[tuple[Table, int, int]] = set()  # runs that were looked up before
         self._client: Any = None
 
     def allow(self, compiled: RegisterMap) -> None:
         """Let requests write what the map says, and nothing else."""
         self._writable = compiled.writable
+        self._allowed.clear()
 
     @property
     def name(self) -> str:
@@ -144,12 +146,16 @@ class Transport:
             raise WriteError(str(error)) from None
 
     def _check_allowed(self, table: Table, address: int, values: Sequence[int]) -> None:
+        run = (table, address, len(values))
+        if run in self._allowed:
+            return
         for i in range(len(values)):
             if (table, address + i) not in self._writable:
                 raise WriteError(
                     f"{self.name}: {table} {address + i}: the profile does not allow it to be "
                     "written"
                 )
+        self._allowed.add(run)
 
     # -- one request ------------------------------------------------------------------------------
 

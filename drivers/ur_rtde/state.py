@@ -213,10 +213,11 @@ class StateReader:
         before = self._q
         if before is None:
             return
-        way = np.abs(q - before)
-        if (way > FASTEST * gap + JITTER).any():
+        # plain numbers: six of them cost an array more
+        way = [abs(now - then) for now, then in zip(q.tolist(), before.tolist(), strict=True)]
+        if max(way) > FASTEST * gap + JITTER:
             self._q = None
-            joint = int(np.argmax(way))
+            joint = way.index(max(way))
             raise self._invalid(
                 f"actual_q_{joint}: found a step of {way[joint]:.4f} rad in {gap:.4f} s"
             )

@@ -29,7 +29,8 @@ def space(seed: int, planted=(), size: float = 1.0):
 
 
 def test_noise_has_no_structure_as_often_as_the_probability_says():
-    drawn = np.array([structure_p_value(space(s), FRAME, ()) for s in range(60)])
+    wide = np.linalg.qr(np.random.default_rng(8).normal(size=(ROWS, 35)))[0]
+    drawn = np.array([structure_p_value(space(s), wide, ()) for s in range(60)])
     for level in (0.05, 0.2, 0.5, 0.8):
         spread = np.sqrt(level * (1 - level) / len(drawn))
         assert abs(np.mean(drawn < level) - level) < 4 * spread

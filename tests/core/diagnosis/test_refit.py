@@ -106,5 +106,9 @@ def test_the_told_deviation_is_the_scatter_over_sessions():
 
 
 def test_what_cannot_be_negative_stays_on_its_bound():
-    _, (term,), _, _ = refitted(exact(small.NOMINAL) + 1e-6, [("backlash", 2)])
-    assert 0 <= term.values[0] < 1e-5
+    ahead = small.turned(2, lambda s, q: 2e-4 * s.approach[:, 1])  # play the wrong way round
+    _, (term,), _, _ = refitted(exact(ahead), [("backlash", 2)])
+    assert term.values[0] == 0.0
+    behind = small.turned(2, lambda s, q: -2e-4 * s.approach[:, 1])
+    _, (term,), _, _ = refitted(exact(behind), [("backlash", 2)])
+    assert term.values[0] == pytest.approx(4e-4, abs=1e-8)

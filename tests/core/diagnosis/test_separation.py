@@ -9,12 +9,14 @@ import pytest
 import small_arm as small
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
-from benchmarks.blind.mechanics import Session, stand
+from benchmarks.blind.mechanics import Session, stand, turn
 from benchmarks.blind.session import Plan
 from core.arm import JointLimits
 from core.diagnosis.diagnosis import diagnose
 from core.diagnosis.separation import next_measurements
+from core.effects import CATALOGUE, Site
 from core.log import Log
 from core.metrology import Metrology
 
@@ -176,3 +178,24 @@ def test_an_effect_the_log_cannot_show_is_asked_for_where_it_shows():
     assert {e for m in found.next_measurements for e in m.separates} <= silent
     spread = np.abs(np.array([m.q for m in asked]) - near.q.mean(axis=0)).max(axis=1)
     assert np.all(spread > 0.5)
+    # what the frame, fitted anew on the log, leaves of a gravity of usual size that leans
+    (size, _) = CATALOGUE["gravity_direction"].parameters(model.arm, Site())
+    leaning = small.replace(
+        small.COMPLIANT,
+        gravity=turn(np.array([[size.scale, size.scale, 0.0]]))[0] @ small.NOMINAL.gravity,
+    )
+    for told in asked:
+        there = session_at(told.q, told.payload, np.ones(3))
+        there = small.replace(there, payload_cog=near.payload_cog[-1:])
+        promised = beside_a_frame(leaning, small.COMPLIANT, near, there)
+        assert promised == pytest.approx(
+            told.expected_gain * found.channels[0].noise_floor_rms, rel=0.1
+        )
+
+
+def beside_a_frame(one, other, log: Session, there: Session) -> float:
+    """Return how far (m) two arms differ at a pose once a frame has carried one onto the other."""
+    a, b = stand(one, log).tcp, stand(other, log).tcp
+    turned, _ = Rotation.align_vectors(b - b.mean(axis=0), a - a.mean(axis=0))
+    moved = turned.apply(stand(one, there).tcp - a.mean(axis=0)) + b.mean(axis=0)
+    return float(np.linalg.norm(moved - stand(other, there).tcp))

@@ -1,0 +1,78 @@
+"""CAN: a soft AgileX PiPER; setpoints move the arm, its frames tell the joints alone."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.daemon import Daemon
+from bridge.demo.links.peer import PeerLink
+from bridge.demo.poses import Load, Scene, Workspace
+from bridge.demo.result import Resolution, reach
+from bridge.demo.trajectory import visits, write_trajectory
+from drivers.can.bus import SOCKETCAND_PORT
+from drivers.can.loading import read_profile
+from drivers.can.settings import CanSettings
+from drivers.simulated.plant_arm import plant_arm
+from drivers.simulated.plant_settings import draw_plant_settings
+from drivers.simulated.settings import BENCH_PORT
+
+Array = NDArray[np.float64]
+SOFTNESS = 30.0
+"""How many times softer than the arm that the seed draws (a UR's class, 100 kNm/rad) the PiPER is:
+joints of some 2 to 10 kNm/rad, as small planetary gears are; it hangs by 1 to 3 mm at its rated
+1.5 kg. Its repeatability is the plant's own, 0.05 mm (its maker says 0.1 mm)."""
+
+
+class CanLink(PeerLink):
+    """A PiPER on a CAN bus between processes, by the socketcand protocol."""
+
+    name = "can"
+    template = "can.yaml"
+    files = ("piper.urdf",)
+    ports = (SOCKETCAND_PORT, BENCH_PORT)
+    scene = Scene(
+        workspace=Workspace(
+            lower=(-0.6, 1.0, -2.0, -0.6, 0.1, -0.8), upper=(0.6, 2.3, -0.6, 0.6, 1.1, 0.8),
+            lowest=0.05, nearest=0.22, far=0.35, regular=0.02,
+        ),
+        calibration_loads=(
+            Load("0.5 kg", 0.5),
+            Load("1.5 kg", 1.5, (0.0, 0.0, 0.08)),
+            Load("1 kg at the side", 1.0, (0.06, 0.03, 0.07)),
+        ),
+        test_loads=(
+            Load("1.4 kg", 1.4, (0.01, 0.0, 0.09)),
+            Load("1.2 kg at the side", 1.2, (-0.04, 0.03, 0.07)),
+        ),
+    )  # fmt: skip
+
+    def _hidden(self) -> str:
+        """Return the soft arm's flexibilities, drawn from the seed."""
+        drawn = draw_plant_settings(plant_arm(self.cell.arm), self.seed)
+        axial, radial = (
+            ", ".join(f"{SOFTNESS * v:.9e}" for v in values)
+            for values in (drawn.axial, drawn.radial)
+        )
+        return f"  compliance: {{axial: [{axial}], radial: [{radial}]}}\n"
+
+    def resolution(self) -> Resolution:
+        """Return one count of the joints' frames (0.001 deg) times the reach, both ways."""
+        link = self.cell.link
+        assert isinstance(link, CanSettings)
+        joints = read_profile(link.profile_path, link.installation).joints
+        assert joints.resolution is not None
+        length = reach(self.cell.model)
+        told = float(np.abs(joints.resolution).max()) * length
+        return Resolution(told, told)
+
+    def prepare(self, folder: Path, poses: Array) -> float:
+        """Write the trajectory that the daemon follows; see DemoLink.prepare."""
+        return write_trajectory(folder / "trajectory.csv", visits(self.home, poses))
+
+    def motion(self, daemon: Daemon, poses: Array) -> AbstractContextManager[object]:
+        """Do nothing: the daemon's setpoints move the arm."""
+        return nullcontext()

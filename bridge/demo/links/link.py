@@ -1,0 +1,99 @@
+"""What may differ from link to link in the demo; everything else is one job for all."""
+
+from __future__ import annotations
+
+import socket
+from abc import ABC, abstractmethod
+from contextlib import AbstractContextManager
+from importlib import resources
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.cell import Cell, load_cell
+from bridge.daemon import Daemon
+from bridge.demo.bench import Bench
+from bridge.demo.poses import Load, Scene
+from bridge.demo.rests import SETTLING
+from bridge.demo.result import Resolution
+from bridge.output_file import write_text
+from core.errors import RunError
+
+Array = NDArray[np.float64]
+LAST_HOST = 60  # 127.0.0.2 to this are tried
+
+
+class DemoLink(ABC):
+    """The demo on one link: which arm, how it is served, who moves it, what it can tell."""
+
+    name: ClassVar[str]
+    template: ClassVar[str]  # the cell, a file of this package's parent
+    files: ClassVar[tuple[str, ...]] = ()  # what the cell names, from there too
+    ports: ClassVar[tuple[int, ...]]  # of the simulated controller
+    scene: ClassVar[Scene]
+    settling: ClassVar[float] = SETTLING  # s from standing still until readings count
+    tells_joints: ClassVar[bool] = True  # joints as read are good enough to fit on
+
+    def __init__(self, out: Path, seed: int) -> None:
+        self.seed = seed
+        self.host = free_address(self.ports)
+        self.cell = self._write_cell(out)
+
+    def _write_cell(self, out: Path) -> Cell:
+        """Write the demo's cell, and what it names, into ``out``."""
+        package = resources.files("bridge.demo")
+        for name in (self.template, *self.files):
+            text = package.joinpath(name).read_text(encoding="utf-8")
+            path = out / ("cell.yaml" if name == self.template else name)
+            write_text(path, text.replace("HOST", self.host) if name == self.template else text)
+        return load_cell(out / "cell.yaml")
+
+    @property
+    @abstractmethod
+    def home(self) -> Array:
+        """Return where the arm stands at the start (n,), rad."""
+
+    @abstractmethod
+    def served(self) -> AbstractContextManager[object]:
+        """Serve the simulated controller in a process of its own. Raises LinkError."""
+
+    @abstractmethod
+    def bench(self) -> Bench:
+        """Return a connection to the people and the tracker around the arm."""
+
+    @abstractmethod
+    def resolution(self) -> Resolution:
+        """Return what one count of what is written and read comes to at the TCP."""
+
+    def declared(self, cell: Cell, load: Load) -> Cell:
+        """Return the cell of a run with a load, where the controller is not told of it."""
+        return cell
+
+    @abstractmethod
+    def prepare(self, folder: Path, poses: Array) -> float:
+        """Prepare a motion from home through ``poses`` (M, n) and home; returns its length, s."""
+
+    @abstractmethod
+    def motion(self, daemon: Daemon, poses: Array) -> AbstractContextManager[object]:
+        """Move the arm during a run, where setpoints do not. Raises LinkError at its end."""
+
+
+def free_address(ports: tuple[int, ...]) -> str:
+    """Return a loopback address on which none of ``ports`` is taken. Raises RunError."""
+    for last in range(2, LAST_HOST + 1):
+        host = f"127.0.0.{last}"
+        if all(_is_free(host, port) for port in ports):
+            return host
+    raise RunError(f"found every address from 127.0.0.2 to 127.0.0.{LAST_HOST} taken")
+
+
+def _is_free(host: str, port: int) -> bool:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError:
+            return False
+    return True

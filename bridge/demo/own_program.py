@@ -1,0 +1,81 @@
+"""The robot's own program, where setpoints ride on it: from pose to pose, with a rest at each."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.daemon import Daemon
+from bridge.demo.bench import Bench
+from bridge.supervisor import State
+from core.errors import LinkError
+
+Array = NDArray[np.float64]
+LONGEST_START = 60.0  # s until the daemon writes
+RAMP = 0.8  # s until offsets are in
+REST = 0.6  # s at each pose, from when it is seen to stand
+LONGEST_VISIT = 15.0  # s
+
+
+class OwnProgram(threading.Thread):
+    """Visits poses as soon as the daemon writes, then has the daemon stop."""
+
+    def __init__(
+        self, daemon: Daemon, bench: Callable[[], Bench], home: Array, poses: Array
+    ) -> None:
+        super().__init__(name="robot's own program", daemon=True)
+        self._daemon, self._open, self._home, self._poses = daemon, bench, home, poses
+        self._over = threading.Event()
+        self._error: LinkError | None = None
+
+    def run(self) -> None:
+        """Wait for the daemon, visit the poses and end the run; a lost daemon ends the program."""
+        try:
+            if self._wait_writing():
+                self._visit()
+        except LinkError as error:
+            self._error = error
+        finally:
+            self._daemon.stop()
+
+    def _wait_writing(self) -> bool:
+        latest = time.monotonic() + LONGEST_START
+        while time.monotonic() < latest:
+            if self._daemon.state == State.COMPENSATING:
+                return not self._over.wait(RAMP)
+            if self._over.wait(0.05):
+                return False
+        return False
+
+    def _visit(self) -> None:
+        bench = self._open()
+        try:
+            for pose in (*self._poses, self._home):
+                if not self._daemon.state.writes:
+                    return
+                bench.go(pose)
+                if self._over.wait(REST):
+                    return
+        finally:
+            bench.close()
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._over.set()
+        self.join(LONGEST_VISIT)
+        if self._error is not None and error is None:
+            raise self._error
