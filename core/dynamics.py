@@ -115,6 +115,9 @@ def pieces_of(model: Model, motion: Motion) -> Pieces:
     hand = frames.rotation[:, n]
     payload_at, acceleration = frames.at(n, _times(hand, rows.payload_cog))
     payload_force = acceleration - gravity
+    sensor = _bent_flange(model, motion, frames)
+    in_hand, _ = sensor.at(n, _times(sensor.rotation[:, n], rows.payload_cog))
+    tcp_in_hand = sensor.origin[:, n] + sensor.rotation[:, n] @ chain.tool_position
     tcp = frames.origin[:, n] + hand @ chain.tool_position
     pull, couple = rows.wrench[:, :3], rows.wrench[:, 3:]
     nothing = np.zeros((count, 3))
@@ -122,10 +125,21 @@ def pieces_of(model: Model, motion: Motion) -> Pieces:
         link_torque=link_torque,
         payload_torque=_about_axes(frames, axis, n, payload_at, payload_force, nothing),
         external_torque=-_about_axes(frames, axis, n, tcp, pull, couple),
-        payload_wrench=_at_flange(frames, payload_at, -payload_force, nothing),
-        external_wrench=_at_flange(frames, tcp, pull, couple),
+        payload_wrench=_at_flange(sensor, in_hand, -payload_force, nothing),
+        external_wrench=_at_flange(sensor, tcp_in_hand, pull, couple),
         payload_mass=rows.payload_mass,
     )
+
+
+def _bent_flange(model: Model, motion: Motion, frames: Frames) -> Frames:
+    """Return the frames with the flange turned as the arm bends: a sensor there sees it."""
+    chain = model.chain()
+    if not (chain.compliance.any() or chain.flexibility.any() or chain.base_compliance.any()):
+        return frames
+    bent = model.predict(motion.q, motion.loads).rotation @ chain.tool_rotation.T
+    rotation = frames.rotation.copy()
+    rotation[:, -1] = bent
+    return replace(frames, rotation=rotation)
 
 
 def _times(matrix: Array, vector: Array) -> Array:

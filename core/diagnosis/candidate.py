@@ -93,7 +93,8 @@ def _at(
             | {t.site.order for t in inside if t.site.order is not None}
         )
         # one cycle a turn is a usual period; of others, more than one has to be seen
-        least = CYCLES / max(turns[site.joint - 1], 1e-6) if site.joint else 1.0
+        seen = turns[site.joint - 1] if site.joint and turns else 1.0
+        least = CYCLES / max(seen, 1e-6)
         return [
             Candidate(effect.identifier, Site(site.joint, float(o)), parameters, free)
             for o in orders

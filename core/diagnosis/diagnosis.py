@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from core.diagnosis import position, torque, tracking, wrench
 from core.diagnosis.cause import Cause, Considered, causes_of, considered_of
@@ -99,10 +100,19 @@ def diagnose(
     simulator, row by row, whose values are the prediction instead of the model's. Raises LogError
     where the log cannot be used at all (units, numbers, no channel to look at).
     """
-    metrology = metrology or Metrology()
-    withhold = tuple(withhold)
+    # matrices of this size gain nothing from threads, which wait for each other on a busy machine
+    with threadpool_limits(1, "blas"):
+        metrology = metrology or Metrology()
+        return _diagnose(model, log, metrology, tuple(withhold), progress, observers, simulated)
+
+
+def _diagnose(
+    model: Model, log: Log, metrology: Metrology, withhold: tuple[str, ...],
+    progress: Callable[[str], None] | None, observers: Mapping[str, Observe],
+    simulated: Log | None,
+) -> Diagnosis:  # fmt: skip
     check_units(model, log)
-    told = findings(log)
+    told = findings(log, model, metrology)
     observed: list[ChannelDiagnosis] = []
     hidden: list[NotObservable] = []
     if simulated is not None:

@@ -32,6 +32,7 @@ INSTRUMENTS = 5.0  # times the instrument's sigma, for coarse instruments
 HINT = 0.05  # probability from which a coordinate is suspect once structure is sure
 TRACE = 0.01  # share of an unnamed function from which a coordinate has it
 TOUCH = 0.1  # share of a cause that acts on a coordinate: more than that touches it
+NESTED = ("axial_compliance", "stiffness_nonlinearity")
 LEAST = 0.002  # share of the held-out gap that a cause has to take beside a leftover
 
 
@@ -174,7 +175,8 @@ def _ties(
         names: list[str] = []
         for _, other in rivals(space, found, c, TIE):
             family = space.candidates[other].family
-            if space.candidates[other].named and family != own and family not in names:
+            nested = (own, family) == NESTED  # the curve holds the line: no rival
+            if space.candidates[other].named and family not in (own, *names) and not nested:
                 names.append(family)
         told[position] = tuple(names)
     return told

@@ -49,7 +49,7 @@ def search(space: Space, depth: int = DEPTH, base: Sequence[int] = ()) -> Found:
         again = improve(space, fit(space, tuple(base)), named_only=True)
         named = min([named, again], key=lambda f: f.score)
     joined = [*joined_sets(space, named), *packed(space, named)]
-    simplest = min(joined, key=lambda f: _counted(f, named))
+    simplest = min([named, *joined], key=lambda f: _counted(f, named))
     if _counted(simplest, named) >= named.score:
         return named
     whole = improve(space, unpack(space, beam_search(space, depth)[0]))
@@ -74,7 +74,7 @@ def _deep_search(space: Space, base: Sequence[int]) -> Found:
         again = grown(space, pruned(space, fit(space, tuple(base))), named_only=True)
         found = min([found, pruned(space, again)], key=lambda f: f.score)
     beside = [fit(space, (*found.chosen, c)) for _, c in children(space, found.chosen, 4)]
-    nearest = min(beside, key=lambda f: f.score)
+    nearest = min([found, *beside], key=lambda f: f.score)
     if nearest.score < found.score:
         return nearest  # no named cause goes for an unknown beside them
     sets = [found, *joined_sets(space, found), *packed(space, found)]

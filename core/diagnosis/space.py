@@ -15,6 +15,7 @@ RANK = 1e-10  # share of a block's own size below which a direction counts as al
 SMOOTH_PRICE = 18.0  # what an unnamed function pays beyond a named cause
 MARGIN = 4.0  # what every accusation pays: keeps clean logs clean
 ABSURD = 200.0  # times a parameter's usual size: beyond, a fit is no explanation
+SENSED = ("N", "Nm", "N/s", "Nm/s")  # units of sensor biases, which may have any size
 SHARP = 6000.0  # times the usual softening of a stiffness curve
 USUAL_ORDERS = (1.0, 2.0, 3.0, 4.0)  # eccentricity and its kin
 
@@ -132,6 +133,6 @@ def _plausible(candidate: Candidate, x: Array, s: Array) -> bool:
         if value < parameter.lower - 2.5 * deviation or value > parameter.upper:
             return False
         most = (SHARP if parameter.name == "softening" else ABSURD) * parameter.scale
-        if abs(value) - 3 * deviation > most:
+        if parameter.unit not in SENSED and abs(value) - 3 * deviation > most:
             return False
     return True
