@@ -53,12 +53,15 @@ class DrivesVirtualCase(LinkCase):
 
     @contextmanager
     def served(self, pause: Pause) -> Iterator[Cycles]:
-        """Yield the two sides."""
+        """Yield the two sides, which sleep in between: spinning starves a thread beside."""
         with written(VIRTUAL) as path:
             cell = load_cell(path)
             assert cell.link is not None
             found = simulated_peer(cell, cell.link)
-            with PeerThread(found.peer, found.servers, found.host), _armed(cell, pause) as cycles:
+            with (
+                PeerThread(found.peer, found.servers, found.host),
+                _armed(cell, time.sleep) as cycles,
+            ):
                 yield cycles
 
 

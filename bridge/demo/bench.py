@@ -60,12 +60,13 @@ class Bench:
         self.ask(f"payload {numbers}")
         self.ask("wrench " + " ".join(f"{v:.9g}" for v in load.wrench))
 
-    def go(self, q: Array) -> None:
+    def go(self, q: Array, travel: float = 0.0) -> None:
         """Move the arm to ``q`` (n,) by its own program, and wait until it stands there.
 
-        Raises LinkError where it does not come to rest in time.
+        It is looked at from ``travel`` s on, which it takes at least. Raises LinkError where it does not come to rest in time.
         """
         self._start(q)
+        time.sleep(travel)
         latest, before = time.monotonic() + LONGEST_MOVE, self.measure()
         while time.monotonic() < latest:
             time.sleep(LOOK)

@@ -15,12 +15,21 @@ from bridge.daemon import Daemon
 from bridge.demo.bench import Bench
 from bridge.supervisor import State
 from core.errors import LinkError
+from drivers.simulated.peer import OWN_ACCELERATION, OWN_SPEED
 
 Array = NDArray[np.float64]
 LONGEST_START = 60.0  # s until the daemon writes
 RAMP = 0.8  # s until offsets are in
-REST = 0.6  # s at each pose, from when it is seen to stand
+REST = 0.35  # s at each pose, from when it is seen to stand
 LONGEST_VISIT = 15.0  # s
+
+
+def travel_time(start: Array, goal: Array) -> float:
+    """Return how long (s) the program's joint move takes: a trapezoid of the leading joint."""
+    way = float(np.abs(goal - start).max())
+    if way < OWN_SPEED**2 / OWN_ACCELERATION:
+        return 2.0 * float(np.sqrt(way / OWN_ACCELERATION))
+    return way / OWN_SPEED + OWN_SPEED / OWN_ACCELERATION
 
 
 class OwnProgram(threading.Thread):
@@ -56,10 +65,12 @@ class OwnProgram(threading.Thread):
     def _visit(self) -> None:
         bench = self._open()
         try:
+            here = self._home
             for pose in (*self._poses, self._home):
                 if not self._daemon.state.writes:
                     return
-                bench.go(pose)
+                bench.go(pose, travel_time(here, pose))
+                here = pose
                 if self._over.wait(REST):
                     return
         finally:

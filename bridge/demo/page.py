@@ -148,6 +148,7 @@ def _figures(result: Result) -> str:
         ("age of the state behind a setpoint, p99", f"{loop.p99:.0f} us"),
         ("one count of what is written, at the TCP", _count(result.resolution.written)),
         ("one count of the joints as read, at the TCP", _count(result.resolution.read)),
+        ("what that means", result.resolution.note or "nothing is lost on the wire"),
         ("whole demo", f"{result.duration:.0f} s"),
     )
     rows = "".join(f"<tr><td>{escape(k)}</td><td>{escape(v)}</td></tr>" for k, v in lines)

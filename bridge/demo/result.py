@@ -32,6 +32,7 @@ class Resolution:
 
     written: float  # of an offset, or of a joint setpoint times the reach
     read: float  # of the joints as read, times the reach
+    note: str = ""  # what that means for the result
 
 
 @dataclass(frozen=True)

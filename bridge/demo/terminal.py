@@ -45,8 +45,8 @@ def show(result: Result, console: Console | None = None) -> None:
     )
     if result.resolution.written:
         console.print(
-            f"one count on the wire is {figures['resolution_mm']:.3g} mm at the TCP as written, "
-            f"{figures['reading_resolution_mm']:.3g} mm as joints are read: no finer than that"
+            f"one count written is {figures['resolution_mm']:.3g} mm at the TCP, one count of the "
+            f"joints as read {figures['reading_resolution_mm']:.3g} mm: {result.resolution.note}"
         )
     console.print(
         f"fitted on {figures['samples']} measured poses; {figures['setpoints_written']} setpoints "

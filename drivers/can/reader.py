@@ -66,14 +66,16 @@ class FrameReader:
 
         Raises LinkError where the bus has gone.
         """
-        return self._take(self._receive(timeout))
+        frame = self._receive(timeout)
+        return None if frame is None else self._take(frame, time.monotonic())
 
     def newest(self) -> Sample | None:
         """Take everything that has piled up; returns the newest complete sample of it."""
         newest, until = None, time.monotonic() + BACKLOG_TIME
         while (frame := self._receive(0.0)) is not None:
-            newest = self._take(frame) or newest
-            if time.monotonic() > until:
+            now = time.monotonic()
+            newest = self._take(frame, now) or newest
+            if now > until:
                 break
         return newest
 
@@ -92,15 +94,12 @@ class FrameReader:
         except Exception as error:  # CanError, OSError, serial's, or a broken text on the wire
             raise LinkError(f"{self._settings.where()}: {first_line(error)}") from None
 
-    def _take(self, frame: Any) -> Sample | None:
-        if frame is None:
-            return None
+    def _take(self, frame: Any, now: float) -> Sample | None:
         if frame.is_error_frame:
             self.error_frames += 1
             return None
         if frame.is_remote_frame or frame.is_fd or not frame.is_rx:
             return None
-        now = time.monotonic()
         key = (frame.arbitration_id, frame.is_extended_id)
         self.identifiers.add(key[0])
         if key in self._profile.control:

@@ -21,10 +21,10 @@ from drivers.simulated.plant_settings import draw_plant_settings
 from drivers.simulated.settings import BENCH_PORT
 
 Array = NDArray[np.float64]
-SOFTNESS = 30.0
-"""How many times softer than the arm that the seed draws (a UR's class, 100 kNm/rad) the PiPER is:
-joints of some 2 to 10 kNm/rad, as small planetary gears are; it hangs by 1 to 3 mm at its rated
-1.5 kg. Its repeatability is the plant's own, 0.05 mm (its maker says 0.1 mm)."""
+SOFTNESS = 40.0
+"""How many times softer the PiPER is than what the seed draws, which is an arm of a UR's class. Its
+joints come out at 1 to 10 kNm/rad about their axes, as small planetary gears are, and it hangs by 1
+to 3 mm under 1.4 kg of its rated 1.5. Its repeatability, 0.05 mm, is the plant's own."""
 
 
 class CanLink(PeerLink):
@@ -48,6 +48,7 @@ class CanLink(PeerLink):
             Load("1.4 kg", 1.4, (0.01, 0.0, 0.09)),
             Load("1.2 kg at the side", 1.2, (-0.04, 0.03, 0.07)),
         ),
+        calibrate=13,
     )  # fmt: skip
 
     def _hidden(self) -> str:
@@ -67,7 +68,7 @@ class CanLink(PeerLink):
         assert joints.resolution is not None
         length = reach(self.cell.model)
         told = float(np.abs(joints.resolution).max()) * length
-        return Resolution(told, told)
+        return Resolution(told, told, "finer than the arm repeats")
 
     def prepare(self, folder: Path, poses: Array) -> float:
         """Write the trajectory that the daemon follows; see DemoLink.prepare."""

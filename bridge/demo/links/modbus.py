@@ -40,7 +40,7 @@ class ModbusLink(PeerLink):
         UR10E,
         # near to each other: the robot's own program moves at 0.5 rad/s
         workspace=Workspace(
-            lower=(-0.4, -1.8, 1.3, -2.3, -1.95, -0.4), upper=(0.4, -1.2, 2.0, -1.4, -1.2, 0.4),
+            lower=(-0.3, -1.7, 1.4, -2.2, -1.9, -0.3), upper=(0.3, -1.2, 2.0, -1.5, -1.25, 0.3),
             lowest=0.15, nearest=0.35, far=0.6, regular=0.05,
         ),
         calibration_loads=(
@@ -51,7 +51,7 @@ class ModbusLink(PeerLink):
             Load("12 kg and off", 12.0, (0.01, 0.0, 0.08)),
             Load("8 kg", 8.0, (0.0, 0.02, 0.07)),
         ),
-        calibrate=10, test=3, visits=2,
+        calibrate=8, test=3, visits=3,
     )  # fmt: skip
 
     def resolution(self) -> Resolution:
@@ -62,7 +62,10 @@ class ModbusLink(PeerLink):
         position = profile.state.position
         assert isinstance(profile.write, Mailbox)
         count = abs(position.scale) * UNITS[position.unit][1]
-        return Resolution(profile.write.length_count, count * reach(self.cell.model))
+        return Resolution(
+            profile.write.length_count, count * reach(self.cell.model),
+            "the fit takes the joints that the robot's program was sent to, not those read",
+        )  # fmt: skip
 
     def prepare(self, folder: Path, poses: Array) -> float:
         """Return how long the robot's program may take; see DemoLink.prepare."""
