@@ -29,15 +29,17 @@ from core.errors import InputError
     "--link",
     default="ur_rtde",
     show_default=True,
-    help="Driver by which the simulated cell is reached.",
+    help="Driver by which the simulated cell is reached: ur_rtde, can or modbus.",
 )
 def demo(seed: int, out: Path, link: str) -> None:  # fmt: skip
     """Do the whole job on a simulated cell, no hardware needed.
 
     Connect, measure, calibrate, compensate, diagnose, report: over the real protocol, against a
-    simulated controller whose flexibilities are drawn from the seed and hidden.
+    simulated controller whose flexibilities are drawn from the seed and hidden. A UR10e over RTDE,
+    a soft AgileX PiPER on CAN, or a UR10e whose own program moves it, over Modbus.
 
     Example: gapbridge demo --seed 3
+    Example: gapbridge demo --link can --out out/demo_can
     """
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: found a file, expected a folder for --out")

@@ -63,7 +63,8 @@ class Bench:
     def go(self, q: Array, travel: float = 0.0) -> None:
         """Move the arm to ``q`` (n,) by its own program, and wait until it stands there.
 
-        It is looked at from ``travel`` s on, which it takes at least. Raises LinkError where it does not come to rest in time.
+        It is looked at from ``travel`` s on, which it takes at least. Raises LinkError where it
+        does not come to rest in time.
         """
         self._start(q)
         time.sleep(travel)
