@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import queue
+import signal
 import subprocess
 import sys
 import threading
@@ -14,6 +16,7 @@ from typing import Self
 
 from core.errors import LinkError
 
+PR_SET_PDEATHSIG = 1  # prctl's
 START_LIMIT = 40.0  # s
 STOP_LIMIT = 5.0  # s
 
@@ -34,6 +37,7 @@ class ServedCell:
         self._process = subprocess.Popen(
             self._command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT, text=True, env=environment, start_new_session=True,
+            preexec_fn=_end_with_parent,
         )  # fmt: skip
         lines: queue.Queue[str] = queue.Queue()
         threading.Thread(target=self._read, args=(lines,), daemon=True).start()
@@ -77,3 +81,9 @@ class ServedCell:
         trace: TracebackType | None,
     ) -> None:
         self._stop()
+
+
+def _end_with_parent() -> None:
+    """Have the kernel end the controller with the demo, however that ends: ports stay free."""
+    if sys.platform.startswith("linux"):
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)

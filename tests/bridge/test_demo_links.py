@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import subprocess
 import sys
 import time
@@ -24,6 +25,7 @@ from drivers.simulated.kinematics import within_limits
 from drivers.simulated.motion import MoveJoints
 from drivers.simulated.peer import OWN_ACCELERATION, OWN_SPEED
 from drivers.simulated.plant_arm import plant_arm
+from drivers.simulated.settings import BENCH_PORT
 
 ROOT = Path(__file__).parents[2]
 PEERS = ("can", "modbus")
@@ -154,3 +156,29 @@ def test_the_demo_shows_on_every_link_what_it_promises(name: str, tmp_path: Path
     assert diagnosis["verdict"] != "no_gap"
     assert len(read_log(out / "calibration.csv", 6)) == summary["samples"]
     assert "bending drawn" in (out / "report.html").read_text()
+
+
+def test_a_demo_that_is_killed_leaves_no_controller_behind(tmp_path: Path) -> None:
+    script = (
+        "import sys, time; from pathlib import Path; from bridge.demo.links import LINKS\n"
+        "link = LINKS['can'](Path(sys.argv[1]), 1)\n"
+        "with link.served():\n    print(link.host, flush=True); time.sleep(60)\n"
+    )
+    demo = subprocess.Popen(
+        [sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert demo.stdout is not None
+    host = demo.stdout.readline().strip()
+    with socket.create_connection((host, BENCH_PORT), timeout=5):
+        demo.kill()
+        demo.wait()
+    demo.stdout.close()
+    until = time.monotonic() + 10
+    while time.monotonic() < until:
+        try:
+            socket.create_connection((host, BENCH_PORT), timeout=5).close()
+        except OSError:
+            return
+        time.sleep(0.1)
+    pytest.fail("the simulated controller still serves")
