@@ -18,6 +18,7 @@ from benchmarks.evidence.measured import distances, published, registered, split
 from bridge.cell import load_cell
 from core.diagnosis.diagnosis import Diagnosis, diagnose
 from core.log import Log, read_log
+from core.metrology import Metrology
 from core.model import Model
 
 SETS = ("tsinghua_ur5_grid", "barrett_wam_grid", "ipa_ur10_a", "ipa_ur10_b")
@@ -30,7 +31,7 @@ def told(what: str, far: np.ndarray) -> None:
     print(f"  {what:28s} mean {far.mean() * 1e3:8.4f}   rms {rms * 1e3:8.4f}", flush=True)
 
 
-def with_effects(model: Model, diagnosis: Diagnosis) -> Model:
+def with_effects(diagnosis: Diagnosis) -> Model:
     """Return the model that `--apply` writes; prints the causes."""
     for channel in diagnosis.channels:
         for cause in channel.causes:
@@ -40,12 +41,12 @@ def with_effects(model: Model, diagnosis: Diagnosis) -> Model:
     return diagnosis.model
 
 
-def report(name: str, cell_model: Model, learned: Log, checked: Log, metrology: object) -> None:
+def report(name: str, cell_model: Model, learned: Log, checked: Log, metrology: Metrology) -> None:
     start = time.perf_counter()
-    found = diagnose(cell_model, learned, metrology)  # type: ignore[arg-type]
+    found = diagnose(cell_model, learned, metrology)
     seconds = time.perf_counter() - start
     print(f"{name}: {len(learned)} rows diagnosed in {seconds:.0f} s, {len(checked)} checked")
-    model = with_effects(cell_model, found)
+    model = with_effects(found)
     told("cell's model", distances(cell_model, checked, registered(cell_model, learned)))
     told("with the found effects", distances(model, checked, registered(model, learned)))
 

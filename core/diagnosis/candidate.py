@@ -44,6 +44,11 @@ class Candidate:
         """Return whether this is a member of the catalogue."""
         return self.family != "smooth"
 
+    @property
+    def by_own_angle(self) -> bool:
+        """Return whether this is a smooth function of the very joint that it moves."""
+        return bool(self.target) and self.target == own_target(self.quantity)
+
     def term(self, x: Array) -> Term:
         """Return the term with fitted values ``x`` (d,)."""
         if self.curve is not None:
@@ -51,6 +56,12 @@ class Candidate:
         free = iter(float(v) for v in x)
         values = tuple(next(free) if f is None else f for f in self.fixed)
         return Term(self.family, self.site, values)
+
+
+def own_target(quantity: str) -> str:
+    """Return the joint whose angle the quantity is, as smooth targets are named ('' if none)."""
+    stem, _, index = quantity.rpartition("_")
+    return f"joint_{int(index) + 1}" if stem in ("actual_q", "target_q") else ""
 
 
 def named_candidates(

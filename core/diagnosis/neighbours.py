@@ -134,11 +134,9 @@ def unpack(space: Space, found: Found) -> Found:
     """
     for c in found.chosen:
         candidate = space.candidates[c]
+        if not candidate.by_own_angle:
+            continue
         joint = candidate.target.removeprefix("joint_")
-        if candidate.named or not joint.isdigit():
-            continue
-        if candidate.quantity.rpartition("_")[2] != str(int(joint) - 1):
-            continue
         rest = tuple(o for o in found.chosen if o != c)
         found = min([found, *_lines(space, rest, int(joint))], key=lambda f: f.score)
     return found
@@ -157,9 +155,7 @@ def packed(space: Space, found: Found) -> list[Found]:
             continue
         rest = tuple(c for c in found.chosen if c not in own)
         for c, candidate in enumerate(space.candidates):
-            if candidate.target == f"joint_{joint}" and candidate.quantity.endswith(
-                f"l_q_{int(joint or 0) - 1}"
-            ):
+            if candidate.by_own_angle and candidate.target == f"joint_{joint}":
                 sets.append(fit(space, (*rest, c)))
     return sorted(sets, key=lambda f: f.score)[:4]
 

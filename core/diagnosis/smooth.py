@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arm import Arm
-from core.diagnosis.candidate import Candidate
+from core.diagnosis.candidate import Candidate, own_target
 from core.diagnosis.observation import Observation
 from core.effects import Parameter, Site
 
@@ -30,7 +30,7 @@ def smooth_candidates(observation: Observation, arm: Arm) -> list[Pair]:
         if len(np.unique(z)) > 2:
             shapes.append(spline_basis(z))
         for target, directions in targets.items():
-            own = target == _own_target(name)
+            own = target == own_target(name)
             for shape in shapes:
                 full = np.hstack([np.ones((len(z), 1)), shape]) if own else shape
                 found.append(_spread(name, target, directions, full))
@@ -41,12 +41,6 @@ def smooth_candidates(observation: Observation, arm: Arm) -> list[Pair]:
     for target, columns in observation.unnamed():
         found.append((_candidate("", target, columns.shape[-1]), columns))
     return found
-
-
-def _own_target(name: str) -> str:
-    """Return the joint whose angle the quantity is."""
-    stem, _, index = name.rpartition("_")
-    return f"joint_{int(index) + 1}" if stem in ("actual_q", "target_q") else ""
 
 
 def _targets(observation: Observation, arm: Arm) -> dict[str, Array]:
