@@ -7,10 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.observation import NotObservable, Observation
+from core.diagnosis.observation import NotObservable, Observation, Predict
 from core.diagnosis.unnamed import unnamed_rivals
 from core.effects import Term
 from core.identification import pose_groups
+from core.loads import Loads
 from core.log import Log
 from core.metrology import Metrology
 from core.model import Model
@@ -38,10 +39,8 @@ def observe(
         return NotObservable("position", ("actual_q",))
     q = log.require("actual_q", "target_q")
     turned = log.get("measured_rotation")
-    good = np.isfinite(measured).all(axis=1)
-    if turned is not None:
-        good &= np.isfinite(turned).all(axis=1)
-    rows = np.flatnonzero(good)
+    whole_pose = measured if turned is None else np.hstack([measured, turned])
+    rows = np.flatnonzero(np.isfinite(whole_pose).all(axis=1))
     if not len(rows):
         return NotObservable("position", ("measured_position",))
     q, measured, loads = q[rows], measured[rows], log.loads()[rows]
@@ -51,14 +50,6 @@ def observe(
         frame = IDENTITY if metrology.registered else register_robustly(measured, poses.position)
     in_base = frame.in_base(measured)
     reference = None if rotation is None else frame.rotation_in_base(rotation)
-
-    def predict(terms: Sequence[Term]) -> Array:
-        real = model.with_terms(terms).predict(q, loads)
-        if reference is None:
-            return real.position
-        # rotations as small vectors against the measured ones, so that gaps simply subtract
-        off = rotation_vector(real.rotation @ np.swapaxes(reference, 1, 2))
-        return np.hstack([real.position, off])
 
     k = 3 if reference is None else 6
     value = in_base if reference is None else np.hstack([in_base, np.zeros((len(rows), 3))])
@@ -78,7 +69,7 @@ def observe(
         channel="position",
         unit="m",
         measured=value,
-        predict=predict,
+        predict=_prediction(model, q, loads, reference),
         nuisance=nuisance,
         weight=np.repeat([1.0, LEVER], 3)[:k],
         sigma=float(np.hypot(metrology.sigma, metrology.repeatability or 0.0)),
@@ -93,6 +84,20 @@ def observe(
         tool_axes=poses.rotation,
         rebase=None if metrology.registered else rebase,
     )
+
+
+def _prediction(model: Model, q: Array, loads: Loads, reference: Array | None) -> Predict:
+    """Return terms -> positions (N, 3), with rotations as vectors off ``reference`` (N, 6)."""
+
+    def predict(terms: Sequence[Term]) -> Array:
+        real = model.with_terms(terms).predict(q, loads)
+        if reference is None:
+            return real.position
+        # rotations as small vectors against the measured ones, so that gaps simply subtract
+        off = rotation_vector(real.rotation @ np.swapaxes(reference, 1, 2))
+        return np.hstack([real.position, off])
+
+    return predict
 
 
 def quantities(log: Log, rows: NDArray[np.int64]) -> dict[str, Array]:
