@@ -105,4 +105,8 @@ def _measurement(m: Measurement) -> str:
     came = ""
     if m.approach:
         came = f", last motions {' '.join(f'{a:+d}' for a in m.approach)}"
+    if m.velocity and m.acceleration:
+        speeds = ", ".join(f"{v:.2f}" for v in m.velocity)
+        came += f", in motion at [{speeds}] rad/s"
+        came += f" and [{', '.join(f'{a:.1f}' for a in m.acceleration)}] rad/s2"
     return f"q = [{q}] rad with {m.payload:.3g} kg{came}: {purpose}"

@@ -80,26 +80,44 @@ def _next(measurements: tuple[Measurement, ...]) -> str:
         return head + paragraph(
             "No question is open that another pose under another load would settle."
         )
-    approach = any(m.approach for m in measurements)
+    approach, moving = (
+        any(m.approach for m in measurements),
+        any(m.velocity for m in measurements),
+    )
     rows = []
     for i, m in enumerate(measurements[:SHOWN], start=1):
-        q = ", ".join(f"{v + 0.0:.1f}".replace("-", "−") for v in np.rad2deg(m.q).round(1))
-        row: list[Cell] = [str(i), q, number(m.payload),
+        row: list[Cell] = [str(i), _degrees(m.q, 1), number(m.payload),
                            _purpose(m), f"{number(m.expected_gain, 2)} × noise"]  # fmt: skip
+        if moving:
+            row.insert(2, _motion(m))
         if approach:
             signs = " ".join({1: "+", -1: "−"}.get(a, "0") for a in m.approach or ())
             row.insert(2, signs or "any")
         rows.append(row)
     heads = ["", "joint angles (deg)", "load (kg)", "decides", "expected difference"]
+    if moving:
+        heads.insert(2, "in motion (deg/s; deg/s²)")
     if approach:
         heads.insert(2, "reach each joint from")
     text = (
-        "Move to these poses with these loads and add the rows to the log. Check each for free "
+        "Move to these poses with these loads and add the rows to the log"
+        f"{'; record a motion through those with a speed' if moving else ''}. Check each for free "
         "space first: the poses keep the joint limits, but nothing here knows your cell."
     )
     more = len(measurements) - SHOWN
     end = paragraph(f"{more} more stand in the JSON.", "note") if more > 0 else ""
     return head + paragraph(text) + table(heads, rows) + end
+
+
+def _degrees(values: tuple[float, ...], digits: int) -> str:
+    told = (f"{v + 0.0:.{digits}f}" for v in np.rad2deg(values).round(digits))
+    return ", ".join(told).replace("-", "−")
+
+
+def _motion(m: Measurement) -> str:
+    if m.velocity is None or m.acceleration is None:
+        return "at rest"
+    return f"{_degrees(m.velocity, 0)}; {_degrees(m.acceleration, 0)}"
 
 
 def _purpose(m: Measurement) -> str:

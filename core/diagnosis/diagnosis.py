@@ -22,6 +22,7 @@ from core.diagnosis.suspicion import check_units, findings
 from core.effects import Term
 from core.errors import LogError
 from core.log import Log
+from core.log_columns import COLUMNS, misspelt
 from core.metrology import Metrology
 from core.model import Model
 
@@ -136,7 +137,9 @@ def _diagnose(
         observed.append(_channel(seen, model, withhold, progress))
     if not observed:
         needs = "; ".join(f"{h.channel}: {', '.join(h.needs)}" for h in hidden)
-        raise LogError(f"{log.path}: found no channel to diagnose, expected one of: {needs}")
+        lacking = [need for h in hidden for need in h.needs if need in COLUMNS]
+        hint = misspelt(log.unknown, lacking, log.n)
+        raise LogError(f"{log.path}: found no channel to diagnose, expected one of: {needs}{hint}")
     for channel in observed:
         told += _channel_findings(channel)
     terms = _for_the_model(observed)

@@ -27,6 +27,8 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
                 "separates": list(m.separates),
                 "expected_gain": m.expected_gain,
                 **({"approach": list(m.approach)} if m.approach else {}),
+                **({"velocity": list(m.velocity)} if m.velocity else {}),
+                **({"acceleration": list(m.acceleration)} if m.acceleration else {}),
             }
             for m in diagnosis.next_measurements
         ],

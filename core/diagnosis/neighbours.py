@@ -11,6 +11,7 @@ from core.diagnosis.space import Found, Space, fit, gains
 Array = NDArray[np.float64]
 MERGED = 9  # terms up to which every pair is tried against one
 GROWTH = 30  # terms added to a set at most
+GATHERED = 4.0  # score that one kind of effect at two places may cost beyond two kinds
 BY_ANGLE = ("joint_offset", "transmission_error")  # what a joint does by its own angle alone
 
 
@@ -125,6 +126,24 @@ def rivals(space: Space, found: Found, c: int, within: float) -> list[tuple[floa
         if trial.score <= found.score + within:
             told.append((trial.score - found.score, other))
     return sorted(told)
+
+
+def gathered(space: Space, found: Found) -> Found:
+    """Return the set with as few kinds of effects as fit the data about as well.
+
+    Which kinds are at work is one guess, at which places another: a kind that is there anyway is
+    the simpler guess for a term that could as well be of it.
+    """
+    for c in found.chosen:
+        family = space.candidates[c].family
+        kinds = {space.candidates[o].family for o in found.chosen if o != c}
+        if not space.candidates[c].named or family in kinds:
+            continue
+        for _, other in rivals(space, found, c, GATHERED):
+            if space.candidates[other].named and space.candidates[other].family in kinds:
+                rest = tuple(o for o in found.chosen if o != c)
+                return gathered(space, fit(space, (*rest, other)))
+    return found
 
 
 def unpack(space: Space, found: Found) -> Found:

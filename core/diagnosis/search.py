@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from core.diagnosis.candidate import Candidate
 from core.diagnosis.growing import DEPTH, beam_search, children, projected
-from core.diagnosis.neighbours import grown, improve, joined_sets, packed, pruned, unpack
+from core.diagnosis.neighbours import gathered, grown, improve, joined_sets, packed, pruned, unpack
 from core.diagnosis.space import USUAL_ORDERS, Found, Space, fit, gains
 
 BEST_LINES = 10  # lines of a joint that a search looks at
@@ -30,7 +30,8 @@ def screened_search(space: Space, depth: int = DEPTH, base: Sequence[int] = ()) 
     """Return the best set among the candidates worth a search, in the indices of ``space``."""
     keep = screened(space, base)
     place = {int(c): i for i, c in enumerate(keep)}
-    found = search(part(space, keep), depth, [place[c] for c in base])
+    near = part(space, keep)
+    found = gathered(near, search(near, depth, [place[c] for c in base]))
     return replace(found, chosen=tuple(int(keep[c]) for c in found.chosen))
 
 

@@ -17,8 +17,8 @@ from core.diagnosis.candidate import (
     Candidate,
     joint_quantity,
     named_candidates,
-    named_columns,
 )
+from core.diagnosis.following import exact_columns, followed
 from core.diagnosis.neighbours import pruned
 from core.diagnosis.noise import Noise, estimate_noise
 from core.diagnosis.observation import Observation
@@ -103,7 +103,7 @@ def select(
             for c in named_candidates(arm, observation.channel, withheld, rotation, base, turns)
             if _has_what_it_needs(c, observation)
         ]
-        columns = [named_columns(work.observation, c, base) for c in work.candidates]
+        columns = [exact_columns(work.observation, c, base) for c in work.candidates]
         if turn == 0:
             look_for_wild(work, columns)
         space, raw, nuisance, target = sample_space(work, columns, base, smooth)
@@ -113,6 +113,7 @@ def select(
             space, raw, nuisance, target, best = with_wild_explained(
                 work, columns, base, smooth, (space, raw, nuisance, target, best)
             )
+        best = followed(work, space, best)
         counted, whitened_by = work.kept.copy(), work.noise
         try:
             terms, index, covariance, residual = refit(work, space, best)

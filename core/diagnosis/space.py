@@ -13,7 +13,7 @@ from core.diagnosis.candidate import Candidate
 Array = NDArray[np.float64]
 RANK = 1e-10  # share of a block's own size below which a direction counts as already explained
 SMOOTH_PRICE = 18.0  # what an unnamed function pays beyond a named cause
-MARGIN = 4.0  # what every accusation pays: keeps clean logs clean
+MARGIN = 6.0  # what every accusation pays: keeps clean logs clean
 ABSURD = 200.0  # times a parameter's usual size: beyond, a fit is no explanation
 SENSED = ("N", "Nm", "N/s", "Nm/s")  # units of sensor biases, which may have any size
 SHARP = 6000.0  # times the usual softening of a stiffness curve

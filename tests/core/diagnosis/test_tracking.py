@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from core.arm import builtin_arm
+from core.diagnosis.diagnosis import diagnose
 from core.diagnosis.observation import NotObservable
 from core.diagnosis.tracking import encoder_step, observe
 from core.effects import Site, Term
@@ -113,3 +114,23 @@ def test_what_is_lacking_is_named():
     assert observe(MODEL, truth.log_of(N, actual_q=q), METROLOGY) == NotObservable(
         "tracking", ("target_q",)
     )
+
+
+@pytest.mark.parametrize("effect", ["latency", "tracking_lag"])
+def test_a_delay_is_not_taken_for_a_lag_nor_a_lag_for_a_delay(effect):
+    """To first order they are the same, so that a search by slopes alone stays with either."""
+    t, sway, late = np.arange(0, 20, 0.02), 0.6, 0.015
+    phase = np.linspace(0, 2, N)
+    target = 0.5 * np.sin(sway * t[:, None] + phase)
+    actual = target.copy()
+    if effect == "latency":
+        actual[:, 2] = 0.5 * np.sin(sway * (t - late) + phase[2])
+    else:
+        shrunk, behind = np.hypot(1, sway * late), np.arctan(sway * late)
+        actual[:, 2] = 0.5 / shrunk * np.sin(sway * t + phase[2] - behind)
+    actual += np.random.default_rng(5).normal(0, 2e-5, actual.shape)
+    found = diagnose(MODEL, truth.log_of(N, timestamp=t, actual_q=actual, target_q=target))
+    (cause,) = found.channels[0].causes
+    assert (cause.effect, cause.joints, cause.indistinguishable_from) == (effect, (3,), ())
+    assert found.verdict == "explained"
+    assert cause.parameters[0].value == pytest.approx(late, rel=0.01)

@@ -1,0 +1,64 @@
+"""What to record next: motions that tell apart what a slow recording leaves open."""
+
+from __future__ import annotations
+
+import moving_truth as truth
+import numpy as np
+import pytest
+
+from core.arm import builtin_arm
+from core.diagnosis.diagnosis import diagnose
+from core.diagnosis.document import document
+from core.model import Model
+
+N = 6
+MODEL = Model(builtin_arm("ur5e"))
+DELAY = 0.015  # s
+SLOW = 0.2  # rad/s of the sway
+
+
+@pytest.fixture(scope="module")
+def slow():
+    """A recording so slow that a delayed joint and a lagging one look alike."""
+    t = np.arange(0, 20, 0.02)
+    phase = np.linspace(0, 2, N)
+
+    def at(time):
+        return 0.5 * np.sin(SLOW * time[:, None] + phase)
+
+    late = at(t)
+    late[:, 2] = at(t - DELAY)[:, 2]
+    late += np.random.default_rng(5).normal(0, 2e-5, late.shape)
+    return diagnose(MODEL, truth.log_of(N, timestamp=t, actual_q=late, target_q=at(t)))
+
+
+def test_a_delay_or_a_lag_in_slow_motion_is_told_as_a_tie(slow):
+    (cause,) = slow.channels[0].causes
+    assert {cause.effect, *cause.indistinguishable_from} == {"latency", "tracking_lag"}
+    assert cause.joints == (3,)
+
+
+def test_the_motion_asked_for_is_one_the_arm_can_make_and_quicker_than_the_recording(slow):
+    asked = [m for m in slow.next_measurements if len(m.separates) == 2]
+    assert asked
+    for told in asked:
+        assert np.all(np.abs(told.velocity) <= MODEL.arm.limits.velocity)
+        began = np.array(told.velocity) - 0.5 * np.array(told.acceleration)
+        assert np.all(np.abs(began) <= MODEL.arm.limits.velocity * 1.000001)
+        assert abs(told.acceleration[2]) > 3 * 0.5 * SLOW**2  # the recording's own hardest, thrice
+        assert told.expected_gain > 1
+
+
+def test_the_expected_gain_is_what_the_two_explanations_come_to_there(slow):
+    """To second order a lag T runs T**2 qdd / 2 off a delay of the same T."""
+    asked = next(m for m in slow.next_measurements if len(m.separates) == 2)
+    floor = slow.channels[0].noise_floor_rms
+    assert asked.expected_gain == pytest.approx(
+        0.5 * DELAY**2 * abs(asked.acceleration[2]) / floor, rel=0.25
+    )
+
+
+def test_speed_and_acceleration_stand_in_the_document(slow):
+    told = [m for m in document(slow)["next_measurements"] if len(m["separates"]) == 2]
+    assert told
+    assert all(len(m["velocity"]) == len(m["acceleration"]) == N for m in told)
