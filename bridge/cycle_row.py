@@ -34,3 +34,10 @@ def fill_row(
     row[slices["nominal_q"]] = nominal_q
     row[slices["corrected_q"]] = corrected_q
     row[slices["offset"]] = offset_in_base
+    at = slices["received"].start
+    row[at] = state.received
+    at = slices["robot_mode"].start
+    row[at : at + 5] = (
+        state.robot_mode, state.safety_mode, state.runtime_state, state.safety_status_bits,
+        state.speed_scaling,
+    )  # fmt: skip

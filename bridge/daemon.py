@@ -23,7 +23,7 @@ from bridge.daemon_settings import DaemonSettings
 from bridge.loop import LONGEST_STOP, Exit
 from bridge.loop_process import LoopProcess
 from bridge.recorder import Recorder
-from bridge.shared_page import Command
+from bridge.shared_page import Command, Page
 from bridge.summary import RunSummary, Tally
 from bridge.supervisor import State
 from core.errors import CellError, InputError, LinkError
@@ -92,6 +92,8 @@ class Daemon:
     ) -> None:
         self._settings = settings
         self._n = load_cell(settings.cell).arm.n
+        self._page = Page(self._n)  # one for the whole run, whatever becomes of the loops
+        self._reader = self._page.reader()
         self._may_write, self._say = may_write, say
         self._recorder = Recorder(settings.recording, self._n)
         self._tally = Tally(self._n, settings.link.rate)
@@ -100,7 +102,6 @@ class Daemon:
         self._faults: list[str] = []
         self._refused = False  # writing was asked for and could not begin
         self._seen = False  # a state has been read, by this or a former loop
-        self._lost = 0
         self._restarts = 0
         self._wait = settings.backoff[0]
         self._last_state = State.DISCONNECTED
@@ -154,13 +155,16 @@ class Daemon:
             return self._summary()
         finally:
             self._recorder.close()
+            self._page.close()
 
     def _run_loop(self, arm: bool, duration: float | None) -> None:
         """Run one process of the loop to its end."""
         output = self._recorder.output
         self._failure = {}
         log: Any = output if output is not None else -3  # subprocess.DEVNULL
-        loop = self._loop = LoopProcess(self._settings, self._n, arm, self._may_write, log)
+        loop = self._loop = LoopProcess(
+            self._settings, self._page, arm, self._may_write, log, self._restarts
+        )
         stop_by = None
         first_cycle = None
         try:
@@ -190,9 +194,7 @@ class Daemon:
 
     def _take(self, loop: LoopProcess) -> None:
         """Take cycles and events over from the loop."""
-        rows = loop.page.drain()
-        self._lost += loop.page.lost
-        loop.page.lost = 0
+        rows = self._reader.drain()
         self._last_state = State(loop.page.state)
         self._tally.add(rows)
         self._recorder.write(rows)
@@ -241,7 +243,7 @@ class Daemon:
         summary = RunSummary(
             **self._tally.figures(),
             restarts=self._restarts,
-            lost_rows=self._lost,
+            lost_rows=self._reader.lost,
             faults=tuple(self._faults),
             state=state.name.lower(),
             exit_code=1 if wrong else 0,

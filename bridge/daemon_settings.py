@@ -6,7 +6,9 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from bridge.metrics.settings import MetricsSettings
 from bridge.settings import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
+from bridge.web.settings import WebSettings
 from drivers.ft_sensor.settings import AnyFtSensor
 from drivers.ur_rtde.settings import UrRtdeSettings
 
@@ -26,6 +28,8 @@ class DaemonSettings(BaseModel):
     limits: LimitSettings = Field(default_factory=LimitSettings)
     setpoints: SetpointSettings = Field(default_factory=SetpointSettings)
     recording: RecordingSettings = Field(default_factory=RecordingSettings)
+    web: WebSettings | None = None
+    metrics: MetricsSettings | None = None
     hang_timeout: float = Field(
         1.0, gt=0.0, description="s without a heartbeat after which the loop's process is ended"
     )

@@ -60,7 +60,9 @@ class Loop:
         source: Source,
         page: Page,
         tell: Tell,
+        number: int = 0,
     ) -> None:
+        self._number = number  # which process of the loop this is, from 0
         self._settings, self._driver, self._source = settings, driver, source
         self._page, self._tell = page, tell
         self._stream = SetpointStream(model, settings.limits, driver.rate)
@@ -150,10 +152,12 @@ class Loop:
         self._check_robot(state)
         loads = self._loads.update(state)
         if self._supervisor.state == State.ARMED and self._start(state, own):
+            self._record(state, missed, own, loads, None)
             return  # the state is old by now
         holding = self._supervisor.state == State.HOLDING
-        written = self._write(state, own, loads) if self._supervisor.state.writes else None
-        self._record(state, missed, own, loads, written)
+        writes = self._supervisor.state.writes
+        written = self._write(state, own, loads) if writes else None
+        self._record(state, missed, own, loads, written, writes)
         if written is not None and holding and self._at_rest(written, state):
             self._release()  # takes a moment: after the cycle has been timed
             self._supervisor.take(Cause.RAMPED_OUT)
@@ -223,6 +227,7 @@ class Loop:
             setpoint = self._stream.advance(state, source_q, loads, 0.0 if holding else 1.0)
             self._driver.write_setpoint(setpoint)
         except LimitError as error:
+            self._stream.forget()
             self._supervisor.take(Cause.SETPOINT_REFUSED, str(error))
             if not self._supervisor.state.writes:
                 self._release()
@@ -280,8 +285,9 @@ class Loop:
         self._clock.skip()
 
     def _record(
-        self, state: RobotState, missed: int, own: Vector, loads: Loads, setpoint: Setpoint | None
-    ) -> None:
+        self, state: RobotState, missed: int, own: Vector, loads: Loads,
+        setpoint: Setpoint | None, attempted: bool = False,
+    ) -> None:  # fmt: skip
         page, stream = self._page, self._stream
         if setpoint is None:
             correction = stream.correct(own, loads)
@@ -297,6 +303,11 @@ class Loop:
         row[6] = time.monotonic() - state.received
         row[7] = stream.clamped if setpoint is not None else 0
         row[8] = stream.residual
+        slices = page.slices
+        row[slices["own_q"]] = own
+        row[slices["flags"].start] = 0.0
+        at = slices["attempted"].start
+        row[at : at + 4] = (attempted, stream.ramp_time, self._driver.rate, self._number)
         page.publish()
         self._source.tell(
             Told(

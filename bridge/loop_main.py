@@ -68,7 +68,7 @@ def _run(order: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Exit:
     if settings.ft_sensor is not None:
         driver = DriverWithSensor(driver, settings.ft_sensor, model)
     source = make_source(settings.setpoints, model.arm.n, driver.moves_arm, settings.cell.parent)
-    loop = Loop(settings, model, driver, source, page, tell)
+    loop = Loop(settings, model, driver, source, page, tell, order["number"])
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: setattr(loop, "stop_requested", True))
     _end_with_parent(order["parent"])

@@ -13,6 +13,7 @@ from typing import IO, Any
 from bridge.daemon_settings import DaemonSettings
 from bridge.loop import Exit
 from bridge.shared_page import Command, Page, Phase
+from bridge.side_process import environment
 
 STARTING_LIMIT = 180.0  # s: imports and, the first time, compilation
 ENDING_LIMIT = 2.0  # s
@@ -20,19 +21,21 @@ _LONGEST_LINE = 65536
 
 
 class LoopProcess:
-    """One process of the loop, from its start to its end."""
+    """One process of the loop, from its start to its end; ``number`` counts them from 0."""
 
     def __init__(
-        self, settings: DaemonSettings, n: int, arm: bool, may_write: bool, log: IO[Any] | int
-    ) -> None:
-        self.page = Page(n)
+        self, settings: DaemonSettings, page: Page, arm: bool, may_write: bool,
+        log: IO[Any] | int, number: int = 0,
+    ) -> None:  # fmt: skip
+        page.renew()
+        self.page = page
         self._settings = settings
         self._events, theirs = os.pipe()
         os.set_blocking(self._events, False)
         self._rest = b""
         self.started = time.monotonic()
         order = {
-            "settings": settings.model_dump(mode="json"), "n": n, "arm": arm,
+            "settings": settings.model_dump(mode="json"), "n": page.n, "arm": arm, "number": number,
             "may_write": may_write, "page": self.page.fd, "events": theirs, "parent": os.getpid(),
         }  # fmt: skip
         try:
@@ -40,7 +43,7 @@ class LoopProcess:
             # in a session of its own, so that a Ctrl-C reaches it through the daemon only
             self._process = subprocess.Popen(
                 [sys.executable, "-X", "faulthandler", "-m", "bridge.loop_main"],
-                stdin=subprocess.PIPE, stdout=log, stderr=log, env=_environment(),
+                stdin=subprocess.PIPE, stdout=log, stderr=log, env=environment(),
                 pass_fds=(self.page.fd, theirs), start_new_session=True,
             )  # fmt: skip
         finally:
@@ -101,7 +104,6 @@ class LoopProcess:
         """Give everything back; ends the process where it still lives."""
         self.kill()
         os.close(self._events)
-        self.page.close()
 
     def describe_end(self) -> str:
         """Return in words how it ended."""
@@ -112,12 +114,3 @@ class LoopProcess:
             return f"was ended by {signal.Signals(-code).name}"
         known = {e.value: e.name.lower() for e in Exit}
         return f"ended with {code} ({known.get(code, 'unknown')})"
-
-
-def _environment() -> dict[str, str]:
-    """Return the environment with this interpreter's import path, and one thread for algebra."""
-    environment = dict(os.environ)
-    environment["PYTHONPATH"] = os.pathsep.join(p for p in sys.path if p)
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        environment[name] = "1"
-    return environment

@@ -101,6 +101,15 @@ class SetpointStream:
         self._ramp, self._last, self.clamped = ramp, state.timestamp, limited.clamped
         return Setpoint(limited.q, nominal, limited.offset_in_base, state.timestamp, state.received)
 
+    def forget(self) -> None:
+        """Solve the next correction from nothing: a refused setpoint leaves no trace in it."""
+        self._compensator.forget()
+
+    @property
+    def ramp_time(self) -> float:
+        """Return the time that ramps take now at least, s."""
+        return self._ramp_time
+
     @property
     def is_bare(self) -> bool:
         """Return whether no offset is left."""

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, TypeAdapter, field_validator
 
+from bridge.recording.settings import RecordingSettings as RecordingSettings
 from drivers.can.settings import CanSettings
 from drivers.canopen.settings import CanopenSettings
 from drivers.modbus.settings import ModbusSettings
@@ -108,14 +109,3 @@ class SetpointSettings(BaseModel):
         if not (value == "localhost" or value.startswith("127.")):
             raise ValueError("expected a loopback address (127.x.x.x)")
         return value
-
-
-class RecordingSettings(BaseModel):
-    """Section ``recording``: where cycles are written to."""
-
-    model_config = _FROZEN
-
-    folder: Path | None = Field(
-        Path("recordings"), description="one CSV per run goes here; null: record nothing"
-    )
-    every: int = Field(1, ge=1, description="record every so manieth cycle")

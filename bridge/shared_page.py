@@ -1,8 +1,9 @@
-"""Memory shared by the loop's process and its parent: heartbeat, commands, cycles.
+"""Memory shared by the loop's process, its parent and who reads along: heartbeat, commands, cycles.
 
-One writer for each word, 8 bytes each, and no locks: whichever side dies, stands still or is
-killed, the other goes on. Cycles go through a ring; each row begins with its own number, so that a
-reader knows a row that is not whole, or was overwritten.
+One page lives as long as the daemon; processes of the loop come and go. One writer for each word, 8
+bytes each, and no locks: whichever side dies, stands still or is killed, the others go on. Cycles
+go through a ring; each row begins with its own number, so that a reader knows a row that is not
+whole, or was overwritten. Who only reads gets a descriptor that cannot be written to.
 """
 
 from __future__ import annotations
@@ -53,6 +54,9 @@ def slices_of(n: int) -> dict[str, slice]:
         ("joint_temperatures", n), ("payload", 1), ("payload_cog", 3),
         ("actual_TCP_force", 6), ("ft_raw_wrench", 6),
         ("nominal_q", n), ("corrected_q", n), ("offset", 6),
+        ("received", 1), ("flags", 1), ("robot_mode", 1), ("safety_mode", 1),
+        ("runtime_state", 1), ("safety_status_bits", 1), ("speed_scaling", 1), ("own_q", n),
+        ("attempted", 1), ("ramp_time", 1), ("rate", 1), ("loop", 1),
     ):  # fmt: skip
         found[name] = slice(at, at + size)
         at += size
@@ -60,20 +64,23 @@ def slices_of(n: int) -> dict[str, slice]:
 
 
 class Page:
-    """The shared memory, seen from either side; ``fd`` is handed to the child."""
+    """The shared memory, seen from any side.
 
-    def __init__(self, n: int, fd: int | None = None) -> None:
+    Without ``fd`` it is made; with one it is joined, for reading only unless ``writable``.
+    """
+
+    def __init__(self, n: int, fd: int | None = None, writable: bool = True) -> None:
+        self.n = n
         self.slices = slices_of(n)
-        width = self.slices["offset"].stop
-        size = 8 * (WORDS + ROWS * width)
+        self.width = max(part.stop for part in self.slices.values())
+        size = 8 * (WORDS + ROWS * self.width)
         self.fd = _anonymous(size) if fd is None else fd
-        self._map = mmap.mmap(self.fd, size)
+        access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
+        self._map = mmap.mmap(self.fd, size, access=access)
         self._words = np.frombuffer(self._map, np.int64, WORDS)
         self._times = np.frombuffer(self._map, np.float64, WORDS)
-        self._rows = np.frombuffer(self._map, np.float64, ROWS * width, 8 * WORDS)
-        self._rows = self._rows.reshape(ROWS, width)
-        self._read = 0
-        self.lost = 0  # rows overwritten before they were read
+        rows = np.frombuffer(self._map, np.float64, ROWS * self.width, 8 * WORDS)
+        self._rows = rows.reshape(ROWS, self.width)
 
     # -- the loop's side --------------------------------------------------------------------------
 
@@ -120,6 +127,17 @@ class Page:
 
     # -- the parent's side ------------------------------------------------------------------------
 
+    def renew(self) -> None:
+        """Make ready for a new process of the loop, the former being dead; cycles go on."""
+        self._times[_BEAT_TIME] = 0.0
+        for word in (_BEATS, _PHASE, _STATE, _COMMAND, _ENDED, _SEEN):
+            self._words[word] = 0
+
+    def open_for_reading(self) -> int:
+        """Return a further descriptor of the page, to be closed by the caller; read-only."""
+        path = f"/proc/self/fd/{self.fd}"
+        return os.open(path, os.O_RDONLY) if os.path.exists(path) else os.dup(self.fd)
+
     def ask(self, command: Command) -> None:
         """Ask the loop for something; STOP is never taken back."""
         if self._words[_COMMAND] != Command.STOP:
@@ -151,18 +169,23 @@ class Page:
         beat = float(self._times[_BEAT_TIME])
         return time.monotonic() - beat if beat else 0.0
 
-    def drain(self) -> Array:
-        """Return a copy of the rows (k, width) that came since the last call."""
-        written = int(self._words[_WRITTEN])
-        first = max(self._read, written - ROWS + ROWS // 8)  # the oldest may be under the pen
-        self.lost += first - self._read
-        index = np.arange(first, written)
-        rows = self._rows[index % ROWS]
-        whole = rows[:, 0] == index
-        self.lost += int((~whole).sum())
-        self._read = written
-        found: Array = rows[whole]
-        return found
+    @property
+    def written(self) -> int:
+        """Return how many cycles have been handed over since the daemon's start."""
+        return int(self._words[_WRITTEN])
+
+    def reader(self, first: int = 0) -> PageReader:
+        """Return a reader of its own cursor that begins at row number ``first``."""
+        return PageReader(self, first)
+
+    def rows(self, first: int, last: int) -> tuple[Array, int]:
+        """Return copies of the rows (k, width) of numbers first..last-1, and how many are gone."""
+        oldest = max(first, last - ROWS + ROWS // 8)  # what is older may be under the pen
+        index = np.arange(oldest, last)
+        places = index % ROWS
+        rows = self._rows[places]
+        whole = (rows[:, 0] == index) & (self._rows[places, 0] == index)
+        return rows[whole], oldest - first + int((~whole).sum())
 
     def close(self) -> None:
         """Let go of the memory."""
@@ -170,6 +193,25 @@ class Page:
         self._rows = np.empty((0, 0))
         self._map.close()
         os.close(self.fd)
+
+
+class PageReader:
+    """One reader of a page's cycles; any number of them read side by side."""
+
+    def __init__(self, page: Page, first: int) -> None:
+        self._page = page
+        self.next = first  # number of the first row that it has not read
+        self.lost = 0  # rows overwritten before they were read
+
+    def drain(self) -> Array:
+        """Return a copy of the rows (k, width) that came since the last call."""
+        last = self._page.written
+        if last < self.next:
+            return np.empty((0, self._page.width))
+        rows, gone = self._page.rows(self.next, last)
+        self.lost += gone
+        self.next = last
+        return rows
 
 
 def _anonymous(size: int) -> int:

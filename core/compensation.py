@@ -240,6 +240,10 @@ class Compensator:
             )  # fmt: skip
         return Correction(q, moved, np.asarray(best), np.asarray(steps))
 
+    def forget(self) -> None:
+        """Begin the next correction from nothing, whatever was solved last."""
+        self._offset[:] = 0.0
+
     def _solve_conditioned(self, nominal: Array, loads: Loads, q: Array) -> tuple[float, int]:
         """Solve where effects in the model look at the joint angles anew in each step."""
         best, steps, row, offset = np.inf, 0, self._view, self._offset

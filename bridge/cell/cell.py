@@ -13,7 +13,9 @@ from bridge.cell.effects import compliance_terms, term_of
 from bridge.cell.message import message
 from bridge.cell.robot import build_arm
 from bridge.cell.schema import CellFile, Frame, Simulation
+from bridge.metrics.settings import MetricsSettings
 from bridge.settings import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
+from bridge.web.settings import WebSettings
 from core.arm import Arm
 from core.errors import ArmError, CellError, InputError
 from core.metrology import Metrology
@@ -81,6 +83,18 @@ class Cell:
         if given.folder is None:
             return given
         return given.model_copy(update={"folder": self.path.parent / given.folder})
+
+    @property
+    def web(self) -> WebSettings | None:
+        """Return section ``web``, its paths seen from here; None where the cell has none."""
+        given = self.file.web
+        return None if given is None else given.located(self.path.parent)
+
+    @property
+    def metrics(self) -> MetricsSettings | None:
+        """Return section ``metrics``, its paths seen from here; None where the cell has none."""
+        given = self.file.metrics
+        return None if given is None else given.located(self.path.parent)
 
     @property
     def simulation(self) -> Simulation:

@@ -6,7 +6,9 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from bridge.metrics.settings import MetricsSettings
 from bridge.settings import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
+from bridge.web.settings import WebSettings
 from drivers.ft_sensor.settings import AnyFtSensor
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -134,4 +136,6 @@ class CellFile(Section):
     limits: LimitSettings = LimitSettings()
     setpoints: SetpointSettings = SetpointSettings()
     recording: RecordingSettings = RecordingSettings()
+    web: WebSettings | None = Field(default=None, description="port, ...: the status page")
+    metrics: MetricsSettings | None = Field(default=None, description="port, ...: for Prometheus")
     simulation: Simulation = Simulation()

@@ -23,7 +23,7 @@ N = 6
 
 def row(k: int, **fields: object) -> NDArray[np.float64]:
     s = slices_of(N)
-    found = np.zeros(s["offset"].stop)
+    found = np.zeros(s["loop"].stop)
     q = np.arange(N) + 0.001 * k
     given: dict[str, object] = {
         "timestamp": 0.002 * k, "received": 0.0, "actual_q": q, "actual_qd": np.zeros(N),

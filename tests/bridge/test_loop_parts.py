@@ -114,32 +114,35 @@ def put(page: Page, timestamp: float) -> None:
 
 
 def test_rows_come_through_once_and_in_order(page: Page) -> None:
+    reader = page.reader()
     for k in range(5):
         put(page, float(k))
-    rows = page.drain()
+    rows = reader.drain()
     assert rows[:, 1].tolist() == [0, 1, 2, 3, 4]
     assert rows[0, page.slices["corrected_q"]] == pytest.approx(Q + 1)
     assert rows[0, page.slices["offset"]] == pytest.approx(np.arange(6))
     assert np.isnan(rows[0, page.slices["ft_raw_wrench"]]).all()
     assert np.isnan(rows[0, page.slices["payload"]]).all()
-    assert len(page.drain()) == 0
+    assert len(reader.drain()) == 0
     put(page, 5.0)
-    assert page.drain()[:, 1].tolist() == [5]
+    assert reader.drain()[:, 1].tolist() == [5]
 
 
 def test_rows_that_were_overwritten_are_counted_not_invented(page: Page) -> None:
+    reader = page.reader()
     for k in range(2 * ROWS):
         put(page, float(k))
-    rows = page.drain()
+    rows = reader.drain()
     assert rows[-1, 1] == 2 * ROWS - 1
     assert (np.diff(rows[:, 1]) == 1).all()
-    assert len(rows) + page.lost == 2 * ROWS
+    assert len(rows) + reader.lost == 2 * ROWS
 
 
 def test_a_row_that_was_not_finished_is_not_read(page: Page) -> None:
+    reader = page.reader()
     put(page, 1.0)
     page.next_row()[1] = 99.0  # the loop was killed here
-    assert page.drain()[:, 1].tolist() == [1]
+    assert reader.drain()[:, 1].tolist() == [1]
 
 
 def test_commands_are_taken_once_and_stop_stays(page: Page) -> None:
@@ -169,6 +172,6 @@ os.abort()
     done = subprocess.run([sys.executable, "-c", code], pass_fds=[page.fd], check=False)
     assert done.returncode == -6
     assert (page.phase, page.state, page.seen, page.ended) == (Phase.RUNNING, 3, True, False)
-    assert page.drain()[:, 1].tolist() == list(range(10))
+    assert page.reader().drain()[:, 1].tolist() == list(range(10))
     assert 0 < page.silence < 30
     assert os.fstat(page.fd).st_nlink == 0

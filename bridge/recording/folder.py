@@ -1,0 +1,94 @@
+"""The folder of recordings: which file comes next, where a run goes on, which files may go."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import time
+from pathlib import Path
+
+from core.errors import InputError
+from core.recording.reading import SUFFIX, last_batch
+
+NAME = re.compile(r"(?P<session>.+)-(?P<number>\d{3,})\.mcap$")
+LOOP_LOG = ".loop.log"
+MB = 1e6
+
+
+def new_session(folder: Path | None) -> str:
+    """Return a name for a run that begins now, run-YYYYmmdd-HHMMSS, not taken in the folder."""
+    stem, number = time.strftime("run-%Y%m%d-%H%M%S"), 1
+    name = stem
+    while folder is not None and _is_taken(folder, name):
+        number += 1
+        name = f"{stem}-{number}"
+    return name
+
+
+def _is_taken(folder: Path, session: str) -> bool:
+    return bool(segments(folder, session)) or (folder / f"{session}{LOOP_LOG}").exists()
+
+
+def require_folder(folder: Path) -> None:
+    """Make the folder. Raises InputError where recordings cannot be written into it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError(13, "Permission denied")
+    except OSError as error:
+        raise InputError(
+            f"recording.folder: {folder}: {error.strerror}, expected a folder that can be written"
+        ) from None
+
+
+def segments(folder: Path, session: str) -> list[Path]:
+    """Return the files of a run, in order."""
+    if not folder.is_dir():
+        return []
+    found = [(path, NAME.match(path.name)) for path in folder.iterdir()]
+    numbered = [
+        (int(match["number"]), path)
+        for path, match in found
+        if match and match["session"] == session
+    ]
+    return [path for _, path in sorted(numbered)]
+
+
+def next_path(folder: Path, session: str) -> Path:
+    """Return the name of the next file of a run: SESSION-001.mcap, ..."""
+    taken = segments(folder, session)
+    match = NAME.match(taken[-1].name) if taken else None
+    return folder / f"{session}-{int(match['number']) + 1 if match else 1:03d}{SUFFIX}"
+
+
+def number_after(path: Path) -> int:
+    """Return the number of the first cycle behind the last one of a file; 0 where it has none."""
+    batch = last_batch(path)
+    return 0 if batch is None else int(batch.columns["number"].max()) + 1
+
+
+def prune(folder: Path, session: str, keep_total: float | None) -> list[Path]:
+    """Remove the oldest files until recordings take no more than ``keep_total`` MB; return them.
+
+    Files of other runs go first, then this run's own oldest. Only names that a recorder gives are
+    touched. Raises nothing: what cannot be removed stays.
+    """
+    if keep_total is None:
+        return []
+    files = [path for path in folder.iterdir() if NAME.match(path.name)]
+    sizes = {path: path.stat().st_size for path in files if path.is_file()}
+    total, gone = sum(sizes.values()), []
+    oldest = sorted(sizes, key=lambda path: (path.name.startswith(f"{session}-"), path.name))
+    for path in oldest:
+        if total <= keep_total * MB:
+            break
+        with contextlib.suppress(OSError):
+            path.unlink()
+            total -= sizes[path]
+            gone.append(path)
+    for name in {match["session"] for path in gone if (match := NAME.match(path.name))}:
+        if name != session and not segments(folder, name):
+            with contextlib.suppress(OSError):
+                (folder / f"{name}{LOOP_LOG}").unlink()
+    return gone

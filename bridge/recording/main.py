@@ -1,0 +1,98 @@
+"""The recorder's process: ``python -m bridge.recording.main``, started by the daemon.
+
+It reads along in the shared page and can be stalled, killed and started anew without the loop
+noticing. It outlives a daemon that was killed for as long as the loop still ramps out.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import signal
+import time
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from bridge.recording.recorder import Recorder
+from bridge.recording.redaction import redacted
+from bridge.side_main import Order, take_order
+
+LOOK_EVERY = 0.1  # s
+QUIET = 0.6  # s without a heartbeat of the loop after which a lost daemon's run is over
+LONGEST_FAREWELL = 4.0  # s: then the process is ended by force
+
+
+def main() -> None:
+    """Record until the daemon has ended."""
+    # a service manager tells all processes to end at once; this one ends when it has everything
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_IGN)
+    order = take_order()
+    recorder = Recorder(
+        order.settings.recording, order.session, order.page, _configuration(order), order.tell
+    )
+    ended = _follow(order, recorder)
+    if not ended:
+        _outlive(order, recorder)
+    recorder.close()
+
+
+def _follow(order: Order, recorder: Recorder) -> bool:
+    """Record while the daemon is there; returns whether it ended in order."""
+    ended = False
+    while not order.events.closed:
+        order.events.wait(LOOK_EVERY)
+        time.sleep(LOOK_EVERY / 2)  # events may come in crowds; cycles wait in the ring
+        for event in order.events.poll():
+            recorder.take(event)
+            ended |= event.get("kind") == "ended"
+            if event.get("kind") == "configuration":
+                recorder.change_configuration(_configuration(order, event))
+        recorder.step()
+    return ended
+
+
+def _outlive(order: Order, recorder: Recorder) -> None:
+    """Record on until the loop, which has lost its daemon, has stopped too."""
+    until = time.monotonic() + LONGEST_FAREWELL
+    recorder.take(
+        {"time": time.time(), "kind": "recorder", "detail": "the daemon is gone without an end"}
+    )
+    while order.page.silence < QUIET and time.monotonic() < until:
+        recorder.step()
+        time.sleep(LOOK_EVERY)
+
+
+def _configuration(order: Order, event: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Return what the run is made of, without secrets."""
+    cell = order.settings.cell
+    raw = _text_of(cell, (event or order.extra).get("text"))
+    return {
+        "program": f"gapbridge {_version()}",
+        "cell": str(cell),
+        "sha256": hashlib.sha256(raw).hexdigest(),
+        "text": redacted(raw.decode("utf-8", "replace")),
+        "joints": order.n,
+        "driver": order.settings.link.driver,
+    }
+
+
+def _text_of(cell: Path, text: object) -> bytes:
+    """Return the cell file's bytes: what the daemon has read, where it says so."""
+    if isinstance(text, str):
+        return text.encode()
+    try:
+        return cell.read_bytes()
+    except OSError:
+        return b""
+
+
+def _version() -> str:
+    try:
+        return version("gapbridge")
+    except PackageNotFoundError:
+        return "not installed"
+
+
+if __name__ == "__main__":
+    main()

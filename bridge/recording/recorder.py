@@ -1,0 +1,217 @@
+"""The recorder: from the shared page into files, whatever happens to the disk or to itself.
+
+What counts is the number of the last cycle that a whole flush has written. After a failure, or in a
+new process, reading goes on behind it as long as the ring still holds what comes next; what it no
+longer holds is counted and told.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from bridge.recording.folder import next_path, number_after, prune, segments
+from bridge.recording.segment import Segment
+from bridge.recording.settings import RecordingSettings
+from bridge.recording.words import LEVELS, level_of, words_of
+from bridge.shared_page import Page
+from bridge.supervisor import State
+from core.errors import LogError
+from core.recording.schema import CONFIGURATION, EVENTS, LOG, STATUS
+
+FLUSH_EVERY = 0.4  # s
+RETRY_EVERY = 2.0  # s after which a disk that refused is tried again
+MOST_EVENTS = 10_000  # kept while nothing can be written
+MB = 1e6
+
+Event = Mapping[str, Any]
+Tell = Callable[[dict[str, Any]], None]
+
+
+class Recorder:
+    """Records one run. ``step`` is called some ten times a second; it never raises for the disk.
+
+    ``configuration`` is the document that every file begins with; ``tell`` takes events of the
+    recorder's own (kind "recorder").
+    """
+
+    def __init__(
+        self,
+        settings: RecordingSettings,
+        session: str,
+        page: Page,
+        configuration: Mapping[str, Any],
+        tell: Tell,
+    ) -> None:
+        assert settings.folder is not None
+        self._settings, self._folder, self._session = settings, settings.folder, session
+        self._page, self._tell = page, tell
+        self.configuration: dict[str, Any] = dict(configuration)
+        self._states = [state.name for state in State]
+        self._segment: Segment | None = None
+        self._events: deque[Event] = deque(maxlen=MOST_EVENTS)  # not yet flushed
+        self._flushed = time.monotonic()
+        self._retry_at = 0.0
+        self._why_paused = ""
+        self.pauses = 0
+        self.lost = 0  # cycles of this process's time that no file holds
+        self._next = self._resume()  # number of the first cycle that no whole flush holds
+        self._reader = page.reader(self._next)
+
+    def _resume(self) -> int:
+        """Return where a former process of this run has stopped."""
+        found = 0
+        for path in segments(self._folder, self._session):
+            with contextlib.suppress(OSError, LogError):
+                found = max(found, number_after(path))
+        return found
+
+    @property
+    def path(self) -> Path | None:
+        """Return the file that is being written."""
+        return None if self._segment is None else self._segment.path
+
+    def take(self, event: Event) -> None:
+        """Take an event over; it is in the file after the next flush."""
+        self._events.append(event)
+
+    def step(self, flush: bool = False) -> int:
+        """Take what the page has; flush, rotate, pause, resume. Returns the cycles taken."""
+        now = time.monotonic()
+        if self._segment is None and now < self._retry_at and not flush:
+            return 0
+        if self._segment is None and not self._open():
+            return 0
+        assert self._segment is not None
+        rows = self._reader.drain()
+        try:
+            if len(rows):
+                numbers = rows[:, 0].astype(int)
+                self._segment.write(rows[numbers % self._settings.every == 0])
+            if flush or now - self._flushed >= FLUSH_EVERY:
+                self._flush(now)
+        except OSError as error:
+            self._pause(error.strerror or str(error))
+        return len(rows)
+
+    def close(self) -> None:
+        """Write what is there and finish the file."""
+        self.step(flush=True)
+        if self._segment is None:
+            self._tell_lost(max(self._page.written - self._next, 0))
+        else:
+            try:
+                self._segment.close()
+            except OSError as error:
+                self._pause(error.strerror or str(error))
+        self._segment = None
+
+    # -- inside -----------------------------------------------------------------------------------
+
+    def _flush(self, now: float) -> None:
+        """Write events and cycles so far into the file, then see how much room there is."""
+        segment = self._segment
+        assert segment is not None
+        for event in self._events:
+            self._write_event(segment, event)
+        segment.flush()
+        self._events.clear()
+        if self._reader.lost:
+            self._tell_lost(self._reader.lost)
+            self._reader.lost = 0
+        self._next, self._flushed = self._reader.next, now
+        room = self._room()
+        if room < self._settings.keep_free:
+            segment.close()
+            self._pause(f"{room:.0f} MB free, recording.keep_free is {self._settings.keep_free:g}")
+        elif (
+            segment.size > self._settings.segment_size * MB
+            or now - segment.opened > self._settings.segment_time
+        ):
+            segment.close()
+            self._segment = None
+            self._open()
+
+    def _write_event(self, segment: Segment, event: Event) -> None:
+        at = event.get("time")
+        at = at if isinstance(at, int | float) else time.time()
+        if event.get("kind") == "status":
+            segment.tell(STATUS, event, at)
+            return
+        segment.tell(EVENTS, event, at)
+        second, rest = divmod(int(at * 1e9), 10**9)
+        log = {
+            "timestamp": {"sec": second, "nsec": rest}, "level": LEVELS[level_of(event)],
+            "message": words_of(event), "name": "gapbridge", "file": "", "line": 0,
+        }  # fmt: skip
+        segment.tell(LOG, log, at)
+
+    def _open(self) -> bool:
+        """Begin a new file; returns whether there is one."""
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            prune(self._folder, self._session, self._settings.keep_total)
+            if self._room() < self._settings.keep_free:
+                raise OSError(0, f"less than {self._settings.keep_free:g} MB free")
+            path = next_path(self._folder, self._session)
+            self._segment = Segment(path, self._page.slices, self._states)
+            self._describe()
+            self._segment.flush()
+        except OSError as error:
+            self._pause(error.strerror or str(error))
+            return False
+        self._why_paused = ""
+        self._reader = self._page.reader(self._next)
+        self._flushed = time.monotonic()
+        self._say(f"recording into {path}", file=str(path))
+        return True
+
+    def _describe(self) -> None:
+        assert self._segment is not None
+        number = int(re.sub(r".*-", "", self._segment.path.stem))
+        document = {
+            "time": time.time(), "session": self._session, "segment": number,
+            "clock": self._segment.clock / 1e9, "every": self._settings.every,
+            "first_cycle": self._next, **self.configuration,
+        }  # fmt: skip
+        self._segment.tell(CONFIGURATION, document)
+
+    def change_configuration(self, configuration: Mapping[str, Any]) -> None:
+        """Note that the daemon runs by another configuration from now on."""
+        self.configuration = dict(configuration)
+        if self._segment is not None:
+            self._describe()
+
+    def _pause(self, why: str) -> None:
+        """Give the file up, keep what whole flushes have written, and try again later."""
+        if self._segment is not None:
+            self._segment.abandon()
+        self._segment = None
+        self._retry_at = time.monotonic() + RETRY_EVERY
+        if why != self._why_paused:
+            self.pauses += 1
+            self._say(f"recording paused: {why}", paused=why, next_cycle=self._next)
+        self._why_paused = why
+
+    def _tell_lost(self, lost: int) -> None:
+        if lost:
+            self.lost += lost
+            self._say(f"{lost} cycles lost before cycle {self._page.written}", lost=lost)
+
+    def _say(self, words: str, **more: Any) -> None:
+        event = {
+            "time": time.time(), "monotonic": time.monotonic(), "kind": "recorder",
+            "detail": words, **more,
+        }  # fmt: skip
+        self._tell(event)
+
+    def _room(self) -> float:
+        """Return the MB that are free for us."""
+        found = os.statvfs(self._folder)
+        return found.f_bavail * found.f_frsize / MB

@@ -1,0 +1,182 @@
+"""One file of a recording: whole chunks of MCAP, handed to the disk as they come.
+
+The library builds records; they reach the file in one write per flush, so that whatever ends the
+process leaves a file that is good up to its last flush.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
+
+from core.recording.layout import layout_of
+from core.recording.schema import (
+    CYCLE_CHANNELS,
+    JSON_CHANNELS,
+    PACKAGE,
+    descriptor_set,
+    fields_by_channel,
+    json_name,
+    json_schema,
+)
+
+Array = NDArray[np.float64]
+LARGEST_CHUNK = 1 << 26  # bytes: chunks end by flush, long before this
+SYNC_SHARE = 0.1  # of the time may be spent in waiting for the disk
+SYNC_EVERY = 0.4  # s between two such waits at least
+
+
+class _File:
+    """What the library writes to: kept until ``flush``, then written in one go."""
+
+    def __init__(self, path: Path) -> None:
+        self.fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self.good = 0  # bytes of the file that were written by whole flushes
+        self._waiting = bytearray()
+
+    def write(self, data: bytes) -> int:
+        self._waiting += data
+        return len(data)
+
+    def tell(self) -> int:
+        return self.good + len(self._waiting)
+
+    def flush(self) -> None:
+        """Write what waits. Raises OSError; then the file is to be given up."""
+        view = memoryview(self._waiting)
+        at = 0
+        while at < len(view):
+            at += os.write(self.fd, view[at:])
+        view.release()
+        self.good += at
+        self._waiting = bytearray()
+
+    def close(self) -> None:
+        fd, self.fd = self.fd, -1
+        if fd >= 0:
+            os.close(fd)
+
+
+class Segment:
+    """One file of a run, from its first byte to its summary."""
+
+    def __init__(self, path: Path, slices: Mapping[str, slice], states: Sequence[str]) -> None:
+        """Open a new file. Raises OSError, FileExistsError where the name is taken."""
+        self.path = path
+        self.opened = time.monotonic()
+        self.rows = 0  # handed over, flushed or not
+        self._slices = slices
+        self._next_sync = 0.0
+        # ns between this machine's monotonic clock and the calendar, the same for the whole file
+        self.clock = time.time_ns() - time.monotonic_ns()
+        self._file = _File(path)
+        try:
+            self._writer = Writer(
+                self._file,  # type: ignore[arg-type]
+                chunk_size=LARGEST_CHUNK,
+                compression=CompressionType.ZSTD,
+            )
+            self._writer.start(profile="", library="gapbridge")
+            self._register(states)
+        except BaseException:
+            self._file.close()
+            raise
+
+    def _register(self, states: Sequence[str]) -> None:
+        writer = self._writer
+        sizes = {name: part.stop - part.start for name, part in self._slices.items()}
+        self._channels, self._layouts = {}, []
+        fields = fields_by_channel(list(sizes))
+        for topic in CYCLE_CHANNELS:
+            schema = writer.register_schema(
+                f"{PACKAGE}.{topic[1:].capitalize()}",
+                "protobuf",
+                descriptor_set(topic, fields[topic], sizes, states),
+            )
+            channel = writer.register_channel(topic, "protobuf", schema)
+            self._layouts.append((channel, layout_of(topic, fields[topic], sizes)))
+        for topic in JSON_CHANNELS:
+            schema = writer.register_schema(json_name(topic), "jsonschema", json_schema(topic))
+            self._channels[topic] = writer.register_channel(topic, "json", schema)
+
+    @property
+    def size(self) -> int:
+        """Return the bytes that are in the file."""
+        return self._file.good
+
+    def write(self, rows: Array) -> None:
+        """Take cycles (k, width) over; they are in the file after the next flush."""
+        if not len(rows):
+            return
+        numbers = rows[:, self._slices["number"].start].astype(np.int64) & 0xFFFFFFFF
+        received = rows[:, self._slices["received"].start]
+        known = np.where(np.isfinite(received), received, time.monotonic())
+        times = ((known * 1e9).astype(np.int64) + self.clock).tolist()
+        add = self._writer.add_message
+        encoded = [
+            (channel, layout.encode(rows, self._slices)) for channel, layout in self._layouts
+        ]
+        for k, (number, at) in enumerate(zip(numbers.tolist(), times, strict=True)):
+            for channel, messages in encoded:
+                add(channel, at, messages[k], at, number)
+        self.rows += len(rows)
+
+    def tell(self, topic: str, document: Mapping[str, Any], at: float | None = None) -> None:
+        """Take a JSON message over; ``at``: s since 1970, else now."""
+        stamp = int((time.time() if at is None else at) * 1e9)
+        data = _json(document)
+        self._writer.add_message(self._channels[topic], stamp, data, stamp)
+
+    def flush(self) -> None:
+        """Hand over what was taken; now and then wait for the disk. Raises OSError."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        now = time.monotonic()
+        if now >= self._next_sync:
+            os.fdatasync(self._file.fd)
+            spent = time.monotonic() - now
+            self._next_sync = now + max(SYNC_EVERY, spent / SYNC_SHARE)
+
+    def close(self) -> None:
+        """Write the summary and close. Raises OSError."""
+        try:
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._file.flush()
+            os.fsync(self._file.fd)
+        except OSError:
+            self.abandon()
+            raise
+        self._file.close()
+
+    def abandon(self) -> None:
+        """Close, leaving what whole flushes have written; never raises."""
+        if self._file.fd >= 0:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._file.fd, self._file.good)
+            with contextlib.suppress(OSError):
+                self._file.close()
+
+
+def _json(document: Mapping[str, Any]) -> bytes:
+    """Return a document as JSON; numbers that JSON does not know become null."""
+    try:
+        return json.dumps(document, default=str, allow_nan=False).encode()
+    except ValueError:
+        return json.dumps(_finite(document), default=str).encode()
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

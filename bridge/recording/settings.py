@@ -1,0 +1,31 @@
+"""Section ``recording`` of the cell file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class RecordingSettings(BaseModel):
+    """Section ``recording``: where cycles are written to, and how much of them."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    folder: Path | None = Field(
+        Path("recordings"), description="the files of each run go here (MCAP); null: record nothing"
+    )
+    every: int = Field(1, ge=1, description="record every so manieth cycle")
+    segment_size: float = Field(
+        256.0, gt=0.0, le=4096.0, description="MB after which a run goes on in a new file"
+    )
+    segment_time: float = Field(
+        3600.0, ge=1.0, description="s after which a run goes on in a new file"
+    )
+    keep_total: float | None = Field(
+        None, gt=0.0,
+        description="MB of recordings kept in the folder; the oldest files go; null: all are kept",
+    )  # fmt: skip
+    keep_free: float = Field(
+        200.0, ge=0.0, description="MB left free on the disk: with less, recording pauses"
+    )

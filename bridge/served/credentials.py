@@ -1,0 +1,68 @@
+"""The files that guard what is served: token, certificate and key, checked before a run."""
+
+from __future__ import annotations
+
+import ssl
+import stat
+from pathlib import Path
+
+from bridge.served.settings import ServedSettings
+from core.errors import InputError
+
+SHORTEST_TOKEN = 32  # characters: beyond guessing, however fast
+LONGEST_TOKEN = 1024
+
+
+def check_credentials(settings: ServedSettings, section: str) -> None:
+    """Raise InputError where a file cannot be used; ``section`` names the cell's section."""
+    if settings.token_file is not None:
+        read_token(settings.token_file, f"{section}.token_file")
+    tls_context(settings, section)
+
+
+def read_token(path: Path, key: str) -> str:
+    """Return the token in a file. Raises InputError where it is readable to others, or too short.
+
+    ``key`` names the cell's key in messages; the token itself is in none.
+    """
+    try:
+        with path.open("rb") as file:
+            mode = path.stat().st_mode
+            raw = file.read(LONGEST_TOKEN + 2)
+    except OSError as error:
+        raise InputError(f"{key}: {path}: {error.strerror}, expected a file with a token") from None
+    if stat.S_IMODE(mode) & 0o077:
+        raise InputError(
+            f"{key}: {path}: found mode {stat.S_IMODE(mode):04o}, expected 0600: a file that "
+            "only its owner reads"
+        )
+    token = raw.decode("ascii", "replace").strip()
+    if not SHORTEST_TOKEN <= len(token) <= LONGEST_TOKEN or not token.isprintable() or (
+        not token.isascii() or " " in token
+    ):  # fmt: skip
+        raise InputError(
+            f"{key}: {path}: found {len(token)} characters, expected {SHORTEST_TOKEN} to "
+            f"{LONGEST_TOKEN} letters, digits and signs in one line (openssl rand -hex 32)"
+        )
+    return token
+
+
+def tls_context(settings: ServedSettings, section: str) -> ssl.SSLContext | None:
+    """Return the server's TLS, None without a certificate. Raises InputError."""
+    if settings.certificate is None or settings.key is None:
+        return None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    for path, name in ((settings.certificate, "certificate"), (settings.key, "key")):
+        if not path.is_file():
+            raise InputError(f"{section}.{name}: {path}: found no file, expected PEM")
+    try:
+        # a password would be asked for on the terminal: the key must have none
+        context.load_cert_chain(settings.certificate, settings.key, password=lambda: b"")
+    except (ssl.SSLError, OSError, ValueError) as error:
+        words = getattr(error, "reason", None) or getattr(error, "strerror", None) or str(error)
+        raise InputError(
+            f"{section}.certificate: {settings.certificate}: cannot be used with "
+            f"{settings.key}: {words}, expected PEM of one pair without a password"
+        ) from None
+    return context

@@ -1,0 +1,80 @@
+"""HTTP connections that end when the other side is too slow, and that are no more than so many."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+HEADER_TIME = 5.0  # s that a request's head may take to come, from its first byte or the connection
+STALL_TIME = 10.0  # s that a client may leave what was sent to it lying
+MOST_CONNECTIONS = 64
+LARGEST_HEAD = 16 * 1024  # bytes of request line and headers
+
+
+class GuardedProtocol(H11Protocol):
+    """The server's own protocol, with the time limits that it lacks.
+
+    Its base waits for ever for a request that never ends (slowloris) and for a client that takes
+    nothing; here both are cut off, and connections beyond MOST_CONNECTIONS are closed at once.
+    """
+
+    header_time = HEADER_TIME
+    stall_time = STALL_TIME
+    most_connections = MOST_CONNECTIONS
+
+    def __init__(self, *arguments: Any, **keys: Any) -> None:
+        super().__init__(*arguments, **keys)
+        self._waiting_for_head: asyncio.TimerHandle | None = None
+        self._stalled: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Take a connection, unless there are too many."""
+        super().connection_made(transport)
+        if len(self.connections) > self.most_connections:
+            transport.abort()
+            return
+        self._waiting_for_head = self.loop.call_later(self.header_time, transport.abort)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget the timers."""
+        self._let_head()
+        self._let_stall()
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Take bytes; a head that is not whole keeps the time that it had."""
+        super().data_received(data)
+        if self.transport.is_closing():
+            return
+        if self.cycle is not None and not self.cycle.response_complete:
+            self._let_head()
+        elif self._waiting_for_head is None:
+            self._waiting_for_head = self.loop.call_later(self.header_time, self.transport.abort)
+
+    def on_response_complete(self) -> None:
+        """Go on to the next request."""
+        super().on_response_complete()
+        self._let_head()
+
+    def pause_writing(self) -> None:
+        """Give a client that does not take what was sent its last chance."""
+        super().pause_writing()
+        if self._stalled is None:
+            self._stalled = self.loop.call_later(self.stall_time, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        """Go on: the client takes again."""
+        self._let_stall()
+        super().resume_writing()
+
+    def _let_head(self) -> None:
+        timer, self._waiting_for_head = self._waiting_for_head, None
+        if timer is not None:
+            timer.cancel()
+
+    def _let_stall(self) -> None:
+        timer, self._stalled = self._stalled, None
+        if timer is not None:
+            timer.cancel()

@@ -1,0 +1,98 @@
+"""One server for a side process: its socket, its limits, its end with the daemon."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+import ssl
+import sys
+from collections.abc import Callable
+
+import uvicorn
+from starlette.types import ASGIApp
+
+from bridge.served.credentials import tls_context
+from bridge.served.protocol import LARGEST_HEAD, MOST_CONNECTIONS, GuardedProtocol
+from bridge.served.settings import ServedSettings
+from core.errors import LinkError
+
+SEND_BUFFER = 64 * 1024  # bytes that the system holds for a client that is slow
+GONE = 20_000  # ms without a sign from the other side
+KEEP_ALIVE = 15  # s
+LOOK = 0.1  # s between two looks whether the daemon still lives
+
+
+class _Config(uvicorn.Config):
+    """The library's configuration with a TLS context of our own."""
+
+    context: ssl.SSLContext | None = None
+
+    def load(self) -> None:
+        super().load()
+        self.ssl = self.context
+
+
+def listen(settings: ServedSettings) -> socket.socket:
+    """Return the listening socket. Raises LinkError where it cannot be had."""
+    host = "127.0.0.1" if settings.host == "localhost" else settings.host
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    server = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+        if sys.platform.startswith("linux"):
+            server.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, GONE)
+        server.bind((host, settings.port))
+        server.listen(MOST_CONNECTIONS)
+    except OSError as error:
+        server.close()
+        raise LinkError(f"{host}:{settings.port}: cannot be served: {error.strerror}") from None
+    return server
+
+
+def serve(
+    app: ASGIApp,
+    settings: ServedSettings,
+    section: str,
+    over: Callable[[], bool],
+    turn: Callable[[], None],
+    every: float,
+) -> None:
+    """Serve until ``over()``, calling ``turn()`` every so many s beside it, in the same thread.
+
+    Raises LinkError where the address is taken, InputError where certificates cannot be used.
+    """
+    context = tls_context(settings, section)
+    with listen(settings) as own:
+        config = _Config(
+            app, http=GuardedProtocol, ws="none", loop="asyncio", lifespan="off",
+            log_config=None, access_log=False, server_header=False, date_header=False,
+            proxy_headers=False, limit_concurrency=MOST_CONNECTIONS,
+            timeout_keep_alive=KEEP_ALIVE, timeout_graceful_shutdown=1,
+            h11_max_incomplete_event_size=LARGEST_HEAD,
+        )  # fmt: skip
+        config.context = context
+        # strangers must not fill the log: what is refused is counted
+        logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)
+        asyncio.run(_serve(uvicorn.Server(config), own, over, turn, every))
+
+
+async def _serve(
+    server: uvicorn.Server,
+    own: socket.socket,
+    over: Callable[[], bool],
+    turn: Callable[[], None],
+    every: float,
+) -> None:
+    serving = asyncio.create_task(server.serve(sockets=[own]))
+    try:
+        while not serving.done():
+            turn()
+            if over():
+                server.should_exit = True
+                break
+            await asyncio.sleep(every)
+    finally:
+        server.should_exit = True
+    await serving

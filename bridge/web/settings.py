@@ -1,0 +1,19 @@
+"""Section ``web`` of a cell: the status page."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from bridge.served.settings import ServedSettings
+
+WEB_PORT = 30380
+
+
+class WebSettings(ServedSettings):
+    """The status page; a cell without this section has none."""
+
+    port: int = Field(WEB_PORT, ge=0, le=65535, description="TCP port; 0: any that is free")
+    clients: int = Field(16, ge=1, le=1000, description="pages that may be open at the same time")
+    history: float = Field(
+        600.0, gt=0.0, le=86400.0, description="s of offsets and wrenches that are kept to show"
+    )

@@ -1,0 +1,72 @@
+"""Cycles as the loop hands them over, and recorders of them, for the tests of recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.recording.recorder import Recorder
+from bridge.recording.settings import RecordingSettings
+from bridge.shared_page import Page
+from bridge.supervisor import State
+
+N = 6
+SESSION = "run-20260101-000000"
+CONFIGURATION = {"program": "test", "cell": "cell.yaml", "sha256": "00", "text": "", "joints": N}
+Array = NDArray[np.float64]
+
+
+def publish(page: Page, count: int, seed: int = 0) -> Array:
+    """Have a loop publish cycles of random numbers; returns them as rows (count, width)."""
+    random = np.random.default_rng(seed)
+    rows = []
+    for _ in range(count):
+        row = page.next_row()
+        number = page.written
+        row[1:] = random.standard_normal(page.width - 1)
+        row[page.slices["timestamp"]] = 0.002 * number
+        row[page.slices["received"]] = 1000.0 + 0.002 * number
+        row[page.slices["state"]] = State.OBSERVING
+        row[page.slices["joint_temperatures"]] = np.nan
+        page.publish()
+        rows.append(row.copy())
+    return np.array(rows)
+
+
+class Desk:
+    """A page, and recorders on it one after the other."""
+
+    def __init__(self, folder: Path, **settings: Any) -> None:
+        self.folder = folder
+        self.page = Page(N)
+        self.told: list[dict[str, Any]] = []
+        self.settings = RecordingSettings(folder=folder, **{"keep_free": 0.0, **settings})
+
+    def recorder(self) -> Recorder:
+        return Recorder(self.settings, SESSION, self.page, CONFIGURATION, self.told.append)
+
+    def record(self, *counts: int) -> Array:
+        """Record so many cycles, a flush after each; returns the rows."""
+        recorder = self.recorder()
+        rows = []
+        for k, count in enumerate(counts):
+            rows.append(publish(self.page, count, seed=k))
+            recorder.step(flush=True)
+        recorder.close()
+        return np.concatenate(rows)
+
+    @property
+    def files(self) -> list[Path]:
+        return sorted(self.folder.glob("*.mcap"))
+
+    @property
+    def stem(self) -> Path:
+        return self.folder / SESSION
+
+
+def same_bits(found: Array, expected: Array) -> bool:
+    """Return whether two arrays are the same, sign of zero and NaN included."""
+    return found.shape == expected.shape and found.tobytes() == expected.tobytes()

@@ -1,0 +1,95 @@
+"""A disk that is full, or gets full: recording pauses, is counted, and goes on."""
+
+from __future__ import annotations
+
+import resource
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from recorded import Desk, publish
+from test_recorder import numbers
+
+from bridge.recording import recorder as recorder_module
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder_module, "RETRY_EVERY", 0.0)
+
+
+@pytest.fixture
+def limited() -> Iterator[None]:
+    """Have writes beyond a size refused by the system, as a full disk refuses them."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    signal.signal(signal.SIGXFSZ, handler)
+
+
+def allow(size: int) -> None:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+
+
+@pytest.mark.usefixtures("quick", "limited")
+def test_a_write_that_fails_in_its_middle_loses_nothing_that_the_ring_holds(
+    tmp_path: Path,
+) -> None:
+    desk = Desk(tmp_path)
+    recorder = desk.recorder()
+    publish(desk.page, 100)
+    recorder.step(flush=True)
+    allow(desk.files[0].stat().st_size + 5000)  # amidst the next chunk
+    publish(desk.page, 200)
+    recorder.step(flush=True)
+    assert recorder.pauses == 1
+    assert recorder.path is None
+    assert "paused" in desk.told[-1]
+    assert numbers(desk.stem) == list(range(100))
+    allow(resource.RLIM_INFINITY)
+    publish(desk.page, 50)
+    recorder.step(flush=True)
+    recorder.close()
+    assert numbers(desk.stem) == list(range(350))
+    assert recorder.lost == 0
+
+
+@pytest.mark.usefixtures("quick", "limited")
+def test_a_disk_that_stays_full_is_told_once_and_what_is_lost_is_counted(tmp_path: Path) -> None:
+    desk = Desk(tmp_path)
+    recorder = desk.recorder()
+    publish(desk.page, 20)
+    recorder.step(flush=True)
+    allow(100)
+    for _ in range(5):
+        publish(desk.page, 20)
+        recorder.step(flush=True)
+    recorder.close()
+    assert recorder.pauses == 1
+    assert recorder.lost == 100
+    assert sum("paused" in event for event in desk.told) == 1
+    assert numbers(desk.files[0]) == list(range(20))
+
+
+@pytest.mark.usefixtures("quick")
+def test_recording_pauses_before_the_disk_is_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk = Desk(tmp_path, keep_free=50.0)
+    room = {"free": 1000.0}
+    recorder = desk.recorder()
+    monkeypatch.setattr(recorder, "_room", lambda: room["free"])
+    publish(desk.page, 20)
+    recorder.step(flush=True)
+    room["free"] = 40.0
+    publish(desk.page, 20)
+    recorder.step(flush=True)  # this one still fits; then the file is finished
+    publish(desk.page, 20)
+    recorder.step(flush=True)
+    assert recorder.path is None
+    assert numbers(desk.stem) == list(range(40))
+    room["free"] = 1000.0
+    recorder.close()
+    assert numbers(desk.stem) == list(range(60))
