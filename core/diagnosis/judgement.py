@@ -33,6 +33,7 @@ HINT = 0.05  # probability from which a coordinate is suspect once structure is 
 TRACE = 0.01  # share of an unnamed function from which a coordinate has it
 TOUCH = 0.1  # share of a cause that acts on a coordinate: more than that touches it
 NESTED = ("axial_compliance", "stiffness_nonlinearity")
+HELD_BY_ALL = ("payload", "link_inertia", "torque_constant")  # one weight, felt by many joints
 LEAST = 0.002  # share of the held-out gap that a cause has to take beside a leftover
 
 
@@ -126,7 +127,10 @@ def _weak(selection: Selection, believed: list[int], smooth: list[int]) -> list[
         bad[j] |= structure_p_value(space, nuisance, chosen, rows=coordinate == j) < HINT
     if not bad.any():
         return believed
-    return [c for c in believed if touched[c][bad].sum() > TOUCH]
+    return [
+        c for c in believed
+        if touched[c][bad].sum() > TOUCH or space.candidates[c].family in HELD_BY_ALL
+    ]  # fmt: skip
 
 
 def _touches(space: Space, c: int, coordinate: NDArray[np.int64], k: int) -> Array:

@@ -27,7 +27,7 @@ from core.diagnosis.search import LARGE, screened_search
 from core.diagnosis.smooth import smooth_candidates
 from core.diagnosis.space import Found, Space, fit
 from core.diagnosis.wild import look_again, look_for_wild, with_wild_explained
-from core.diagnosis.work import Work, locate, sample_space
+from core.diagnosis.work import Work, flat, locate, sample_space
 from core.effects import CATALOGUE, Term
 from core.errors import InputError
 from core.model import Model
@@ -128,7 +128,7 @@ def select(
         same = terms_alike(terms, base) and turn > 0
         found = best
         free = 1 - sum(len(v) for v in best.values) / space.freedom
-        changed = look_again(work, residual, free)
+        changed = look_again(work, _less_smooth(work, space, best, smooth, residual), free)
         if same and not changed:
             break
         base = terms
@@ -142,6 +142,22 @@ def select(
         work.observation, space, found, terms, index, covariance, counted, whitened_by,
         residual, base, raw, nuisance, target,
     )  # fmt: skip
+
+
+def _less_smooth(
+    work: Work, space: Space, best: Found, smooth: list[tuple[Candidate, Array]], residual: Array
+) -> Array:
+    """Return the residual (N, k) less what the set's unnamed functions take of it.
+
+    They are part of the explanation: what they account for is no noise.
+    """
+    named = len(work.candidates)
+    columns = [smooth[c - named][1] for c in best.chosen if c >= named]
+    if not columns:
+        return residual
+    both = np.concatenate([*columns, work.observation.nuisance], axis=2)
+    rows, target = flat(both, work), flat(residual[..., None], work)[:, 0]
+    return residual - both @ np.linalg.lstsq(rows, target, rcond=1e-9)[0]
 
 
 def _bounded(candidate: Candidate, model: Model) -> Candidate:
