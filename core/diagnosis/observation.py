@@ -46,6 +46,7 @@ class Observation:
     axes: tuple[str, ...]  # name of each coordinate
     joint_columns: Array | None = None  # (N, k, n) d prediction / d joint angle, where it has one
     unnamed: Callable[[], Rivals] = tuple  # target, columns (N, k, d) of further rivals
+    friction: Array | None = None  # (N, k) sign of each joint's motion, where friction shows
     tool_axes: Array | None = None  # (N, 3, 3) axes of the TCP in base, as columns
     axial_moment: Array | None = None  # (N, n) Nm about each joint's axis, where it is known
     order_in_time: bool = False  # True: neighbours in time are correlated (a moving log)
@@ -81,6 +82,7 @@ def thinned(observation: Observation, most: int) -> Observation:
         rows=observation.rows[take],
         joint_columns=some(observation.joint_columns),
         unnamed=lambda: tuple((target, columns[take]) for target, columns in unnamed()),
+        friction=some(observation.friction),
         tool_axes=some(observation.tool_axes),
         axial_moment=some(observation.axial_moment),
         rebase=None,

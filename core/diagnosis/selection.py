@@ -157,7 +157,7 @@ def _less_smooth(
         return residual
     both = np.concatenate([*columns, work.observation.nuisance], axis=2)
     rows, target = flat(both, work), flat(residual[..., None], work)[:, 0]
-    return residual - both @ np.linalg.lstsq(rows, target, rcond=1e-9)[0]
+    return np.asarray(residual - both @ np.linalg.lstsq(rows, target, rcond=1e-9)[0])
 
 
 def _bounded(candidate: Candidate, model: Model) -> Candidate:

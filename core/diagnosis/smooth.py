@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 Pair = tuple[Candidate, Array]
 KNOTS = 5
 BUMPS = 24  # places along a joint's range where something local may sit
+CHANGES_FRICTION = ("timestamp", "payload")
+SLOW = (0.03, 0.1, 0.3)  # shares of the greatest speed over which friction may fall (Stribeck)
 STEPS = 23  # moments at which something may have jumped
 
 
@@ -38,8 +40,41 @@ def smooth_candidates(observation: Observation, arm: Arm) -> list[Pair]:
                 found += _bumps(name, target, z, directions)
         if name == "timestamp":
             found += _steps(name, z, targets)
+        found += _frictions(name, z, observation)
+    found += _springs(observation)
     for target, columns in observation.unnamed():
         found.append((_candidate("", target, columns.shape[-1]), columns))
+    return found
+
+
+def _springs(observation: Observation) -> list[Pair]:
+    """Return joints that give way to their own moment by a curve of any shape."""
+    J, moment = observation.joint_columns, observation.axial_moment
+    if J is None or moment is None:
+        return []
+    return [
+        _spread("", f"moment_{j + 1}", J[:, :, j : j + 1], spline_basis(moment[:, j]))
+        for j in range(moment.shape[1])
+        if np.ptp(moment[:, j]) > 1e-9 * max(float(np.abs(moment).max()), 1e-300)
+    ]
+
+
+def _frictions(name: str, z: Array, observation: Observation) -> list[Pair]:
+    """Return friction that changes with time, load, or the joint's own warmth or slowness."""
+    if observation.friction is None:
+        return []
+    found = []
+    stem, _, index = name.rpartition("_")
+    for j in range(observation.friction.shape[1]):
+        shapes = []
+        if name in CHANGES_FRICTION or (stem == "joint_temperatures" and index == str(j)):
+            shapes = [linear_basis(z)]
+        elif stem == "actual_qd" and index == str(j):
+            slow = np.abs(z) / max(float(np.abs(z).max()), 1e-300)
+            shapes = [np.exp(-slow / share)[:, None] for share in SLOW]
+        columns = np.zeros((*observation.friction.shape, 1))
+        columns[:, j, 0] = observation.friction[:, j]
+        found += [_spread(name, f"friction_{j + 1}", columns, shape) for shape in shapes]
     return found
 
 

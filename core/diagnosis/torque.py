@@ -60,6 +60,7 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
         axes=joint_axes(n),
         joint_columns=own_joints(len(motion), n),
         order_in_time=motion.moving,
+        friction=motion.direction if motion.moving else None,
         unnamed=lambda: unnamed_pulls(model, motion, "torque"),
     )
 
