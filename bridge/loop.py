@@ -233,6 +233,7 @@ class Loop:
                 self._release()
             return None
         except WriteError as error:
+            self._stream.forget()
             self._supervisor.take(Cause.WRITE_FAILED, str(error))
             self._ready_to_write = False
             self._lose(str(error))

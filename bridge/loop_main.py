@@ -26,14 +26,19 @@ import numpy as np
 from bridge.daemon_settings import DaemonSettings
 from bridge.loop import Exit, Loop
 from bridge.realtime import become_realtime
+from bridge.replayed_loop import ReplayedLoop
 from bridge.setpoint_source import make_source
+from bridge.setpoint_source.source import Source
 from bridge.setpoint_stream import SetpointStream
+from bridge.settings import SetpointSettings
 from bridge.shared_page import Page, Phase
 from core.errors import GapbridgeError, InputError
 from core.loads import Loads
 from core.model import Model
 from drivers import make_driver
+from drivers.driver import Driver
 from drivers.ft_sensor.joined import DriverWithSensor
+from drivers.replay import ReplayDriver
 
 _PR_SET_PDEATHSIG = 1
 
@@ -65,10 +70,8 @@ def _run(order: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Exit:
     page.enter(Phase.STARTING)
     model = _read_model(settings)
     driver = make_driver(settings.link, model)
-    if settings.ft_sensor is not None:
-        driver = DriverWithSensor(driver, settings.ft_sensor, model)
-    source = make_source(settings.setpoints, model.arm.n, driver.moves_arm, settings.cell.parent)
-    loop = Loop(settings, model, driver, source, page, tell, order["number"])
+    source = _make_source(settings, model, driver)
+    loop = _make_loop(settings, model, driver, source, page, tell, order["number"])
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: setattr(loop, "stop_requested", True))
     _end_with_parent(order["parent"])
@@ -77,6 +80,24 @@ def _run(order: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Exit:
         source.open()
     tell({"granted": become_realtime()})
     return loop.run(order["arm"], order["may_write"])
+
+
+def _make_source(settings: DaemonSettings, model: Model, driver: Driver) -> Source:
+    """Return where setpoints come from; on a recording they are in the recording."""
+    is_replay = isinstance(driver, ReplayDriver)
+    setpoints = SetpointSettings() if is_replay else settings.setpoints
+    return make_source(setpoints, model.arm.n, driver.moves_arm, settings.cell.parent)
+
+
+def _make_loop(
+    settings: DaemonSettings, model: Model, driver: Driver, source: Source, *more: Any
+) -> Loop:
+    """Return the loop of a link; a recording has the sensor's readings in it."""
+    if isinstance(driver, ReplayDriver):
+        return ReplayedLoop(settings, model, driver, source, *more)
+    if settings.ft_sensor is not None:
+        driver = DriverWithSensor(driver, settings.ft_sensor, model)
+    return Loop(settings, model, driver, source, *more)
 
 
 def _teller(events: int) -> Callable[[dict[str, Any]], None]:

@@ -65,12 +65,15 @@ class SetpointStream:
         self.residual = float(correction.residual)
         return correction
 
-    def start(self, own_q: Vector, timestamp: float) -> None:
-        """Begin at rest at ``own_q`` (n,) with no offset. Raises LimitError."""
+    def start(self, own_q: Vector, timestamp: float, led: bool = False) -> None:
+        """Begin at rest at ``own_q`` (n,) with no offset. Raises LimitError.
+
+        ``led``: the setpoints that follow are led over from where the arm stands already.
+        """
         self.limiter.start(own_q)
         self._nominal.start(own_q)
         self._ramp = 0.0
-        self._start_gap, self._since_start = None, 0.0
+        self._start_gap, self._since_start = None, np.inf if led else 0.0
         # as if a setpoint had been there one cycle ago
         self._last = timestamp - self.limiter.limits.cycle
 
