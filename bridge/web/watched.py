@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bridge.daemon_settings import DaemonSettings
 from bridge.shared_page import ROWS, Page
 from bridge.supervisor import State
-from bridge.web.history import COLUMNS, History
+from bridge.web.history import COLUMNS, STEP, History
 from bridge.web.prediction import WrenchPrediction
 from bridge.web.timing import Timing
 from core.limits import CLAMPS
@@ -93,8 +93,9 @@ class Watched:
             cycles[:, 0], cycles[:, 1] = received + wall, rows[:, s["state"].start]
             cycles[:, 2:8] = rows[:, s["offset"]]
             cycles[:, 8:14] = rows[:, s[self._sensor]]
-            # one in ten is plenty: points are means of more
-            picked = np.arange(len(rows) - 1, -1, -10)[::-1]
+            # a few for each point are plenty: points are means
+            step = max(int(rate * STEP / 2), 1)
+            picked = np.arange(len(rows) - 1, -1, -step)[::-1]
             cycles[picked, 14:20] = self._prediction.of(rows[picked])
         return self._history.add(cycles, now + wall)
 
