@@ -13,12 +13,15 @@ from typing import Any, Self
 
 import httpx
 import numpy as np
+from numpy.typing import NDArray
 
+from bridge.cell import load_cell
 from bridge.daemon_settings import DaemonSettings
 from bridge.shared_page import Page, Phase
 from bridge.side_process import SideProcess
 from bridge.supervisor import State
 
+Array = NDArray[np.float64]
 N, RATE = 6, 125.0
 CELL = """robot: {model: ur10e}
 tool: {tcp: {xyz: [0, 0, 0.18]}}
@@ -44,6 +47,7 @@ class Feed:
         self.port = keys.setdefault("port", free_port())
         cell = folder / "ur10e_press.yaml"
         cell.write_text(CELL)
+        self._hand = load_cell(cell).model.without_terms()
         self.settings = DaemonSettings.model_validate(
             {
                 "cell": cell, "link": {"driver": "ur_rtde", "host": "127.0.0.2", "rate": RATE},
@@ -174,8 +178,7 @@ class Feed:
         row[s["joint_temperatures"]] = 27.0
         pull = np.array([12 * math.sin(0.9 * t), 6 * math.cos(0.7 * t), -8.0, 0.3, 0.0, 0.1])
         row[s["actual_TCP_force"]] = pull
-        raw = 49.0 * np.array([math.sin(0.5 * t) * 0.3, math.cos(0.5 * t) * 0.2, 0.95])
-        row[s["ft_raw_wrench"]] = [*(raw + rng.normal(0, 0.8, 3)), *rng.normal(0, 0.05, 3)]
+        row[s["ft_raw_wrench"]] = self.wrench(q, pull) + rng.normal(0, [0.8] * 3 + [0.05] * 3)
         size = 1e-3 * np.array([0.5, -0.35, -1.1]) * (1 + 0.3 * np.sin(0.5 * t + np.arange(3)))
         row[s["offset"]] = [*size, *(0.8e-3 * np.sin(0.4 * t + np.arange(3)))]
         row[s["received"]] = time.monotonic() - 2e-4
@@ -183,6 +186,13 @@ class Feed:
         row[s["robot_mode"]], row[s["safety_mode"]] = 7, 1
         self.page.beat()
         self.page.publish()
+
+    def wrench(self, q: Array, pull: Array) -> Array:
+        """Return what a flange sensor reads that carries 0.4 kg more than is declared."""
+        force = self._hand.predict(q[None]).rotation[0].T @ (
+            (5.4 * np.array([0, 0, -9.80665])) + pull[:3]
+        )
+        return np.array([*force, *np.cross([0, 0, 0.06], force)])
 
 
 def self_signed(folder: Path) -> tuple[Path, Path]:

@@ -1,5 +1,5 @@
 // The page: takes the daemon's messages, fills in words and figures, draws.
-import { MEANING, clock, duration, inWords, number } from './words.js';
+import { MEANING, clock, count, duration, inWords, number } from './words.js';
 import { Lines, drawHistogram, forgetColours } from './drawing.js';
 
 const $ = (id) => document.getElementById(id);
@@ -160,13 +160,13 @@ function showFigures() {
   tile('last state', silence === null ? 'never' : silence < 1 ? 'now' : duration(silence),
     silence !== null && silence >= 1 ? 'ago' : '', silence === null || silence > 1);
   tile('age, 99 %', age && age.p99 !== null ? duration(age.p99) : '–');
-  tile('cycles', number(now.cycles, 4));
+  tile('cycles', count(now.cycles));
   const share = now.missed / Math.max(now.cycles + now.missed, 1);
-  tile('missed', number(now.missed), `${(100 * share).toFixed(2)} %`, share > 0.002);
-  tile('late', number(now.late));
-  tile('written', number(now.written, 4), 'setpoints');
+  tile('missed', count(now.missed), `${(100 * share).toFixed(2)} %`, share > 0.002);
+  tile('late', count(now.late));
+  tile('written', count(now.written), 'setpoints');
   const held = Object.values(now.clamped).reduce((a, b) => a + b, 0);
-  tile('held back', number(held, 4), 'by limits');
+  tile('held back', count(held), 'by limits');
 }
 
 function gauge(id, size, limit, unit) {
@@ -203,28 +203,28 @@ function showHealth() {
   const loop = status.loop || {}, link = status.link || {};
   rows.push(row('heartbeat of the loop', now.heartbeat < 0.5 ? 'now' : `${duration(now.heartbeat)} ago`,
     now.heartbeat >= 0.5));
-  rows.push(row('loop restarts', number(loop.restarts ?? 0), (loop.restarts ?? 0) > 0));
-  for (const [reason, count] of Object.entries(link.dropped || {})) {
-    rows.push(row(`dropped: ${reason}`, number(count), count > 0));
+  rows.push(row('loop restarts', count(loop.restarts ?? 0), (loop.restarts ?? 0) > 0));
+  for (const [reason, times] of Object.entries(link.dropped || {})) {
+    rows.push(row(`dropped: ${reason}`, count(times), times > 0));
   }
-  for (const [name, count] of Object.entries(now.clamped)) {
-    if (count) rows.push(row(`held back: ${name.replace('_', ' ')}`, number(count, 4)));
+  for (const [name, times] of Object.entries(now.clamped)) {
+    if (times) rows.push(row(`held back: ${name.replace('_', ' ')}`, count(times)));
   }
   for (const [name, side] of Object.entries(status.sides || {})) {
     const dead = !side.pid;
     const again = side.restarts ? `, ${side.restarts} restarts` : '';
     rows.push(row(name, `${dead ? 'not running' : 'running'}${again}`, dead || side.restarts > 0));
   }
-  for (const [kind, count] of Object.entries(status.counts || {})) {
-    if (/fault|refused|failed/i.test(kind) && count) rows.push(row(kind, number(count), true));
+  for (const [kind, times] of Object.entries(status.counts || {})) {
+    if (/fault|refused|failed/i.test(kind) && times) rows.push(row(kind, count(times), true));
   }
   if (status.recording) rows.push(row('recording', String(status.recording).split('/').pop()));
   if (status.recorder && status.recorder.lost !== undefined) {
-    rows.push(row('rows not recorded', number(status.recorder.lost), status.recorder.lost > 0));
+    rows.push(row('rows not recorded', count(status.recorder.lost), status.recorder.lost > 0));
   } else if (status.lost_rows !== undefined) {
-    rows.push(row('rows not recorded', number(status.lost_rows), status.lost_rows > 0));
+    rows.push(row('rows not recorded', count(status.lost_rows), status.lost_rows > 0));
   }
-  if (now.lost) rows.push(row('cycles this page did not see', number(now.lost)));
+  if (now.lost) rows.push(row('cycles this page did not see', count(now.lost)));
   $('health').replaceChildren(...rows);
 }
 

@@ -18,6 +18,11 @@ export function number(value, digits = 3) {
   return value.toFixed(Math.min(places, 6));
 }
 
+export function count(value) {
+  if (!Number.isFinite(value)) return '–';
+  return Math.round(value).toLocaleString('en').replace(/,/g, '\u202f');
+}
+
 export function duration(seconds) {
   if (seconds === null || seconds === undefined || !Number.isFinite(seconds)) return '–';
   if (seconds < 1e-3) return `${number(1e6 * seconds)} µs`;
