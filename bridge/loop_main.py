@@ -41,6 +41,7 @@ from drivers.ft_sensor.joined import DriverWithSensor
 from drivers.replay import ReplayDriver
 
 _PR_SET_PDEATHSIG = 1
+LONGEST_WORDS = 1000  # of an event: a line that a pipe takes whole or not at all
 
 
 def main() -> None:
@@ -52,14 +53,14 @@ def main() -> None:
     try:
         code = _run(order, tell)
     except InputError as error:
-        tell({"failure": str(error), "input": True})
+        tell({"kind": "failure", "detail": str(error), "input": True})
         code = Exit.INPUT
     except GapbridgeError as error:
-        tell({"failure": str(error)})
+        tell({"kind": "failure", "detail": str(error)})
         code = Exit.LINK
     except BaseException as error:
         traceback.print_exc()
-        tell({"failure": f"the loop failed: {type(error).__name__}: {error}"})
+        tell({"kind": "failure", "detail": f"the loop failed: {type(error).__name__}: {error}"})
     sys.stderr.flush()
     os._exit(code)
 
@@ -78,8 +79,8 @@ def _run(order: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Exit:
     _compile(settings, model)
     if order["may_write"]:
         source.open()
-    tell({"granted": become_realtime()})
-    return loop.run(order["arm"], order["may_write"])
+    tell({"kind": "granted", "detail": ", ".join(become_realtime())})
+    return loop.run(order["arm"], order["may_write"], order["latched"])
 
 
 def _make_source(settings: DaemonSettings, model: Model, driver: Driver) -> Source:
@@ -104,7 +105,10 @@ def _teller(events: int) -> Callable[[dict[str, Any]], None]:
     """Return a function that tells the daemon of an event and never blocks."""
 
     def tell(event: dict[str, Any]) -> None:
-        line = json.dumps({"time": time.time(), **event}) + "\n"
+        if len(event.get("detail", "")) > LONGEST_WORDS:
+            event = {**event, "detail": event["detail"][:LONGEST_WORDS]}
+        now = {"time": time.time(), "monotonic": time.monotonic()}
+        line = json.dumps({**now, **event}) + "\n"
         with contextlib.suppress(OSError):
             os.write(events, line.encode())
 

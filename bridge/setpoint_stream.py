@@ -57,12 +57,16 @@ class SetpointStream:
         self._since_start = 0.0  # s
         self.unsolved = 0  # setpoints without a correction that meets the wanted pose
         self.residual = 0.0  # m, of the last correction
+        self.finite = True  # the last correction is numbers
         self.clamped = 0  # bits of the last setpoint
 
     def correct(self, nominal_q: Vector, loads: Loads) -> Correction:
         """Return the correction alone, neither ramped nor limited."""
         correction = self._compensator.correct(nominal_q, loads)
         self.residual = float(correction.residual)
+        self.finite = bool(
+            np.isfinite(correction.q).all() and np.isfinite(correction.offset_in_base).all()
+        )
         return correction
 
     def start(self, own_q: Vector, timestamp: float, led: bool = False) -> None:
