@@ -1,108 +1,82 @@
 """The daemon: the parent that survives its loop.
 
 It starts the loop in a process of its own, watches the heartbeat, ends what hangs, starts anew what
-died (observing, never writing), records every cycle, and says at the end how it went.
+died (observing, never writing), looks after the processes that record and show, and says at the end
+how it went.
 """
 
 from __future__ import annotations
 
-import gc
-import signal
+import queue
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
-import click
-from pydantic import ValidationError
-
-from bridge.cell import Cell, load_cell
+from bridge.control import Control
+from bridge.control_socket import ControlSocket
+from bridge.daemon_opening import open_all
 from bridge.daemon_settings import DaemonSettings
+from bridge.daemon_sides import Sides
+from bridge.daemon_status import DaemonStatus
+from bridge.event_book import Event, EventBook
 from bridge.loop import LONGEST_STOP, Exit
 from bridge.loop_process import LoopProcess
 from bridge.recorder import Recorder
-from bridge.shared_page import Command, Page
+from bridge.reload import Reload
+from bridge.run_settings import configuration_for, settings_of
+from bridge.service_manager import ServiceManager
+from bridge.shared_page import Command, Page, Phase
 from bridge.summary import RunSummary, Tally
 from bridge.supervisor import State
-from core.errors import CellError, InputError, LinkError
+from core.errors import InputError, LinkError
+
+__all__ = ["Daemon", "Say", "settings_of"]
 
 TICK = 0.02  # s between two looks at the loop
 HEALTHY = 10.0  # s after which a restart counts as the first again
 STOP_MARGIN = 0.4  # s on top of the loop's own time: then it is ended by force
+STATUS_EVERY = 0.5  # s
 
 Say = Callable[[str], None]
 
 
-def settings_of(cell: Cell) -> DaemonSettings:
-    """Return what a run of this cell is made of. Raises CellError where sections do not fit."""
-    if cell.link is None:
-        raise CellError(f"{cell.path}: link: found nothing, expected the robot's address for a run")
-    try:
-        return DaemonSettings(
-            cell=cell.path.resolve(), link=cell.link, limits=cell.limits,
-            setpoints=cell.setpoints.model_copy(
-                update={"file": cell.setpoints.file and cell.setpoints.file.resolve()}
-            ),
-            recording=cell.recording, ft_sensor=cell.ft_sensor,
-        )  # fmt: skip
-    except ValidationError as error:
-        words = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
-        raise CellError(f"{cell.path}: {words}") from None
-
-
-def run_cell(
-    cell: Cell | Path, observe: bool = False, arm: bool = False, duration: float | None = None
-) -> int:
-    """Run a cell's daemon until it is stopped, its trajectory ends or ``duration`` s are over.
-
-    Prints what happens and a summary; returns the exit code. Raises InputError for a cell that
-    cannot be run, LinkError where the robot cannot be reached.
-    """
-    settings = settings_of(cell if isinstance(cell, Cell) else load_cell(cell))
-    summary = run_daemon(
-        settings, observe=observe, arm=arm or settings.setpoints.arm, duration=duration,
-        say=click.echo,
-    )  # fmt: skip
-    for line in summary.lines():
-        click.echo(line)
-    gc.freeze()  # else Python's last collection, of all compiled code, delays the end by 0.5 s
-    return summary.exit_code
-
-
-def run_daemon(
-    settings: DaemonSettings,
-    observe: bool = False,
-    arm: bool = False,
-    duration: float | None = None,
-    say: Say = lambda _: None,
-) -> RunSummary:
-    """Run the daemon and return how it went; see ``run_cell``. Stops on SIGINT and SIGTERM."""
-    daemon = Daemon(settings, may_write=not observe, say=say)
-    with _signals(daemon.stop):
-        return daemon.run(arm=arm and not observe, duration=duration)
-
-
 class Daemon:
-    """One run. ``stop``, ``arm`` and ``disarm`` may be called from other threads."""
+    """One run. ``stop``, ``reload``, ``arm`` and ``disarm`` may be called from other threads."""
 
     def __init__(
-        self, settings: DaemonSettings, may_write: bool, say: Say = lambda _: None
+        self,
+        settings: DaemonSettings,
+        may_write: bool,
+        say: Say = lambda _: None,
+        log: Callable[[Event], None] | None = None,
     ) -> None:
-        self._settings = settings
-        self._n = load_cell(settings.cell).arm.n
-        self._page = Page(self._n)  # one for the whole run, whatever becomes of the loops
-        self._reader = self._page.reader()
-        self._may_write, self._say = may_write, say
-        self._recorder = Recorder(settings.recording, self._n)
-        self._tally = Tally(self._n, settings.link.rate)
-        self._loop: LoopProcess | None = None
-        self._failure: dict[str, Any] = {}
+        self.configuration = configuration_for(settings)
+        self.may_write, self._say = may_write, say
+        n = self.configuration.n
+        self.page = Page(n)  # one for the whole run, whatever becomes of the loops
+        self._reader = self.page.reader()
+        self.recorder = Recorder(settings.recording, n)
+        self.sides = Sides()
+        self.tally = Tally(n, settings.link.rate)
+        listeners = [self._hear, self.recorder.tell, self.sides.tell]
+        self.book = EventBook(*listeners, *([log] if log else []))
+        self._posted: queue.SimpleQueue[Event] = queue.SimpleQueue()  # by other threads
+        self.manager = ServiceManager()
+        self.session = ""
+        self._status = DaemonStatus(self)
+        self._status_at = 0.0
+        self._reload = Reload(self)
+        self.control = Control(self)
+        self.socket: ControlSocket | None = None
+        self.loop: LoopProcess | None = None
+        self._failure: Event = {}
         self._faults: list[str] = []
         self._refused = False  # writing was asked for and could not begin
         self._seen = False  # a state has been read, by this or a former loop
-        self._restarts = 0
+        self.restarts = 0
         self._wait = settings.backoff[0]
         self._last_state = State.DISCONNECTED
         self._stopping = threading.Event()
@@ -110,164 +84,220 @@ class Daemon:
     # -- for others -------------------------------------------------------------------------------
 
     @property
+    def settings(self) -> DaemonSettings:
+        """Return what runs now; a reload changes it."""
+        return self.configuration.settings
+
+    @property
     def state(self) -> State:
         """Return what the loop is doing."""
         return self._last_state
 
     @property
+    def phase(self) -> Phase:
+        """Return what the loop's process is at."""
+        return self.page.phase
+
+    @property
+    def latched(self) -> str:
+        """Return the fault that waits for being acknowledged; empty: none."""
+        return self._status.latched
+
+    @property
+    def sequence(self) -> int:
+        """Return the number of the last event."""
+        return self.book.sequence
+
+    @property
     def loop_pid(self) -> int | None:
         """Return the process id of the loop, None between two of them."""
-        loop = self._loop
+        loop = self.loop
         return None if loop is None else loop.pid
 
     @property
     def recording(self) -> Path | None:
         """Return the file that cycles go to."""
-        return self._recorder.path
+        return self.recorder.path
+
+    @property
+    def lost_rows(self) -> int:
+        """Return how many cycles were overwritten before they were read here."""
+        return self._reader.lost
+
+    def events_since(self, sequence: int) -> list[Event]:
+        """Return the events after a number."""
+        return self.book.since(sequence)
+
+    def status(self) -> dict[str, Any]:
+        """Return the status document."""
+        return self._status.document()
+
+    def note(self, event: Event) -> None:
+        """Have an event told by the daemon's own thread."""
+        self._posted.put(event)
 
     def stop(self) -> None:
         """Ramp out and end."""
         self._stopping.set()
 
-    def arm(self) -> None:
-        """Ask the loop to write setpoints."""
-        if self._loop is not None and self._may_write:
-            self._loop.page.ask(Command.ARM)
+    def reload(self) -> None:
+        """Read the cell file again; what is wrong is told, and the old one stays."""
+        self._reload.ask()
 
-    def disarm(self) -> None:
-        """Ask the loop to ramp out and observe."""
-        if self._loop is not None:
-            self._loop.page.ask(Command.DISARM)
+    def arm(self, by: str = "") -> None:
+        """Ask the loop to write setpoints."""
+        if self.loop is not None and self.may_write:
+            self.told_to_arm(by)
+            self.page.ask(Command.ARM)
+
+    def told_to_arm(self, by: str) -> None:
+        """Take note of who or what has asked for arming."""
+        self._status.armed_by = by
+
+    def disarm(self, by: str = "") -> None:
+        """Ask the loop to ramp out and observe; in a fault, acknowledge it."""
+        if self.loop is not None:
+            self.page.ask(Command.DISARM)
 
     # -- the run ----------------------------------------------------------------------------------
 
-    def run(self, arm: bool = False, duration: float | None = None) -> RunSummary:
-        """Run until stopped; see run_cell."""
-        try:
+    def run(self, arm: bool = False, duration: float | None = None, by: str = "") -> RunSummary:
+        """Run until stopped; ``by`` says who or what has asked for arming. See run_cell."""
+        with ExitStack() as stack:
+            arm = open_all(self, stack, arm, by)
             while not self._stopping.is_set():
                 self._run_loop(arm, duration)
-                arm = False  # whatever happened, only a person starts the writing again
-                if self._stopping.is_set():
-                    break
-                self._stopping.wait(self._wait)
-                self._wait = min(2.0 * self._wait, self._settings.backoff[1])
-                self._restarts += 1
+                arm = self._reload.swap()  # else only a person starts the writing again
+                if not self._stopping.is_set() and not self._reload.swapped:
+                    self._pause()
+                    self.restarts += 1
+            self._take()
             return self._summary()
-        finally:
-            self._recorder.close()
-            self._page.close()
+
+    def _pause(self) -> None:
+        """Wait before the next process of the loop, and go on looking after the rest."""
+        until = time.monotonic() + self._wait
+        self._wait = min(2.0 * self._wait, self.settings.backoff[1])
+        while time.monotonic() < until and not self._stopping.wait(TICK):
+            self._tick()
+
+    def _tick(self) -> None:
+        """Look after everything but the loop."""
+        self._take()
+        for event in self.sides.check():
+            self.book.add(event)
+        while not self._posted.empty():
+            self.book.add(self._posted.get())
+        if time.monotonic() >= self._status_at:
+            self._status_at = time.monotonic() + STATUS_EVERY
+            self.sides.tell({"kind": "status", **self.status()})
+        loop = self.loop
+        if loop is None or not loop.hangs:
+            self.manager.kick()
 
     def _run_loop(self, arm: bool, duration: float | None) -> None:
         """Run one process of the loop to its end."""
-        output = self._recorder.output
         self._failure = {}
-        log: Any = output if output is not None else -3  # subprocess.DEVNULL
-        loop = self._loop = LoopProcess(
-            self._settings, self._page, arm, self._may_write, log, self._restarts
-        )
-        stop_by = None
-        first_cycle = None
+        log: Any = self.recorder.output or -3  # subprocess.DEVNULL
+        loop = self.loop = LoopProcess(
+            self.settings, self.page, arm, self.may_write, log, self.restarts,
+            self._status.latched,
+        )  # fmt: skip
+        stop_by = first_cycle = None
         try:
             while loop.exit_code is None:
                 time.sleep(TICK)
-                self._take(loop)
-                if loop.page.seen and first_cycle is None:
+                self._tick()
+                if self.page.seen and first_cycle is None:
                     first_cycle, self._seen = time.monotonic(), True
+                    self.manager.ready()
                 over = first_cycle is not None and (
                     duration is not None and time.monotonic() - first_cycle >= duration
                 )
-                if over or (loop.page.ended and duration is None):
+                if over or (self.page.ended and duration is None):
                     self._stopping.set()
-                if self._stopping.is_set() and stop_by is None:
+                self._reload.step(self.state, self.phase)
+                if (self._stopping.is_set() or self._reload.wants_end) and stop_by is None:
                     stop_by = time.monotonic() + LONGEST_STOP + STOP_MARGIN
+                    if self._stopping.is_set():
+                        self.manager.stopping()
                     loop.ask_to_stop()
                 if loop.hangs or (stop_by is not None and time.monotonic() > stop_by):
-                    self._fault(f"the loop stood still for {loop.page.silence:.2f} s and was ended")
+                    self._fault(
+                        "hang", f"the loop stood still for {self.page.silence:.2f} s and was ended"
+                    )
                     loop.kill()
-            self._take(loop)
+            self._take()
             self._after(loop)
             if first_cycle is not None and time.monotonic() - first_cycle > HEALTHY:
-                self._wait = self._settings.backoff[0]
+                self._wait = self.settings.backoff[0]
         finally:
-            self._loop = None
+            self.loop = None
             loop.close()
 
-    def _take(self, loop: LoopProcess) -> None:
+    def _take(self) -> None:
         """Take cycles and events over from the loop."""
         rows = self._reader.drain()
-        self._last_state = State(loop.page.state)
-        self._tally.add(rows)
-        self._recorder.write(rows)
-        for event in loop.events():
-            self._recorder.tell(event)
-            self._hear(event)
+        if self.loop is not None:
+            self._last_state = State(self.page.state)
+        self.tally.add(rows)
+        self._status.take(rows)
+        self.recorder.write(rows)
+        for event in self.loop.events() if self.loop is not None else ():
+            self.book.add(event)
 
-    def _hear(self, event: dict[str, Any]) -> None:
-        if "failure" in event:
+    def _hear(self, event: Event) -> None:
+        """Act on an event, and tell it to the person at the terminal."""
+        kind, detail = event["kind"], str(event.get("detail", ""))
+        self._status.hear(event)
+        if kind == "failure":
             self._failure = event
-        if "to" in event:
-            detail = f": {event['detail']}" if event["detail"] else ""
-            text = f"{event['from'].lower()} -> {event['to'].lower()} ({event['cause']}){detail}"
+        if kind == "refused":
+            self._refused = True
+        if kind == "transition":
+            tail = f": {detail}" if detail else ""
+            text = f"{event['from'].lower()} -> {event['to'].lower()} ({event['cause']}){tail}"
             self._say(text)
             self._refused |= event["cause"] == "start refused"
-            if event["detail"]:
+            if detail:
                 self._faults.append(text)
-        elif "granted" not in event:
-            self._say("; ".join(str(v) for k, v in event.items() if k not in ("time", "input")))
+        elif detail and kind not in ("granted", "summary"):
+            self._say(detail)
 
     def _after(self, loop: LoopProcess) -> None:
         """Judge how the loop's process ended; raises where it is no use to start it again."""
         code = loop.exit_code
         if code == Exit.DONE:
-            self._stopping.set()
+            if not self._reload.wants_end:
+                self._stopping.set()
             return
         self._last_state = State.DISCONNECTED
-        words = str(self._failure.get("failure", "")) or f"the loop's process {loop.describe_end()}"
+        self._status.lost_loop()
+        words = str(self._failure.get("detail", "")) or f"the loop's process {loop.describe_end()}"
         if self._stopping.is_set() and not self._failure:
             return
         if code == Exit.INPUT:
             raise InputError(words)
         if not self._seen:
             raise LinkError(words)
-        self._fault(words)
+        self._fault("loop", words)
 
-    def _fault(self, words: str) -> None:
+    def _fault(self, cause: str, words: str) -> None:
         self._faults.append(words)
-        self._recorder.tell({"fault": words})
-        self._say(words)
+        self.book.add({"kind": "fault", "cause": cause, "detail": words})
 
     def _summary(self) -> RunSummary:
         state = self._last_state
-        wrong = self._refused and not self._tally.written
+        wrong = self._refused and not self.tally.written
         wrong |= state in (State.FAULT, State.DISCONNECTED)
         summary = RunSummary(
-            **self._tally.figures(),
-            restarts=self._restarts,
-            lost_rows=self._reader.lost,
+            **self.tally.figures(),
+            restarts=self.restarts,
+            lost_rows=self.lost_rows,
             faults=tuple(self._faults),
             state=state.name.lower(),
             exit_code=1 if wrong else 0,
-            recording=self._recorder.path,
+            recording=self.recording,
         )
-        self._recorder.tell({"summary": summary.to_json()})
+        self.book.add({"kind": "summary", "summary": summary.to_json()})
         return summary
-
-
-class _signals:  # noqa: N801
-    """SIGINT and SIGTERM call ``stop`` while the block lasts; only where that is possible."""
-
-    def __init__(self, stop: Callable[[], None]) -> None:
-        self._stop = stop
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> None:
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._before[number] = signal.signal(number, self._handle)
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        self._stop()
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)

@@ -50,8 +50,18 @@ class LiveLoads:
             approach=self._approach,
         )
 
+    def forget(self) -> None:
+        """Begin anew after a gap: an old force means nothing."""
+        self._last = -math.inf
+
     def _filter_force(self, state: RobotState) -> None:
-        """Low-pass the force: its noise must not shake the arm. A long gap begins anew."""
+        """Low-pass the force: its noise must not shake the arm. A long gap begins anew.
+
+        A sensor that was lost counts as no force; the limiter leads over.
+        """
+        if state.sensor_lost:
+            self._wrench[0], self._last = 0.0, -math.inf
+            return
         gap = state.timestamp - self._last
         self._last = state.timestamp
         if self._constant <= 0.0 or not 0.0 < gap < 10.0 * self._constant:

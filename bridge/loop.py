@@ -15,15 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.controller_clock import ControllerClock
+from bridge.counts import Count
 from bridge.cycle_row import fill_row
 from bridge.daemon_settings import DaemonSettings
 from bridge.live_loads import LiveLoads
-from bridge.setpoint_source.source import Source, SourceDryError, Told
+from bridge.loop_checks import LoopChecks
+from bridge.loop_writing import Writing
+from bridge.setpoint_source.source import Source, Told
 from bridge.setpoint_stream import SetpointStream
 from bridge.shared_page import Command, Page, Phase
 from bridge.state_watch import StateWatch
 from bridge.supervisor import Cause, State, Supervisor
-from core.errors import InvalidStateError, LimitError, LinkError, WriteError
+from core.errors import InvalidStateError, LinkError
 from core.loads import Loads
 from core.model import Model
 from core.setpoint import Setpoint
@@ -31,8 +34,6 @@ from core.state import RobotState
 from drivers.driver import Driver
 
 Vector = NDArray[np.float64]
-SETTLED, LONGEST_SETTLING = 2e-6, 0.3  # rad, s
-ROBOT_RUNNING, SAFE = 7, (1, 2)  # robot_mode; safety_mode normal, reduced
 
 LONGEST_STOP = 1.0  # s from a request to stop to letting go, at rest or not
 HASTY_RAMP = 0.5  # s: what a stop takes for the ramp at most
@@ -71,28 +72,35 @@ class Loop:
         )
         self._clock = ControllerClock(driver.rate)
         self._supervisor = Supervisor(self._changed)
-        self._watch = StateWatch(driver, self._supervisor, tell, self._lose)
-        self._ready_to_write = False  # the driver is armed
-        self._settling = 0.0  # s, monotonic: since when the last setpoint stands
+        self._watch = StateWatch(driver, model.arm, self._supervisor, page, tell, self._lose)
+        self._checks = LoopChecks(driver.rate, self._supervisor, page, tell)
+        self._writing = Writing(
+            settings.setpoints, driver, source, self._stream, self._supervisor, page, tell,
+            self._skip, self._lose,
+        )  # fmt: skip
+        self._acknowledged = False  # a person has seen the fault; it ends when the robot is fine
         self._stop_by: float | None = None  # s, monotonic
         self._exit: Exit | None = None
         self.stop_requested = False  # set by signal handlers
 
     # -- the frame --------------------------------------------------------------------------------
 
-    def run(self, arm: bool, may_write: bool) -> Exit:
+    def run(self, arm: bool, may_write: bool, latched: str = "") -> Exit:
         """Connect and loop until told to stop, or until the link is lost.
 
-        ``arm``: arm as soon as a state is there. ``may_write`` False: nothing can arm.
+        ``arm``: arm as soon as a state is there. ``may_write`` False: nothing can arm. ``latched``:
+        the fault of a loop before this one that nobody has acknowledged.
         """
         self._page.enter(Phase.CONNECTING)
         try:
             self._driver.connect()
         except LinkError as error:
-            self._tell({"failure": str(error)})
+            self._tell({"kind": "failure", "detail": str(error)})
             return Exit.LINK
-        self._watch.believe()
+        self._watch.forget()
         self._supervisor.take(Cause.CONNECTED)
+        if latched:
+            self._supervisor.take(Cause.LATCHED, latched)
         self._page.enter(Phase.RUNNING)
         wanted = arm
         while self._exit is None:
@@ -101,23 +109,52 @@ class Loop:
             if self.stop_requested or command == Command.STOP:
                 self._stop()
             elif command == Command.DISARM:
-                self._supervisor.take(Cause.DISARM)
+                wanted = False
+                self._disarm()
             elif command == Command.ARM:
                 wanted = True
             if wanted and may_write and self._page.seen and self._stop_by is None:
                 wanted = False
-                self._supervisor.take(Cause.ARM)
+                self._arm()
             if self._exit is None:
                 self._cycle()
         self._page.enter(Phase.ENDING)
         self._source.close()
         return self._exit
 
+    def _arm(self) -> None:
+        """Arm where a robot is that can move, and nothing that waits for a person."""
+        if self._supervisor.state == State.FAULT:
+            words = "a fault is latched: acknowledge it first (gapbridge disarm)"
+        elif not self._checks.fine:
+            words = f"the robot is not ready: {self._checks.robot}"
+        else:
+            self._supervisor.take(Cause.ARM)
+            return
+        self._tell({"kind": "refused", "what": "arm", "detail": words})
+
+    def _disarm(self) -> None:
+        if self._supervisor.state == State.FAULT:
+            self._acknowledged = True
+        else:
+            self._supervisor.take(Cause.DISARM)
+
     def _changed(self, before: State, after: State, cause: Cause, detail: str) -> None:
         self._page.tell_state(after)
-        self._tell({"from": before.name, "to": after.name, "cause": cause.value, "detail": detail})
+        self._tell(
+            {"kind": "transition", "from": before.name, "to": after.name, "cause": cause.value,
+             "detail": detail, "cycle": self._page.written}
+        )  # fmt: skip
+        if after == State.FAULT:
+            self._acknowledged = False
         if after == State.ARMED:
-            self._clock.skip()
+            self._skip()
+
+    def _skip(self) -> None:
+        """Do not count what the loop does not see now: it does something else."""
+        self._clock.skip()
+        self._checks.forget()
+        self._watch.forget()
 
     def _stop(self) -> None:
         """Ramp out, then end; a deadline makes sure of the end."""
@@ -126,18 +163,21 @@ class Loop:
             self._stream.hasten(HASTY_RAMP)
             self._supervisor.take(Cause.STOP)
         if not self._supervisor.state.writes or time.monotonic() > self._stop_by:
-            self._release()
+            self._writing.release()
             self._supervisor.take(Cause.RAMPED_OUT, "not at rest in time")
             self._exit = Exit.DONE
 
     def _lose(self, detail: str) -> None:
         """Give the process up: a link that broke is only safe in a new one."""
+        self._page.count(Count.LINK_LOST)
         self._supervisor.take(Cause.LINK_LOST, detail)
+        self._tell({"kind": "failure", "detail": detail})
         self._exit = Exit.LINK
 
     # -- one cycle --------------------------------------------------------------------------------
 
     def _cycle(self) -> None:
+        self._watch.has_written = self._writing.has_armed
         state = self._watch.next()
         if state is None:
             return
@@ -149,173 +189,65 @@ class Loop:
         self._watch.believe()
         missed = self._clock.take(state)
         self._page.tell_seen()
-        self._check_robot(state)
+        if self._checks.begin(state, missed):
+            self._loads.forget()
+        self._acknowledge()
+        supervisor, writing = self._supervisor, self._writing
+        if supervisor.state == State.FAULT:
+            writing.ready = False  # its own watchdog, or a person, has the robot
         loads = self._loads.update(state)
-        if self._supervisor.state == State.ARMED and self._start(state, own):
+        if supervisor.state == State.ARMED and writing.start(state, own):
             self._record(state, missed, own, loads, None)
             return  # the state is old by now
-        holding = self._supervisor.state == State.HOLDING
-        writes = self._supervisor.state.writes
-        written = self._write(state, own, loads) if writes else None
+        holding = supervisor.state == State.HOLDING
+        writes = supervisor.state.writes
+        written = writing.write(state, own, loads) if writes else None
         self._record(state, missed, own, loads, written, writes)
-        if written is not None and holding and self._at_rest(written, state):
-            self._release()  # takes a moment: after the cycle has been timed
-            self._supervisor.take(Cause.RAMPED_OUT)
+        clamped = 0 if written is None else self._stream.clamped
+        commanded = own if written is None else written.q
+        self._checks.end(state, commanded, clamped, time.monotonic() - state.received)
+        if written is not None and holding and writing.at_rest(written, state):
+            writing.release()  # takes a moment: after the cycle has been timed
+            supervisor.take(Cause.RAMPED_OUT)
 
-    def _check_robot(self, state: RobotState) -> None:
-        """Take note of a robot that cannot move, and of its coming back."""
-        fine = state.robot_mode == ROBOT_RUNNING and state.safety_mode in SAFE
-        if not fine:
-            self._supervisor.take(
-                Cause.UNSAFE, f"robot_mode {state.robot_mode}, safety_mode {state.safety_mode}"
-            )
-            self._ready_to_write = False
-        elif self._supervisor.state == State.FAULT:
-            self._supervisor.take(Cause.RECOVERED)
-
-    def _start(self, state: RobotState, own: Vector) -> bool:
-        """Begin writing once the source has a first setpoint and the driver is ready.
-
-        Returns whether it took so long that a fresh state is needed.
-        """
-        first = self._source.first(own)
-        if first is None:
-            if self._ready_to_write:
-                self._refuse_start("the source fell silent before the first setpoint")
-            return False
-        away = np.abs(first - own)
-        tolerance = self._settings.setpoints.start_tolerance
-        if not (away <= tolerance).all():
-            joint = int(np.argmax(away))
-            self._refuse_start(
-                f"joint {joint + 1}: found the first setpoint {away[joint]:.4f} rad from the arm, "
-                f"expected at most {tolerance:g} (setpoints.start_tolerance)"
-            )
-            return False
-        try:
-            if not self._ready_to_write:
-                self._arm_driver(state)
-                return True
-            self._stream.start(own, state.timestamp)
-        except (WriteError, LimitError) as error:
-            self._refuse_start(str(error))
-            return True
-        self._source.begin(state.timestamp, own)
-        self._supervisor.take(Cause.WRITING)
-        return False
-
-    def _arm_driver(self, state: RobotState) -> None:
-        """Make the driver ready, which takes a moment: a fresh state is needed after it."""
-        self._page.enter(Phase.ARMING)
-        self._watch.has_written = True
-        try:
-            self._driver.arm(state)
-            self._ready_to_write = True
-        finally:
-            self._page.enter(Phase.RUNNING)
-            self._clock.skip()
-
-    def _refuse_start(self, detail: str) -> None:
-        self._release()
-        self._supervisor.take(Cause.START_REFUSED, detail)
-
-    def _write(self, state: RobotState, own: Vector, loads: Loads) -> Setpoint | None:
-        """Send one setpoint; returns it, or None where none has left."""
-        source_q = self._next(state, own)
-        holding = self._supervisor.state == State.HOLDING
-        try:
-            setpoint = self._stream.advance(state, source_q, loads, 0.0 if holding else 1.0)
-            self._driver.write_setpoint(setpoint)
-        except LimitError as error:
-            self._stream.forget()
-            self._supervisor.take(Cause.SETPOINT_REFUSED, str(error))
-            if not self._supervisor.state.writes:
-                self._release()
-            return None
-        except WriteError as error:
-            self._supervisor.take(Cause.WRITE_FAILED, str(error))
-            self._ready_to_write = False
-            self._lose(str(error))
-            return None
-        return setpoint
-
-    def _at_rest(self, setpoint: Setpoint, state: RobotState) -> bool:
-        """Return whether the offset is out, and the arm, where it is ours, stands.
-
-        The controller's target follows late: who lets go at once leaves the arm short of it.
-        """
-        if not self._driver.moves_arm:
-            return self._stream.is_bare
-        if not self._stream.rests:
-            return False
-        now = time.monotonic()
-        self._settling = self._settling or now
-        near = bool((np.abs(state.target_q - setpoint.q) < SETTLED).all())
-        if near or now - self._settling > LONGEST_SETTLING:
-            self._settling = 0.0
-            return True
-        return False
-
-    def _next(self, state: RobotState, own: Vector) -> Vector | None:
-        """Return the source's setpoint; None: the motion must brake."""
-        if self._supervisor.state == State.HOLDING:
-            return None if self._driver.moves_arm else own
-        try:
-            found = self._source.sample(state.timestamp, own)
-        except SourceDryError as error:
-            self._supervisor.take(Cause.SOURCE_DRY, str(error))
-            return None if self._driver.moves_arm else own
-        if self._source.ended and not self._page.ended:
-            self._page.tell_ended()
-            self._tell({"ended": "the source has come to its end; the arm stays there"})
-        return found
-
-    def _release(self) -> None:
-        """Leave the robot to itself; the arm has come to rest, or its watchdog stops it."""
-        self._stream.end()
-        if not self._ready_to_write:
-            return
-        self._ready_to_write = False
-        self._page.enter(Phase.ARMING)
-        try:
-            self._driver.release()
-        except WriteError as error:
-            self._tell({"release": str(error)})
-        self._page.enter(Phase.RUNNING)
-        self._clock.skip()
+    def _acknowledge(self) -> None:
+        """Leave a fault that a person has acknowledged, once the robot is fine."""
+        if self._acknowledged and self._supervisor.state == State.FAULT and self._checks.fine:
+            self._acknowledged = False
+            self._supervisor.take(Cause.ACKNOWLEDGED)
 
     def _record(
-        self, state: RobotState, missed: int, own: Vector, loads: Loads,
-        setpoint: Setpoint | None, attempted: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        state: RobotState,
+        missed: int,
+        own: Vector,
+        loads: Loads,
+        setpoint: Setpoint | None,
+        attempted: bool = False,
+    ) -> None:
         page, stream = self._page, self._stream
         if setpoint is None:
             correction = stream.correct(own, loads)
             nominal, corrected, offset = own, correction.q, correction.offset_in_base
+            if not stream.finite:
+                self._supervisor.take(Cause.BAD_OUTPUT, "the model's correction is no number")
         else:
             nominal, corrected, offset = setpoint.nominal_q, setpoint.q, setpoint.offset_in_base
-        row = page.next_row()
-        fill_row(row, page.slices, state, nominal, corrected, offset)
+        clamped = stream.clamped if setpoint is not None else 0
+        row, slices = page.next_row(), page.slices
+        fill_row(row, slices, state, nominal, corrected, offset)
         row[2] = self._supervisor.state
         row[3] = setpoint is not None
         row[4] = missed
         row[5] = self._clock.age(state)
         row[6] = time.monotonic() - state.received
-        row[7] = stream.clamped if setpoint is not None else 0
+        row[7] = clamped
         row[8] = stream.residual
-        slices = page.slices
         row[slices["own_q"]] = own
-        row[slices["flags"].start] = 0.0
+        row[slices["flags"].start] = self._checks.flags
         at = slices["attempted"].start
         row[at : at + 4] = (attempted, stream.ramp_time, self._driver.rate, self._number)
         page.publish()
         self._source.tell(
-            Told(
-                self._supervisor.state,
-                nominal,
-                corrected,
-                offset,
-                setpoint is not None,
-                stream.clamped if setpoint is not None else 0,
-            )
+            Told(self._supervisor.state, nominal, corrected, offset, setpoint is not None, clamped)
         )

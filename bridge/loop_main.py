@@ -26,16 +26,22 @@ import numpy as np
 from bridge.daemon_settings import DaemonSettings
 from bridge.loop import Exit, Loop
 from bridge.realtime import become_realtime
+from bridge.replayed_loop import ReplayedLoop
 from bridge.setpoint_source import make_source
+from bridge.setpoint_source.source import Source
 from bridge.setpoint_stream import SetpointStream
+from bridge.settings import SetpointSettings
 from bridge.shared_page import Page, Phase
 from core.errors import GapbridgeError, InputError
 from core.loads import Loads
 from core.model import Model
 from drivers import make_driver
+from drivers.driver import Driver
 from drivers.ft_sensor.joined import DriverWithSensor
+from drivers.replay import ReplayDriver
 
 _PR_SET_PDEATHSIG = 1
+LONGEST_WORDS = 1000  # of an event: a line that a pipe takes whole or not at all
 
 
 def main() -> None:
@@ -47,14 +53,14 @@ def main() -> None:
     try:
         code = _run(order, tell)
     except InputError as error:
-        tell({"failure": str(error), "input": True})
+        tell({"kind": "failure", "detail": str(error), "input": True})
         code = Exit.INPUT
     except GapbridgeError as error:
-        tell({"failure": str(error)})
+        tell({"kind": "failure", "detail": str(error)})
         code = Exit.LINK
     except BaseException as error:
         traceback.print_exc()
-        tell({"failure": f"the loop failed: {type(error).__name__}: {error}"})
+        tell({"kind": "failure", "detail": f"the loop failed: {type(error).__name__}: {error}"})
     sys.stderr.flush()
     os._exit(code)
 
@@ -65,25 +71,44 @@ def _run(order: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Exit:
     page.enter(Phase.STARTING)
     model = _read_model(settings)
     driver = make_driver(settings.link, model)
-    if settings.ft_sensor is not None:
-        driver = DriverWithSensor(driver, settings.ft_sensor, model)
-    source = make_source(settings.setpoints, model.arm.n, driver.moves_arm, settings.cell.parent)
-    loop = Loop(settings, model, driver, source, page, tell, order["number"])
+    source = _make_source(settings, model, driver)
+    loop = _make_loop(settings, model, driver, source, page, tell, order["number"])
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: setattr(loop, "stop_requested", True))
     _end_with_parent(order["parent"])
     _compile(settings, model)
     if order["may_write"]:
         source.open()
-    tell({"granted": become_realtime()})
-    return loop.run(order["arm"], order["may_write"])
+    tell({"kind": "granted", "detail": ", ".join(become_realtime())})
+    return loop.run(order["arm"], order["may_write"], order["latched"])
+
+
+def _make_source(settings: DaemonSettings, model: Model, driver: Driver) -> Source:
+    """Return where setpoints come from; on a recording they are in the recording."""
+    is_replay = isinstance(driver, ReplayDriver)
+    setpoints = SetpointSettings() if is_replay else settings.setpoints
+    return make_source(setpoints, model.arm.n, driver.moves_arm, settings.cell.parent)
+
+
+def _make_loop(
+    settings: DaemonSettings, model: Model, driver: Driver, source: Source, *more: Any
+) -> Loop:
+    """Return the loop of a link; a recording has the sensor's readings in it."""
+    if isinstance(driver, ReplayDriver):
+        return ReplayedLoop(settings, model, driver, source, *more)
+    if settings.ft_sensor is not None:
+        driver = DriverWithSensor(driver, settings.ft_sensor, model)
+    return Loop(settings, model, driver, source, *more)
 
 
 def _teller(events: int) -> Callable[[dict[str, Any]], None]:
     """Return a function that tells the daemon of an event and never blocks."""
 
     def tell(event: dict[str, Any]) -> None:
-        line = json.dumps({"time": time.time(), **event}) + "\n"
+        if len(event.get("detail", "")) > LONGEST_WORDS:
+            event = {**event, "detail": event["detail"][:LONGEST_WORDS]}
+        now = {"time": time.time(), "monotonic": time.monotonic()}
+        line = json.dumps({**now, **event}) + "\n"
         with contextlib.suppress(OSError):
             os.write(events, line.encode())
 

@@ -25,7 +25,7 @@ class LoopProcess:
 
     def __init__(
         self, settings: DaemonSettings, page: Page, arm: bool, may_write: bool,
-        log: IO[Any] | int, number: int = 0,
+        log: IO[Any] | int, number: int = 0, latched: str = "",
     ) -> None:  # fmt: skip
         page.renew()
         self.page = page
@@ -36,6 +36,7 @@ class LoopProcess:
         self.started = time.monotonic()
         order = {
             "settings": settings.model_dump(mode="json"), "n": page.n, "arm": arm, "number": number,
+            "latched": latched,
             "may_write": may_write, "page": self.page.fd, "events": theirs, "parent": os.getpid(),
         }  # fmt: skip
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -36,10 +37,21 @@ def require_writable(path: Path, *inputs: Path) -> Path:
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[IO[str]]:
     """Give a text file that takes the place of ``path`` when the block ends without an error."""
+    with replacing_bytes(path) as raw:
+        file = io.TextIOWrapper(raw, "utf-8", newline="\n")
+        try:
+            yield file
+        finally:
+            file.detach()  # flushes; the file below is closed by who has opened it
+
+
+@contextlib.contextmanager
+def replacing_bytes(path: Path) -> Iterator[IO[bytes]]:
+    """Give a binary file that takes the place of ``path`` when the block ends without an error."""
     place = Path(os.path.realpath(path))
     part = place.with_name(f".{place.name}.{os.getpid()}.part")
     try:
-        with open(part, "w", encoding="utf-8", newline="\n") as file:
+        with open(part, "wb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())

@@ -57,20 +57,27 @@ class SetpointStream:
         self._since_start = 0.0  # s
         self.unsolved = 0  # setpoints without a correction that meets the wanted pose
         self.residual = 0.0  # m, of the last correction
+        self.finite = True  # the last correction is numbers
         self.clamped = 0  # bits of the last setpoint
 
     def correct(self, nominal_q: Vector, loads: Loads) -> Correction:
         """Return the correction alone, neither ramped nor limited."""
         correction = self._compensator.correct(nominal_q, loads)
         self.residual = float(correction.residual)
+        self.finite = bool(
+            np.isfinite(correction.q).all() and np.isfinite(correction.offset_in_base).all()
+        )
         return correction
 
-    def start(self, own_q: Vector, timestamp: float) -> None:
-        """Begin at rest at ``own_q`` (n,) with no offset. Raises LimitError."""
+    def start(self, own_q: Vector, timestamp: float, led: bool = False) -> None:
+        """Begin at rest at ``own_q`` (n,) with no offset. Raises LimitError.
+
+        ``led``: the setpoints that follow are led over from where the arm stands already.
+        """
         self.limiter.start(own_q)
         self._nominal.start(own_q)
         self._ramp = 0.0
-        self._start_gap, self._since_start = None, 0.0
+        self._start_gap, self._since_start = None, np.inf if led else 0.0
         # as if a setpoint had been there one cycle ago
         self._last = timestamp - self.limiter.limits.cycle
 

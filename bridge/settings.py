@@ -14,6 +14,7 @@ from bridge.recording.settings import RecordingSettings as RecordingSettings
 from drivers.can.settings import CanSettings
 from drivers.canopen.settings import CanopenSettings
 from drivers.modbus.settings import ModbusSettings
+from drivers.replay import ReplaySettings
 from drivers.ur_rtde.settings import UrRtdeSettings
 
 DEFAULT_DRIVER = "ur_rtde"
@@ -30,7 +31,8 @@ LinkSettings = Annotated[
     Annotated[UrRtdeSettings, Tag("ur_rtde")]
     | Annotated[ModbusSettings, Tag("modbus")]
     | Annotated[CanSettings, Tag("can")]
-    | Annotated[CanopenSettings, Tag("canopen")],
+    | Annotated[CanopenSettings, Tag("canopen")]
+    | Annotated[ReplaySettings, Tag("replay")],
     Discriminator(_driver_of),
 ]
 """Section ``link``: the settings of the driver that it names (left out: ur_rtde)."""

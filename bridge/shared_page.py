@@ -17,12 +17,15 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from bridge.counts import Count
+
 Array = NDArray[np.float64]
-WORDS = 64
+WORDS = 128
 ROWS = 8192  # cycles kept: 16 s at 500 Hz
 # words; the heartbeat's time is a float in a word of its own
 _BEATS, _PHASE, _STATE, _COMMAND, _WRITTEN, _ENDED, _SEEN = range(7)
 _BEAT_TIME = 32
+_COUNTS = 64  # from here on one word for each Count, over all processes of the loop
 
 
 class Phase(IntEnum):
@@ -106,6 +109,10 @@ class Page:
         """Tell that a state has been read: the link works."""
         self._words[_SEEN] = 1
 
+    def count(self, what: Count, times: int = 1) -> None:
+        """Count an event."""
+        self._words[_COUNTS + what] += times
+
     def next_row(self) -> Array:
         """Return the row of the next cycle, to be filled from column 1 on."""
         row: Array = self._rows[self._words[_WRITTEN] % ROWS]
@@ -173,6 +180,10 @@ class Page:
     def written(self) -> int:
         """Return how many cycles have been handed over since the daemon's start."""
         return int(self._words[_WRITTEN])
+
+    def counts(self) -> dict[str, int]:
+        """Return how often each Count has happened since the daemon's start."""
+        return {what.words: int(self._words[_COUNTS + what]) for what in Count}
 
     def reader(self, first: int = 0) -> PageReader:
         """Return a reader of its own cursor that begins at row number ``first``."""

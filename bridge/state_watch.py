@@ -6,7 +6,11 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from bridge.counts import Count
+from bridge.sample_check import SampleCheck
+from bridge.shared_page import Page
 from bridge.supervisor import Cause, Supervisor
+from core.arm import Arm
 from core.errors import InvalidStateError, LinkError, StaleStateError
 from core.state import RobotState
 from drivers.driver import Driver
@@ -15,6 +19,12 @@ INVALID_IN_A_ROW = 3  # states that cannot be believed, after which they count a
 SILENCE = 0.2  # s without a state: a fault
 LOST = 3.0  # s without a state: the link is lost
 LOST_AFTER_WRITING = 0.5  # s: the library's writing half does not survive a break
+TELL_EVERY = 1.0  # s between two events of samples dropped for the same reason
+
+
+def hold_time(rate: float) -> float:
+    """Return for how long the last offset may stay without a new state, s: 5 cycles or 40 ms."""
+    return min(max(5.0 / rate, 0.04), SILENCE)
 
 
 class StateWatch:
@@ -26,45 +36,80 @@ class StateWatch:
     def __init__(
         self,
         driver: Driver,
+        arm: Arm,
         supervisor: Supervisor,
+        page: Page,
         tell: Callable[[dict[str, Any]], None],
         lose: Callable[[str], None],
     ) -> None:
-        self._driver, self._supervisor = driver, supervisor
+        self._driver, self._supervisor, self._page = driver, supervisor, page
         self._tell, self._lose = tell, lose
+        self._hold = hold_time(driver.rate)
+        self._check = SampleCheck(arm)
         self._invalid = 0
+        self._stale = self._silent = False  # has been told since the last believable state
+        self._told: dict[Count, float] = {}  # s, monotonic
         self._heard = time.monotonic()  # s, of the last believable state
         self.has_written = False  # the library's writing half exists in this process
 
     def next(self) -> RobotState | None:
         """Return the next state, or None where none came that can be used."""
         try:
-            return self._driver.read_state()
+            state = self._driver.read_state()
         except StaleStateError as error:
-            self._supervisor.take(Cause.STALE, str(error))
-            self._fall_silent(str(error))
+            self._stand_still(str(error))
         except InvalidStateError as error:
             self.doubt(str(error))
         except LinkError as error:
             self._lose(str(error))
+        else:
+            doubt = self._check.doubt(state)
+            if doubt is None:
+                return state
+            self.doubt(doubt.words, doubt.count)
         return None
 
     def believe(self) -> None:
         """Take note of a state that is fine."""
         self._heard, self._invalid = time.monotonic(), 0
+        self._stale = self._silent = False
 
-    def doubt(self, detail: str) -> None:
-        """Drop a state that cannot be believed; several in a row are as good as none."""
+    def forget(self) -> None:
+        """Take note that nobody asked for states meanwhile."""
+        self._check.forget()
+        self._heard = time.monotonic()
+
+    def _stand_still(self, detail: str) -> None:
+        """Judge a clock that stands still: late at first, then stale, then silent."""
+        if time.monotonic() - self._heard <= self._hold:
+            self._page.count(Count.LATE)
+            return
+        if not self._stale:
+            self._stale = True
+            self._page.count(Count.STALE)
+            if not self._supervisor.take(Cause.STALE, detail):
+                self._tell({"kind": "link", "what": "stale", "detail": detail})
+        self._fall_silent(detail)
+
+    def doubt(self, detail: str, reason: Count = Count.DROPPED_TORN) -> None:
+        """Drop a state that cannot be believed; several in a row end the compensation."""
+        self._page.count(reason)
         self._invalid += 1
-        if self._invalid == 1:
-            self._tell({"dropped": detail})
+        now = time.monotonic()
+        if now - self._told.get(reason, -TELL_EVERY) >= TELL_EVERY:
+            self._told[reason] = now
+            self._tell({"kind": "dropped", "what": reason.words, "detail": detail})
         if self._invalid >= INVALID_IN_A_ROW:
-            self._supervisor.take(Cause.STALE, detail)
+            self._supervisor.take(Cause.IMPLAUSIBLE, detail)
+            self._check.forget()  # the arm may well be there: judge what comes by itself
         self._fall_silent(detail)
 
     def _fall_silent(self, detail: str) -> None:
         silent = time.monotonic() - self._heard
         if silent > SILENCE:
+            if not self._silent:
+                self._silent = True
+                self._page.count(Count.SILENCE)
             self._supervisor.take(Cause.SILENCE, detail)
         if silent > (LOST_AFTER_WRITING if self.has_written else LOST):
             self._lose(detail)

@@ -14,7 +14,7 @@ class State(IntEnum):
     ARMED = 2  # told to write; waits for the source's first setpoint
     COMPENSATING = 3  # writes; the offset ramps in and stays
     HOLDING = 4  # writes; the offset ramps out, the arm comes to rest
-    FAULT = 5  # writes nothing
+    FAULT = 5  # writes nothing until a person has acknowledged it
 
     @property
     def writes(self) -> bool:
@@ -26,6 +26,7 @@ class Cause(StrEnum):
     """Why a state was left."""
 
     CONNECTED = "connected"
+    LATCHED = "fault latched"  # one that a process of the loop before this one has found
     ARM = "arm"
     DISARM = "disarm"
     STOP = "stop"
@@ -34,45 +35,63 @@ class Cause(StrEnum):
     SOURCE_DRY = "source dry"
     SETPOINT_REFUSED = "setpoint refused"
     STALE = "state stale"
+    IMPLAUSIBLE = "state implausible"
+    FROZEN = "values frozen"
+    RESYNC = "gap in time"
+    OVERRUN = "deadlines missed"
+    SATURATED = "offset saturated"
+    BAD_OUTPUT = "correction no number"
+    FOREIGN = "another commander"
+    INEFFECTIVE = "write without effect"
     SILENCE = "silence"
     UNSAFE = "robot not ready"
     WRITE_FAILED = "write failed"
     RAMPED_OUT = "ramped out"
-    RECOVERED = "recovered"
+    ACKNOWLEDGED = "acknowledged"
     LINK_LOST = "link lost"
 
 
 _S, _C = State, Cause
+
+STOPS_AT_ONCE = (_C.SILENCE, _C.UNSAFE, _C.WRITE_FAILED, _C.BAD_OUTPUT)
+"""Faults after which nothing more is written, whatever was going on."""
+
+RAMPS_OUT = (
+    _C.DISARM, _C.STOP, _C.SOURCE_DRY, _C.SETPOINT_REFUSED, _C.STALE, _C.IMPLAUSIBLE, _C.FROZEN,
+    _C.RESYNC, _C.OVERRUN, _C.SATURATED, _C.FOREIGN, _C.INEFFECTIVE,
+)  # fmt: skip
+"""Causes that end compensating by way of a ramp."""
+
 TRANSITIONS: dict[tuple[State, Cause], State] = {
     (_S.DISCONNECTED, _C.CONNECTED): _S.OBSERVING,
     (_S.OBSERVING, _C.ARM): _S.ARMED,
+    (_S.OBSERVING, _C.LATCHED): _S.FAULT,
     (_S.OBSERVING, _C.SILENCE): _S.FAULT,
-    (_S.ARMED, _C.DISARM): _S.OBSERVING,
-    (_S.ARMED, _C.STOP): _S.OBSERVING,
-    (_S.ARMED, _C.START_REFUSED): _S.OBSERVING,
+    (_S.OBSERVING, _C.BAD_OUTPUT): _S.FAULT,
     (_S.ARMED, _C.WRITING): _S.COMPENSATING,
-    (_S.ARMED, _C.STALE): _S.OBSERVING,
-    (_S.ARMED, _C.UNSAFE): _S.FAULT,
-    (_S.ARMED, _C.WRITE_FAILED): _S.FAULT,
-    (_S.COMPENSATING, _C.DISARM): _S.HOLDING,
-    (_S.COMPENSATING, _C.STOP): _S.HOLDING,
-    (_S.COMPENSATING, _C.SOURCE_DRY): _S.HOLDING,
-    (_S.COMPENSATING, _C.SETPOINT_REFUSED): _S.HOLDING,
-    (_S.COMPENSATING, _C.STALE): _S.HOLDING,
-    (_S.COMPENSATING, _C.UNSAFE): _S.FAULT,
-    (_S.COMPENSATING, _C.WRITE_FAILED): _S.FAULT,
+    (_S.ARMED, _C.START_REFUSED): _S.OBSERVING,
+    **{(_S.ARMED, cause): _S.OBSERVING for cause in RAMPS_OUT},
+    **{(_S.ARMED, cause): _S.FAULT for cause in STOPS_AT_ONCE},
+    **{(_S.COMPENSATING, cause): _S.HOLDING for cause in RAMPS_OUT},
+    **{(_S.COMPENSATING, cause): _S.FAULT for cause in STOPS_AT_ONCE},
     (_S.HOLDING, _C.RAMPED_OUT): _S.OBSERVING,
+    # what cannot be ramped out must not be written either
     (_S.HOLDING, _C.SETPOINT_REFUSED): _S.FAULT,
-    (_S.HOLDING, _C.SILENCE): _S.FAULT,
-    (_S.HOLDING, _C.UNSAFE): _S.FAULT,
-    (_S.HOLDING, _C.WRITE_FAILED): _S.FAULT,
-    (_S.FAULT, _C.RECOVERED): _S.OBSERVING,
-    **{(s, _C.LINK_LOST): _S.DISCONNECTED for s in State},
+    (_S.HOLDING, _C.FOREIGN): _S.FAULT,
+    (_S.HOLDING, _C.INEFFECTIVE): _S.FAULT,
+    **{(_S.HOLDING, cause): _S.FAULT for cause in STOPS_AT_ONCE},
+    (_S.FAULT, _C.ACKNOWLEDGED): _S.OBSERVING,
+    **{(s, _C.LINK_LOST): _S.DISCONNECTED for s in State if s},
 }
 """(state, cause) -> next state. What is not in the table changes nothing.
 
-Only a person's ARM leads to writing; no fault leads back to it.
+Only a person's ARM leads to writing; no fault leads back to it. FAULT is left by a person's
+ACKNOWLEDGED, or with the link.
 """
+
+HEALED_BY_RECONNECTING = (_C.SILENCE, _C.WRITE_FAILED, _C.INEFFECTIVE)
+"""Faults of a link. They end with it: its successor begins by observing. All others stay latched
+over a new link and a new process, until a person acknowledges them."""
 
 Listener = Callable[[State, State, Cause, str], None]
 

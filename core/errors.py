@@ -13,6 +13,9 @@
         │   ├── StaleStateError     no fresh state in time
         │   ├── InvalidStateError   a state that is torn, not finite or implausible
         │   └── WriteError          a setpoint could not be delivered
+        │       ├── PartialWriteError       a part of it has left; the next one is sent whole
+        │       ├── IneffectiveWriteError   it was sent and nothing came of it
+        │       └── ForeignCommandError     somebody else commands the arm
         └── LimitError        a setpoint that must not leave
 """
 
@@ -65,6 +68,18 @@ class InvalidStateError(LinkError):
 
 class WriteError(LinkError):
     """A setpoint could not be delivered, or the controller refused it."""
+
+
+class PartialWriteError(WriteError):
+    """A part of a setpoint has left, the link lives: the next one may be sent, whole."""
+
+
+class IneffectiveWriteError(WriteError):
+    """Setpoints were sent and nothing came of them, though the link lives."""
+
+
+class ForeignCommandError(WriteError):
+    """Somebody else commands the arm: two masters, expected one."""
 
 
 class LimitError(RunError):

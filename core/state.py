@@ -34,3 +34,4 @@ class RobotState:
     runtime_state: int = 2  # RTDE runtime_state; 2 = playing
     safety_status_bits: int = 1  # RTDE safety_status_bits; bit 0 = normal mode
     speed_scaling: float = 1.0
+    sensor_lost: str = ""  # why the force is missing: then actual_TCP_force is NaN

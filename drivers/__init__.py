@@ -15,6 +15,7 @@ DRIVERS: dict[str, str] = {
     "can": "drivers.can.driver:CanDriver",
     "canopen": "drivers.canopen.driver:CanopenDriver",
     "modbus": "drivers.modbus.driver:ModbusDriver",
+    "replay": "drivers.replay:ReplayDriver",
     "ur_rtde": "drivers.ur_rtde.driver:UrRtdeDriver",
 }
 """Driver name in a cell file -> ``module:Class``, imported when it is used."""

@@ -24,14 +24,15 @@ from core.errors import InputError
 def run(cell: Path, observe: bool, arm: bool, duration: float | None) -> None:  # fmt: skip
     """Run the on-cell daemon: read the arm's state, predict how it bends, correct its setpoints.
 
-    Setpoints are written where the cell has `setpoints.arm: true`, or with --arm.
+    Setpoints are written where the cell has `setpoints.arm: true`, with --arm, or after
+    `gapbridge arm CELL`. SIGHUP reads the cell file again; SIGTERM ramps out and ends.
 
     Example: gapbridge run config/ur10e_simulated.yaml --observe --duration 60
     """
     if observe and arm:
         raise InputError("--observe: found beside --arm, expected one of them")
     given = open_cell(cell)
-    result = member("bridge.daemon", "run_cell", "run")(
+    result = member("bridge.daemon_run", "run_cell", "run")(
         given, observe=observe, arm=arm, duration=duration
     )
     if isinstance(result, int) and not isinstance(result, bool) and result:

@@ -6,6 +6,13 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("bridge.cli.demo:demo", "Do the whole job on a simulated cell, no hardware."),
     "simulate": ("bridge.cli.simulate:simulate", "Serve the simulated controller of a cell."),
     "run": ("bridge.cli.run:run", "Run the on-cell daemon."),
+    "status": ("bridge.cli.status:status", "Tell what running daemons do."),
+    "arm": ("bridge.cli.arm:arm", "Have a running daemon write setpoints."),
+    "disarm": ("bridge.cli.arm:disarm", "Have a running daemon ramp out; acknowledge a fault."),
+    "export": (
+        "bridge.cli.export:export_recording",
+        "Turn a recording of the daemon into a log.",
+    ),
     "fit": ("bridge.cli.fit:fit", "Identify the compliance of a cell from a log."),
     "predict": ("bridge.cli.predict:predict", "Predict the TCP pose of every row of a log."),
     "compensate": (

@@ -41,6 +41,7 @@ class _File:
 
     def __init__(self, path: Path) -> None:
         self.fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        _sync_folder(path.parent)  # else a power cut may take the name
         self.good = 0  # bytes of the file that were written by whole flushes
         self._waiting = bytearray()
 
@@ -64,6 +65,15 @@ class _File:
     def close(self) -> None:
         fd, self.fd = self.fd, -1
         if fd >= 0:
+            os.close(fd)
+
+
+def _sync_folder(folder: Path) -> None:
+    with contextlib.suppress(OSError):  # not every file system knows it
+        fd = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(fd)
+        finally:
             os.close(fd)
 
 

@@ -87,11 +87,17 @@ def read_configuration(path: Path) -> Document:
     raise LogError(f"{path}: found no configuration, expected one at the beginning of a recording")
 
 
-def read_columns(path: Path) -> dict[str, Array]:
-    """Return all cycles of a recording by field name, empty where there are none."""
+def read_columns(path: Path, told_only: bool = False) -> dict[str, Array]:
+    """Return all cycles of a recording by field name, empty where there are none.
+
+    ``told_only``: without what the controller never told, which is NaN throughout.
+    """
     batches = [batch.columns for batch in read_batches(path) if len(batch)]
     names = list(batches[0]) if batches else []
-    return {name: np.concatenate([columns[name] for columns in batches]) for name in names}
+    found = {name: np.concatenate([columns[name] for columns in batches]) for name in names}
+    return {
+        name: values for name, values in found.items() if not (told_only and np.isnan(values).all())
+    }
 
 
 def last_batch(path: Path) -> Batch | None:

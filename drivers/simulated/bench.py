@@ -52,6 +52,10 @@ class BenchSubject(Protocol):
         """Stop as after a collision."""
         ...
 
+    def unlock(self) -> None:
+        """Clear a protective stop."""
+        ...
+
     def emergency_stop(self) -> None:
         """Stop as after a push of the button."""
         ...
@@ -87,6 +91,7 @@ class BenchServer:
             "protective_stop": (0, self._protective_stop, "as a collision would"),
             "emergency_stop": (0, self._emergency_stop, "press the button"),
             "release": (0, self._release, "release the emergency stop button"),
+            "unlock": (0, self._unlock, "clear a protective stop, after a look at its cause"),
             "freeze": (0, self._freeze, "the controller's clock stands still, packets go on"),
             "thaw": (0, self._thaw, "the clock goes on"),
             "stall": (1, self._stall, "SECONDS: the controller sends and answers nothing"),
@@ -159,6 +164,10 @@ class BenchServer:
 
     def _release(self, _: list[float]) -> str:
         self._controller.release_emergency_stop()
+        return "ok"
+
+    def _unlock(self, _: list[float]) -> str:
+        self._controller.unlock()
         return "ok"
 
     # -- faults of the link -----------------------------------------------------------------------

@@ -256,6 +256,11 @@ class Controller:
         self.set_safety(modes.SAFETY_PROTECTIVE)
         self.pause(2.0 * DEFAULT_STOP)
 
+    def unlock(self) -> None:
+        """Clear a protective stop; the program stays paused."""
+        if self.memory["safety_mode"] == modes.SAFETY_PROTECTIVE:
+            self.set_safety(modes.SAFETY_NORMAL)
+
     def emergency_stop(self) -> None:
         """Stop: the program is gone, power is off."""
         log.warning("emergency stop")

@@ -195,7 +195,7 @@ class StateReader:
             )
         if payload is not None and not 0.0 <= payload <= 1e3:
             raise self._invalid(f"payload: found {payload:g} kg, expected 0 to 1000")
-        found = {name: values[start:end] for name, start, end in self._fields}
+        found: dict[str, Any] = {n: values[start:end] for n, start, end in self._fields}
         self._check_motion(found["actual_q"], gap)
         self._q = found["actual_q"]
         found.pop("actual_TCP_pose", None)

@@ -16,9 +16,9 @@ from core.errors import LinkError, RunError
 
 
 def daemon(monkeypatch: pytest.MonkeyPatch, run_cell: object) -> None:
-    module = ModuleType("bridge.daemon")
+    module = ModuleType("bridge.daemon_run")
     module.run_cell = run_cell  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "bridge.daemon", module)
+    monkeypatch.setitem(sys.modules, "bridge.daemon_run", module)
 
 
 def test_run_hands_the_cell_and_its_options_to_the_daemon(

@@ -90,7 +90,12 @@ def test_a_clock_that_stands_still_is_seen_though_packets_flow(robot: Robot) -> 
         robot.bench("freeze")
         assert run.wait(State.FAULT, 2.0) < 0.6
         robot.bench("thaw")
+        time.sleep(0.5)
+        assert run.daemon.state == State.FAULT  # it stays, until a person has seen it
+        assert "silence" in run.daemon.latched
+        run.daemon.disarm()
         run.wait(State.OBSERVING, 2.0)
+        assert run.daemon.latched == ""
         summary = run.end()
     assert summary.restarts == 0
     assert summary.exit_code == 0

@@ -129,7 +129,8 @@ def test_a_recording_is_a_log_as_it_stands(robot: Robot) -> None:
     assert [e["to"] for e in told if "to" in e] == [
         "OBSERVING", "ARMED", "COMPENSATING", "HOLDING", "OBSERVING",
     ]  # fmt: skip
-    assert told[-1]["summary"]["setpoints_written"] > 100
+    (summary,) = [e["summary"] for e in told if e["kind"] == "summary"]
+    assert summary["setpoints_written"] > 100
 
 
 def settled_error(robot: Robot, wanted: np.ndarray, patience: float = 15.0) -> float:

@@ -231,14 +231,9 @@ class ModbusServer(PeerServer):
                 self.program.running = bool(numbers[0])
             return "ok"
 
-        def unlock(numbers: list[float]) -> str:
-            peer.unlock()
-            return "ok"
-
         return {
             "tear": (1, tear, "N: mix two moments in the next N samples"),
             "program": (1, program, "0 or 1: stop or start the robot's mailbox program"),
-            "unlock": (0, unlock, "release a protective stop"),
         }
 
 

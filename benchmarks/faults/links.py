@@ -1,0 +1,250 @@
+"""The links on which faults are made: a cell for the daemon, one for its simulated peer, a tap."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import shutil
+import socket
+import time
+from abc import ABC, abstractmethod
+from pathlib import Path
+
+from benchmarks.faults.invariants import Bounds
+from benchmarks.faults.peer import Peer
+from benchmarks.faults.proxy import Port
+from benchmarks.faults.splitting import ModbusFrames, Raw, RtdeFrames, SocketcandMessages
+from benchmarks.faults.wire.modbus import ModbusDecoder
+from benchmarks.faults.wire.rtde import RtdeDecoder
+from benchmarks.faults.wire.seen import Decoder
+from benchmarks.faults.wire.socketcand import PiperDecoder
+from bridge.cell import load_cell
+from drivers.simulated.kinematics import frame_of
+from drivers.simulated.plant_arm import plant_arm
+from drivers.ur_rtde.driver import OFFSET_SCRIPT
+
+CONFIG = Path(__file__).parents[2] / "config"
+OFFSET, ROTATION, OFFSET_RATE, ROTATION_RATE = 0.002, 0.01, 0.008, 0.08
+LIMITS = f"""
+limits:
+  offset: {OFFSET}
+  offset_rotation: {ROTATION}
+  offset_rate: {OFFSET_RATE}
+  offset_rotation_rate: {ROTATION_RATE}
+  ramp_time: 0.05
+recording: {{folder: null}}
+"""
+UR = """
+robot: {model: ur10e}
+tool: {tcp: {xyz: [0, 0, 0.18], rpy: [0, 0, 0]}}
+payload: {mass: 5.0, cog: [0, 0, 0.06]}
+compliance: &soft
+  axial: [2.0e-6, 3.0e-6, 4.0e-6, 8.0e-6, 8.0e-6, 8.0e-6]
+  radial: [1.0e-6, 1.0e-6, 1.0e-6, 2.0e-6, 2.0e-6, 2.0e-6]
+simulation: {seed: 11, compliance: *soft}
+"""
+PIPER = """
+robot: {urdf: piper.urdf, tip: link6}
+tool: {tcp: {xyz: [0, 0, 0.1358], rpy: [0, 0, 0]}}
+payload: {mass: 1.0, cog: [0, 0, 0.06]}
+compliance: &soft
+  axial: [3.0e-5, 6.0e-5, 8.0e-5, 1.0e-4, 1.2e-4, 1.2e-4]
+  radial: [5.0e-6, 8.0e-6, 1.0e-5, 1.0e-5, 2.0e-5, 2.0e-5]
+simulation: {seed: 1, start_q: [0.0, 1.5, -1.2, 0.0, 0.6, 0.0], compliance: *soft}
+"""
+_hosts = itertools.count(1)
+
+
+def own_address() -> str:
+    """Return a loopback address that nobody else uses."""
+    pid = os.getpid()
+    return f"127.{1 + (pid >> 8) % 250}.{pid % 256}.{next(_hosts)}"
+
+
+class Link(ABC):
+    """One kind of link. ``rate`` is in Hz; ``hold`` (s) is after what silence the offset goes."""
+
+    name: str
+    rate: float
+    moves_arm: bool
+    base: str
+    main: str  # name of the port that states come over
+    hold = 0.1
+    grain, grain_rotation = 1e-8, 1e-8
+
+    @abstractmethod
+    def section(self, host: str) -> str:
+        """Return section ``link`` of a cell whose controller is at ``host``."""
+
+    @abstractmethod
+    def ports(self) -> list[Port]:
+        """Return the ports that the proxy serves."""
+
+    @abstractmethod
+    def decoder(self) -> Decoder:
+        """Return a decoder of what goes over the wire."""
+
+    def prepare(self, peer: Peer, host: str) -> None:
+        """Do what a person does at the robot before it can be armed (again)."""
+
+    def write_cells(self, folder: Path, front: str, back: str, more: str) -> tuple[Path, Path]:
+        """Write the daemon's cell, whose controller is at ``front``, and the peer's.
+
+        ``more``: further sections of the daemon's, in place of limits and recording where given.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        shutil.copy(CONFIG / "piper.urdf", folder / "piper.urdf")
+        cells = []
+        for name, host in (("daemon", front), ("peer", back)):
+            path = folder / f"{name}.yaml"
+            extra = (more or LIMITS) if name == "daemon" else ""
+            path.write_text(self.base + self.section(host) + extra, encoding="utf-8")
+            cells.append(path)
+        return cells[0], cells[1]
+
+    def bounds(self, cell: Path) -> Bounds:
+        """Return what the daemon's cell allows, for the checker."""
+        found = load_cell(cell)
+        limits = found.limits
+        tcp = found.file.tool.tcp
+        tool = frame_of((*tcp.xyz, 0.0, 0.0, 0.0))  # tools here are not turned
+        return Bounds(
+            plant_arm(found.arm), tool, limits.offset, limits.offset_rotation, limits.offset_rate,
+            limits.offset_rotation_rate, 1.0 / self.rate, self.grain, self.grain_rotation,
+            max(0.04, 5.0 / self.rate),
+        )  # fmt: skip
+
+
+class UrServo(Link):
+    """UR by servoJ: our setpoints are the arm's motion."""
+
+    name, rate, moves_arm, base, main = "ur_rtde servoj", 500.0, True, UR, "rtde"
+    mode = "servoj"
+    grain, grain_rotation = 2e-6, 4e-6  # a limited offset is shared out by joints, to first order
+
+    def section(self, host: str) -> str:
+        """See Link.section."""
+        return f"link: {{driver: ur_rtde, host: {host}, mode: {self.mode}}}\n"
+
+    def ports(self) -> list[Port]:
+        """See Link.ports."""
+        return [
+            Port("rtde", 30004, RtdeFrames), Port("script", 30003, Raw),
+            Port("dashboard", 29999, Raw),
+        ]  # fmt: skip
+
+    def decoder(self) -> Decoder:
+        """See Link.decoder."""
+        return RtdeDecoder(servoj=self.mode == "servoj")
+
+    def prepare(self, peer: Peer, host: str) -> None:
+        """Leave the robot without a program and ready to move."""
+        self._make_ready(peer, host)
+
+    def _make_ready(self, peer: Peer, host: str) -> None:
+        peer.bench("thaw")
+        peer.bench("release")
+        peer.bench("unlock")
+        if "RUNNING" not in dashboard(host, "robotmode"):
+            dashboard(host, "power on")
+            time.sleep(0.05)
+            dashboard(host, "brake release")
+            time.sleep(0.05)
+        if self.mode == "servoj" and "true" in dashboard(host, "running"):
+            dashboard(host, "stop")
+
+
+class UrOffset(UrServo):
+    """UR by offsets in registers that the robot's own program applies."""
+
+    name, moves_arm, mode = "ur_rtde offset", False, "offset"
+    grain, grain_rotation = 2e-8, 2e-8
+
+    def prepare(self, peer: Peer, host: str) -> None:
+        """Have the robot's own program run."""
+        self._make_ready(peer, host)
+        if "true" not in dashboard(host, "running"):
+            self.start_program(host)
+
+    @staticmethod
+    def start_program(host: str) -> None:
+        """Send the program to the robot."""
+        with socket.create_connection((host, 30003), timeout=5.0) as upload:
+            upload.sendall(OFFSET_SCRIPT.read_bytes())
+            time.sleep(0.2)
+
+
+class Modbus(Link):
+    """A UR controller's Modbus server, offsets through the mailbox."""
+
+    name, rate, moves_arm, base, main = "modbus mailbox", 50.0, False, UR, "modbus"
+    hold = 0.2
+    port = 15020
+    grain, grain_rotation = 2e-6, 2e-6
+
+    def section(self, host: str) -> str:
+        """See Link.section."""
+        return (
+            f"link: {{driver: modbus, profile: ur, host: {host}, port: {self.port}, "
+            f"rate: {self.rate:g}, timeout: 0.05, state_timeout: {self.hold}}}\n"
+        )
+
+    def ports(self) -> list[Port]:
+        """See Link.ports."""
+        return [Port("modbus", self.port, ModbusFrames)]
+
+    def decoder(self) -> Decoder:
+        """See Link.decoder."""
+        return ModbusDecoder()
+
+    def prepare(self, peer: Peer, host: str) -> None:
+        """Clear stops; have the mailbox program run."""
+        for line in ("thaw", "release", "unlock", "program 1"):
+            peer.bench(line)
+
+
+class CanPiper(Link):
+    """An AgileX PiPER on a bus between processes."""
+
+    name, rate, moves_arm, base, main = "can piper", 200.0, True, PIPER, "can"
+    port = 29536
+    grain, grain_rotation = 2e-5, 6e-5  # 0.001 degrees of each joint
+
+    def section(self, host: str) -> str:
+        """See Link.section."""
+        return (
+            f"link: {{driver: can, profile: piper, interface: socketcand, host: {host}, "
+            f"port: {self.port}, rate: {self.rate:g}, state_timeout: {self.hold}, "
+            "foreign_quiet: 0.3}\n"
+        )
+
+    def ports(self) -> list[Port]:
+        """See Link.ports."""
+        return [Port("can", self.port, SocketcandMessages)]
+
+    def decoder(self) -> Decoder:
+        """See Link.decoder."""
+        return PiperDecoder()
+
+    def prepare(self, peer: Peer, host: str) -> None:
+        """Clear stops."""
+        for line in ("thaw", "release", "unlock", "resume"):
+            peer.bench(line)
+
+
+def dashboard(host: str, line: str) -> str:
+    """Say a line to a UR's dashboard; returns the answer."""
+    with socket.create_connection((host, 29999), timeout=5.0) as link:
+        answers = link.makefile("r")
+        answers.readline()
+        link.sendall(line.encode() + b"\n")
+        return answers.readline().strip()
+
+
+LINKS: dict[str, type[Link]] = {
+    "ur_servoj": UrServo,
+    "ur_offset": UrOffset,
+    "modbus": Modbus,
+    "can": CanPiper,
+}
+"""The links of the table of faults."""

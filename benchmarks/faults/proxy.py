@@ -1,0 +1,264 @@
+"""A TCP proxy between the real client and its peer that does harm, and tells a tap of it all.
+
+One thread serves every port. Messages from the client are told before anything is done to them:
+that is what was written. Messages to the client are told as they leave: that is what it could know.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import heapq
+import itertools
+import os
+import selectors
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Self
+
+from benchmarks.faults.mischief import Mischief, passing
+from benchmarks.faults.splitting import Splitter
+
+UP, DOWN = "up", "down"  # from the client, to the client
+RESET = struct.pack("ii", 1, 0)  # SO_LINGER: closing sends RST
+Tell = Callable[[float, int, str, str, bytes], None]
+"""s monotonic, connection, name of the port, direction, message."""
+
+
+@dataclass
+class Port:
+    """One port of the peer: where it is, and how its messages are told apart."""
+
+    name: str
+    port: int
+    splitter: type[Splitter]
+
+
+@dataclass(eq=False)
+class Connection:
+    """One client and the peer's end that belongs to it."""
+
+    number: int
+    port: Port
+    ends: dict[str, socket.socket]  # by the direction that is read from it
+    splitters: dict[str, Splitter] = field(default_factory=dict)
+    out: dict[str, bytearray] = field(default_factory=lambda: {UP: bytearray(), DOWN: bytearray()})
+
+
+class Proxy:
+    """Serves ``ports`` of ``target`` at ``host`` while the ``with`` block lasts.
+
+    ``up`` and ``down`` are done to each message, by the name of its port; ``on`` limits a mischief
+    to one connection. Methods may be called from any thread.
+    """
+
+    def __init__(self, host: str, target: str, ports: Iterable[Port], tell: Tell) -> None:
+        self.host, self.target, self._tell = host, target, tell
+        self._ports = list(ports)
+        self._mischief: dict[tuple[str, str], Mischief] = {}
+        self._selector = selectors.DefaultSelector()
+        self._connections: list[Connection] = []
+        self._listeners: list[socket.socket] = []
+        self._due: list[tuple[float, int, Connection, str, bytes]] = []
+        self._order = itertools.count()
+        self._numbers = itertools.count()
+        self._stalled_until = 0.0
+        self._refusing = self._mute = self._stopping = False
+        self._orders: list[Callable[[], None]] = []
+        self._lock = threading.Lock()
+        self._wake_out, self._wake_in = os.pipe()
+        self._thread = threading.Thread(target=self._serve, name="proxy", daemon=True)
+
+    # -- harm -------------------------------------------------------------------------------------
+
+    def do(self, direction: str, mischief: Mischief, port: str) -> None:
+        """Do ``mischief`` to the messages of a direction from now on."""
+        self._mischief[port, direction] = mischief
+
+    def heal(self) -> None:
+        """Do no more harm."""
+        self._mischief = {}
+        self._stalled_until, self._refusing, self._mute = 0.0, False, False
+        self._order_thread(lambda: None)
+
+    def stall(self, seconds: float) -> None:
+        """Hand nothing on for a while; what comes waits in the sockets."""
+        self._stalled_until = time.monotonic() + seconds
+
+    def cut(self, reset: bool = True) -> None:
+        """End every connection, by RST or by FIN."""
+        self._order_thread(lambda: self._cut_all(reset))
+
+    def refuse(self) -> None:
+        """Reset whoever comes from now on."""
+        self._refusing = True
+
+    def mute(self) -> None:
+        """Accept whoever comes and never say a word."""
+        self._mute = True
+
+    def inject(self, direction: str, port: str, data: bytes) -> None:
+        """Put bytes of our own into every connection of a port."""
+
+        def put() -> None:
+            for connection in self._connections:
+                if connection.port.name == port:
+                    self._send(connection, direction, data, time.monotonic())
+
+        self._order_thread(put)
+
+    def _order_thread(self, order: Callable[[], None]) -> None:
+        with self._lock:
+            self._orders.append(order)
+        with contextlib.suppress(OSError):
+            os.write(self._wake_in, b".")
+
+    # -- serving ----------------------------------------------------------------------------------
+
+    def __enter__(self) -> Self:
+        for port in self._ports:
+            listener = socket.create_server((self.host, port.port), backlog=16)
+            listener.setblocking(False)
+            self._listeners.append(listener)
+            self._selector.register(listener, selectors.EVENT_READ, port)
+        self._selector.register(self._wake_out, selectors.EVENT_READ, None)
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stopping = True
+        self._order_thread(lambda: None)
+        self._thread.join(5.0)
+        self._cut_all(reset=True)
+        for listener in self._listeners:
+            listener.close()
+        self._selector.close()
+        os.close(self._wake_in)
+        os.close(self._wake_out)
+
+    def _serve(self) -> None:
+        while not self._stopping:
+            now = time.monotonic()
+            wait = min(self._due[0][0] - now, 0.5) if self._due else 0.5
+            stalled = self._stalled_until - now
+            if stalled > 0.0:  # nothing is read: the sockets fill, as on a dead line
+                time.sleep(min(stalled, 0.002))
+                self._take_orders()
+                continue
+            for key, _ in self._selector.select(max(wait, 0.0)):
+                if key.fileobj == self._wake_out:
+                    os.read(self._wake_out, 64)
+                elif isinstance(key.data, Port):
+                    self._accept(key.fileobj, key.data)
+                else:
+                    self._read(*key.data)
+            self._take_orders()
+            self._send_due()
+
+    def _take_orders(self) -> None:
+        with self._lock:
+            orders, self._orders = self._orders, []
+        for order in orders:
+            order()
+
+    def _accept(self, listener: object, port: Port) -> None:
+        assert isinstance(listener, socket.socket)
+        try:
+            client, _ = listener.accept()
+        except OSError:
+            return
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        if self._refusing:
+            self._close(client, reset=True)
+            return
+        ends = {UP: client}
+        if not self._mute:
+            try:
+                real = socket.create_connection((self.target, port.port), timeout=2.0)
+            except OSError:
+                self._close(client, reset=True)
+                return
+            real.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            ends[DOWN] = real
+        connection = Connection(next(self._numbers), port, ends)
+        for direction, end in ends.items():
+            end.setblocking(False)
+            connection.splitters[direction] = port.splitter()
+            self._selector.register(end, selectors.EVENT_READ, (connection, direction))
+        self._connections.append(connection)
+
+    def _read(self, connection: Connection, direction: str) -> None:
+        if connection not in self._connections:
+            return
+        try:
+            data = connection.ends[direction].recv(65536)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self._drop(connection, reset=False)
+            return
+        port = connection.port.name
+        for message in connection.splitters[direction].feed(data):
+            now = time.monotonic()
+            if direction == UP:
+                self._tell(now, connection.number, port, UP, message)
+            mischief = self._mischief.get((port, direction), passing)
+            for delay, made in mischief(message):
+                if delay > 0.0:
+                    item = (now + delay, next(self._order), connection, direction, made)
+                    heapq.heappush(self._due, item)
+                else:
+                    self._send(connection, direction, made, now)
+
+    def _send_due(self) -> None:
+        now = time.monotonic()
+        while self._due and self._due[0][0] <= now:
+            _, _, connection, direction, message = heapq.heappop(self._due)
+            if connection in self._connections:
+                self._send(connection, direction, message, now)
+
+    def _send(self, connection: Connection, direction: str, message: bytes, now: float) -> None:
+        end = connection.ends.get(DOWN if direction == UP else UP)
+        if end is None:
+            return
+        if direction == DOWN:
+            self._tell(now, connection.number, connection.port.name, DOWN, message)
+        waiting = connection.out[direction]
+        waiting += message
+        try:
+            del waiting[: end.send(waiting)]
+        except BlockingIOError:
+            pass  # goes out with the next message
+        except OSError:
+            self._drop(connection, reset=False)
+
+    def _cut_all(self, reset: bool) -> None:
+        for connection in list(self._connections):
+            self._drop(connection, reset)
+
+    def _drop(self, connection: Connection, reset: bool) -> None:
+        if connection not in self._connections:
+            return
+        self._connections.remove(connection)
+        for direction, end in connection.ends.items():
+            with contextlib.suppress(KeyError, ValueError):
+                self._selector.unregister(end)
+            self._close(end, reset and direction == UP)
+
+    @staticmethod
+    def _close(end: socket.socket, reset: bool) -> None:
+        with contextlib.suppress(OSError):
+            if reset:
+                end.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
+            end.close()

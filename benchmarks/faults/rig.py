@@ -1,0 +1,118 @@
+"""A daemon, its peer, and between the two of them a proxy and a tap."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from benchmarks.faults.invariants import Checker, Found
+from benchmarks.faults.links import Link, own_address
+from benchmarks.faults.peer import Peer
+from benchmarks.faults.proxy import Proxy
+from benchmarks.faults.running import Running
+from benchmarks.faults.tap import Tap
+from bridge.supervisor import State
+
+SETTLED = 0.12  # s of compensating before a fault is made
+START_LIMIT, RECOVERY_LIMIT = 90.0, 30.0  # s
+
+
+class Rig:
+    """One link with everything around it, while the ``with`` block lasts."""
+
+    def __init__(self, link: Link, folder: Path, more: str = "", **changed: Any) -> None:
+        self.link, self._changed = link, changed
+        self.front, self.back = own_address(), own_address()
+        self.cell, peer_cell = link.write_cells(folder, self.front, self.back, more)
+        self.peer = Peer(peer_cell, self.back, 30100, folder / "peer.log")
+        self.checker = Checker(link.bounds(self.cell))
+        self._runs: list[Running] = []
+        self.tap = Tap(link.decoder(), self._state_word)
+        self.proxy = Proxy(self.front, self.back, link.ports(), self.tap.tell)
+
+    def _state_word(self) -> int:
+        return self._runs[-1].state_word() if self._runs else -1
+
+    @property
+    def run(self) -> Running:
+        """Return the daemon's run of now."""
+        return self._runs[-1]
+
+    @property
+    def found(self) -> Found:
+        """Return what the checker has found up to now."""
+        self.checker.take(self.tap.drain())
+        return self.checker.found
+
+    def __enter__(self) -> Self:
+        try:
+            self.peer.start()
+            self.link.prepare(self.peer, self.back)
+            self.proxy.__enter__()
+            self.start_daemon()
+        except BaseException:
+            self.peer.stop()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            if self.run.alive:
+                self.peer.go_on()
+                self.proxy.heal()
+                self.run.stop()
+        finally:
+            self.proxy.__exit__(None, None, None)
+            self.peer.stop()
+
+    def start_daemon(self) -> None:
+        """Start a run, observing."""
+        self._runs.append(Running(self.cell, **self._changed))
+        self.run.start()
+        self.run.wait(lambda: self.run.state == State.OBSERVING, START_LIMIT, "observing")
+
+    # -- between faults ---------------------------------------------------------------------------
+
+    def heal(self) -> None:
+        """Undo every fault that can be undone from here."""
+        self.proxy.heal()
+        self.peer.go_on()
+        if not self.peer.runs:
+            self.peer.start()
+        self.link.prepare(self.peer, self.back)
+
+    def recover(self, limit: float = RECOVERY_LIMIT) -> None:
+        """Heal, and acknowledge faults as a person does, until the daemon observes."""
+        self.heal()
+        until = time.monotonic() + limit
+        while (state := self.run.state) not in (State.OBSERVING, State.COMPENSATING):
+            if self.run.error is not None:
+                raise self.run.error
+            if time.monotonic() > until:
+                raise TimeoutError(f"{state.name} after {limit:g} s: {self.run.last_words()}")
+            if state == State.FAULT:
+                self.run.daemon.disarm()
+            time.sleep(0.02)
+
+    def compensate(self, limit: float = RECOVERY_LIMIT) -> None:
+        """Bring the daemon to where it writes, arming it as a person does."""
+        until = time.monotonic() + limit
+        while True:
+            self.recover(limit)
+            if self.run.state != State.COMPENSATING:
+                self.run.daemon.arm()
+            with contextlib.suppress(TimeoutError):
+                self.run.wait(lambda: self.run.state == State.COMPENSATING, 2.0, "compensating")
+                time.sleep(SETTLED)
+            if self.run.state == State.COMPENSATING:
+                return
+            if time.monotonic() > until:
+                raise TimeoutError(f"cannot be armed: {self.run.last_words()}")

@@ -1,0 +1,89 @@
+"""A daemon in a thread of this process; its loop and all else are processes as always."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from bridge.cell import load_cell
+from bridge.daemon import Daemon, settings_of
+from bridge.summary import RunSummary
+from bridge.supervisor import State
+
+POLL = 0.002  # s
+Event = dict[str, Any]
+
+
+class Running:
+    """One run of the daemon; every event is kept, with its wall clock's time."""
+
+    def __init__(self, cell: Path, observe: bool = False, **changed: Any) -> None:
+        settings = settings_of(load_cell(cell)).model_copy(update=changed)
+        self.events: list[Event] = []
+        self.daemon = Daemon(settings, may_write=not observe, log=self.events.append)
+        self.page = self.daemon.page
+        self.summary: RunSummary | None = None
+        self.error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, daemon=True, name="daemon")
+
+    def start(self) -> None:
+        """Start it, observing."""
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self.summary = self.daemon.run()
+        except Exception as error:
+            self.error = error
+
+    @property
+    def alive(self) -> bool:
+        """Return whether it runs."""
+        return self._thread.is_alive()
+
+    @property
+    def state(self) -> State:
+        """Return the loop's state at this moment."""
+        return State(self.page.state) if self.daemon.loop_pid else State.DISCONNECTED
+
+    def state_word(self) -> int:
+        """Return the supervisor's state from the shared page, -1 where that is gone."""
+        try:
+            return self.page.state
+        except (IndexError, ValueError):
+            return -1
+
+    def wait(self, what: Callable[[], bool], limit: float, words: str) -> None:
+        """Wait until ``what`` holds. Raises TimeoutError."""
+        until = time.monotonic() + limit
+        while not what():
+            if self.error is not None:
+                raise self.error
+            if time.monotonic() > until:
+                raise TimeoutError(f"{words}: not within {limit:g} s; last: {self.last_words()}")
+            time.sleep(POLL)
+
+    def last_words(self) -> str:
+        """Return the last events in short."""
+        return "; ".join(f"{e.get('kind')} {words_of(e)}" for e in self.events[-4:])
+
+    def since(self, moment: float) -> list[Event]:
+        """Return the events that happened after ``moment`` (s, wall clock)."""
+        return [event for event in list(self.events) if event["time"] >= moment]
+
+    def stop(self) -> None:
+        """End it and wait."""
+        self.daemon.stop()
+        self._thread.join(30.0)
+        if self._thread.is_alive():
+            raise TimeoutError("the daemon did not end")
+
+
+def words_of(event: Event) -> str:
+    """Return an event in words."""
+    if event.get("kind") == "transition":
+        return f"{event['from']} -> {event['to']} ({event['cause']})"
+    return str(event.get("detail", ""))[:120]

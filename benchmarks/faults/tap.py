@@ -1,0 +1,35 @@
+"""The tap: keeps what goes over the wire with its time, and hands it on decoded.
+
+Keeping costs next to nothing, so that the wire is not slowed; decoding comes when ``drain`` is
+called, in another thread.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+from benchmarks.faults.proxy import UP
+from benchmarks.faults.wire.seen import Decoder, Fresh, Write
+
+
+class Tap:
+    """Messages of one link; ``state`` gives the supervisor's state at this moment."""
+
+    def __init__(self, decoder: Decoder, state: Callable[[], int]) -> None:
+        self.state = state
+        self._decoder = decoder
+        self._kept: deque[tuple[float, int, str, bool, bytes, int]] = deque()
+        self.messages = 0
+
+    def tell(self, time: float, connection: int, port: str, direction: str, message: bytes) -> None:
+        """Keep a message; called by the proxy."""
+        self.messages += 1
+        self._kept.append((time, connection, port, direction == UP, message, self.state()))
+
+    def drain(self) -> list[Fresh | Write]:
+        """Return what has been seen since the last call."""
+        found: list[Fresh | Write] = []
+        while self._kept:
+            found += self._decoder.feed(*self._kept.popleft())
+        return found

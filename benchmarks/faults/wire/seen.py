@@ -1,0 +1,53 @@
+"""What a decoder makes of messages: fresh states on the way in, writes on the way out."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Literal
+
+Numbers = tuple[float, ...]
+Kind = Literal["offset", "joints", "release", "other", "broken", "forbidden"]
+
+
+@dataclass(frozen=True, slots=True)
+class Fresh:
+    """A state that the client can know from ``time`` on (s, monotonic).
+
+    ``stamp``: the controller's clock, s, NaN where the wire has none. ``safe``: whether it may
+    move; ``safe_known``: whether the wire has said so at all. ``state`` is the supervisor's.
+    """
+
+    time: float
+    stamp: float
+    q: Numbers
+    target_q: Numbers | None
+    safe: bool
+    safe_known: bool
+    state: int
+
+
+@dataclass(frozen=True, slots=True)
+class Write:
+    """Something that the client wrote.
+
+    offset: ``values`` (6,) m and rad, in base. joints: ``values`` (n,) rad. other: part of a
+    write, watchdogs, enabling. broken: does not pass the receiver's own check. forbidden: nothing
+    that a daemon may write. ``state`` is the supervisor's as the write was seen.
+    """
+
+    time: float
+    kind: Kind
+    values: Numbers
+    where: str
+    state: int
+
+
+class Decoder(ABC):
+    """Decodes one link, all its connections."""
+
+    @abstractmethod
+    def feed(
+        self, time: float, connection: int, port: str, up: bool, message: bytes, state: int
+    ) -> list[Fresh | Write]:
+        """Return what a message tells; nothing for most."""

@@ -1,0 +1,32 @@
+"""``gapbridge arm`` and ``gapbridge disarm``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from bridge.cli.options import cell_argument
+from bridge.control_client import ask
+
+
+@click.command()
+@cell_argument
+def arm(cell: Path) -> None:
+    """Have the daemon of a cell write setpoints, and wait until it does.
+
+    Goes over a local socket that only the daemon's own user can open; never over the network.
+
+    Example: gapbridge arm config/ur10e_simulated.yaml
+    """
+    click.echo(ask(cell, "arm"))
+
+
+@click.command()
+@cell_argument
+def disarm(cell: Path) -> None:
+    """Have the daemon of a cell ramp out and observe; in a fault, acknowledge it.
+
+    Example: gapbridge disarm config/ur10e_simulated.yaml
+    """
+    click.echo(ask(cell, "disarm"))

@@ -1,0 +1,74 @@
+"""``gapbridge export``."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from pathlib import Path
+
+import click
+
+from bridge.output_file import require_writable, write_text
+from bridge.recording.export import Exported, Span, export, moment
+from core.errors import InputError
+from core.recording.reading import SUFFIX, files_of, read_configuration
+
+
+@click.command("export")
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="The log to write, .csv or .parquet; left out: a CSV beside the recording.",
+)
+@click.option("--from", "start", metavar="T", help="Leave out what was before.")
+@click.option("--to", "stop", metavar="T", help="Leave out what was after.")
+@click.option(
+    "--cell-out", type=click.Path(path_type=Path), help="Write the cell file that it ran by, too."
+)
+def export_recording(
+    recording: Path, out: Path | None, start: str | None, stop: str | None, cell_out: Path | None
+) -> None:
+    """Turn a recording of the daemon into a log that fit and diagnose take.
+
+    RECORDING is one file (run-20260131-140500-001.mcap) or a run as a whole
+    (run-20260131-140500). T is seconds from its beginning (negative: before its end) or a time like
+    2026-01-31T14:05:00. Beside the log's columns stand nominal_q, corrected_q, offset (of the TCP
+    in base, m and rad), written and state.
+
+    Example: gapbridge export recordings/run-20260131-140500 --out log.csv --from 10 --to 70
+    """
+    files = files_of(recording)
+    if out is None:
+        name = recording.name.removesuffix(SUFFIX)
+        out = recording.with_name(f"{name}.csv")
+    if out.suffix.lower() not in (".csv", ".parquet", ".pq"):
+        raise InputError(
+            f"--out {out}: found {out.suffix or 'no suffix'}, expected .csv or .parquet"
+        )
+    require_writable(out, *files)
+    span = Span(_moment("--from", start), _moment("--to", stop))
+    if cell_out is not None:
+        require_writable(cell_out, *files)
+        write_text(cell_out, str(read_configuration(recording).get("text", "")))
+    _tell(out, export(recording, out, span))
+
+
+def _moment(option: str, text: str | None) -> float | datetime | None:
+    try:
+        return None if text is None else moment(text)
+    except InputError as error:
+        raise InputError(f"{option}: {error}") from None
+
+
+def _tell(out: Path, exported: Exported) -> None:
+    lasted = (exported.last or 0.0) - (exported.first or 0.0)
+    states = ", ".join(f"{count} {state}" for state, count in exported.states.items())
+    click.echo(f"{out}: {exported.rows} cycles over {lasted:.3f} s ({states})")
+    if exported.gaps:
+        click.echo(f"warning: {exported.gaps} cycles in between were not recorded", err=True)
+    if exported.back is not None:
+        click.echo(
+            f"warning: {out}: row {exported.back + 2}: the controller's clock goes back; "
+            "export each stretch with --from and --to",
+            err=True,
+        )

@@ -1,0 +1,28 @@
+"""``gapbridge status``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from bridge.control_client import ask, running
+from bridge.status import lines
+
+
+@click.command()
+@click.argument("cell", type=click.Path(path_type=Path), required=False)
+@click.option("--json", "as_json", is_flag=True, help="Print the whole status document.")
+def status(cell: Path | None, as_json: bool) -> None:
+    """Tell what the daemon of a cell does; without CELL, what all of this user's daemons do.
+
+    Example: gapbridge status config/ur10e_simulated.yaml --json
+    """
+    found = running() if cell is None else [ask(cell, "status")]
+    if as_json:
+        click.echo(json.dumps(found if cell is None else found[0], indent=1))
+    elif not found:
+        click.echo("no daemon is running")
+    for each in [] if as_json else found:
+        click.echo("\n".join(lines(each)))

@@ -1,0 +1,141 @@
+"""The daemon's local socket: status, arm, disarm. Only its owner, and root, can open it.
+
+One line of JSON in, ``{"command": "arm"}``, one out, ``{"ok": true, "answer": ...}``. Arming has no
+other way in than this one and the cell file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import stat
+import struct
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+LONGEST_REQUEST = 4096  # bytes
+PATIENCE = 5.0  # s for a request to come
+MOST_AT_ONCE = 8
+COMMANDS = ("status", "arm", "disarm")
+_CREDENTIALS = struct.Struct("3i")
+
+
+@dataclass(frozen=True)
+class Peer:
+    """Who is at the other end, as the kernel says."""
+
+    pid: int
+    uid: int
+
+
+Answer = Callable[[str, Peer], dict[str, Any]]
+
+
+class ControlSocket:
+    """Serves a unix socket in threads of its own; ``answer`` is called in them."""
+
+    def __init__(self, path: Path, answer: Answer) -> None:
+        self.path = path
+        self._answer = answer
+        self._listener: socket.socket | None = None
+        self._slots = threading.BoundedSemaphore(MOST_AT_ONCE)
+
+    def open(self) -> None:
+        """Listen; what a killed daemon left behind is replaced. The caller holds the cell's lock.
+
+        Raises OSError.
+        """
+        with contextlib.suppress(FileNotFoundError):
+            if stat.S_ISSOCK(self.path.lstat().st_mode):
+                self.path.unlink()
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            listener.bind(str(self.path))
+            self.path.chmod(0o600)  # its folder is 0700: nobody came in between
+            listener.listen(MOST_AT_ONCE)
+        except OSError:
+            listener.close()
+            raise
+        self._listener = listener
+        threading.Thread(target=self._serve, args=(listener,), daemon=True).start()
+
+    def close(self) -> None:
+        """Stop listening and take the socket away; may be repeated."""
+        listener, self._listener = self._listener, None
+        if listener is not None:
+            with contextlib.suppress(OSError):
+                listener.shutdown(socket.SHUT_RDWR)
+            listener.close()
+            with contextlib.suppress(OSError):
+                self.path.unlink()
+
+    def _serve(self, listener: socket.socket) -> None:
+        while True:
+            try:
+                connection, _ = listener.accept()
+            except OSError:
+                return
+            if not self._slots.acquire(blocking=False):
+                connection.close()
+                continue
+            threading.Thread(target=self._talk, args=(connection,), daemon=True).start()
+
+    def _talk(self, connection: socket.socket) -> None:
+        try:
+            with connection, contextlib.suppress(OSError):
+                connection.settimeout(PATIENCE)
+                reply = self._reply(connection)
+                connection.sendall(json.dumps(reply).encode() + b"\n")
+        finally:
+            self._slots.release()
+
+    def _reply(self, connection: socket.socket) -> dict[str, Any]:
+        peer = peer_of(connection)
+        if peer.uid not in (0, os.geteuid()):
+            return refusal(f"found user {peer.uid}, expected the daemon's own ({os.geteuid()})")
+        line = _read_line(connection)
+        try:
+            request = json.loads(line)
+            command = request["command"]
+        except (ValueError, TypeError, KeyError):
+            return refusal('found no request, expected {"command": ...} as one line of JSON')
+        if command not in COMMANDS:
+            return refusal(f"found command {str(command)[:40]!r}, expected {', '.join(COMMANDS)}")
+        return self._answer(command, peer)
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def refusal(words: str) -> dict[str, Any]:
+    """Return the answer to what is not done."""
+    return {"ok": False, "error": words}
+
+
+def peer_of(connection: socket.socket) -> Peer:
+    """Return who opened a unix connection."""
+    option = getattr(socket, "SO_PEERCRED", None)
+    if option is None:  # not Linux: the folder's and the socket's modes stand alone
+        return Peer(0, os.geteuid())
+    raw = connection.getsockopt(socket.SOL_SOCKET, option, _CREDENTIALS.size)
+    pid, uid, _ = _CREDENTIALS.unpack(raw)
+    return Peer(pid, uid)
+
+
+def _read_line(connection: socket.socket) -> bytes:
+    data = b""
+    while b"\n" not in data and len(data) < LONGEST_REQUEST:
+        piece = connection.recv(LONGEST_REQUEST)
+        if not piece:
+            break
+        data += piece
+    return data[:LONGEST_REQUEST].split(b"\n")[0]

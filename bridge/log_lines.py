@@ -1,0 +1,81 @@
+"""Structured logs: each of the daemon's events as one line of JSON (``run --log json``).
+
+Fields that every line has: ``time`` (ISO 8601, UTC), ``level``, ``event`` (its kind), ``message``.
+What else an event carries follows under its own name. Nothing of a cell's text, keys or tokens is
+among it: see HIDDEN.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import IO, Any
+
+HIDDEN = re.compile(
+    r"token|password|secret|passwd|api_?key|private|credential|^key$", re.IGNORECASE
+)
+LEFT_OUT = ("text", "monotonic", "kind", "time", "detail")  # text: the whole cell file
+LONGEST = 2000  # characters of one value
+_GRAVE = ("fault", "refused")
+
+
+def log_line(event: Mapping[str, Any]) -> str:
+    """Return an event as one line of JSON, without its end."""
+    at = datetime.fromtimestamp(float(event.get("time", 0.0)), UTC)
+    found: dict[str, Any] = {
+        "time": at.isoformat(timespec="milliseconds").replace("+00:00", "Z"),
+        "level": _level(event),
+        "event": str(event.get("kind", "note")),
+        "message": _message(event),
+    }
+    for key, value in event.items():
+        if key not in LEFT_OUT:
+            found.setdefault(key, _shown(key, value))
+    return json.dumps(found, ensure_ascii=True, default=str)
+
+
+class JsonLines:
+    """Writes events to a stream, usually stderr; a stream that is gone or full stops nothing."""
+
+    def __init__(self, stream: IO[str]) -> None:
+        self._stream = stream
+
+    def tell(self, event: Mapping[str, Any]) -> None:
+        """Write one event."""
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.write(log_line(event) + "\n")
+            self._stream.flush()
+
+
+def _level(event: Mapping[str, Any]) -> str:
+    if event.get("kind") in _GRAVE or "failure" in event:
+        return "error"
+    if str(event.get("to", "")).lower() == "fault":
+        return "error"
+    if event.get("kind") == "side" or "paused" in event or "lost" in event:
+        return "warning"
+    return "info"
+
+
+def _message(event: Mapping[str, Any]) -> str:
+    if "to" in event:
+        words = f"{event.get('from', '')} -> {event['to']} ({event.get('cause', '')})".lower()
+        return f"{words}: {event['detail']}" if event.get("detail") else words
+    for key in ("detail", "failure", "fault", "ended"):
+        if event.get(key):
+            return str(event[key])[:LONGEST]
+    return str(event.get("kind", "note"))
+
+
+def _shown(key: str, value: Any) -> Any:
+    """Return a value as it may be shown: no secrets, at any depth, and not endless."""
+    if HIDDEN.search(key) and not isinstance(value, bool):
+        return "(hidden)"
+    if isinstance(value, Mapping):
+        return {str(k): _shown(str(k), v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_shown("", v) for v in value]
+    return value[:LONGEST] if isinstance(value, str) else value

@@ -1,0 +1,195 @@
+"""The writing half of the loop: begin, send, bring to rest, let go."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.counts import Count
+from bridge.setpoint_source.source import Source, SourceDryError
+from bridge.setpoint_stream import SetpointStream
+from bridge.settings import SetpointSettings
+from bridge.shared_page import Page, Phase
+from bridge.supervisor import Cause, State, Supervisor
+from core.errors import (
+    ForeignCommandError,
+    IneffectiveWriteError,
+    LimitError,
+    PartialWriteError,
+    WriteError,
+)
+from core.loads import Loads
+from core.setpoint import Setpoint
+from core.state import RobotState
+from drivers.driver import Driver
+
+Vector = NDArray[np.float64]
+SETTLED, LONGEST_SETTLING = 2e-6, 0.3  # rad, s
+PARTS_IN_A_ROW = 3  # setpoints that left in part only, after which the motion is ended
+
+
+class Writing:
+    """Sends what the states of the supervisor allow, and nothing else."""
+
+    def __init__(
+        self,
+        settings: SetpointSettings,
+        driver: Driver,
+        source: Source,
+        stream: SetpointStream,
+        supervisor: Supervisor,
+        page: Page,
+        tell: Callable[[dict[str, Any]], None],
+        skip: Callable[[], None],
+        lose: Callable[[str], None],
+    ) -> None:
+        self._settings, self._driver, self._source = settings, driver, source
+        self._stream, self._supervisor, self._page = stream, supervisor, page
+        self._tell, self._skip, self._lose = tell, skip, lose
+        self.ready = False  # the driver is armed
+        self.has_armed = False  # it was, at some time in this process
+        self._failed = 0  # setpoints in a row that did not leave, or without effect
+        self._settling = 0.0  # s, monotonic: since when the last setpoint stands
+
+    def start(self, state: RobotState, own: Vector) -> bool:
+        """Begin writing once the source has a first setpoint and the driver is ready.
+
+        Returns whether it took so long that a fresh state is needed.
+        """
+        first = self._source.first(own)
+        if first is None:
+            if self.ready:
+                self._refuse_start("the source fell silent before the first setpoint")
+            return False
+        away = np.abs(first - own)
+        tolerance = self._settings.start_tolerance
+        if not (away <= tolerance).all():
+            joint = int(np.argmax(away))
+            self._refuse_start(
+                f"joint {joint + 1}: found the first setpoint {away[joint]:.4f} rad from the arm, "
+                f"expected at most {tolerance:g} (setpoints.start_tolerance)"
+            )
+            return False
+        try:
+            if not self.ready:
+                self._arm_driver(state)
+                return True
+            self._stream.start(own, state.timestamp)
+        except (WriteError, LimitError) as error:
+            if isinstance(error, ForeignCommandError):
+                self._page.count(Count.FOREIGN)
+            self._refuse_start(str(error))
+            return True
+        self._source.begin(state.timestamp, own)
+        self._failed = 0
+        self._supervisor.take(Cause.WRITING)
+        return False
+
+    def _arm_driver(self, state: RobotState) -> None:
+        """Make the driver ready, which takes a moment: a fresh state is needed after it."""
+        self._page.enter(Phase.ARMING)
+        self.has_armed = True
+        try:
+            self._driver.arm(state)
+            self.ready = True
+        finally:
+            self._page.enter(Phase.RUNNING)
+            self._skip()
+
+    def _refuse_start(self, detail: str) -> None:
+        self.release()
+        self._supervisor.take(Cause.START_REFUSED, detail)
+
+    def write(self, state: RobotState, own: Vector, loads: Loads) -> Setpoint | None:
+        """Send one setpoint; returns it, or None where none has left."""
+        source_q = self._next(state, own)
+        holding = self._supervisor.state == State.HOLDING
+        stream = self._stream
+        try:
+            setpoint = stream.advance(state, source_q, loads, 0.0 if holding else 1.0)
+            if stream.finite:
+                self._driver.write_setpoint(setpoint)
+                self._failed = 0
+                return setpoint
+            self._end(Count.BAD_OUTPUT, Cause.BAD_OUTPUT, "the model's correction is no number")
+        except LimitError as error:
+            stream.forget()
+            self._end(Count.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))
+        except PartialWriteError as error:
+            self._repeat(Count.WRITE_PARTIAL, PARTS_IN_A_ROW, str(error))
+        except IneffectiveWriteError as error:
+            self._repeat(Count.WRITE_RETRIED, 2, str(error))
+        except ForeignCommandError as error:
+            self._end(Count.FOREIGN, Cause.FOREIGN, str(error))
+        except WriteError as error:
+            self._page.count(Count.WRITE_FAILED)
+            self._supervisor.take(Cause.WRITE_FAILED, str(error))
+            self.ready = False
+            self._lose(str(error))
+        return None
+
+    def _repeat(self, what: Count, most: int, detail: str) -> None:
+        """Leave it to the next cycle, whose setpoint goes out whole; after some, end the motion."""
+        self._page.count(what)
+        self._failed += 1
+        if self._failed >= most:
+            self._failed = 0
+            self._end(Count.WRITE_INEFFECTIVE, Cause.INEFFECTIVE, detail)
+
+    def _end(self, what: Count, cause: Cause, detail: str) -> None:
+        """End the motion as the table says; let go where it says that nothing more is written."""
+        self._page.count(what)
+        self._supervisor.take(cause, detail)
+        if not self._supervisor.state.writes:
+            self.release()
+
+    def at_rest(self, setpoint: Setpoint, state: RobotState) -> bool:
+        """Return whether the offset is out, and the arm, where it is ours, stands.
+
+        The controller's target follows late: who lets go at once leaves the arm short of it.
+        """
+        if not self._driver.moves_arm:
+            return self._stream.is_bare
+        if not self._stream.rests:
+            return False
+        now = time.monotonic()
+        self._settling = self._settling or now
+        near = bool((np.abs(state.target_q - setpoint.q) < SETTLED).all())
+        if near or now - self._settling > LONGEST_SETTLING:
+            self._settling = 0.0
+            return True
+        return False
+
+    def _next(self, state: RobotState, own: Vector) -> Vector | None:
+        """Return the source's setpoint; None: the motion must brake."""
+        if self._supervisor.state == State.HOLDING:
+            return None if self._driver.moves_arm else own
+        try:
+            found = self._source.sample(state.timestamp, own)
+        except SourceDryError as error:
+            self._page.count(Count.SOURCE_DRY)
+            self._supervisor.take(Cause.SOURCE_DRY, str(error))
+            return None if self._driver.moves_arm else own
+        if self._source.ended and not self._page.ended:
+            self._page.tell_ended()
+            words = "the source has come to its end; the arm stays there"
+            self._tell({"kind": "source", "what": "ended", "detail": words})
+        return found
+
+    def release(self) -> None:
+        """Leave the robot to itself; the arm has come to rest, or its watchdog stops it."""
+        self._stream.end()
+        if not self.ready:
+            return
+        self.ready = False
+        self._page.enter(Phase.ARMING)
+        try:
+            self._driver.release()
+        except WriteError as error:
+            self._tell({"kind": "link", "what": "release", "detail": str(error)})
+        self._page.enter(Phase.RUNNING)
+        self._skip()

@@ -1,0 +1,64 @@
+"""The metrics' process: ``python -m bridge.metrics.main``, started by the daemon.
+
+It reads along as the status page does, and answers Prometheus at /metrics.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from prometheus_client import CollectorRegistry, generate_latest
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
+
+from bridge.metrics.counts import Counts
+from bridge.metrics.families import Families
+from bridge.served.credentials import read_token
+from bridge.served.guard import Guard
+from bridge.served.server import serve
+from bridge.side_main import Order, take_order
+from core.errors import GapbridgeError
+
+TURN = 0.25  # s between two looks at the shared page
+TEXT = "text/plain; version=0.0.4; charset=utf-8"
+
+
+def main() -> int:
+    """Run until the daemon is gone; returns the exit code."""
+    order = take_order()
+    try:
+        run(order)
+    except GapbridgeError as error:
+        order.tell({"kind": "metrics", "failure": str(error)})
+        sys.stderr.write(f"{error}\n")
+        return 1
+    return 0
+
+
+def run(order: Order) -> None:
+    """Serve metrics until the daemon is gone. Raises LinkError, InputError."""
+    settings = order.settings.metrics
+    assert settings is not None
+    path = settings.token_file
+    token = None if path is None else read_token(path, "metrics.token_file")
+    counts = Counts(order.page, order.settings.link.rate)
+    families = Families(order.settings, order.session, counts)
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(families)
+
+    async def metrics(request: Request) -> Response:
+        counts.turn(order.events.poll())
+        return Response(generate_latest(registry), media_type=TEXT)
+
+    guard = Guard(Starlette(routes=[Route("/metrics", metrics)]), settings, token)
+    families.refused = guard.refused
+    serve(
+        guard, settings, "metrics", lambda: order.events.closed,
+        lambda: counts.turn(order.events.poll()), TURN,
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,232 @@
+"""From a recording to a log: the contract's columns, and what the daemon made of them beside."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.output_file import replacing_bytes
+from core.errors import InputError, LogError
+from core.log_columns import COLUMNS
+from core.recording.reading import Batch, read_batches
+from core.recording.schema import ENUM_FIELD
+
+if TYPE_CHECKING:
+    import pyarrow
+
+Array = NDArray[np.float64]
+BESIDE = ("nominal_q", "corrected_q", "offset", "written", "age", "residual", "clamped", "number")
+PARQUET = (".parquet", ".pq")
+GROUP = 20_000  # rows of a Parquet row group at least
+
+
+@dataclass
+class Exported:
+    """What was exported."""
+
+    rows: int = 0
+    gaps: int = 0  # cycles that the recording lacks between its first and its last
+    back: int | None = None  # row (from 0) at which the controller's clock goes back
+    first: float | None = None  # s since 1970
+    last: float | None = None
+    states: dict[str, int] = field(default_factory=dict)  # rows by state
+    _number: float | None = None
+    _timestamp: float = -np.inf
+
+    def take(self, batch: Batch, every: int) -> None:
+        """Count a batch."""
+        numbers, times = batch.columns["number"], batch.columns["timestamp"]
+        before = numbers[0] - every if self._number is None else self._number
+        steps = np.diff(numbers, prepend=before)
+        self.gaps += int(np.sum(np.maximum(steps - every, 0)) // every)
+        wrong = np.flatnonzero(np.diff(times, prepend=self._timestamp) <= 0)
+        if len(wrong) and self.back is None:
+            self.back = self.rows + int(wrong[0])
+        if self.first is None:
+            self.first = batch.log_time[0] / 1e9
+        self.last = batch.log_time[-1] / 1e9
+        self._number, self._timestamp = numbers[-1], times[-1]
+        self.rows += len(batch)
+        for value, count in zip(*np.unique(batch.columns[ENUM_FIELD], return_counts=True),
+                                strict=True):  # fmt: skip
+            name = _state(batch, value)
+            self.states[name] = self.states.get(name, 0) + int(count)
+
+
+@dataclass(frozen=True)
+class Span:
+    """A stretch of a recording: bounds as ``moment`` reads them, None = open."""
+
+    start: float | datetime | None = None
+    stop: float | datetime | None = None
+
+
+def moment(text: str) -> float | datetime:
+    """Return a bound of a stretch: s from the beginning (negative: from the end), or a time.
+
+    Raises InputError where it is neither.
+    """
+    with contextlib.suppress(ValueError):
+        if math.isfinite(seconds := float(text)):
+            return seconds
+    try:
+        return datetime.fromisoformat(text).astimezone()
+    except ValueError:
+        raise InputError(
+            f"found {text!r}, expected seconds from the beginning (negative: before the end) or a "
+            "time like 2026-01-31T14:05:00"
+        ) from None
+
+
+def export(recording: Path, out: Path, span: Span | None = None) -> Exported:
+    """Write a recording's cycles as a log: CSV, or Parquet where the suffix of ``out`` says so.
+
+    Columns that no cycle carries are left out. Raises LogError where the recording cannot be used
+    or holds no cycle of the stretch.
+    """
+    first, last = _bounds(recording, span or Span())
+    columns = _columns_of(recording, first, last)
+    exported, every = Exported(), _every(recording)
+    writer = _Parquet if out.suffix.lower() in PARQUET else _Csv
+    with replacing_bytes(out) as file, writer(file) as log:
+        for batch in _within(recording, first, last):
+            exported.take(batch, every)
+            log.write(_table(batch, columns))
+    return exported
+
+
+def _every(recording: Path) -> int:
+    for batch in read_batches(recording):
+        for channel, document in batch.documents:
+            if channel == "/configuration":
+                return max(int(document.get("every", 1)), 1)
+    return 1
+
+
+def _within(recording: Path, first: int, last: int) -> Iterator[Batch]:
+    """Yield the batches that hold cycles between two times, ns since 1970, cut to them."""
+    for batch in read_batches(recording):
+        wanted = (batch.log_time >= first) & (batch.log_time <= last)
+        if wanted.all() and len(wanted):
+            yield batch
+        elif wanted.any():
+            yield Batch(
+                {name: values[wanted] for name, values in batch.columns.items()},
+                batch.log_time[wanted], (), batch.state_names,
+            )  # fmt: skip
+
+
+def _bounds(recording: Path, span: Span) -> tuple[int, int]:
+    """Return a stretch as ns since 1970."""
+    begin, end = None, 0
+    if isinstance(span.start, float) or isinstance(span.stop, float):
+        for batch in read_batches(recording):
+            if len(batch):
+                begin = int(batch.log_time[0]) if begin is None else begin
+                end = int(batch.log_time[-1])
+
+    def at(bound: float | datetime | None, otherwise: int) -> int:
+        if bound is None:
+            return otherwise
+        if isinstance(bound, datetime):
+            return int(bound.timestamp() * 1e9)
+        return int(bound * 1e9) + (end if bound < 0 else begin or 0)
+
+    return at(span.start, 0), at(span.stop, 2**63 - 1)
+
+
+def _columns_of(recording: Path, first: int, last: int) -> list[str]:
+    """Return the columns that some cycle carries, in the log's order."""
+    carried: set[str] = set()
+    empty = True
+    for batch in _within(recording, first, last):
+        empty = False
+        left = [name for name in batch.columns if name not in carried]
+        carried.update(name for name in left if not np.isnan(batch.columns[name]).all())
+    if empty:
+        raise LogError(f"{recording}: found no cycles there, expected at least one to export")
+    return [name for name in (*COLUMNS, *BESIDE) if name in carried]
+
+
+def _table(batch: Batch, columns: list[str]) -> pyarrow.Table:
+    import pyarrow
+
+    found: dict[str, Any] = {}
+    for name in columns:
+        values = batch.columns[name]
+        if values.ndim == 1:
+            found[name] = values
+        else:
+            found.update((f"{name}_{i}", values[:, i].copy()) for i in range(values.shape[1]))
+    found[ENUM_FIELD] = [_state(batch, value) for value in batch.columns[ENUM_FIELD]]
+    return pyarrow.table(found)
+
+
+def _state(batch: Batch, value: float) -> str:
+    known: Mapping[int, str] = dict(enumerate(batch.state_names))
+    return known.get(int(value), str(int(value))).lower()
+
+
+class _Csv:
+    """Rows of CSV, numbers as short as they read back exactly."""
+
+    def __init__(self, file: Any) -> None:
+        self._file = file
+        self._begun = False
+
+    def write(self, table: pyarrow.Table) -> None:
+        from pyarrow import csv
+
+        if not self._begun:
+            self._file.write((",".join(table.column_names) + "\n").encode())
+        self._begun = True
+        options = csv.WriteOptions(include_header=False, quoting_style="none")
+        csv.write_csv(table, self._file, options)
+
+    def __enter__(self) -> _Csv:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+class _Parquet:
+    """Row groups of a Parquet file."""
+
+    def __init__(self, file: Any) -> None:
+        self._file = file
+        self._writer: Any = None
+        self._waiting: list[pyarrow.Table] = []
+
+    def write(self, table: pyarrow.Table) -> None:
+        self._waiting.append(table)
+        if sum(len(one) for one in self._waiting) >= GROUP:
+            self._flush()
+
+    def _flush(self) -> None:
+        import pyarrow
+        from pyarrow import parquet
+
+        if not self._waiting:
+            return
+        table = pyarrow.concat_tables(self._waiting)
+        self._waiting = []
+        if self._writer is None:
+            self._writer = parquet.ParquetWriter(self._file, table.schema, compression="zstd")
+        self._writer.write_table(table)
+
+    def __enter__(self) -> _Parquet:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._flush()
+        if self._writer is not None:
+            self._writer.close()

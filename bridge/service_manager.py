@@ -1,0 +1,63 @@
+"""What systemd is told: ready, alive, reloading, stopping (sd_notify's protocol, no library).
+
+Source: sd_notify(3): datagrams of KEY=VALUE lines to the socket named in NOTIFY_SOCKET.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import time
+
+
+class ServiceManager:
+    """Speaks to the service manager where there is one; silent where there is none."""
+
+    def __init__(self) -> None:
+        self._address = os.environ.get("NOTIFY_SOCKET", "")
+        if self._address.startswith("@"):
+            self._address = "\0" + self._address[1:]
+        wanted = os.environ.get("WATCHDOG_USEC", "0")
+        mine = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+        period = int(wanted) / 1e6 if wanted.isdigit() and mine else 0.0
+        self._every = period / 3.0  # s between two signs of life; 0: none wanted
+        self._kicked = 0.0
+
+    @property
+    def present(self) -> bool:
+        """Return whether a service manager has started this process."""
+        return bool(self._address)
+
+    def ready(self) -> None:
+        """Tell that the run has begun."""
+        self._send("READY=1")
+
+    def reloading(self) -> None:
+        """Tell that a changed cell file is being taken; ``ready`` follows."""
+        self._send(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
+
+    def stopping(self) -> None:
+        """Tell that the run ends."""
+        self._send("STOPPING=1")
+
+    def status(self, words: str) -> None:
+        """Tell in one line what goes on."""
+        self._send(f"STATUS={words.splitlines()[0] if words else ''}")
+
+    def kick(self) -> None:
+        """Give a sign of life, where one is due; only to be called when there was progress."""
+        now = time.monotonic()
+        if self._every and now - self._kicked >= self._every:
+            self._kicked = now
+            self._send("WATCHDOG=1")
+
+    def _send(self, text: str) -> None:
+        if not self._address:
+            return
+        with (
+            contextlib.suppress(OSError),
+            socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link,
+        ):
+            link.setblocking(False)
+            link.sendto(text.encode(), self._address)

@@ -1,0 +1,57 @@
+"""The status page's process: ``python -m bridge.web.main``, started by the daemon.
+
+It reads along - the shared page through a descriptor that cannot be written to - and answers
+browsers. It has no way to the robot and none to arm anything.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from bridge.served.credentials import read_token
+from bridge.served.server import serve
+from bridge.side_main import Order, take_order
+from bridge.web.app import make_app
+from bridge.web.stream import Stream
+from bridge.web.watched import Watched, encoded
+from core.errors import GapbridgeError
+
+TURN = 0.1  # s between two looks at the shared page
+
+
+def main() -> int:
+    """Run until the daemon is gone; returns the exit code."""
+    order = take_order()
+    try:
+        run(order)
+    except GapbridgeError as error:
+        order.tell({"kind": "web", "failure": str(error)})
+        sys.stderr.write(f"{error}\n")
+        return 1
+    return 0
+
+
+def run(order: Order) -> None:
+    """Serve the page until the daemon is gone. Raises LinkError, InputError."""
+    settings = order.settings.web
+    assert settings is not None
+    path = settings.token_file
+    token = None if path is None else read_token(path, "web.token_file")
+    watched = Watched(order.settings, order.n, order.session, order.page)
+    stream = Stream(settings.clients)
+
+    def turn() -> None:
+        for kind, data in watched.turn(order.events.poll()):
+            if stream.is_watched:
+                stream.publish(kind, encoded(data))
+
+    def over() -> bool:
+        if order.events.closed:
+            stream.close()
+        return order.events.closed
+
+    serve(make_app(watched, stream, settings, token), settings, "web", over, turn, TURN)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,183 @@
+"""All that the page shows, kept up to date from the shared page and the daemon's events."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections import deque
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.daemon_settings import DaemonSettings
+from bridge.shared_page import ROWS, Page
+from bridge.supervisor import State
+from bridge.web.history import COLUMNS, STEP, History
+from bridge.web.prediction import WrenchPrediction
+from bridge.web.timing import Timing
+from core.limits import CLAMPS
+
+Array = NDArray[np.float64]
+Message = tuple[str, dict[str, Any]]  # kind, data
+EVENTS = 200  # kept to show
+TIMING_EVERY = 1.0  # s
+RATE_SPAN = 2.0  # s that the rate is taken over
+DIGITS = 6  # significant ones of what is drawn
+
+
+class Watched:
+    """Reads along; ``turn`` returns what is new since the last call."""
+
+    def __init__(self, settings: DaemonSettings, n: int, session: str, page: Page) -> None:
+        assert settings.web is not None
+        self._settings, self._session, self._page = settings, session, page
+        self._slices, self._n = page.slices, n
+        # whoever comes late still shows what the ring holds
+        self._reader = page.reader(max(page.written - ROWS + ROWS // 4, 0))
+        self._prediction = WrenchPrediction(settings, page.slices)
+        self._history = History(settings.web.history)
+        self._timing = Timing()
+        self._timing_at = 0.0
+        self._times = np.empty(0)  # s, monotonic, of the last cycles
+        self.events: deque[dict[str, Any]] = deque(maxlen=EVENTS)
+        self.status: dict[str, Any] = {}
+        self._why: dict[str, Any] = {}  # the last transition
+        self._counts = {"cycles": 0, "missed": 0, "late": 0, "written": 0}
+        self._clamped = dict.fromkeys(CLAMPS, 0)
+        self._last = 0.0  # s, monotonic: when the last state was received
+        self._sensor = "actual_TCP_force"
+
+    # -- in ---------------------------------------------------------------------------------------
+
+    def turn(self, events: list[dict[str, Any]]) -> list[Message]:
+        """Take what has come; returns messages for the pages that are open."""
+        messages = [message for event in events for message in self._hear(event)]
+        points = self._take(self._reader.drain())
+        messages.append(("tick", {**self.now(), "points": plain(points)}))
+        if time.monotonic() >= self._timing_at:
+            self._timing_at = time.monotonic() + TIMING_EVERY
+            messages.append(("timing", self._timing.figures()))
+        return messages
+
+    def _hear(self, event: dict[str, Any]) -> list[Message]:
+        if event.get("kind") == "status":
+            self.status = event
+            return [("status", event)]
+        if "to" in event:
+            self._why = event
+        self.events.append(event)
+        return [("event", event)]
+
+    def _take(self, rows: Array) -> Array:
+        s, now = self._slices, time.monotonic()
+        wall = time.time() - now
+        cycles = np.full((len(rows), len(COLUMNS)), np.nan)
+        if len(rows):
+            received, age = rows[:, s["received"].start], rows[:, s["age"].start]
+            rate = self._settings.link.rate
+            self._counts["cycles"] += len(rows)
+            self._counts["missed"] += int(rows[:, s["missed"].start].sum())
+            self._counts["late"] += int((age > 1.0 / rate).sum())
+            self._counts["written"] += int(rows[:, s["written"].start].sum())
+            bits = rows[:, s["clamped"].start].astype(np.int64)
+            for bit, name in enumerate(CLAMPS):
+                self._clamped[name] += int((bits >> bit & 1).sum())
+            self._last = float(received[-1])
+            times = np.concatenate([self._times, received])
+            self._times = times[times > times[-1] - RATE_SPAN]
+            self._timing.add(received, rows[:, s["duration"].start], age)
+            raw = rows[:, s["ft_raw_wrench"]]
+            self._sensor = "actual_TCP_force" if np.isnan(raw).all() else "ft_raw_wrench"
+            cycles[:, 0], cycles[:, 1] = received + wall, rows[:, s["state"].start]
+            cycles[:, 2:8] = rows[:, s["offset"]]
+            cycles[:, 8:14] = rows[:, s[self._sensor]]
+            # a few for each point are plenty: points are means
+            step = max(int(rate * STEP / 2), 1)
+            picked = np.arange(len(rows) - 1, -1, -step)[::-1]
+            cycles[picked, 14:20] = self._prediction.of(rows[picked])
+        return self._history.add(cycles, now + wall)
+
+    # -- out --------------------------------------------------------------------------------------
+
+    def now(self) -> dict[str, Any]:
+        """Return what is the case at this moment."""
+        times, now = self._times, time.monotonic()
+        silence = now - self._last if self._last else None
+        alive = len(times) > 1 and silence is not None and silence < RATE_SPAN
+        rate = (len(times) - 1) / (times[-1] - times[0]) if alive else 0.0
+        return {
+            "time": time.time(),
+            "state": State(self._page.state).name.lower(),
+            "phase": self._page.phase.name.lower(),
+            "why": {k: v for k, v in self._why.items() if k in ("cause", "detail", "time")},
+            "silence": silence,  # s since the last state of the robot
+            "heartbeat": self._page.silence,  # s since the loop's last sign of life
+            "rate": rate,
+            "sensor": self._sensor,
+            "clamped": self._clamped,
+            "lost": self._reader.lost,
+            **self._counts,
+        }
+
+    def about(self) -> dict[str, Any]:
+        """Return what does not change during a run."""
+        settings = self._settings
+        return {
+            "session": self._session,
+            "cell": settings.cell.stem,
+            "driver": settings.link.driver,
+            "rate": settings.link.rate,
+            "joints": self._n,
+            "limits": settings.limits.model_dump(mode="json"),
+            "columns": COLUMNS,
+            "states": [state.name.lower() for state in State],
+        }
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return everything but the history."""
+        return {
+            **self.about(),
+            "now": self.now(),
+            "status": self.status,
+            "timing": self._timing.figures(),
+            "events": list(self.events),
+        }
+
+    def history(self, seconds: float, most: int) -> dict[str, Any]:
+        """Return the last ``seconds`` of what is drawn, in ``most`` points or fewer."""
+        return {
+            "session": self._session,
+            "columns": COLUMNS,
+            "points": plain(self._history.since(seconds, most)),
+        }
+
+
+def plain(points: Array) -> list[list[float | None]]:
+    """Return points as JSON has them: None where there is no number, six digits, times in ms."""
+    return [
+        [
+            round(row[0], 3),
+            *(float(f"{v:.{DIGITS}g}") if math.isfinite(v) else None for v in row[1:]),
+        ]
+        for row in points.tolist()
+    ]
+
+
+def encoded(data: dict[str, Any]) -> str:
+    """Return JSON that every browser reads: no NaN in it."""
+    try:
+        return json.dumps(data, allow_nan=False, default=str, separators=(",", ":"))
+    except ValueError:
+        return json.dumps(_finite(data), default=str, separators=(",", ":"))
+
+
+def _finite(data: Any) -> Any:
+    if isinstance(data, float) and not math.isfinite(data):
+        return None
+    if isinstance(data, dict):
+        return {key: _finite(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [_finite(value) for value in data]
+    return data

@@ -1,0 +1,176 @@
+"""A recording of the daemon as a controller: its states once more, in their own time.
+
+What the daemon computed then it computes again from the same numbers: with the same cell, the same
+offsets bit for bit; with another, what that one would have made of it. Nothing is written anywhere.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from core.errors import LinkError, LogError
+from core.setpoint import Setpoint
+from core.state import RobotState
+from drivers.driver import Driver, DriverSettings
+
+if TYPE_CHECKING:
+    from core.model import Model
+
+Vector = NDArray[np.float64]
+NEEDED = (
+    "number", "timestamp", "state", "written", "attempted", "nominal_q", "own_q", "ramp_time",
+    "rate", "loop", "target_q", "actual_q", "actual_qd", "actual_TCP_force", "robot_mode",
+    "safety_mode", "runtime_state", "safety_status_bits", "speed_scaling",
+)  # fmt: skip
+LONGEST_PAUSE = 1.0  # s: longer gaps of a recording are not waited for
+
+
+class EndOfRecordingError(LinkError):
+    """The recording has come to its end."""
+
+
+class ReplaySettings(DriverSettings):
+    """Section ``link`` of a cell that runs on a recording."""
+
+    driver: Literal["replay"] = "replay"
+    file: Path = Field(
+        description="a recording: one file, or a whole run (its name without -001.mcap)"
+    )
+    speed: float = Field(1.0, gt=0.0, le=100.0, description="times as fast as it was")
+
+    def located(self, folder: Path) -> Self:
+        """Return the settings with the recording's path made whole.
+
+        Raises InputError where there is none.
+        """
+        from core.recording.reading import files_of
+
+        path = (folder / self.file).resolve()
+        try:
+            files_of(path)
+        except LogError as error:
+            raise LogError(f"link.file: {error}") from None
+        return self.model_copy(update={"file": path})
+
+
+@dataclass(frozen=True, slots=True)
+class Cycle:
+    """What a recorded cycle was, beside the controller's state."""
+
+    number: int
+    loop: int  # which process of the loop it was
+    state: int  # of the supervisor, at its end
+    written: bool
+    attempted: bool  # a setpoint was computed for writing, whether it left or not
+    own_q: Vector  # (n,) rad, what the robot itself wanted
+    nominal_q: Vector  # (n,) rad, what the correction was computed for
+    ramp_time: float  # s
+
+
+class ReplayDriver(Driver):
+    """Gives the states of a recording, one after the other; ``cycle`` is the present one's.
+
+    The constructor reads the recording's first cycle: its rate is the driver's. Raises LogError
+    where the recording holds none, or was made of another arm.
+    """
+
+    def __init__(self, settings: ReplaySettings, model: Model) -> None:
+        self.settings = settings
+        first = next(self._rows(), None)
+        if first is None:
+            raise LogError(f"{settings.file}: found no cycles, expected a recording to replay")
+        lacking = [name for name in NEEDED if name not in first]
+        if lacking:
+            raise LogError(f"{settings.file}: found no {lacking[0]}, expected it for a replay")
+        n = len(first["actual_q"])
+        if n != model.arm.n:
+            raise LogError(
+                f"{settings.file}: found {n} joints, expected {model.arm.n} as the cell's arm has"
+            )
+        super().__init__(float(first["rate"]), n)
+        self.cycle: Cycle | None = None
+        self._left: Iterator[Mapping[str, Vector]] = iter(())
+        self._begun = 0.0  # s, monotonic: when the recording's time 0 was
+        self._last = -np.inf  # s, controller clock
+
+    def connect(self) -> None:
+        """Begin at the recording's beginning."""
+        self._left = self._rows()
+        self._last = -np.inf
+
+    def read_state(self) -> RobotState:
+        """Wait as long as it took then, and return the next state.
+
+        Raises EndOfRecordingError where there is none.
+        """
+        row = next(self._left, None)
+        if row is None:
+            raise EndOfRecordingError(f"{self.settings.file}: the recording has come to its end")
+        self._wait(float(row["timestamp"]))
+        self.cycle = Cycle(
+            int(row["number"]), int(row["loop"]), int(row["state"]), bool(row["written"]),
+            bool(row["attempted"]), row["own_q"], row["nominal_q"], float(row["ramp_time"]),
+        )  # fmt: skip
+        return _state(row)
+
+    def nominal_q(self, state: RobotState) -> Vector:
+        """Return what the robot itself wanted then, (n,) rad."""
+        assert self.cycle is not None
+        return self.cycle.own_q
+
+    def write_setpoint(self, setpoint: Setpoint) -> None:
+        """Move nothing: there is no arm."""
+
+    def close(self) -> None:
+        """Leave the recording."""
+        self._left = iter(())
+
+    def _rows(self) -> Iterator[Mapping[str, Vector]]:
+        from core.recording.reading import read_batches  # only who replays loads MCAP
+
+        for batch in read_batches(self.settings.file):
+            for k in range(len(batch)):
+                yield {name: values[k] for name, values in batch.columns.items()}
+
+    def _wait(self, timestamp: float) -> None:
+        now, speed = time.monotonic(), self.settings.speed
+        if not 0.0 < timestamp - self._last < LONGEST_PAUSE:
+            self._begun = now - timestamp / speed
+        self._last = timestamp
+        time.sleep(max(self._begun + timestamp / speed - now, 0.0))
+
+
+def _state(row: Mapping[str, Vector]) -> RobotState:
+    """Return the state of a recorded cycle; what it lacked is NaN there."""
+
+    def known(name: str) -> Vector | None:
+        value = row.get(name)
+        return None if value is None or np.isnan(value).all() else value
+
+    payload = known("payload")
+    return RobotState(
+        timestamp=float(row["timestamp"]),
+        received=time.monotonic(),
+        actual_q=row["actual_q"],
+        actual_qd=row["actual_qd"],
+        target_q=row["target_q"],
+        actual_TCP_force=row["actual_TCP_force"],
+        ft_raw_wrench=known("ft_raw_wrench"),
+        joint_temperatures=known("joint_temperatures"),
+        actual_current_as_torque=known("actual_current_as_torque"),
+        payload=None if payload is None else float(payload),
+        payload_cog=known("payload_cog"),
+        robot_mode=int(row["robot_mode"]),
+        safety_mode=int(row["safety_mode"]),
+        runtime_state=int(row["runtime_state"]),
+        safety_status_bits=int(row["safety_status_bits"]),
+        speed_scaling=float(row["speed_scaling"]),
+    )

@@ -1,0 +1,141 @@
+"""Export: a recording becomes a log in the contract's columns."""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from pyarrow import parquet
+from recorded import Desk, N, publish, same_bits
+
+from bridge.cli.main import gapbridge
+from bridge.recording.export import Span, export, moment
+from core.errors import InputError, LogError
+from core.log import read_log
+from core.recording.reading import read_batches
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Desk:
+    return Desk(tmp_path / "recordings")
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_the_log_holds_the_contracts_columns_bit_for_bit(
+    desk: Desk, tmp_path: Path, suffix: str
+) -> None:
+    rows = desk.record(40, 40)
+    out = tmp_path / f"log{suffix}"
+    assert export(desk.stem, out).rows == 80
+    log = read_log(out, N)
+    for name in ("timestamp", "actual_q", "target_q", "payload_cog", "ft_raw_wrench", "payload"):
+        expected = rows[:, desk.page.slices[name]].reshape(log.require(name).shape)
+        assert same_bits(log.require(name), expected.copy()), name
+    assert not log.has("joint_temperatures")  # no cycle has them
+    beside = ("nominal_q_5", "corrected_q_0", "offset_5", "written", "state")
+    assert set(beside) <= set(log.unknown)
+
+
+def test_states_stand_in_words(desk: Desk, tmp_path: Path) -> None:
+    desk.record(3)
+    export(desk.stem, tmp_path / "log.csv")
+    lines = (tmp_path / "log.csv").read_text().splitlines()
+    assert lines[0].endswith(",state")
+    assert lines[3].endswith(",observing")
+    export(desk.stem, tmp_path / "log.parquet")
+    table = parquet.read_table(tmp_path / "log.parquet")
+    assert table["state"].to_pylist() == ["observing"] * 3
+
+
+def test_a_stretch_is_given_from_the_beginning_from_the_end_or_by_the_calendar(
+    desk: Desk, tmp_path: Path
+) -> None:
+    desk.record(100, 100)  # one cycle every 2 ms
+    out = tmp_path / "log.csv"
+
+    def rows(start: float | datetime | None, stop: float | datetime | None) -> list[int]:
+        export(desk.stem, out, Span(start, stop))
+        number = out.read_text().splitlines()[0].split(",").index("number")
+        return [int(float(line.split(",")[number])) for line in out.read_text().splitlines()[1:]]
+
+    assert rows(0.0999, 0.1021) == [50, 51]
+    assert rows(-0.0041, None) == [197, 198, 199]
+    assert rows(None, -0.3939) == [0, 1, 2]
+    begin = next(batch.log_time[0] for batch in read_batches(desk.stem) if len(batch)) / 1e9
+    at = datetime.fromtimestamp(begin + 0.1001, UTC)
+    assert rows(at, None)[0] == 51
+    with pytest.raises(LogError, match="found no cycles there"):
+        rows(5.0, None)
+
+
+def test_bounds_that_mean_nothing_are_refused() -> None:
+    for text in ("yesterday", "nan", "inf", ""):
+        with pytest.raises(InputError, match="expected seconds from the beginning"):
+            moment(text)
+
+
+def test_gaps_and_a_clock_that_goes_back_are_told(desk: Desk, tmp_path: Path) -> None:
+    recorder = desk.recorder()
+    publish(desk.page, 10)
+    recorder.step(flush=True)
+    publish(desk.page, 5)
+    recorder._reader.next += 5  # as if the ring had been overwritten
+    first = publish(desk.page, 1)
+    assert first[0, 0] == 15
+    desk.page._rows[15, 1] = 0.0
+    recorder.close()
+    runner = CliRunner()
+    done = runner.invoke(gapbridge, ["export", str(desk.stem), "--out", str(tmp_path / "l.csv")])
+    assert done.exit_code == 0, done.output
+    assert "5 cycles in between were not recorded" in done.output
+    assert "row 12: the controller's clock goes back" in done.output
+
+
+def test_the_command_writes_beside_the_recording_and_gives_the_cell_back(
+    desk: Desk, tmp_path: Path
+) -> None:
+    desk.record(3)
+    recorder = desk.recorder()
+    recorder.configuration["text"] = "robot: {model: ur10e}\n"
+    recorder.close()
+    runner = CliRunner()
+    done = runner.invoke(gapbridge, ["export", str(desk.files[0])])
+    assert done.exit_code == 0
+    log = desk.files[0].with_suffix(".csv")
+    assert re.match(rf"{re.escape(str(log))}: 3 cycles over 0\.004 s \(3 observing\)", done.output)
+    cell = tmp_path / "cell.yaml"
+    done = runner.invoke(gapbridge, ["export", str(desk.files[1]), "--cell-out", str(cell)])
+    assert cell.read_text() == "robot: {model: ur10e}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["missing"], "missing: file not found, expected a recording"),
+        (["{recording}", "--out", "log.txt"], "found .txt, expected .csv or .parquet"),
+        (["{recording}", "--from", "noon"], "--from: found 'noon'"),
+        (["{recording}", "--out", "{recording}.csv/x.csv"], "found no folder"),
+    ],
+)
+def test_what_cannot_be_exported_is_one_line(desk: Desk, arguments: list[str], words: str) -> None:
+    desk.record(3)
+    given = [argument.format(recording=desk.stem) for argument in arguments]
+    done = CliRunner().invoke(gapbridge, ["export", *given])
+    assert words in str(done.exception)
+
+
+def test_a_long_recording_is_exported_in_pieces(desk: Desk, tmp_path: Path) -> None:
+    recorder = desk.recorder()
+    for _ in range(6):
+        publish(desk.page, 5000)
+        recorder.step(flush=True)
+    recorder.close()
+    export(desk.stem, tmp_path / "log.parquet")
+    file = parquet.ParquetFile(tmp_path / "log.parquet")
+    assert file.metadata.num_rows == 30_000
+    assert file.metadata.num_row_groups == 2
+    assert np.all(np.diff(file.read(["timestamp"])["timestamp"].to_numpy()) > 0)

@@ -1,0 +1,187 @@
+"""The recorder as a process: killed, stalled, left behind; what was published is in the files."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recorded import SESSION, N
+
+from bridge import side_process
+from bridge.daemon_settings import DaemonSettings
+from bridge.recording.settings import RecordingSettings
+from bridge.shared_page import Page
+from bridge.side_process import SideProcess
+from bridge.supervisor import State
+from core.recording.reading import read_columns, read_configuration, read_documents
+from core.recording.records import is_whole
+
+RATE = 500.0
+CELL = "robot: {model: ur10e}\nweb: {token: squeamish}\n"
+
+
+class Publisher:
+    """A loop's half of a page, in a thread of the test: 500 cycles a second."""
+
+    def __init__(self) -> None:
+        self.page = Page(N)
+        self.stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        random, begun = np.random.default_rng(0), time.monotonic()
+        while not self.stop.is_set():
+            self.page.beat()
+            for _ in range(int((time.monotonic() - begun) * RATE) - self.page.written):
+                row = self.page.next_row()
+                row[1:] = random.standard_normal(self.page.width - 1)
+                row[1] = self.page.written / RATE
+                row[self.page.slices["state"]] = State.OBSERVING
+                row[self.page.slices["received"]] = time.monotonic()
+                self.page.publish()
+            time.sleep(0.005)
+
+    def end(self) -> int:
+        """Stop publishing; returns how many cycles there were."""
+        self.stop.set()
+        self._thread.join()
+        return self.page.written
+
+
+class Recording:
+    """A recorder's process, as the daemon has it."""
+
+    def __init__(self, folder: Path, publisher: Publisher) -> None:
+        cell = folder / "cell.yaml"
+        cell.write_text(CELL)
+        self.stem = folder / "recordings" / SESSION
+        settings = DaemonSettings(
+            cell=cell, recording=RecordingSettings(folder=self.stem.parent, keep_free=0.0)
+        )
+        order = {"settings": settings.model_dump(mode="json"), "n": N, "session": SESSION,
+                 "extra": {}}  # fmt: skip
+        self.process = SideProcess("bridge.recording.main", order, publisher.page)
+        self._seen = 0  # files of former lives
+
+    def wait_for_file(self) -> None:
+        """Wait until this life of the process writes."""
+        begun = time.monotonic()
+        while self._files() == self._seen:
+            assert time.monotonic() - begun < 20.0
+            self.process.check()
+            self.process.events()
+            time.sleep(0.01)
+        self._seen = self._files()
+
+    def _files(self) -> int:
+        return len(list(self.stem.parent.glob("*.mcap")))
+
+    def end(self) -> None:
+        self.process.tell({"kind": "ended", "time": time.time()})
+        self.process.close(10.0)
+
+    def numbers(self) -> list[int]:
+        return [int(number) for number in read_columns(self.stem).get("number", [])]
+
+
+@pytest.fixture
+def publisher() -> Iterator[Publisher]:
+    found = Publisher()
+    yield found
+    found.end()
+    found.page.close()
+
+
+@pytest.fixture
+def recording(
+    tmp_path: Path, publisher: Publisher, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Recording]:
+    monkeypatch.setattr(side_process, "BACKOFF", (0.02, 0.05))
+    found = Recording(tmp_path, publisher)
+    yield found
+    found.process.close(0.1)
+
+
+def test_it_ends_in_order_with_everything_and_without_secrets(
+    recording: Recording, publisher: Publisher
+) -> None:
+    recording.wait_for_file()
+    recording.process.tell({"kind": "transition", "time": time.time(), "from": "DISCONNECTED",
+                            "to": "OBSERVING", "cause": "connected", "detail": ""})  # fmt: skip
+    time.sleep(0.5)
+    count = publisher.end()
+    begun = time.monotonic()
+    recording.end()
+    assert time.monotonic() - begun < 3.0
+    assert recording.numbers() == list(range(count))
+    assert [event["kind"] for event in read_documents(recording.stem)] == ["transition", "ended"]
+    (path,) = recording.stem.parent.glob("*.mcap")
+    assert is_whole(path)
+    text = read_configuration(recording.stem)["text"]
+    assert "ur10e" in text
+    assert "squeamish" not in text
+
+
+def kill_at_random_moments(recording: Recording, publisher: Publisher, times: int) -> None:
+    random = np.random.default_rng(5)
+    for _ in range(times):
+        recording.wait_for_file()
+        begun = time.monotonic()
+        time.sleep(random.uniform(0.0, 1.8))
+        assert recording.process.pid is not None
+        os.kill(recording.process.pid, signal.SIGKILL)
+        published = publisher.page.written
+        alive = time.monotonic() - begun
+        numbers = recording.numbers()
+        assert numbers == list(range(len(numbers)))
+        if alive > 1.0:
+            assert len(numbers) > published - RATE * 1.0
+    recording.wait_for_file()
+    count = publisher.end()
+    recording.end()
+    assert recording.numbers() == list(range(count))
+
+
+def test_killed_at_random_moments_it_goes_on_from_the_ring_and_nothing_is_lost(
+    recording: Recording, publisher: Publisher
+) -> None:
+    kill_at_random_moments(recording, publisher, 4)
+
+
+@pytest.mark.slow
+def test_killed_often_nothing_is_lost(recording: Recording, publisher: Publisher) -> None:
+    kill_at_random_moments(recording, publisher, 25)
+
+
+def test_stalled_for_a_while_it_loses_nothing(recording: Recording, publisher: Publisher) -> None:
+    recording.wait_for_file()
+    pid = recording.process.pid
+    assert pid is not None
+    os.kill(pid, signal.SIGSTOP)
+    time.sleep(2.0)
+    os.kill(pid, signal.SIGCONT)
+    time.sleep(0.3)
+    count = publisher.end()
+    recording.end()
+    assert recording.numbers() == list(range(count))
+
+
+def test_a_daemon_that_is_gone_without_an_end_is_outlived_until_the_loop_has_stopped(
+    recording: Recording, publisher: Publisher
+) -> None:
+    recording.wait_for_file()
+    assert recording.process.pid is not None
+    os.kill(recording.process.pid, signal.SIGTERM)  # as a service manager tells all at once
+    recording.process.begin_close()  # as the system does when the daemon is killed
+    time.sleep(1.0)
+    count = publisher.end()
+    recording.process.close(10.0)
+    assert recording.numbers() == list(range(count))
+    assert "gone" in read_documents(recording.stem)[-1]["detail"]

@@ -1,0 +1,210 @@
+"""A daemon's half without a robot: a shared page that fills, events, and a side process on it."""
+
+from __future__ import annotations
+
+import math
+import socket
+import subprocess
+import threading
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import httpx
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.cell import load_cell
+from bridge.daemon_settings import DaemonSettings
+from bridge.shared_page import Page, Phase
+from bridge.side_process import SideProcess
+from bridge.supervisor import State
+
+Array = NDArray[np.float64]
+N, RATE = 6, 125.0
+CELL = """robot: {model: ur10e}
+tool: {tcp: {xyz: [0, 0, 0.18]}}
+payload: {mass: 5.0, cog: [0, 0, 0.06]}
+compliance: {axial: [1e-6, 3e-6, 4e-6, 1e-5, 1e-5, 1e-5], radial: [1e-7, 1e-7, 1e-7, 0, 0, 0]}
+link: {host: 127.0.0.2}
+"""
+HOME = np.array([0.3, -1.4, 1.9, -1.2, -1.57, 0.2])
+
+
+def free_port() -> int:
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return int(s.getsockname()[1])
+
+
+class Feed:
+    """``section``: web or metrics, with its keys; the rest of a daemon is imitated."""
+
+    def __init__(
+        self, folder: Path, section: str, session: str = "run-20260101-120000", **keys: Any
+    ) -> None:
+        self.port = keys.setdefault("port", free_port())
+        cell = folder / "ur10e_press.yaml"
+        cell.write_text(CELL)
+        self._hand = load_cell(cell).model.without_terms()
+        self.settings = DaemonSettings.model_validate(
+            {
+                "cell": cell, "link": {"driver": "ur_rtde", "host": "127.0.0.2", "rate": RATE},
+                section: keys,
+            }
+        )  # fmt: skip
+        self.section, self.session = section, session
+        self.folder = folder
+        scheme = "https" if keys.get("certificate") else "http"
+        self.url = f"{scheme}://127.0.0.1:{self.port}/"
+        self.page = Page(N)
+        self.state = State.OBSERVING
+        self.restarts = 0
+        self.counts: dict[str, int] = {"transition": 1}
+        self._sequence = 0
+        self._stop = threading.Event()
+        self._lock = threading.Lock()
+        self.side: SideProcess | None = None
+        self.log = (folder / f"{section}.log").open("ab")
+
+    # -- life -------------------------------------------------------------------------------------
+
+    def __enter__(self) -> Self:
+        order = {
+            "settings": self.settings.model_dump(mode="json"), "n": N, "session": self.session,
+        }  # fmt: skip
+        self.side = SideProcess(f"bridge.{self.section}.main", order, self.page, self.log)
+        self.page.enter(Phase.RUNNING)
+        self.page.tell_state(self.state)
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stop.set()
+        self._thread.join()
+        assert self.side is not None
+        self.side.close()
+        self.page.close()
+        self.log.close()
+
+    def wait(self, path: str = "", limit: float = 20.0, **keys: Any) -> httpx.Response:
+        """Return the first answer that the process gives."""
+        until = time.monotonic() + limit
+        while True:
+            try:
+                return httpx.get(self.url + path, timeout=5, **keys)
+            except httpx.TransportError:
+                words = (self.folder / f"{self.section}.log").read_text()
+                assert time.monotonic() < until, f"{self.section} does not answer: {words}"
+                time.sleep(0.05)
+
+    # -- what a daemon does -----------------------------------------------------------------------
+
+    def tell(self, **event: Any) -> None:
+        with self._lock:
+            self._sequence += 1
+            assert self.side is not None
+            self.side.tell(
+                {
+                    "time": time.time(), "monotonic": time.monotonic(),
+                    "sequence": self._sequence, **event,
+                }
+            )  # fmt: skip
+
+    def change(self, to: State, cause: str, detail: str = "") -> None:
+        """Go into a state as the loop does."""
+        before, self.state = self.state, to
+        self.page.tell_state(to)
+        self.tell(kind="transition", **{"from": before.name, "to": to.name}, cause=cause,
+                  detail=detail)  # fmt: skip
+
+    def status(self) -> dict[str, Any]:
+        return {
+            "kind": "status", "schema": "gapbridge.status/1", "session": self.session,
+            "cell": "ur10e_press", "pid": 4242, "configuration_hash": "6f1c" * 16,
+            "state": self.state.name.lower(), "since": time.time(), "why": "connected",
+            "armed_by": "operator", "latched": "", "loop": {"pid": 4243, "restarts": self.restarts},
+            "link": {
+                "age": 0.004, "rate_hz": RATE, "cycles": self.page.written, "missed": 3, "late": 1,
+                "written": 0, "dropped": {"stale": 2, "not finite": 1},
+            },
+            "sides": {
+                "recorder": {"pid": 4244, "restarts": 0}, "web": {"pid": 4245, "restarts": 0},
+            },
+            "counts": self.counts, "recording": "recordings/run-20260101-120000",
+            "lost_rows": 7,
+        }  # fmt: skip
+
+    def _run(self) -> None:
+        rng = np.random.default_rng(5)
+        told = 0.0
+        begun = time.monotonic()
+        due, number = begun, 0
+        while not self._stop.is_set():
+            self.row(number, due - begun, rng)
+            number += 1
+            if due - told > 0.5:
+                told = due
+                assert self.side is not None
+                with self._lock:
+                    self.side.tell({"time": time.time(), **self.status()})
+            due += 1.0 / RATE
+            time.sleep(max(due - time.monotonic(), 0.0))
+
+    def row(self, number: int, t: float, rng: np.random.Generator) -> None:
+        """Write one cycle: an arm that swings, and an offset that goes with it."""
+        s, row = self.page.slices, self.page.next_row()
+        writing = self.state in (State.COMPENSATING, State.HOLDING)
+        q = HOME + 0.35 * np.sin(0.5 * t + np.arange(N))
+        row[1:] = 0.0
+        row[s["timestamp"]] = t
+        row[s["state"]] = self.state
+        row[s["written"]] = writing
+        row[s["missed"]] = number % 400 == 399
+        row[s["age"]] = 4e-4 * rng.lognormal(0.0, 0.3) + (9e-3 if number % 300 == 299 else 0.0)
+        row[s["duration"]] = 1.1e-4 * rng.lognormal(0.0, 0.25)
+        row[s["clamped"]] = 2 if writing and number % 50 == 0 else 0
+        for name in ("actual_q", "target_q", "nominal_q", "corrected_q"):
+            row[s[name]] = q
+        row[s["payload"]] = 5.0
+        row[s["payload_cog"]] = (0.0, 0.0, 0.06)
+        row[s["joint_temperatures"]] = 27.0
+        pull = np.array([12 * math.sin(0.9 * t), 6 * math.cos(0.7 * t), -8.0, 0.3, 0.0, 0.1])
+        row[s["actual_TCP_force"]] = pull
+        row[s["ft_raw_wrench"]] = self.wrench(q, pull) + rng.normal(0, [0.8] * 3 + [0.05] * 3)
+        size = 1e-3 * np.array([0.5, -0.35, -1.1]) * (1 + 0.3 * np.sin(0.5 * t + np.arange(3)))
+        row[s["offset"]] = [*size, *(0.8e-3 * np.sin(0.4 * t + np.arange(3)))]
+        row[s["received"]] = time.monotonic() - 2e-4
+        row[s["rate"]] = RATE
+        row[s["robot_mode"]], row[s["safety_mode"]] = 7, 1
+        self.page.beat()
+        self.page.publish()
+
+    def wrench(self, q: Array, pull: Array) -> Array:
+        """Return what a flange sensor reads that carries 0.4 kg more than is declared."""
+        force = self._hand.predict(q[None]).rotation[0].T @ (
+            (5.4 * np.array([0, 0, -9.80665])) + pull[:3]
+        )
+        return np.array([*force, *np.cross([0, 0, 0.06], force)])
+
+
+def self_signed(folder: Path) -> tuple[Path, Path]:
+    """Return certificate and key of 127.0.0.1, valid for a day."""
+    certificate, key = folder / "certificate.pem", folder / "key.pem"
+    subprocess.run(
+        [
+            "openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1",
+            "-nodes", "-days", "1", "-subj", "/CN=127.0.0.1",
+            "-addext", "subjectAltName=IP:127.0.0.1",
+            "-keyout", key, "-out", certificate,
+        ],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    return certificate, key
