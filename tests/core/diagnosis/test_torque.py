@@ -8,6 +8,7 @@ import moving_truth as truth
 import numpy as np
 import pytest
 
+from core.diagnosis.diagnosis import diagnose
 from core.diagnosis.observation import NotObservable, Observation
 from core.diagnosis.torque import observe
 from core.effects import Site, Term
@@ -176,3 +177,28 @@ def test_what_is_lacking_is_named(plant):
     assert none == NotObservable("torque", ("actual_current_as_torque",))
     blind = observe(plant.model(), truth.log_of(N, actual_current_as_torque=q), METROLOGY)
     assert blind == NotObservable("torque", ("actual_q",))
+
+
+def faded(plant, recorded):
+    """Friction of joint 3 that was identified warm: more at first, less in the end."""
+    t, _, qd, _, nominal = recorded
+    here = np.arange(N) == 2
+    fading = 0.25 - 0.5 * t / t[-1]
+    return nominal + 6.0 * np.sign(qd) * here * fading[:, None]
+
+
+def test_friction_that_fades_is_owned_up_to_and_depends_on_time(plant, recorded):
+    found = diagnose(plant.model(2.0), log_of(recorded, faded(plant, recorded)))
+    (torque,) = (c for c in found.channels if c.channel == "torque")
+    assert torque.structured
+    assert "timestamp" in [name for name, _ in torque.depends_on[:3]]
+
+
+@pytest.mark.parametrize("effect", ["link_inertia", "torque_constant"])
+def test_what_bears_weight_is_not_blamed_for_one_another(plant, recorded, effect):
+    joint, value = CASES[effect]
+    log = log_of(recorded, torque_with(plant, recorded, effect, joint, value))
+    found = diagnose(plant.model(2.0), log, withhold=(effect,))
+    (torque,) = (c for c in found.channels if c.channel == "torque")
+    assert torque.structured
+    assert not torque.causes
