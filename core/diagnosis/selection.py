@@ -18,7 +18,7 @@ from core.diagnosis.candidate import (
     joint_quantity,
     named_candidates,
 )
-from core.diagnosis.following import exact_columns, followed
+from core.diagnosis.following import exact_columns
 from core.diagnosis.neighbours import pruned
 from core.diagnosis.noise import Noise, estimate_noise
 from core.diagnosis.observation import Observation
@@ -113,7 +113,6 @@ def select(
             space, raw, nuisance, target, best = with_wild_explained(
                 work, columns, base, smooth, (space, raw, nuisance, target, best)
             )
-        best = followed(work, space, best)
         counted, whitened_by = work.kept.copy(), work.noise
         try:
             terms, index, covariance, residual = refit(work, space, best)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from core.motion import Motion, motion_of
 Array = NDArray[np.float64]
 SHORTEST_LEAD = 0.1  # s left out at the start of each stretch, whose past is unknown
 TEXT = 2e-7  # rad: smaller differences come from how the log was written
+REMEMBERED = 64  # predictions of one joint
 LEADS = 4.0  # times the delay: what is left out where it is longer
 
 
@@ -36,8 +38,18 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     rows = picked(_known_past(motion))
     part = motion.pick(rows)
 
+    plain = predict_tracking(model, motion)[rows]
+
+    # a fit asks again and again with one joint changed: the others are remembered
+    @lru_cache(maxsize=REMEMBERED)
+    def followed(own: tuple[Term, ...]) -> Array:
+        return predict_tracking(model, motion, own)[rows, (own[0].site.joint or 1) - 1]
+
     def predict(terms: Sequence[Term]) -> Array:
-        return predict_tracking(model, motion, terms)[rows]
+        told = plain.copy()
+        for joint in {term.site.joint for term in terms if term.site.joint is not None}:
+            told[:, joint - 1] = followed(tuple(t for t in terms if t.site.joint == joint))
+        return told
 
     n = model.arm.n
     return Observation(
