@@ -8,8 +8,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.moving import conditions, joint_axes, own_joints, picked, quantities
-from core.diagnosis.observation import NotObservable, Observation
+from core.diagnosis.moving import Index, conditions, joint_axes, own_joints, picked, quantities
+from core.diagnosis.observation import NotObservable, Observation, Predict
 from core.dynamics import predict_tracking
 from core.effects import Term
 from core.log import Log
@@ -37,26 +37,12 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     motion = motion_of(log)
     rows = picked(_known_past(motion))
     part = motion.pick(rows)
-
-    plain = predict_tracking(model, motion)[rows]
-
-    # a fit asks again and again with one joint changed: the others are remembered
-    @lru_cache(maxsize=REMEMBERED)
-    def followed(own: tuple[Term, ...]) -> Array:
-        return predict_tracking(model, motion, own)[rows, (own[0].site.joint or 1) - 1]
-
-    def predict(terms: Sequence[Term]) -> Array:
-        told = plain.copy()
-        for joint in {term.site.joint for term in terms if term.site.joint is not None}:
-            told[:, joint - 1] = followed(tuple(t for t in terms if t.site.joint == joint))
-        return told
-
     n = model.arm.n
     return Observation(
         channel="tracking",
         unit="rad",
         measured=part.q,
-        predict=predict,
+        predict=_following(model, motion, rows),
         nuisance=np.zeros((len(part), n, 0)),
         weight=np.ones(n),
         sigma=encoder_step(log.require("actual_q")) / np.sqrt(12),
@@ -68,6 +54,28 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
         joint_columns=own_joints(len(part), n),
         order_in_time=motion.moving,
     )
+
+
+def _following(model: Model, motion: Motion, rows: Index) -> Predict:
+    """Return where the encoders of some rows stand under further terms.
+
+    A fit asks again and again with one joint changed: the others are remembered.
+    """
+    plain: Array = predict_tracking(model, motion)[rows]
+
+    @lru_cache(maxsize=REMEMBERED)
+    def joint_under(joint: int, own: tuple[Term, ...]) -> Array:
+        whole: Array = predict_tracking(model, motion, own)
+        return whole[rows, joint - 1]
+
+    def predict(terms: Sequence[Term]) -> Array:
+        told = plain.copy()
+        for joint in {term.site.joint for term in terms if term.site.joint is not None}:
+            own = tuple(term for term in terms if term.site.joint == joint)
+            told[:, joint - 1] = joint_under(joint, own)
+        return told
+
+    return predict
 
 
 def encoder_step(q: Array) -> float:
