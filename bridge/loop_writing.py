@@ -52,7 +52,7 @@ class Writing:
         self._tell, self._skip, self._lose = tell, skip, lose
         self.ready = False  # the driver is armed
         self.has_armed = False  # it was, at some time in this process
-        self._failed = 0  # setpoints in a row that did not leave, or without effect
+        self._failed = 0  # setpoints in a row that left in part only
         self._settling = 0.0  # s, monotonic: since when the last setpoint stands
 
     def start(self, state: RobotState, own: Vector) -> bool:
@@ -120,9 +120,9 @@ class Writing:
             stream.forget()
             self._end(Count.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))
         except PartialWriteError as error:
-            self._repeat(Count.WRITE_PARTIAL, PARTS_IN_A_ROW, str(error))
+            self._repeat(str(error))
         except IneffectiveWriteError as error:
-            self._repeat(Count.WRITE_RETRIED, 2, str(error))
+            self._end(Count.WRITE_INEFFECTIVE, Cause.INEFFECTIVE, str(error))
         except ForeignCommandError as error:
             self._end(Count.FOREIGN, Cause.FOREIGN, str(error))
         except WriteError as error:
@@ -132,11 +132,11 @@ class Writing:
             self._lose(str(error))
         return None
 
-    def _repeat(self, what: Count, most: int, detail: str) -> None:
+    def _repeat(self, detail: str) -> None:
         """Leave it to the next cycle, whose setpoint goes out whole; after some, end the motion."""
-        self._page.count(what)
+        self._page.count(Count.WRITE_PARTIAL)
         self._failed += 1
-        if self._failed >= most:
+        if self._failed >= PARTS_IN_A_ROW:
             self._failed = 0
             self._end(Count.WRITE_INEFFECTIVE, Cause.INEFFECTIVE, detail)
 
