@@ -43,6 +43,7 @@ class Bounds:
     grain: float = 1e-8
     grain_rotation: float = 1e-8
     fresh: float = 0.04
+    burst: float = 0.0  # s for which the transport may hold small packets back
 
 
 @dataclass
@@ -159,7 +160,7 @@ class Checker:
         self.found.oldest_state = max(self.found.oldest_state, age)
         if age > self.bounds.fresh:
             self.found.add(f"write {age:.3f} s after the last fresh state")
-        elif self._since_fresh > AHEAD:
+        elif self._since_fresh > AHEAD + self.bounds.burst / self.bounds.cycle:
             self.found.add(f"{self._since_fresh} writes after one state")
 
     def _offset_of(self, write: Write) -> Numbers:
@@ -204,7 +205,8 @@ class Checker:
         if self._fresh is not None and math.isfinite(self._fresh.stamp):
             stamp = self._fresh.stamp
         for then, before in self._recent:
-            allowed = stamp - then + (3.0 * b.cycle if stamp is not write.time else GRACE)
+            slack = 3.0 * b.cycle if stamp is not write.time else GRACE
+            allowed = stamp - then + slack + b.burst
             shift, turn = _apart(offset, before)
             if shift > b.offset_rate * allowed * 1.001 + 2.0 * b.grain:
                 found.add(f"{1e3 * shift:.4f} mm within {1e3 * (stamp - then):.1f} ms")

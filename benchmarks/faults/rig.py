@@ -30,7 +30,8 @@ class Rig:
         self.peer = Peer(peer_cell, self.back, 30100, folder / "peer.log")
         self.checker = Checker(link.bounds(self.cell))
         self._runs: list[Running] = []
-        self.tap = Tap(link.decoder(), self._state_word)
+        self.decoder = link.decoder()
+        self.tap = Tap(self.decoder, self._state_word)
         self.proxy = Proxy(self.front, self.back, link.ports(), self.tap.tell)
 
     def _state_word(self) -> int:
