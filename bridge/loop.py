@@ -196,8 +196,9 @@ class Loop:
         if supervisor.state == State.FAULT:
             writing.ready = False  # its own watchdog, or a person, has the robot
         loads = self._loads.update(state)
+        seen = time.monotonic()
         if supervisor.state == State.ARMED and writing.start(state, own):
-            self._record(state, missed, own, loads, None)
+            self._record(state, missed, own, loads, None, at=seen)
             return  # the state is old by now
         holding = supervisor.state == State.HOLDING
         writes = supervisor.state.writes
@@ -224,6 +225,7 @@ class Loop:
         loads: Loads,
         setpoint: Setpoint | None,
         attempted: bool = False,
+        at: float | None = None,
     ) -> None:
         page, stream = self._page, self._stream
         if setpoint is None:
@@ -234,19 +236,20 @@ class Loop:
         else:
             nominal, corrected, offset = setpoint.nominal_q, setpoint.q, setpoint.offset_in_base
         clamped = stream.clamped if setpoint is not None else 0
+        late = 0.0 if at is None else time.monotonic() - at  # arming: no part of the cycle
         row, slices = page.next_row(), page.slices
         fill_row(row, slices, state, nominal, corrected, offset)
         row[2] = self._supervisor.state
         row[3] = setpoint is not None
         row[4] = missed
-        row[5] = self._clock.age(state)
-        row[6] = time.monotonic() - state.received
+        row[5] = self._clock.age(state) - late
+        row[6] = time.monotonic() - state.received - late
         row[7] = clamped
         row[8] = stream.residual
         row[slices["own_q"]] = own
         row[slices["flags"].start] = self._checks.flags
-        at = slices["attempted"].start
-        row[at : at + 4] = (attempted, stream.ramp_time, self._driver.rate, self._number)
+        last = slices["attempted"].start
+        row[last : last + 4] = (attempted, stream.ramp_time, self._driver.rate, self._number)
         page.publish()
         self._source.tell(
             Told(self._supervisor.state, nominal, corrected, offset, setpoint is not None, clamped)

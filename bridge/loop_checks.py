@@ -74,10 +74,9 @@ class LoopChecks:
         self._judge(
             Count.SATURATED, self._saturation.update(state.timestamp, clamped), Cause.SATURATED
         )
-        if duration > self._period and self._last is not None:
-            words = self._overrun.update(state.timestamp, 1)
-            if words is not None:
-                self._judge(Count.OVERRUN, words, Cause.OVERRUN)
+        # its own work only: what a controller sends late or never is the link's affair
+        words = self._overrun.update(state.timestamp, int(duration / self._period))
+        self._judge(Count.OVERRUN, words, Cause.OVERRUN)
 
     def _check_robot(self, state: RobotState) -> None:
         """Take note of a robot that cannot move."""
