@@ -238,12 +238,14 @@ class Daemon:
 
     def _take(self) -> None:
         """Take cycles and events over from the loop."""
-        rows = self._reader.drain()
+        # in this order: who has heard of a change finds the state changed, and its rows counted
+        events = [] if self.loop is None else self.loop.events()
         if self.loop is not None:
             self._last_state = State(self.page.state)
+        rows = self._reader.drain()
         self.tally.add(rows)
         self._status.take(rows)
-        for event in self.loop.events() if self.loop is not None else ():
+        for event in events:
             self.book.add(event)
 
     def _hear(self, event: Event) -> None:
