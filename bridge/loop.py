@@ -19,7 +19,7 @@ from bridge.counts import Count
 from bridge.cycle_row import fill_row
 from bridge.daemon_settings import DaemonSettings
 from bridge.live_loads import LiveLoads
-from bridge.loop_checks import LoopChecks
+from bridge.loop_checks import RAMPING_OUT, LoopChecks
 from bridge.loop_writing import Writing
 from bridge.setpoint_source.source import Source, Told
 from bridge.setpoint_stream import SetpointStream
@@ -37,6 +37,8 @@ Vector = NDArray[np.float64]
 
 LONGEST_STOP = 1.0  # s from a request to stop to letting go, at rest or not
 HASTY_RAMP = 0.5  # s: what a stop takes for the ramp at most
+
+UNSENT = 2  # "attempted" of a cycle whose setpoint was computed and did not (wholly) leave
 
 Tell = Callable[[dict[str, Any]], None]
 
@@ -73,7 +75,9 @@ class Loop:
         self._clock = ControllerClock(driver.rate)
         self._supervisor = Supervisor(self._changed)
         self._watch = StateWatch(driver, model.arm, self._supervisor, page, tell, self._lose)
-        self._checks = LoopChecks(driver.rate, self._supervisor, page, tell)
+        self._checks = LoopChecks(
+            driver.rate, self._supervisor, page, tell, settings.link.state_timeout
+        )
         self._writing = Writing(
             settings.setpoints, driver, source, self._stream, self._supervisor, page, tell,
             self._skip, self._lose,
@@ -203,7 +207,10 @@ class Loop:
         holding = supervisor.state == State.HOLDING
         writes = supervisor.state.writes
         written = writing.write(state, own, loads) if writes else None
-        self._record(state, missed, own, loads, written, writes)
+        if writes and writing.ramps_out:
+            self._checks.flags |= RAMPING_OUT
+        setpoint = writing.unsent if writes and written is None else written
+        self._record(state, missed, own, loads, setpoint, writes, written is not None)
         clamped = 0 if written is None else self._stream.clamped
         commanded = own if written is None else written.q
         self._checks.end(state, commanded, clamped, time.monotonic() - state.received)
@@ -225,8 +232,10 @@ class Loop:
         loads: Loads,
         setpoint: Setpoint | None,
         attempted: bool = False,
+        left: bool = False,
         at: float | None = None,
     ) -> None:
+        """Publish a cycle: ``setpoint`` was computed for writing, and has ``left`` or not."""
         page, stream = self._page, self._stream
         if setpoint is None:
             correction = stream.correct(own, loads)
@@ -240,7 +249,7 @@ class Loop:
         row, slices = page.next_row(), page.slices
         fill_row(row, slices, state, nominal, corrected, offset)
         row[2] = self._supervisor.state
-        row[3] = setpoint is not None
+        row[3] = left
         row[4] = missed
         row[5] = self._clock.age(state) - late
         row[6] = time.monotonic() - state.received - late
@@ -249,8 +258,7 @@ class Loop:
         row[slices["own_q"]] = own
         row[slices["flags"].start] = self._checks.flags
         last = slices["attempted"].start
-        row[last : last + 4] = (attempted, stream.ramp_time, self._driver.rate, self._number)
+        kind = UNSENT if setpoint is not None and not left else int(attempted)
+        row[last : last + 4] = (kind, stream.ramp_time, self._driver.rate, self._number)
         page.publish()
-        self._source.tell(
-            Told(self._supervisor.state, nominal, corrected, offset, setpoint is not None, clamped)
-        )
+        self._source.tell(Told(self._supervisor.state, nominal, corrected, offset, left, clamped))

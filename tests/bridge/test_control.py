@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from daemon_cell import Robot, Run, gapbridge
+from daemon_cell import Robot, Run, gapbridge, wait_for
 
 from bridge import control_socket
 from bridge.control_client import ask, ask_socket, running
@@ -21,6 +21,8 @@ from bridge.control_socket import ControlSocket, Peer
 from bridge.runtime_folder import cell_key, runtime_folder
 from bridge.supervisor import State
 from core.errors import InputError, RunError
+
+PATIENT = ", state_timeout: 0.25"  # a busy machine holds the simulated controller up
 
 
 @pytest.fixture(autouse=True)
@@ -135,7 +137,7 @@ def test_a_cell_that_nobody_runs_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_person_arms_and_disarms_a_running_daemon(robot: Robot) -> None:
-    cell = robot.cell()
+    cell = robot.cell(PATIENT)
     with Run(cell) as run:
         run.wait(State.OBSERVING)
         assert ask(cell, "disarm") == "is observing already"
@@ -149,7 +151,12 @@ def test_a_person_arms_and_disarms_a_running_daemon(robot: Robot) -> None:
         assert ask(cell, "arm") == "is compensating already"
         assert ask(cell, "disarm") == "observing"
         assert ask(cell, "status")["armed_by"] == ""
-        events = [e for e in run.daemon.events_since(0) if e["kind"] == "control"]
+
+        def told() -> list[dict[str, Any]]:
+            return [e for e in run.daemon.events_since(0) if e["kind"] == "control"]
+
+        wait_for(lambda: len(told()) == 4, 2.0, "the last request's event")
+        events = told()
     assert [(e["command"], e["uid"], e["ok"]) for e in events] == [
         (command, os.getuid(), True) for command in ("disarm", "arm", "arm", "disarm")
     ]
@@ -157,7 +164,7 @@ def test_a_person_arms_and_disarms_a_running_daemon(robot: Robot) -> None:
 
 
 def test_a_fault_waits_for_a_person_and_arming_is_refused_until_then(robot: Robot) -> None:
-    cell = robot.cell()
+    cell = robot.cell(PATIENT)
     with Run(cell, arm=True) as run:
         run.wait(State.COMPENSATING)
         robot.bench("protective_stop")
@@ -172,7 +179,7 @@ def test_a_fault_waits_for_a_person_and_arming_is_refused_until_then(robot: Robo
 
 
 def test_a_latched_fault_outlives_the_loop_that_found_it(robot: Robot) -> None:
-    with Run(robot.cell(), arm=True) as run:
+    with Run(robot.cell(PATIENT), arm=True) as run:
         run.wait(State.COMPENSATING)
         robot.bench("protective_stop")
         run.wait(State.FAULT, 2.0)
@@ -188,7 +195,7 @@ def test_a_latched_fault_outlives_the_loop_that_found_it(robot: Robot) -> None:
 
 
 def test_a_daemon_that_only_observes_cannot_be_armed(robot: Robot) -> None:
-    cell = robot.cell()
+    cell = robot.cell(PATIENT)
     with Run(cell, observe=True) as run:
         run.wait(State.OBSERVING)
         with pytest.raises(RunError, match="--observe"):
@@ -196,7 +203,7 @@ def test_a_daemon_that_only_observes_cannot_be_armed(robot: Robot) -> None:
 
 
 def test_the_commands_tell_in_a_line_and_as_json(robot: Robot) -> None:
-    cell = robot.cell()
+    cell = robot.cell(PATIENT)
     with Run(cell) as run:
         run.wait(State.OBSERVING)
 
@@ -213,7 +220,7 @@ def test_the_commands_tell_in_a_line_and_as_json(robot: Robot) -> None:
         every = json.loads(told("status", "--json")[1])
         assert str(cell) in [each["cell"] for each in every]
         assert told("arm", cell) == (0, "compensating\n", "")
-        assert told("disarm", cell) == (0, "observing\n", "")
+        assert told("disarm", cell) == (0, "observing\n", ""), run.said
     code, out, err = told("arm", cell)
     assert (code, out) == (2, "")
     assert err.startswith("error: ")
