@@ -23,7 +23,7 @@ def make_fault(rig: Rig, row: Row) -> Result:
     moment = time.time()
     row.inject(rig)
     detected = _await(rig, row, moment, counts)
-    time.sleep(row.lasting)
+    rig.pass_time(row.lasting)
     rig.heal()
     if row.after is not None:
         row.after(rig)
@@ -46,7 +46,7 @@ def _await(rig: Rig, row: Row, moment: float, before: dict[str, int]) -> float |
         seen = _left(rig, moment) if row.sign == "left" else _counted(rig, row, before)
         if seen is not None:
             return seen - moment
-        time.sleep(POLL)
+        rig.pass_time(POLL)
     return None
 
 
@@ -75,7 +75,7 @@ def _settle(rig: Rig, row: Row) -> str:
         rests = state.name.lower() in row.end and state != State.HOLDING
         if rests and time.monotonic() - since > AFTERWARDS:
             break
-        time.sleep(POLL)
+        rig.pass_time(POLL)
     return state.name.lower()
 
 

@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
-from benchmarks.faults.families import connection, loop, robot, silence
+from benchmarks.faults.families import (
+    answers,
+    connection,
+    loop,
+    robot,
+    silence,
+    ur_library,
+    values,
+    writing,
+)
 from benchmarks.faults.row import Row
 
-FAMILIES = (silence, connection, robot, loop)
+FAMILIES = (silence, connection, values, answers, ur_library, robot, writing, loop)
 ROWS: tuple[Row, ...] = tuple(row for family in FAMILIES for row in family.ROWS)
 """All rows, in the order of docs/reliability.md."""
 

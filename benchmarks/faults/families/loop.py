@@ -56,7 +56,7 @@ ROWS = (
     Row("loop hangs", "core hangs (other process)", "SIGSTOP of the loop",
         _signal(signal.SIGSTOP), within=seconds(1.6), slow=True),
     Row("loop overruns", "loop overrun", "the loop stopped 8 times for 4 cycles or 20 ms",
-        _stutter, within=seconds(1.5), sign="overrun|resync"),
+        _stutter, within=seconds(1.5), sign="overrun|resync|late"),
     Row("suspended", "wall-clock jump, suspend", "the loop stopped for 0.4 s",
-        pause(0.4), within=seconds(0.8), sign="resync"),
+        pause(0.4), within=seconds(0.8), sign="resync|overrun|stale", end=("observing", "fault")),
 )  # fmt: skip

@@ -73,7 +73,8 @@ ROWS = (
     Row("late sample", "single late or missing sample", "proxy holds everything for 3 cycles",
         _late, sign="late", within=cycles(15, 0.25), end=("compensating",)),
     Row("stale link", "stale link, socket alive", "proxy hands nothing on for 0.12 or 0.3 s",
-        lambda rig: rig.proxy.stall(rig.link.hold + (0.02 if rig.link.hold < 0.2 else 0.1))),
+        lambda rig: rig.proxy.stall(rig.link.hold + (0.02 if rig.link.hold < 0.2 else 0.1)),
+        end=SILENT),
     Row("silent link", "stale link, socket alive", "proxy hands nothing on for 0.4 s",
         _stall(0.4), end=SILENT),
     Row("half-open link", "half-open (cable pulled)", "proxy hands nothing on for 4 s",
@@ -86,7 +87,7 @@ ROWS = (
         _freeze_in_packets, links=UR, lasting=0.3, end=SILENT),
     Row("frozen values", "frozen values, timestamp moving",
         "proxy writes the same joints, and velocities that say they turn",
-        _freeze_values, within=seconds(1.5), lasting=0.0),
+        _freeze_values, within=seconds(1.5), end=SILENT),
     Row("doubled packets", "duplicate packets", "proxy sends 200 messages twice",
         _double, links=("ur_servoj", "ur_offset"), sign="none", end=("compensating",)),
 )  # fmt: skip
