@@ -18,7 +18,6 @@ import pytest
 from daemon_cell import Robot, wait_for
 from watched_feed import free_port
 
-
 pytestmark = pytest.mark.slow
 
 
