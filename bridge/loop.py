@@ -74,10 +74,11 @@ class Loop:
         )
         self._clock = ControllerClock(driver.rate)
         self._supervisor = Supervisor(self._changed)
-        self._watch = StateWatch(driver, model.arm, self._supervisor, page, tell, self._lose)
-        self._checks = LoopChecks(
-            driver.rate, self._supervisor, page, tell, settings.link.state_timeout
+        patience = settings.link.state_timeout
+        self._watch = StateWatch(
+            driver, model.arm, self._supervisor, page, tell, self._lose, patience
         )
+        self._checks = LoopChecks(driver.rate, self._supervisor, page, tell, patience)
         self._writing = Writing(
             settings.setpoints, driver, source, self._stream, self._supervisor, page, tell,
             self._skip, self._lose,
