@@ -58,12 +58,14 @@ class Found:
     oldest_state: float = 0.0  # s, behind a write
     violations: list[str] = field(default_factory=list)
     violated: int = 0
+    recent: deque[str] = field(default_factory=lambda: deque(maxlen=10))
 
     def add(self, words: str) -> None:
-        """Note a violation."""
+        """Note a violation, the first few with what went over the wire just before."""
         self.violated += 1
         if len(self.violations) < LONGEST_LIST:
-            self.violations.append(words)
+            before = "; ".join(self.recent) if self.violated < 5 else ""
+            self.violations.append(f"{words} [{before}]" if before else words)
 
 
 class Checker:
@@ -84,6 +86,8 @@ class Checker:
     def take(self, seen: Sequence[Fresh | Write]) -> None:
         """Check what the tap has seen next."""
         for item in seen:
+            what = "state" if isinstance(item, Fresh) else item.kind
+            self.found.recent.append(f"{item.time:.3f} {what} in {item.state}")
             if item.state in WRITING:
                 self._last_writing = item.time
             elif item.time - self._last_writing > GRACE:
@@ -205,7 +209,8 @@ class Checker:
         if self._fresh is not None and math.isfinite(self._fresh.stamp):
             stamp = self._fresh.stamp
         for then, before in self._recent:
-            slack = 3.0 * b.cycle if stamp is not write.time else GRACE
+            # a client may still write for a sample that is not the last one that it was sent
+            slack = (GAP + 3.0) * b.cycle if stamp is not write.time else GRACE
             allowed = stamp - then + slack + b.burst
             shift, turn = _apart(offset, before)
             if shift > b.offset_rate * allowed * 1.001 + 2.0 * b.grain:

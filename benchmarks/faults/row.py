@@ -33,7 +33,7 @@ class Result:
         return None if self.detected is None else self.detected / self.cycle
 
 
-Apart = Callable[[Link, Path], Result]
+Apart = Callable[["Row", Link, Path], Result]
 
 
 @dataclass(frozen=True)

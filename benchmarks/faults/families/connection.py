@@ -25,9 +25,9 @@ AT_ONCE = seconds(0.3)  # the library says so in its own time; a busy machine ta
 
 ROWS = (
     Row("reset", "TCP RST", "proxy resets every connection", lambda rig: rig.proxy.cut(),
-        within=AT_ONCE),
+        within=AT_ONCE, slow=True),
     Row("end of file", "TCP EOF", "proxy closes every connection",
-        lambda rig: rig.proxy.cut(reset=False), within=AT_ONCE),
+        lambda rig: rig.proxy.cut(reset=False), within=AT_ONCE, slow=True),
     Row("peer dies", "server restart, CAN peer death", "SIGKILL of the controller, started anew",
         _kill, within=AT_ONCE, lasting=0.5, slow=True),
     Row("peer refuses", "connection refused", "proxy cuts and refuses for 1.5 s",
