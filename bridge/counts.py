@@ -24,7 +24,6 @@ class Count(IntEnum):
     FOREIGN = 13  # another commander
     WRITE_INEFFECTIVE = 14
     WRITE_PARTIAL = 15
-    WRITE_RETRIED = 16
     WRITE_FAILED = 17
     SETPOINT_REFUSED = 18  # by the limiter
     SOURCE_DRY = 19

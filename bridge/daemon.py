@@ -8,12 +8,13 @@ how it went.
 from __future__ import annotations
 
 import queue
+import subprocess
 import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from bridge.control import Control
 from bridge.control_socket import ControlSocket
@@ -24,7 +25,6 @@ from bridge.daemon_status import DaemonStatus
 from bridge.event_book import Event, EventBook
 from bridge.loop import LONGEST_STOP, Exit
 from bridge.loop_process import LoopProcess
-from bridge.recorder import Recorder
 from bridge.reload import Reload
 from bridge.run_settings import configuration_for, settings_of
 from bridge.service_manager import ServiceManager
@@ -58,10 +58,10 @@ class Daemon:
         n = self.configuration.n
         self.page = Page(n)  # one for the whole run, whatever becomes of the loops
         self._reader = self.page.reader()
-        self.recorder = Recorder(settings.recording, n)
+        self.output: IO[bytes] | int = subprocess.DEVNULL  # of all processes of the run
         self.sides = Sides()
         self.tally = Tally(n, settings.link.rate)
-        listeners = [self._hear, self.recorder.tell, self.sides.tell]
+        listeners = [self._hear, self.sides.tell]
         self.book = EventBook(*listeners, *([log] if log else []))
         self._posted: queue.SimpleQueue[Event] = queue.SimpleQueue()  # by other threads
         self.manager = ServiceManager()
@@ -74,6 +74,7 @@ class Daemon:
         self.loop: LoopProcess | None = None
         self._failure: Event = {}
         self._faults: list[str] = []
+        self._lost_rows = 0
         self._refused = False  # writing was asked for and could not begin
         self._seen = False  # a state has been read, by this or a former loop
         self.restarts = 0
@@ -116,13 +117,14 @@ class Daemon:
 
     @property
     def recording(self) -> Path | None:
-        """Return the file that cycles go to."""
-        return self.recorder.path
+        """Return the run's recording as a whole: its files' name without their numbers."""
+        folder = self.settings.recording.folder
+        return None if folder is None or not self.session else folder / self.session
 
     @property
     def lost_rows(self) -> int:
-        """Return how many cycles were overwritten before they were read here."""
-        return self._reader.lost
+        """Return how many cycles the recorder says that no file holds."""
+        return self._lost_rows
 
     def events_since(self, sequence: int) -> list[Event]:
         """Return the events after a number."""
@@ -198,9 +200,8 @@ class Daemon:
     def _run_loop(self, arm: bool, duration: float | None) -> None:
         """Run one process of the loop to its end."""
         self._failure = {}
-        log: Any = self.recorder.output or -3  # subprocess.DEVNULL
         loop = self.loop = LoopProcess(
-            self.settings, self.page, arm, self.may_write, log, self.restarts,
+            self.settings, self.page, arm, self.may_write, self.output, self.restarts,
             self._status.latched,
         )  # fmt: skip
         stop_by = first_cycle = None
@@ -237,13 +238,14 @@ class Daemon:
 
     def _take(self) -> None:
         """Take cycles and events over from the loop."""
-        rows = self._reader.drain()
+        # in this order: who has heard of a change finds the state changed, and its rows counted
+        events = [] if self.loop is None else self.loop.events()
         if self.loop is not None:
             self._last_state = State(self.page.state)
+        rows = self._reader.drain()
         self.tally.add(rows)
         self._status.take(rows)
-        self.recorder.write(rows)
-        for event in self.loop.events() if self.loop is not None else ():
+        for event in events:
             self.book.add(event)
 
     def _hear(self, event: Event) -> None:
@@ -254,6 +256,8 @@ class Daemon:
             self._failure = event
         if kind == "refused":
             self._refused = True
+        if kind == "recorder":
+            self._lost_rows += int(event.get("lost", 0))
         if kind == "transition":
             tail = f": {detail}" if detail else ""
             text = f"{event['from'].lower()} -> {event['to'].lower()} ({event['cause']}){tail}"

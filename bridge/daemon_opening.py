@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from bridge.control_socket import ControlSocket
 from bridge.owner_lock import OwnerLock, address_of
-from bridge.recording.folder import new_session, require_folder
+from bridge.recording.folder import LOOP_LOG, new_session, require_folder
 from bridge.runtime_folder import cell_key, runtime_folder
 from core.errors import InputError
 
@@ -22,18 +22,20 @@ def open_all(daemon: Daemon, stack: ExitStack, arm: bool, by: str) -> bool:
     """
     settings = daemon.settings
     stack.callback(daemon.page.close)
-    stack.callback(daemon.recorder.close)
     lock = OwnerLock(address_of(settings.link), settings.cell)
     stack.enter_context(lock)
-    if settings.recording.folder is not None:
-        require_folder(settings.recording.folder)
-    daemon.session = new_session(settings.recording.folder)
+    folder = settings.recording.folder
+    if folder is not None:
+        require_folder(folder)
+    daemon.session = new_session(folder)
+    if folder is not None:
+        daemon.output = stack.enter_context((folder / f"{daemon.session}{LOOP_LOG}").open("ab"))
     order = {
         "settings": settings.model_dump(mode="json"), "n": daemon.configuration.n,
         "session": daemon.session, "extra": {"text": daemon.configuration.text},
     }  # fmt: skip
     stack.callback(daemon.sides.close)
-    daemon.sides.start(settings, order, daemon.page, daemon.recorder.output or -3)
+    daemon.sides.start(settings, order, daemon.page, daemon.output)
     stack.callback(lambda: daemon.book.add({"kind": "ended"}))
     _open_socket(daemon, stack)
     if settings.web is not None:

@@ -16,7 +16,7 @@ SIDES: dict[str, tuple[str, Callable[[DaemonSettings], bool]]] = {
 }
 """Name -> (module to run, whether a run's settings want it)."""
 
-PATIENCE = {"recorder": 3.0}  # s to finish in, where it is not LITTLE
+PATIENCE = {"recorder": 10.0}  # s to finish in, where it is not LITTLE
 LITTLE = 0.3
 
 

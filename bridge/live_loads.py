@@ -59,7 +59,7 @@ class LiveLoads:
 
         A sensor that was lost counts as no force; the limiter leads over.
         """
-        if state.sensor_lost:
+        if state.sensor_lost and not np.isfinite(state.actual_TCP_force).all():
             self._wrench[0], self._last = 0.0, -math.inf
             return
         gap = state.timestamp - self._last

@@ -19,7 +19,7 @@ from bridge.counts import Count
 from bridge.cycle_row import fill_row
 from bridge.daemon_settings import DaemonSettings
 from bridge.live_loads import LiveLoads
-from bridge.loop_checks import LoopChecks
+from bridge.loop_checks import RAMPING_OUT, LoopChecks
 from bridge.loop_writing import Writing
 from bridge.setpoint_source.source import Source, Told
 from bridge.setpoint_stream import SetpointStream
@@ -37,6 +37,8 @@ Vector = NDArray[np.float64]
 
 LONGEST_STOP = 1.0  # s from a request to stop to letting go, at rest or not
 HASTY_RAMP = 0.5  # s: what a stop takes for the ramp at most
+
+UNSENT = 2  # "attempted" of a cycle whose setpoint was computed and did not (wholly) leave
 
 Tell = Callable[[dict[str, Any]], None]
 
@@ -72,8 +74,11 @@ class Loop:
         )
         self._clock = ControllerClock(driver.rate)
         self._supervisor = Supervisor(self._changed)
-        self._watch = StateWatch(driver, model.arm, self._supervisor, page, tell, self._lose)
-        self._checks = LoopChecks(driver.rate, self._supervisor, page, tell)
+        patience = settings.link.state_timeout
+        self._watch = StateWatch(
+            driver, model.arm, self._supervisor, page, tell, self._lose, patience
+        )
+        self._checks = LoopChecks(driver.rate, self._supervisor, page, tell, patience)
         self._writing = Writing(
             settings.setpoints, driver, source, self._stream, self._supervisor, page, tell,
             self._skip, self._lose,
@@ -196,13 +201,17 @@ class Loop:
         if supervisor.state == State.FAULT:
             writing.ready = False  # its own watchdog, or a person, has the robot
         loads = self._loads.update(state)
+        seen = time.monotonic()
         if supervisor.state == State.ARMED and writing.start(state, own):
-            self._record(state, missed, own, loads, None)
+            self._record(state, missed, own, loads, None, at=seen)
             return  # the state is old by now
         holding = supervisor.state == State.HOLDING
         writes = supervisor.state.writes
         written = writing.write(state, own, loads) if writes else None
-        self._record(state, missed, own, loads, written, writes)
+        if writes and writing.ramps_out:
+            self._checks.flags |= RAMPING_OUT
+        setpoint = writing.unsent if writes and written is None else written
+        self._record(state, missed, own, loads, setpoint, writes, written is not None)
         clamped = 0 if written is None else self._stream.clamped
         commanded = own if written is None else written.q
         self._checks.end(state, commanded, clamped, time.monotonic() - state.received)
@@ -224,7 +233,10 @@ class Loop:
         loads: Loads,
         setpoint: Setpoint | None,
         attempted: bool = False,
+        left: bool = False,
+        at: float | None = None,
     ) -> None:
+        """Publish a cycle: ``setpoint`` was computed for writing, and has ``left`` or not."""
         page, stream = self._page, self._stream
         if setpoint is None:
             correction = stream.correct(own, loads)
@@ -234,20 +246,20 @@ class Loop:
         else:
             nominal, corrected, offset = setpoint.nominal_q, setpoint.q, setpoint.offset_in_base
         clamped = stream.clamped if setpoint is not None else 0
+        late = 0.0 if at is None else time.monotonic() - at  # arming: no part of the cycle
         row, slices = page.next_row(), page.slices
         fill_row(row, slices, state, nominal, corrected, offset)
         row[2] = self._supervisor.state
-        row[3] = setpoint is not None
+        row[3] = left
         row[4] = missed
-        row[5] = self._clock.age(state)
-        row[6] = time.monotonic() - state.received
+        row[5] = self._clock.age(state) - late
+        row[6] = time.monotonic() - state.received - late
         row[7] = clamped
         row[8] = stream.residual
         row[slices["own_q"]] = own
         row[slices["flags"].start] = self._checks.flags
-        at = slices["attempted"].start
-        row[at : at + 4] = (attempted, stream.ramp_time, self._driver.rate, self._number)
+        last = slices["attempted"].start
+        kind = UNSENT if setpoint is not None and not left else int(attempted)
+        row[last : last + 4] = (kind, stream.ramp_time, self._driver.rate, self._number)
         page.publish()
-        self._source.tell(
-            Told(self._supervisor.state, nominal, corrected, offset, setpoint is not None, clamped)
-        )
+        self._source.tell(Told(self._supervisor.state, nominal, corrected, offset, left, clamped))

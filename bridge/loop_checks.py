@@ -19,7 +19,7 @@ from core.state import RobotState
 
 ROBOT_RUNNING, SAFE = 7, (1, 2)  # robot_mode; safety_mode normal, reduced
 LONG_GAP = 10.0  # cycles: after a longer one, what was before means nothing
-DEGRADED, LATE = 1, 2  # bits of a cycle's flags
+DEGRADED, LATE, RESYNC, RAMPING_OUT = 1, 2, 4, 8  # bits of a cycle's flags
 
 
 class LoopChecks:
@@ -31,10 +31,11 @@ class LoopChecks:
         supervisor: Supervisor,
         page: Page,
         tell: Callable[[dict[str, Any]], None],
+        stale_after: float = 0.0,
     ) -> None:
         self._supervisor, self._page, self._tell = supervisor, page, tell
         self._period = 1.0 / rate
-        self._longest_gap = max(LONG_GAP / rate, hold_time(rate))
+        self._longest_gap = max(LONG_GAP / rate, hold_time(rate), stale_after)
         self._frozen, self._overrun = FrozenWatch(), OverrunWatch(rate)
         self._saturation = SaturationWatch()
         self._lasting: set[Count] = set()
@@ -59,6 +60,7 @@ class LoopChecks:
         words = f"found a gap of {gap:.3f} s between two states: begun anew" if resync else None
         self._judge(Count.RESYNC, words, Cause.RESYNC)
         if resync:
+            self.flags |= RESYNC
             self._overrun.forget()
         else:
             self._judge(Count.OVERRUN, self._overrun.update(state.timestamp, missed), Cause.OVERRUN)
@@ -74,10 +76,9 @@ class LoopChecks:
         self._judge(
             Count.SATURATED, self._saturation.update(state.timestamp, clamped), Cause.SATURATED
         )
-        if duration > self._period and self._last is not None:
-            words = self._overrun.update(state.timestamp, 1)
-            if words is not None:
-                self._judge(Count.OVERRUN, words, Cause.OVERRUN)
+        # its own work only: what a controller sends late or never is the link's affair
+        words = self._overrun.update(state.timestamp, int(duration / self._period))
+        self._judge(Count.OVERRUN, words, Cause.OVERRUN)
 
     def _check_robot(self, state: RobotState) -> None:
         """Take note of a robot that cannot move."""

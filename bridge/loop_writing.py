@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -52,7 +53,9 @@ class Writing:
         self._tell, self._skip, self._lose = tell, skip, lose
         self.ready = False  # the driver is armed
         self.has_armed = False  # it was, at some time in this process
-        self._failed = 0  # setpoints in a row that did not leave, or without effect
+        self.unsent: Setpoint | None = None  # computed in the last cycle, and not (wholly) sent
+        self.ramps_out = False  # the last one's offset was to go
+        self._failed = 0  # setpoints in a row that left in part only
         self._settling = 0.0  # s, monotonic: since when the last setpoint stands
 
     def start(self, state: RobotState, own: Vector) -> bool:
@@ -107,36 +110,45 @@ class Writing:
     def write(self, state: RobotState, own: Vector, loads: Loads) -> Setpoint | None:
         """Send one setpoint; returns it, or None where none has left."""
         source_q = self._next(state, own)
-        holding = self._supervisor.state == State.HOLDING
+        self.unsent, self.ramps_out = None, self._supervisor.state == State.HOLDING
         stream = self._stream
         try:
-            setpoint = stream.advance(state, source_q, loads, 0.0 if holding else 1.0)
+            setpoint = stream.advance(state, source_q, loads, 0.0 if self.ramps_out else 1.0)
+        except LimitError as error:
+            stream.forget()
+            self._end(Count.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))
+            return None
+        try:
             if stream.finite:
                 self._driver.write_setpoint(setpoint)
                 self._failed = 0
                 return setpoint
+            self.unsent = _copied(setpoint)
             self._end(Count.BAD_OUTPUT, Cause.BAD_OUTPUT, "the model's correction is no number")
-        except LimitError as error:
-            stream.forget()
-            self._end(Count.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))
-        except PartialWriteError as error:
-            self._repeat(Count.WRITE_PARTIAL, PARTS_IN_A_ROW, str(error))
-        except IneffectiveWriteError as error:
-            self._repeat(Count.WRITE_RETRIED, 2, str(error))
-        except ForeignCommandError as error:
-            self._end(Count.FOREIGN, Cause.FOREIGN, str(error))
         except WriteError as error:
+            self.unsent = _copied(setpoint)
+            self._fail(error)
+        return None
+
+    def _fail(self, error: WriteError) -> None:
+        """Act on a setpoint that could not be delivered."""
+        if isinstance(error, PartialWriteError):
+            self._repeat(str(error))
+        elif isinstance(error, IneffectiveWriteError):
+            self._end(Count.WRITE_INEFFECTIVE, Cause.INEFFECTIVE, str(error))
+        elif isinstance(error, ForeignCommandError):
+            self._end(Count.FOREIGN, Cause.FOREIGN, str(error))
+        else:
             self._page.count(Count.WRITE_FAILED)
             self._supervisor.take(Cause.WRITE_FAILED, str(error))
             self.ready = False
             self._lose(str(error))
-        return None
 
-    def _repeat(self, what: Count, most: int, detail: str) -> None:
+    def _repeat(self, detail: str) -> None:
         """Leave it to the next cycle, whose setpoint goes out whole; after some, end the motion."""
-        self._page.count(what)
+        self._page.count(Count.WRITE_PARTIAL)
         self._failed += 1
-        if self._failed >= most:
+        if self._failed >= PARTS_IN_A_ROW:
             self._failed = 0
             self._end(Count.WRITE_INEFFECTIVE, Cause.INEFFECTIVE, detail)
 
@@ -193,3 +205,13 @@ class Writing:
             self._tell({"kind": "link", "what": "release", "detail": str(error)})
         self._page.enter(Phase.RUNNING)
         self._skip()
+
+
+def _copied(setpoint: Setpoint) -> Setpoint:
+    """Return a setpoint whose arrays stay, whatever the limiter does next."""
+    return replace(
+        setpoint,
+        q=setpoint.q.copy(),
+        nominal_q=setpoint.nominal_q.copy(),
+        offset_in_base=setpoint.offset_in_base.copy(),
+    )

@@ -9,7 +9,7 @@ MOST = 0.05  # share of a span's cycles that may be missed
 
 
 class OverrunWatch:
-    """Counts the cycles missed within the last span."""
+    """Counts the cycles that the loop's own work took from those after it, within a span."""
 
     def __init__(self, rate: float) -> None:
         self._rate = rate
@@ -31,7 +31,7 @@ class OverrunWatch:
         queue.append((now, missed))
         self._sum += missed
         if self._sum <= MOST * SPAN * self._rate or len(queue) < 2:
-            return None  # one gap alone is judged by its length
+            return None  # a single long one is judged by the gap that it leaves
         words = f"{self._sum} of {SPAN * self._rate:.0f} cycles missed within {SPAN:g} s"
         self.forget()
         return words

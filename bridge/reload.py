@@ -57,8 +57,7 @@ class Reload:
         if following is None:
             return False
         self._daemon.configuration = following  # a loop that died instead begins with it too
-        self._daemon.manager.ready()
-        return rearm
+        return rearm  # the service manager hears of it with the new loop's first cycle
 
     def _read(self, state: State) -> None:
         daemon = self._daemon

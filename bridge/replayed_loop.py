@@ -10,7 +10,8 @@ from enum import StrEnum
 from typing import Any, cast
 
 from bridge.live_loads import LiveLoads
-from bridge.loop import Exit, Loop
+from bridge.loop import UNSENT, Exit, Loop
+from bridge.loop_checks import RAMPING_OUT, RESYNC
 from bridge.setpoint_stream import SetpointStream
 from bridge.supervisor import Cause, State
 from core.errors import LimitError
@@ -50,10 +51,14 @@ class ReplayedLoop(Loop):
             self._renew(cycle.loop)
         missed = self._clock.take(state)
         self._page.tell_seen()
+        if cycle.flags & RESYNC:
+            self._loads.forget()
         loads = self._loads.update(state)
+        self._checks.flags = cycle.flags
         self._follow(State(cycle.state))
-        written = self._write_again(cycle, state, loads)
-        self._record(state, missed, cycle.own_q, loads, written, cycle.attempted)
+        setpoint = self._write_again(cycle, state, loads)
+        left = cycle.written and setpoint is not None
+        self._record(state, missed, cycle.own_q, loads, setpoint, cycle.attempted > 0, left)
 
     def _renew(self, process: int) -> None:
         """Begin as a new process of the loop begins, knowing nothing of the former."""
@@ -86,11 +91,11 @@ class ReplayedLoop(Loop):
             if not self._streaming:
                 stream.start(cycle.own_q, state.timestamp, led=True)
                 self._streaming = True
-            if not cycle.written:
+            if not cycle.written and cycle.attempted != UNSENT:
                 stream.forget()  # it was refused, and left no trace
                 return None
             stream.hasten(cycle.ramp_time)
-            goal = 0.0 if self._supervisor.state == State.HOLDING else 1.0
+            goal = 0.0 if cycle.flags & RAMPING_OUT else 1.0
             setpoint = stream.advance(state, cycle.nominal_q, loads, goal)
         except LimitError as error:  # of another cell than it was then
             stream.forget()

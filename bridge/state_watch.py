@@ -19,6 +19,7 @@ INVALID_IN_A_ROW = 3  # states that cannot be believed, after which they count a
 SILENCE = 0.2  # s without a state: a fault
 LOST = 3.0  # s without a state: the link is lost
 LOST_AFTER_WRITING = 0.5  # s: the library's writing half does not survive a break
+SUSPENDED = 0.1  # s that a reading takes longer than it may: this process was stopped meanwhile
 TELL_EVERY = 1.0  # s between two events of samples dropped for the same reason
 
 
@@ -41,12 +42,15 @@ class StateWatch:
         page: Page,
         tell: Callable[[dict[str, Any]], None],
         lose: Callable[[str], None],
+        patience: float = 0.0,
     ) -> None:
         self._driver, self._supervisor, self._page = driver, supervisor, page
         self._tell, self._lose = tell, lose
         self._hold = hold_time(driver.rate)
+        self._patience = max(patience, self._hold)  # s that one reading takes at most
         self._check = SampleCheck(arm)
         self._invalid = 0
+        self._left = 0.0  # s, monotonic: when the last reading ended
         self._stale = self._silent = False  # has been told since the last believable state
         self._told: dict[Count, float] = {}  # s, monotonic
         self._heard = time.monotonic()  # s, of the last believable state
@@ -54,10 +58,23 @@ class StateWatch:
 
     def next(self) -> RobotState | None:
         """Return the next state, or None where none came that can be used."""
+        begun, self._left = time.monotonic(), self._left or time.monotonic()
+        away = begun - self._left > self._hold
+        try:
+            return self._read(begun, away)
+        finally:
+            self._left = time.monotonic()
+
+    def _read(self, begun: float, away: bool) -> RobotState | None:
+        """Return the next state; ``away``: this process itself stood still before ``begun``."""
         try:
             state = self._driver.read_state()
         except StaleStateError as error:
-            self._stand_still(str(error))
+            if away or time.monotonic() - begun > self._patience + SUSPENDED:
+                self._heard = time.monotonic()  # it was this process that slept: ask once more
+                self._page.count(Count.LATE)
+            else:
+                self._stand_still(str(error))
         except InvalidStateError as error:
             self.doubt(str(error))
         except LinkError as error:
@@ -77,7 +94,7 @@ class StateWatch:
     def forget(self) -> None:
         """Take note that nobody asked for states meanwhile."""
         self._check.forget()
-        self._heard = time.monotonic()
+        self._heard = self._left = time.monotonic()
 
     def _stand_still(self, detail: str) -> None:
         """Judge a clock that stands still: late at first, then stale, then silent."""

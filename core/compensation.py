@@ -20,7 +20,7 @@ from core.least_offset import LARGEST_OFFSET as LARGEST_OFFSET
 from core.least_offset import smallest_offset
 from core.loads import Loads
 from core.model import Model, Poses
-from core.packed import chain_of, pack, row_of, shape_of, view_row
+from core.packed import chain_of, pack, row_of, shape_of, shape_size, sizes_of, view_row
 
 Array = NDArray[np.float64]
 TOLERANCE = 1e-9  # m, and rad times the tool's lever: where the pose counts as reached
@@ -35,8 +35,8 @@ class Correction:
 
     q: Array  # (N, n) rad
     offset_in_base: Array  # (N, 6) m, rad: rigid TCP pose at q minus that at nominal_q
-    residual: Array  # (N,) m: distance of the predicted pose from the wanted one (rotation x lever)
-    steps: NDArray[np.int64]  # (N,) Newton steps taken
+    residual: Array | np.float64  # (N,) m: distance of predicted and wanted pose (rotation x lever)
+    steps: NDArray[np.int64] | np.int64  # (N,) Newton steps taken
 
 
 @njit(**JIT)
@@ -98,10 +98,14 @@ def newton_step(chain, rows, r, shape, position, rotation, lever, dq):  # type: 
 @njit(**JIT)
 def _turned(A, B, out):  # type: ignore[no-untyped-def]
     """Write the rotation vector of A B^T; accurate at zero, where it is needed."""
-    R = A @ B.T
-    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    x = y = z = trace = 0.0
+    for k in range(3):
+        x += A[2, k] * B[1, k] - A[1, k] * B[2, k]
+        y += A[0, k] * B[2, k] - A[2, k] * B[0, k]
+        z += A[1, k] * B[0, k] - A[0, k] * B[1, k]
+        trace += A[0, k] * B[0, k] + A[1, k] * B[1, k] + A[2, k] * B[2, k]
     twice_sine = np.sqrt(x * x + y * y + z * z)
-    angle = np.arctan2(twice_sine, R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
+    angle = np.arctan2(twice_sine, trace - 1.0)
     # offsets are small: half turns, where the sine alone says nothing, do not occur
     scale = angle / twice_sine if twice_sine > 1e-12 else 0.5
     out[0], out[1], out[2] = scale * x, scale * y, scale * z
@@ -150,21 +154,23 @@ def _solve(chain, row, shape, pose, nominal, offset, q):  # type: ignore[no-unty
 
 
 @njit(**JIT)
-def _correct(  # type: ignore[no-untyped-def]
-    block, rigid_block, row_block, rigid_row_block, shape_block, rigid_shape_block, wanted,
-    nominal, offset, q, moved,
-):  # fmt: skip
-    """Write the corrected setpoint q (n,), its offset and the motion; returns distance, steps.
+def _correct(block, rigid_block, n, nominal, found):  # type: ignore[no-untyped-def]
+    """Write the corrected setpoint q (n,) and the motion (6,); returns distance, steps.
 
-    For rows of which nothing but the joint angles changes from step to step.
+    The blocks hold all that is kept: chain, row, shape; the first one the last offset besides, the
+    second one the wanted pose. For rows of which nothing but the joint angles changes from step to
+    step.
     """
-    n = nominal.shape[0]
-    rigid, rigid_row = chain_of(rigid_block, n), row_of(rigid_row_block, n)
-    rigid_shape = shape_of(rigid_shape_block, n)
+    c, r = sizes_of(n)
+    row_end, shape_end = c + r, block.shape[0] - n
+    offset, wanted = block[shape_end:], rigid_block[rigid_block.shape[0] - 12 :]
+    rigid, rigid_row = chain_of(rigid_block, n), row_of(rigid_block[c:row_end], n)
+    rigid_shape = shape_of(rigid_block[row_end:], n)
+    q, moved = found[:n], found[n:]
     _rigid_pose(rigid, rigid_row, rigid_shape, nominal, wanted)
     best, steps = _solve(
-        chain_of(block, n), row_of(row_block, n), shape_of(shape_block, n), wanted, nominal, offset,
-        q,
+        chain_of(block, n), row_of(block[c:row_end], n), shape_of(block[row_end:], n), wanted,
+        nominal, offset, q,
     )  # fmt: skip
     for i in range(n):
         # where nothing was found, nothing (nor a joint angle that is no number) may go on
@@ -194,6 +200,13 @@ def _step(chain_block, row_block, shape_block, pose, offset):  # type: ignore[no
     )  # fmt: skip
 
 
+def _parts(block: Array, n: int) -> tuple[Array, Array, Array, Array]:
+    """Return chain, row, shape, and what else is in a block, as views of it."""
+    c, r = sizes_of(n)
+    s = c + r + shape_size(n)
+    return block[:c], block[c : c + r], block[c + r : s], block[s:]
+
+
 class Compensator:
     """Live compensation of one setpoint after the other, with buffers kept between them.
 
@@ -204,18 +217,20 @@ class Compensator:
     def __init__(self, model: Model) -> None:
         self.model = model
         self._n = n = model.arm.n
-        self._chain = pack(model.chain())
-        self._rigid = pack(model.without_terms().chain())
-        self._shape = pack(kernel.new_shape(n))
-        self._rigid_shape = pack(kernel.new_shape(n))
         plain = Rows(
             np.zeros((1, n)), np.ones((1, n)), np.zeros(1), np.zeros((1, 3)), np.zeros((1, 6))
         )
-        self._row, self._rigid_row = pack(plain), pack(plain)
+        shape, row = pack(kernel.new_shape(n)), pack(plain)
+        # one block for all that is kept: each array handed to compiled code is unwrapped anew
+        self._block = np.concatenate([pack(model.chain()), row, shape, np.zeros(n)])
+        rigid = pack(model.without_terms().chain())
+        self._rigid_block = np.concatenate([rigid, row, shape, np.zeros(12)])
+        self._chain, self._row, self._shape, self._offset = _parts(self._block, n)
+        self._rigid, self._rigid_row, self._rigid_shape, self._wanted = _parts(self._rigid_block, n)
         self._view = view_row(self._row, n)
+        self._loaded: Loads | None = None
         self._conditions = model.conditions()
-        self._offset = np.zeros(n)
-        self._wanted, self._pose = np.zeros(12), np.zeros(12)
+        self._nominal, self._pose = np.zeros(n), np.zeros(12)
 
     def correct(self, nominal_q: Array, loads: Loads | None = None) -> Correction:
         """Return the corrected setpoint for ``nominal_q`` (n,); ``loads`` holds one row.
@@ -223,22 +238,23 @@ class Compensator:
         The wanted pose is the rigid, effect-free arm's at ``nominal_q``. A row that cannot be
         solved comes back with the distance left in ``residual`` (inf: no equilibrium).
         """
-        nominal = np.array(nominal_q, dtype=float)
-        q, moved = np.empty(self._n), np.empty(6)
-        loads, rigid = loads or NOTHING, self._rigid
-        self._load(loads)
+        n = self._n
+        found, nominal = np.empty(n + 6), self._nominal
+        nominal[:] = nominal_q
+        q, moved = found[:n], found[n:]
+        if loads is not None or self._loaded is not NOTHING:
+            loads = loads or NOTHING
+            self._load(loads)
         if self._conditions:
+            rigid = self._rigid
             _want(rigid, self._rigid_row, self._rigid_shape, nominal, self._wanted)
-            best, steps = self._solve_conditioned(nominal, loads, q)
+            best, steps = self._solve_conditioned(nominal, loads or NOTHING, q)
             self._offset[:] = q - nominal if best < np.inf else 0.0
             _want(rigid, self._rigid_row, self._rigid_shape, q, self._pose)
             _moved(self._wanted, self._pose, self._offset, moved)
         else:
-            best, steps = _correct(
-                self._chain, rigid, self._row, self._rigid_row, self._shape, self._rigid_shape,
-                self._wanted, nominal, self._offset, q, moved,
-            )  # fmt: skip
-        return Correction(q, moved, np.asarray(best), np.asarray(steps))
+            best, steps = _correct(self._block, self._rigid_block, n, nominal, found)
+        return Correction(q, moved, np.float64(best), np.int64(steps))
 
     def forget(self) -> None:
         """Begin the next correction from nothing, whatever was solved last."""
@@ -264,6 +280,7 @@ class Compensator:
 
     def _load(self, loads: Loads) -> None:
         """Write what acts into the row's own buffers."""
+        self._loaded = loads
         row, model = self._view, self.model
         given = loads.payload_mass
         row.payload_mass[0] = model.payload_mass if given is None else given[0]

@@ -22,6 +22,17 @@ def pack(record: Chain | Rows | Shape) -> Array:
 
 
 @njit(**JIT)
+def sizes_of(n):  # type: ignore[no-untyped-def]
+    """Return how many numbers a chain and one row of n joints have."""
+    return 9 * (n + 1) + 3 * (n + 1) + 12 + n + 3 * n + 3 + 3 * n + 2 * n + 3, 2 * n + 10
+
+
+def shape_size(n: int) -> int:
+    """Return how many numbers the buffers of n joints have."""
+    return 12 * (n + 1) + 15 * n + 12
+
+
+@njit(**JIT)
 def chain_of(block, n):  # type: ignore[no-untyped-def]
     """Return the chain of n joints whose arrays are views of ``block``."""
     a = 9 * (n + 1)

@@ -28,7 +28,7 @@ class DriverSettings(BaseModel):
 
     rate: float = Field(500.0, gt=0.0, le=1000.0, description="cycles per second asked for")
     state_timeout: float = Field(
-        0.05, gt=0.0, le=1.0,
+        0.04, gt=0.0, le=1.0,
         description="s without a new controller timestamp after which the state is stale",
     )  # fmt: skip
     connect_timeout: float = Field(

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 Vector = NDArray[np.float64]
 NEEDED = (
-    "number", "timestamp", "state", "written", "attempted", "nominal_q", "own_q", "ramp_time",
-    "rate", "loop", "target_q", "actual_q", "actual_qd", "actual_TCP_force", "robot_mode",
-    "safety_mode", "runtime_state", "safety_status_bits", "speed_scaling",
+    "number", "timestamp", "state", "written", "attempted", "flags", "nominal_q", "own_q",
+    "ramp_time", "rate", "loop", "target_q", "actual_q", "actual_qd", "actual_TCP_force",
+    "robot_mode", "safety_mode", "runtime_state", "safety_status_bits", "speed_scaling",
 )  # fmt: skip
 LONGEST_PAUSE = 1.0  # s: longer gaps of a recording are not waited for
 
@@ -69,7 +69,8 @@ class Cycle:
     loop: int  # which process of the loop it was
     state: int  # of the supervisor, at its end
     written: bool
-    attempted: bool  # a setpoint was computed for writing, whether it left or not
+    attempted: int  # 0: not writing; 1: a setpoint was, or was refused; 2: computed, not sent
+    flags: int  # of the loop's own
     own_q: Vector  # (n,) rad, what the robot itself wanted
     nominal_q: Vector  # (n,) rad, what the correction was computed for
     ramp_time: float  # s
@@ -117,7 +118,8 @@ class ReplayDriver(Driver):
         self._wait(float(row["timestamp"]))
         self.cycle = Cycle(
             int(row["number"]), int(row["loop"]), int(row["state"]), bool(row["written"]),
-            bool(row["attempted"]), row["own_q"], row["nominal_q"], float(row["ramp_time"]),
+            int(row["attempted"]), int(row["flags"]), row["own_q"], row["nominal_q"],
+            float(row["ramp_time"]),
         )  # fmt: skip
         return _state(row)
 
@@ -173,4 +175,5 @@ def _state(row: Mapping[str, Vector]) -> RobotState:
         runtime_state=int(row["runtime_state"]),
         safety_status_bits=int(row["safety_status_bits"]),
         speed_scaling=float(row["speed_scaling"]),
+        sensor_lost="" if known("actual_TCP_force") is not None else "as recorded",
     )

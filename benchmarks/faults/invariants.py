@@ -43,6 +43,7 @@ class Bounds:
     grain: float = 1e-8
     grain_rotation: float = 1e-8
     fresh: float = 0.04
+    burst: float = 0.0  # s for which the transport may hold small packets back
 
 
 @dataclass
@@ -57,12 +58,14 @@ class Found:
     oldest_state: float = 0.0  # s, behind a write
     violations: list[str] = field(default_factory=list)
     violated: int = 0
+    recent: deque[str] = field(default_factory=lambda: deque(maxlen=10))
 
     def add(self, words: str) -> None:
-        """Note a violation."""
+        """Note a violation, the first few with what went over the wire just before."""
         self.violated += 1
         if len(self.violations) < LONGEST_LIST:
-            self.violations.append(words)
+            before = "; ".join(self.recent) if self.violated < 5 else ""
+            self.violations.append(f"{words} [{before}]" if before else words)
 
 
 class Checker:
@@ -83,6 +86,8 @@ class Checker:
     def take(self, seen: Sequence[Fresh | Write]) -> None:
         """Check what the tap has seen next."""
         for item in seen:
+            what = "state" if isinstance(item, Fresh) else item.kind
+            self.found.recent.append(f"{item.time:.3f} {what} in {item.state}")
             if item.state in WRITING:
                 self._last_writing = item.time
             elif item.time - self._last_writing > GRACE:
@@ -159,7 +164,7 @@ class Checker:
         self.found.oldest_state = max(self.found.oldest_state, age)
         if age > self.bounds.fresh:
             self.found.add(f"write {age:.3f} s after the last fresh state")
-        elif self._since_fresh > AHEAD:
+        elif self._since_fresh > AHEAD + self.bounds.burst / self.bounds.cycle:
             self.found.add(f"{self._since_fresh} writes after one state")
 
     def _offset_of(self, write: Write) -> Numbers:
@@ -204,7 +209,9 @@ class Checker:
         if self._fresh is not None and math.isfinite(self._fresh.stamp):
             stamp = self._fresh.stamp
         for then, before in self._recent:
-            allowed = stamp - then + (3.0 * b.cycle if stamp is not write.time else GRACE)
+            # a client may still write for a sample that is not the last one that it was sent
+            slack = (GAP + 3.0) * b.cycle if stamp is not write.time else GRACE
+            allowed = stamp - then + slack + b.burst
             shift, turn = _apart(offset, before)
             if shift > b.offset_rate * allowed * 1.001 + 2.0 * b.grain:
                 found.add(f"{1e3 * shift:.4f} mm within {1e3 * (stamp - then):.1f} ms")

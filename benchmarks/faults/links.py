@@ -65,12 +65,21 @@ class Link(ABC):
     """One kind of link. ``rate`` is in Hz; ``hold`` (s) is after what silence the offset goes."""
 
     name: str
-    rate: float
+    usual_rate: float
     moves_arm: bool
     base: str
     main: str  # name of the port that states come over
     hold = 0.1
     grain, grain_rotation = 1e-8, 1e-8
+    burst = 0.0
+
+    def __init__(self, rate: float | None = None) -> None:
+        self.rate = rate or self.usual_rate
+
+    @property
+    def cycle(self) -> float:
+        """Return the duration of a cycle, s."""
+        return 1.0 / self.rate
 
     @abstractmethod
     def section(self, host: str) -> str:
@@ -111,20 +120,20 @@ class Link(ABC):
         return Bounds(
             plant_arm(found.arm), tool, limits.offset, limits.offset_rotation, limits.offset_rate,
             limits.offset_rotation_rate, 1.0 / self.rate, self.grain, self.grain_rotation,
-            max(0.04, 5.0 / self.rate),
+            max(0.04, 5.0 / self.rate), self.burst,
         )  # fmt: skip
 
 
 class UrServo(Link):
     """UR by servoJ: our setpoints are the arm's motion."""
 
-    name, rate, moves_arm, base, main = "ur_rtde servoj", 500.0, True, UR, "rtde"
+    name, usual_rate, moves_arm, base, main = "ur_rtde servoj", 250.0, True, UR, "rtde"
     mode = "servoj"
     grain, grain_rotation = 2e-6, 4e-6  # a limited offset is shared out by joints, to first order
 
     def section(self, host: str) -> str:
         """See Link.section."""
-        return f"link: {{driver: ur_rtde, host: {host}, mode: {self.mode}}}\n"
+        return f"link: {{driver: ur_rtde, host: {host}, mode: {self.mode}, rate: {self.rate:g}}}\n"
 
     def ports(self) -> list[Port]:
         """See Link.ports."""
@@ -157,8 +166,10 @@ class UrServo(Link):
 class UrOffset(UrServo):
     """UR by offsets in registers that the robot's own program applies."""
 
-    name, moves_arm, mode = "ur_rtde offset", False, "offset"
+    name, usual_rate, moves_arm, mode = "ur_rtde offset", 125.0, False, "offset"
     grain, grain_rotation = 2e-8, 2e-8
+    # the library sends nine small packets a cycle, and at first each waits for a delayed ACK
+    burst = 0.05
 
     def prepare(self, peer: Peer, host: str) -> None:
         """Have the robot's own program run."""
@@ -177,7 +188,7 @@ class UrOffset(UrServo):
 class Modbus(Link):
     """A UR controller's Modbus server, offsets through the mailbox."""
 
-    name, rate, moves_arm, base, main = "modbus mailbox", 50.0, False, UR, "modbus"
+    name, usual_rate, moves_arm, base, main = "modbus mailbox", 50.0, False, UR, "modbus"
     hold = 0.2
     port = 15020
     grain, grain_rotation = 2e-6, 2e-6
@@ -206,7 +217,7 @@ class Modbus(Link):
 class CanPiper(Link):
     """An AgileX PiPER on a bus between processes."""
 
-    name, rate, moves_arm, base, main = "can piper", 200.0, True, PIPER, "can"
+    name, usual_rate, moves_arm, base, main = "can piper", 200.0, True, PIPER, "can"
     port = 29536
     grain, grain_rotation = 2e-5, 6e-5  # 0.001 degrees of each joint
 

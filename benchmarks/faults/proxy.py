@@ -67,7 +67,7 @@ class Proxy:
         self._order = itertools.count()
         self._numbers = itertools.count()
         self._stalled_until = 0.0
-        self._refusing = self._mute = self._stopping = False
+        self._mute = self._stopping = False
         self._orders: list[Callable[[], None]] = []
         self._lock = threading.Lock()
         self._wake_out, self._wake_in = os.pipe()
@@ -82,11 +82,11 @@ class Proxy:
     def heal(self) -> None:
         """Do no more harm."""
         self._mischief = {}
-        self._stalled_until, self._refusing, self._mute = 0.0, False, False
-        self._order_thread(lambda: None)
+        self._stalled_until, self._mute = 0.0, False
+        self._order_thread(self._listen)
 
     def stall(self, seconds: float) -> None:
-        """Hand nothing on for a while; what comes waits in the sockets."""
+        """Hand nothing on for a while; all that comes leaves when it is over."""
         self._stalled_until = time.monotonic() + seconds
 
     def cut(self, reset: bool = True) -> None:
@@ -94,8 +94,8 @@ class Proxy:
         self._order_thread(lambda: self._cut_all(reset))
 
     def refuse(self) -> None:
-        """Reset whoever comes from now on."""
-        self._refusing = True
+        """Listen no more: whoever comes is refused."""
+        self._order_thread(self._listen_no_more)
 
     def mute(self) -> None:
         """Accept whoever comes and never say a word."""
@@ -120,11 +120,7 @@ class Proxy:
     # -- serving ----------------------------------------------------------------------------------
 
     def __enter__(self) -> Self:
-        for port in self._ports:
-            listener = socket.create_server((self.host, port.port), backlog=16)
-            listener.setblocking(False)
-            self._listeners.append(listener)
-            self._selector.register(listener, selectors.EVENT_READ, port)
+        self._listen()
         self._selector.register(self._wake_out, selectors.EVENT_READ, None)
         self._thread.start()
         return self
@@ -139,21 +135,30 @@ class Proxy:
         self._order_thread(lambda: None)
         self._thread.join(5.0)
         self._cut_all(reset=True)
-        for listener in self._listeners:
-            listener.close()
+        self._listen_no_more()
         self._selector.close()
         os.close(self._wake_in)
         os.close(self._wake_out)
+
+    def _listen(self) -> None:
+        if self._listeners:
+            return
+        for port in self._ports:
+            listener = socket.create_server((self.host, port.port), backlog=16)
+            listener.setblocking(False)
+            self._listeners.append(listener)
+            self._selector.register(listener, selectors.EVENT_READ, port)
+
+    def _listen_no_more(self) -> None:
+        for listener in self._listeners:
+            self._selector.unregister(listener)
+            listener.close()
+        self._listeners = []
 
     def _serve(self) -> None:
         while not self._stopping:
             now = time.monotonic()
             wait = min(self._due[0][0] - now, 0.5) if self._due else 0.5
-            stalled = self._stalled_until - now
-            if stalled > 0.0:  # nothing is read: the sockets fill, as on a dead line
-                time.sleep(min(stalled, 0.002))
-                self._take_orders()
-                continue
             for key, _ in self._selector.select(max(wait, 0.0)):
                 if key.fileobj == self._wake_out:
                     os.read(self._wake_out, 64)
@@ -177,9 +182,6 @@ class Proxy:
         except OSError:
             return
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        if self._refusing:
-            self._close(client, reset=True)
-            return
         ends = {UP: client}
         if not self._mute:
             try:
@@ -208,18 +210,23 @@ class Proxy:
         if not data:
             self._drop(connection, reset=False)
             return
-        port = connection.port.name
+        self._send_due()  # what was held back goes first
+        port, now, at_once = connection.port.name, time.monotonic(), b""
         for message in connection.splitters[direction].feed(data):
-            now = time.monotonic()
             if direction == UP:
                 self._tell(now, connection.number, port, UP, message)
             mischief = self._mischief.get((port, direction), passing)
-            for delay, made in mischief(message):
+            for asked, made in mischief(message):
+                delay = max(asked, self._stalled_until - now)
                 if delay > 0.0:
                     item = (now + delay, next(self._order), connection, direction, made)
                     heapq.heappush(self._due, item)
-                else:
-                    self._send(connection, direction, made, now)
+                    continue
+                if direction == DOWN:
+                    self._tell(now, connection.number, port, DOWN, made)
+                at_once += made
+        if at_once:
+            self._push(connection, direction, at_once)
 
     def _send_due(self) -> None:
         now = time.monotonic()
@@ -229,11 +236,14 @@ class Proxy:
                 self._send(connection, direction, message, now)
 
     def _send(self, connection: Connection, direction: str, message: bytes, now: float) -> None:
+        if direction == DOWN:
+            self._tell(now, connection.number, connection.port.name, DOWN, message)
+        self._push(connection, direction, message)
+
+    def _push(self, connection: Connection, direction: str, message: bytes) -> None:
         end = connection.ends.get(DOWN if direction == UP else UP)
         if end is None:
             return
-        if direction == DOWN:
-            self._tell(now, connection.number, connection.port.name, DOWN, message)
         waiting = connection.out[direction]
         waiting += message
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 import time
 from pathlib import Path
 from types import TracebackType
@@ -16,6 +17,7 @@ from benchmarks.faults.running import Running
 from benchmarks.faults.tap import Tap
 from bridge.supervisor import State
 
+SOME = 40  # messages decoded at a time
 SETTLED = 0.12  # s of compensating before a fault is made
 START_LIMIT, RECOVERY_LIMIT = 90.0, 30.0  # s
 
@@ -30,7 +32,8 @@ class Rig:
         self.peer = Peer(peer_cell, self.back, 30100, folder / "peer.log")
         self.checker = Checker(link.bounds(self.cell))
         self._runs: list[Running] = []
-        self.tap = Tap(link.decoder(), self._state_word)
+        self.decoder = link.decoder()
+        self.tap = Tap(self.decoder, self._state_word)
         self.proxy = Proxy(self.front, self.back, link.ports(), self.tap.tell)
 
     def _state_word(self) -> int:
@@ -44,10 +47,18 @@ class Rig:
     @property
     def found(self) -> Found:
         """Return what the checker has found up to now."""
-        self.checker.take(self.tap.drain())
+        while self.check():
+            time.sleep(0.0005)  # the proxy goes first: who decodes must not slow the wire
         return self.checker.found
 
+    def check(self) -> bool:
+        """Check some of what the tap has kept; returns whether there was any."""
+        seen = self.tap.drain(SOME)
+        self.checker.take(seen)
+        return bool(self.tap.waiting)
+
     def __enter__(self) -> Self:
+        sys.setswitchinterval(1e-4)  # the proxy's thread must not wait for others
         try:
             self.peer.start()
             self.link.prepare(self.peer, self.back)
@@ -77,7 +88,29 @@ class Rig:
         """Start a run, observing."""
         self._runs.append(Running(self.cell, **self._changed))
         self.run.start()
-        self.run.wait(lambda: self.run.state == State.OBSERVING, START_LIMIT, "observing")
+        self.wait(State.OBSERVING, START_LIMIT)
+
+    def wait(self, state: State, limit: float) -> None:
+        """Wait for a state of the loop. Raises TimeoutError, and what the daemon ended with."""
+        until = time.monotonic() + limit
+        while self.run.state != state:
+            if self.run.error is not None:
+                raise self.run.error
+            if time.monotonic() > until:
+                raise TimeoutError(
+                    f"{state.name}: not within {limit:g} s; last: {self.run.last_words()}"
+                )
+            self.pass_time(0.002)
+
+    def pass_time(self, seconds: float) -> None:
+        """Wait, and check meanwhile what goes over the wire."""
+        until = time.monotonic() + seconds
+        while True:
+            self.check()
+            left = until - time.monotonic()
+            if left <= 0.0:
+                return
+            time.sleep(min(0.002, left))
 
     # -- between faults ---------------------------------------------------------------------------
 
@@ -100,7 +133,7 @@ class Rig:
                 raise TimeoutError(f"{state.name} after {limit:g} s: {self.run.last_words()}")
             if state == State.FAULT:
                 self.run.daemon.disarm()
-            time.sleep(0.02)
+            self.pass_time(0.02)
 
     def compensate(self, limit: float = RECOVERY_LIMIT) -> None:
         """Bring the daemon to where it writes, arming it as a person does."""
@@ -110,8 +143,8 @@ class Rig:
             if self.run.state != State.COMPENSATING:
                 self.run.daemon.arm()
             with contextlib.suppress(TimeoutError):
-                self.run.wait(lambda: self.run.state == State.COMPENSATING, 2.0, "compensating")
-                time.sleep(SETTLED)
+                self.wait(State.COMPENSATING, 2.0)
+                self.pass_time(SETTLED)
             if self.run.state == State.COMPENSATING:
                 return
             if time.monotonic() > until:

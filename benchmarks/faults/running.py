@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,7 @@ from bridge.daemon import Daemon, settings_of
 from bridge.summary import RunSummary
 from bridge.supervisor import State
 
-POLL = 0.002  # s
+BACKOFF = (0.1, 0.5)  # s before a restart: not to wait long between faults
 Event = dict[str, Any]
 
 
@@ -21,7 +19,8 @@ class Running:
     """One run of the daemon; every event is kept, with its wall clock's time."""
 
     def __init__(self, cell: Path, observe: bool = False, **changed: Any) -> None:
-        settings = settings_of(load_cell(cell)).model_copy(update=changed)
+        given = {"backoff": BACKOFF, **changed}
+        settings = settings_of(load_cell(cell)).model_copy(update=given)
         self.events: list[Event] = []
         self.daemon = Daemon(settings, may_write=not observe, log=self.events.append)
         self.page = self.daemon.page
@@ -55,16 +54,6 @@ class Running:
             return self.page.state
         except (IndexError, ValueError):
             return -1
-
-    def wait(self, what: Callable[[], bool], limit: float, words: str) -> None:
-        """Wait until ``what`` holds. Raises TimeoutError."""
-        until = time.monotonic() + limit
-        while not what():
-            if self.error is not None:
-                raise self.error
-            if time.monotonic() > until:
-                raise TimeoutError(f"{words}: not within {limit:g} s; last: {self.last_words()}")
-            time.sleep(POLL)
 
     def last_words(self) -> str:
         """Return the last events in short."""

@@ -27,9 +27,14 @@ class Tap:
         self.messages += 1
         self._kept.append((time, connection, port, direction == UP, message, self.state()))
 
-    def drain(self) -> list[Fresh | Write]:
-        """Return what has been seen since the last call."""
+    @property
+    def waiting(self) -> int:
+        """Return how many messages have not been decoded yet."""
+        return len(self._kept)
+
+    def drain(self, most: int | None = None) -> list[Fresh | Write]:
+        """Return what has been seen since the last call, in ``most`` messages at most."""
         found: list[Fresh | Write] = []
-        while self._kept:
+        for _ in range(len(self._kept) if most is None else min(most, len(self._kept))):
             found += self._decoder.feed(*self._kept.popleft())
         return found

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import click
 
 from bridge.cli.optional import member
 from bridge.cli.options import cell_argument, open_cell
+from bridge.log_lines import JsonLines
 from core.errors import InputError
 
 
@@ -21,7 +23,14 @@ from core.errors import InputError
     metavar="S",
     help="End after so many seconds; else on SIGINT or SIGTERM.",
 )
-def run(cell: Path, observe: bool, arm: bool, duration: float | None) -> None:  # fmt: skip
+@click.option(
+    "--log",
+    type=click.Choice(["text", "json"]),
+    default="text",
+    show_default=True,
+    help="json: every event also as a line of JSON on stderr.",
+)
+def run(cell: Path, observe: bool, arm: bool, duration: float | None, log: str) -> None:
     """Run the on-cell daemon: read the arm's state, predict how it bends, correct its setpoints.
 
     Setpoints are written where the cell has `setpoints.arm: true`, with --arm, or after
@@ -33,7 +42,11 @@ def run(cell: Path, observe: bool, arm: bool, duration: float | None) -> None:  
         raise InputError("--observe: found beside --arm, expected one of them")
     given = open_cell(cell)
     result = member("bridge.daemon_run", "run_cell", "run")(
-        given, observe=observe, arm=arm, duration=duration
+        given,
+        observe=observe,
+        arm=arm,
+        duration=duration,
+        log=JsonLines(sys.stderr).tell if log == "json" else None,
     )
     if isinstance(result, int) and not isinstance(result, bool) and result:
         raise click.exceptions.Exit(result)

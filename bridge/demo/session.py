@@ -20,7 +20,7 @@ from bridge.demo.result import LoopFigures
 from bridge.summary import RunSummary
 from bridge.supervisor import State
 from core.errors import LinkError, RunError
-from core.log import read_log
+from core.recording.reading import read_columns
 
 Array = NDArray[np.float64]
 ATTEMPTS = 3
@@ -74,8 +74,8 @@ class Session:
         self._runs.append(summary)
         if summary.faults or summary.recording is None:
             raise RunError(summary.faults[0] if summary.faults else "nothing was recorded")
-        recording = read_log(summary.recording, cell.arm.n)
-        return rests(recording.columns, tracker.readings(), poses, load, self._link.settling)
+        recording = read_columns(summary.recording, told_only=True)
+        return rests(recording, tracker.readings(), poses, load, self._link.settling)
 
     @property
     def written(self) -> int:

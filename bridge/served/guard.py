@@ -12,6 +12,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from bridge.served.protocol import LARGEST_HEAD
 from bridge.served.settings import ServedSettings
 
 POLICY = (
@@ -76,6 +77,10 @@ class Guard:
     async def _refusal(self, scope: Scope) -> ASGIApp | None:
         """Return what answers a request that may not pass."""
         headers = Headers(scope=scope)
+        # the library limits heads that come in pieces only
+        size = len(scope["raw_path"]) + len(scope["query_string"])
+        if size + sum(len(k) + len(v) + 4 for k, v in scope["headers"]) > LARGEST_HEAD:
+            return self._refuse("size", 431, "the request is too large", connection="close")
         if not self._host_is_ours(headers):
             return self._refuse("host", 421, "this server is not known by that name")
         signs_in = scope["path"] == SIGN_IN and scope["method"] == "POST" and self._sign_in

@@ -8,7 +8,13 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
+from core.errors import (
+    ForeignCommandError,
+    InvalidStateError,
+    LinkError,
+    StaleStateError,
+    WriteError,
+)
 from core.model import Model
 from core.setpoint import Setpoint
 from core.state import RobotState
@@ -233,10 +239,10 @@ class CanDriver(Driver):
         told = not self.profile.enabled_values or self.reader.enabled
         return told and (goal == "enabled" or not self.reader.trouble(writing=True)[0])
 
-    def _commanded_by_another(self) -> WriteError:
+    def _commanded_by_another(self) -> ForeignCommandError:
         foreign = self.reader.foreign
         assert foreign is not None
-        return WriteError(
+        return ForeignCommandError(
             f"{self.settings.where()}: another commander sent {foreign.key[0]:#x} "
             f"{time.monotonic() - foreign.seen:.2f} s ago: found two masters, expected one"
         )

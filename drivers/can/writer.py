@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import WriteError
+from core.errors import PartialWriteError, WriteError
 from drivers.can.bus import first_line
 from drivers.can.profile import Action, CanProfile, Key, Outgoing
 from drivers.can.settings import CanSettings
@@ -44,7 +44,8 @@ class FrameWriter:
                 self._send(key, data)
             except WriteError as error:
                 done = self._mend() if sent else "nothing of it was sent"
-                raise WriteError(f"{error} ({sent} of {len(frames)} frames out; {done})") from None
+                words = f"{error} ({sent} of {len(frames)} frames out; {done})"
+                raise PartialWriteError(words) from None
         self._last, self.target = frames, q.copy()
 
     def _mend(self) -> str:

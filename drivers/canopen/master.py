@@ -15,6 +15,7 @@ import canopen
 
 from core.errors import LinkError
 from drivers.can.bus import close_bus, first_line, open_bus
+from drivers.canopen.allowed import AllowedFrames
 from drivers.canopen.listening import BusListener, Life
 from drivers.canopen.objects import HEARTBEAT_BASE, SYNC, Address
 from drivers.canopen.profile import CanopenProfile
@@ -26,10 +27,19 @@ OPERATIONAL_STATE = 5
 
 
 class _Network(canopen.Network):
-    """The library's network, whose thread ends soon when it is asked to."""
+    """The library's network; it sends what is allowed, and its thread ends soon when asked to."""
 
     NOTIFIER_CYCLE = 0.05
     NOTIFIER_SHUTDOWN_TIMEOUT = 1.0
+
+    def __init__(self, bus: Any, allowed: AllowedFrames) -> None:
+        super().__init__(bus)
+        self._allowed = allowed
+
+    def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:
+        """Send a frame that the profile allows; all of the library's go this way."""
+        self._allowed.check(can_id, data)
+        super().send_message(can_id, data, remote)
 
 
 class Master:
@@ -51,7 +61,7 @@ class Master:
     def open(self) -> None:
         """Open the bus and listen; sends nothing. Raises LinkError."""
         bus = open_bus(self._settings)
-        network: Any = _Network(bus)
+        network: Any = _Network(bus, AllowedFrames(self._profile))
         self.listener = BusListener(network, self._profile, self.collector)
         network.listeners[:] = [self.listener]
         for node in self._profile.nodes:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import LinkError, WriteError
+from core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
 from core.model import Model
 from core.setpoint import Setpoint
 from core.state import RobotState
@@ -51,11 +51,20 @@ class DriverWithSensor(Driver):
     def read_state(self) -> RobotState:
         """Return the arm's next sample with the sensor's wrench; see Driver.read_state.
 
-        Raises StaleStateError, InvalidStateError also where the sensor is the reason.
+        Where the sensor is silent, overloaded or not well, the state has no force and says why; or,
+        with ``when_lost: stop``, raises StaleStateError, InvalidStateError.
         """
         state = self._arm.read_state()
         moment = self._clock.take(state.timestamp, state.received)
-        raw = self._to_flange @ self._reader.at(moment).wrench
+        try:
+            raw = self._to_flange @ self._reader.at(moment).wrench
+        except (StaleStateError, InvalidStateError) as error:
+            if self.settings.when_lost == "stop":
+                raise
+            force = state.actual_TCP_force if self._tcp_force is None else np.full(6, np.nan)
+            return replace(
+                state, ft_raw_wrench=None, actual_TCP_force=force, sensor_lost=str(error)
+            )
         if self._tcp_force is None:
             return replace(state, ft_raw_wrench=raw)
         force = self._tcp_force.of(raw, state)

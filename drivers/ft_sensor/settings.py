@@ -46,6 +46,10 @@ class FtSensorSettings(BaseModel):
     )
     connect_timeout: float = Field(2.0, gt=0.0, le=60.0, description="s until the first sample")
     overload: Overload = Field(Overload(), description="what it may carry")
+    when_lost: Literal["degrade", "stop"] = Field(
+        "degrade",
+        description="silent or overloaded: degrade goes on without force, stop ends compensating",
+    )
     tcp_force: Literal["sensor", "arm"] = Field(
         "sensor", description="where actual_TCP_force comes from: this sensor, or the arm as before"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +49,7 @@ class ModbusDriver(Driver):
         self._freshness = Freshness(profile)
         self._writer = make_writer(profile, self.transport, model)
         self._nominal = None if self.moves_arm else Nominal(model)
-        self._slow: dict[Block, list[int]] = {}
+        self._slow: dict[Block, Sequence[int]] = {}
         self._slow_at = 0.0
         self._due = 0.0  # s, monotonic: when the next reading is due
         self._fresh_at = 0.0  # s, monotonic: of the last new sample
@@ -124,7 +125,7 @@ class ModbusDriver(Driver):
             self.transport.open()  # raises LinkError where nobody is there any more
             return None
 
-    def _read_blocks(self) -> dict[Block, list[int]]:
+    def _read_blocks(self) -> dict[Block, Sequence[int]]:
         """Return the registers of one cycle: one block, where the profile's map allows it."""
         now = time.monotonic()
         if self.map.slow and now - self._slow_at > SLOW_EVERY:

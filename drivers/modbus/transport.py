@@ -17,6 +17,7 @@ from pymodbus.exceptions import ModbusException, ModbusIOException
 from pymodbus.pdu import ModbusPDU
 
 from core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
+from drivers.modbus.answers import Registers, WriteRegisters, Written, take_answers
 from drivers.modbus.map import Block, RegisterMap
 from drivers.modbus.registers import Table
 from drivers.modbus.settings import ModbusSettings
@@ -39,6 +40,7 @@ class Transport:
         self._writable: frozenset[tuple[Table, int]] = frozenset()
         self._allowed: set[tuple[Table, int, int]] = set()  # runs that were looked up before
         self._client: Any = None
+        self._calls: dict[Table, Any] = {}  # the client's methods that read
 
     def allow(self, compiled: RegisterMap) -> None:
         """Let requests write what the map says, and nothing else."""
@@ -69,6 +71,11 @@ class Transport:
             raise LinkError(f"{self.name}: cannot be reached: no answer or refused")
         if settings_are_tcp(self._settings) and client.socket is not None:
             client.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        take_answers(client)
+        self._calls = {
+            "coil": client.read_coils, "discrete": client.read_discrete_inputs,
+            "holding": client.read_holding_registers, "input": client.read_input_registers,
+        }  # fmt: skip
         self._client = client
 
     def _make(self) -> Any:
@@ -93,26 +100,28 @@ class Transport:
 
     # -- reading ----------------------------------------------------------------------------------
 
-    def read(self, block: Block) -> list[int]:
+    def read(self, block: Block) -> Sequence[int]:
         """Return the registers (or bits, 0 and 1) of a block.
 
         Raises LinkError where the link broke, InvalidStateError for an answer that is none.
         """
-        function = READ_FUNCTIONS[block.table]
-        client = self._opened()
-        call = {
-            1: client.read_coils, 2: client.read_discrete_inputs,
-            3: client.read_holding_registers, 4: client.read_input_registers,
-        }[function]  # fmt: skip
-        answer = self._ask(call, block.first, count=block.count)
-        return check_answer(answer, function, block.count, f"{self.name}: {block.table}")
+        self._opened()
+        table = block.table
+        answer = self._ask(
+            self._calls[table], block.first, count=block.count, device_id=self._device
+        )
+        function = READ_FUNCTIONS[table]
+        fine = isinstance(answer, Registers) and answer.function_code == function
+        if fine and len(answer.registers) == block.count:
+            return answer.registers  # of 16 bits each: they were taken out of bytes here
+        return check_answer(answer, function, block.count, f"{self.name}: {table}")
 
-    def exchange(self, block: Block, address: int, values: Sequence[int]) -> list[int]:
+    def exchange(self, block: Block, address: int, values: Sequence[int]) -> Sequence[int]:
         """Write holding registers, then read a block of them, in one request (function 23)."""
         self._check_allowed("holding", address, values)
         answer = self._ask(
             self._opened().readwrite_registers, read_address=block.first, read_count=block.count,
-            write_address=address, values=list(values),
+            write_address=address, values=list(values), device_id=self._device,
         )  # fmt: skip
         return check_answer(answer, 23, block.count, f"{self.name}: holding")
 
@@ -129,21 +138,32 @@ class Transport:
         client = self._opened()
         one = single or len(values) == 1
         try:
+            if table == "holding" and not one:
+                self._write_registers(client, address, values)
+                return
             for start, chunk in _chunks(address, values, one):
                 if table == "coil":
                     call = client.write_coil if one else client.write_coils
                 else:
-                    call = client.write_register if one else client.write_registers
+                    call = client.write_register
                 sent: Any = chunk[0] if one else chunk
                 sent = bool(sent) if table == "coil" and one else sent
-                function = {("coil", True): 5, ("coil", False): 15, ("holding", True): 6}.get(
-                    (table, one), 16
-                )
+                function = {("coil", True): 5, ("coil", False): 15}.get((table, one), 6)
                 check_written(
-                    self._ask(call, start, sent), function, start, f"{self.name}: {table}"
+                    self._ask(call, start, sent, device_id=self._device),
+                    function,
+                    start,
+                    f"{self.name}: {table}",
                 )
         except InvalidStateError as error:
             raise WriteError(str(error)) from None
+
+    def _write_registers(self, client: Any, address: int, values: Sequence[int]) -> None:
+        """Write holding registers in one request. Raises InvalidStateError, LinkError."""
+        request = WriteRegisters(dev_id=self._device, address=address, registers=values)
+        answer = self._ask(client.execute, False, request)
+        if type(answer) is not Written or answer.address != address:
+            check_written(answer, 16, address, f"{self.name}: holding")
 
     def _check_allowed(self, table: Table, address: int, values: Sequence[int]) -> None:
         run = (table, address, len(values))
@@ -166,7 +186,7 @@ class Transport:
 
     def _ask(self, call: Any, *arguments: Any, **keys: Any) -> ModbusPDU:
         try:
-            answer: ModbusPDU = call(*arguments, device_id=self._device, **keys)
+            answer: ModbusPDU = call(*arguments, **keys)
         except ModbusIOException:
             self._fresh_socket()
             raise StaleStateError(

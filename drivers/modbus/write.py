@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import StaleStateError, WriteError
+from core.errors import IneffectiveWriteError, StaleStateError, WriteError
 from core.model import Model
 from core.setpoint import Setpoint
 from core.state import RobotState
@@ -159,9 +159,11 @@ class MailboxWriter:
             if ahead < encode.SEQUENCES // 2:
                 self._awaited = 0
         late = self._awaited and time.monotonic() - self._since > self._box.echo
-        if late or echo[1] != encode.RUNNING:
+        if echo[1] != encode.RUNNING:
             self._armed = False
             raise WriteError(self._silence(echo))
+        if late:  # it was sent again in every cycle since
+            raise IneffectiveWriteError(self._silence(echo))
 
     def _silence(self, echo: tuple[int, ...]) -> str:
         said = {0: "absent", 1: "running", 2: "watchdog expired", 3: "checksum rejected"}

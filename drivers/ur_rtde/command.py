@@ -16,6 +16,7 @@ from core.errors import WriteError
 from core.setpoint import Setpoint
 from core.state import RobotState
 from drivers.ur_rtde import registers
+from drivers.ur_rtde.allowed import AllowedControl, AllowedInputs
 from drivers.ur_rtde.registers import Program
 from drivers.ur_rtde.settings import UrRtdeSettings
 
@@ -101,7 +102,8 @@ class ServoWriter:
         if not settings.remote_control:
             flags |= NO_REMOTE_CHECK
         try:
-            return RTDEControlInterface(settings.host, settings.rate, flags)
+            library = RTDEControlInterface(settings.host, settings.rate, flags)
+            return AllowedControl(settings.host, library)
         except Exception as error:
             words = str(error).strip().splitlines() or [type(error).__name__]
             raise WriteError(f"{settings.host}: {words[0].strip()}") from None
@@ -208,7 +210,7 @@ class OffsetWriter:
             try:
                 from rtde_io import RTDEIOInterface
 
-                self._io = RTDEIOInterface(host)
+                self._io = AllowedInputs(host, RTDEIOInterface(host))
             except Exception as error:
                 words = str(error).strip().splitlines() or [type(error).__name__]
                 raise WriteError(f"{host}: {words[0].strip()}") from None

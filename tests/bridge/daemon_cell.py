@@ -23,6 +23,7 @@ from bridge.cell import load_cell
 from bridge.daemon import Daemon, settings_of
 from bridge.summary import RunSummary
 from bridge.supervisor import State
+from core.recording.reading import read_columns
 from drivers.simulated.process import SimulatedController
 from drivers.simulated.settings import BENCH_PORT, ServerSettings, simulated_cell
 from drivers.ur_rtde.driver import OFFSET_SCRIPT
@@ -180,13 +181,21 @@ def read_recording(daemon: Daemon) -> dict[str, Any]:
 
 
 def read_cycles(path: Path) -> dict[str, Any]:
-    """Return the whole lines of a recording by column."""
-    header, *lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-    names = header.strip().split(",")
-    rows = [line.strip().split(",") for line in lines if line.endswith("\n")]
-    columns = {name: [row[i] for row in rows] for i, name in enumerate(names)}
-    states = columns.pop("state")
-    return {**{k: np.array(v, dtype=float) for k, v in columns.items()}, "state": states}
+    """Return a recording's cycles: one array per column of the log, and the states as words."""
+    found: dict[str, Any] = {}
+    for name, values in read_columns(path).items():
+        if values.ndim == 1:
+            found[name] = values
+        else:
+            found.update({f"{name}_{i}": values[:, i] for i in range(values.shape[1])})
+    found["state"] = [State(int(state)).name.lower() for state in found["state"]]
+    return found
+
+
+def only_recording(folder: Path) -> Path:
+    """Return the one run that is recorded in a folder."""
+    (session,) = {path.name.rsplit("-", 1)[0] for path in folder.glob("run-*.mcap")}
+    return folder / session
 
 
 def offsets(cycles: dict[str, Any]) -> Array:

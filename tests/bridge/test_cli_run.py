@@ -30,7 +30,7 @@ def test_run_hands_the_cell_and_its_options_to_the_daemon(
     assert gapbridge("run", path, "--observe", "--duration", "1.5").code == 0
     ((cell, options),) = seen
     assert cell.path == path
-    assert options == {"observe": True, "arm": False, "duration": 1.5}
+    assert options == {"observe": True, "arm": False, "duration": 1.5, "log": None}
 
 
 def test_a_broken_link_is_one_line_and_a_failure_at_run_time(

@@ -13,8 +13,10 @@ import pytest
 from daemon_cell import Robot, Run, offsets, wait_for
 
 from bridge.cell import load_cell
+from bridge.recording.export import export
 from bridge.supervisor import State
 from core.log import read_log
+from core.recording.reading import read_configuration, read_documents
 
 
 @pytest.fixture
@@ -114,23 +116,26 @@ def test_a_robot_program_is_not_ended_to_arm(robot: Robot) -> None:
     assert "own_work ended" not in robot.controller.log()
 
 
-def test_a_recording_is_a_log_as_it_stands(robot: Robot) -> None:
-    with Run(robot.cell(), arm=True, duration=1.0) as run:
+def test_a_recording_is_exported_as_a_log_and_has_the_events(robot: Robot) -> None:
+    cell = robot.cell()
+    with Run(cell, arm=True, duration=1.0) as run:
         run.join()
     path = run.daemon.recording
     assert path is not None
-    log = read_log(path, 6)
+    export(path, robot.folder / "log.csv")
+    log = read_log(robot.folder / "log.csv", 6)
     assert log.require("actual_q").shape == (len(log), 6)
     assert log.require("payload")[0] == 5.0
     assert (np.diff(log.require("timestamp")) > 0.001).all()
     assert not log.has("actual_current_as_torque")  # the library does not deliver it
-    events = path.with_suffix(".events.jsonl").read_text(encoding="utf-8").splitlines()
-    told = [json.loads(line) for line in events]
+    told = read_documents(path)
     assert [e["to"] for e in told if "to" in e] == [
         "OBSERVING", "ARMED", "COMPENSATING", "HOLDING", "OBSERVING",
     ]  # fmt: skip
     (summary,) = [e["summary"] for e in told if e["kind"] == "summary"]
     assert summary["setpoints_written"] > 100
+    assert told[-1]["kind"] == "ended"
+    assert read_configuration(path)["text"] == cell.read_text(encoding="utf-8")
 
 
 def settled_error(robot: Robot, wanted: np.ndarray, patience: float = 15.0) -> float:

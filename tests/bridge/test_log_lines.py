@@ -46,7 +46,8 @@ def test_no_secret_and_no_cell_text_reaches_a_log():
     line = log_line(
         {
             "kind": "configuration", "time": 1.0, "text": "link: {password: hunter2}",
-            "token": "hunter2", "link": {"password": "hunter2", "options": [{"api_key": "hunter2"}]},
+            "token": "hunter2",
+            "link": {"password": "hunter2", "options": [{"api_key": "hunter2"}]},
         }
     )  # fmt: skip
     assert "hunter2" not in line

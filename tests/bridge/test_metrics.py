@@ -1,6 +1,8 @@
 """Metrics over the wire: read by Prometheus' own parser, counted from cycles and events."""
 
 import re
+import shutil
+import subprocess
 import time
 
 import httpx
@@ -122,3 +124,12 @@ def test_the_names_are_also_good_openmetrics(feed):
     registry = CollectorRegistry(auto_describe=False)
     registry.register(Again())
     assert len(list(strict_parser(generate_latest(registry).decode()))) > 20
+
+
+@pytest.mark.skipif(shutil.which("promtool") is None, reason="promtool is not installed")
+def test_promtool_has_nothing_to_say(feed):
+    text = feed.wait("metrics").text
+    found = subprocess.run(
+        ["promtool", "check", "metrics"], input=text, capture_output=True, text=True, timeout=60
+    )
+    assert (found.returncode, found.stdout + found.stderr) == (0, "")

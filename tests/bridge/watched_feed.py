@@ -61,7 +61,7 @@ class Feed:
         self.page = Page(N)
         self.state = State.OBSERVING
         self.restarts = 0
-        self.counts: dict[str, int] = {"transition": 1}
+        self.counts: dict[str, int] = {"late": 1, "stale": 2, "overrun": 0}
         self._sequence = 0
         self._stop = threading.Event()
         self._lock = threading.Lock()

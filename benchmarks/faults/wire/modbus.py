@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import struct
 
-from benchmarks.faults.wire.seen import Decoder, Fresh, Write
+from benchmarks.faults.wire.seen import Change, Decoder, Fresh, Write
 
 READS, WRITES = (3, 4), (5, 6, 15, 16, 22, 23)
 MAILBOX, WORDS = 236, 9  # sequence, six counts, heartbeat, checksum
@@ -22,6 +22,7 @@ class ModbusDecoder(Decoder):
     def __init__(self) -> None:
         self._asked: dict[tuple[int, int], tuple[int, int, int]] = {}
         self._registers: dict[int, int] = {}
+        self._block = (0, 0)  # address and count of the block with the joints
 
     def feed(
         self, time: float, connection: int, port: str, up: bool, message: bytes, state: int
@@ -54,12 +55,25 @@ class ModbusDecoder(Decoder):
         self._registers.update(zip(range(address, address + count), words, strict=True))
         if not address <= 270 < address + count:
             return []
+        self._block = (address, count)
         get = self._registers.get
         turns = [_signed(get(320 + i, 0)) for i in range(6)]
         q = tuple(get(270 + i, 0) * 1e-3 + 2 * math.pi * turns[i] for i in range(6))
         known = all(register in self._registers for register in GOOD)
         safe = all(get(register) == value for register, value in GOOD.items())
         return [Fresh(time, math.nan, q, None, safe, known, state)]
+
+    def patch(self, message: bytes, what: str, change: Change) -> bytes:
+        """See Decoder.patch: whole milliradians, of one turn; there is no clock."""
+        address, count = self._block
+        first = {"q": 270, "qd": 280}[what]
+        if message[7:9] not in (bytes((3, 2 * count)), bytes((23, 2 * count))) or not count:
+            return message
+        data, at = bytearray(message), 9 + 2 * (first - address)
+        words = [_signed(word) * 1e-3 for word in struct.unpack_from(">6H", data, at)]
+        changed = [round(v * 1e3) & 0xFFFF for v in change(words)]
+        struct.pack_into(">6H", data, at, *changed)
+        return bytes(data)
 
     def _written(self, time: float, function: int, body: bytes, state: int) -> Write:
         at = 4 if function == 23 else 0

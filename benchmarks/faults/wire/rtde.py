@@ -10,7 +10,7 @@ import struct
 from dataclasses import dataclass, field
 from typing import Any
 
-from benchmarks.faults.wire.seen import Decoder, Fresh, Numbers, Write
+from benchmarks.faults.wire.seen import Change, Decoder, Fresh, Numbers, Write
 
 SIZES = {
     "DOUBLE": "d", "VECTOR3D": "3d", "VECTOR6D": "6d", "INT32": "i", "UINT32": "I", "UINT64": "Q",
@@ -18,9 +18,11 @@ SIZES = {
 }  # fmt: skip
 SERVOJ, SERVO_STOP, STOP_SCRIPT = 11, 16, 255
 HARMLESS = {0, 35, SERVO_STOP, STOP_SCRIPT}  # nothing, setWatchdog, servoStop, stopScript
+FIELDS = {"q": "actual_q", "qd": "actual_qd", "clock": "timestamp"}
 RUNNING, SAFE = 7, (1, 2)
 SEQUENCE = "input_int_register_19"
 UNIT, MODULUS = 1e-9, 2**31
+LIBRARY = "23"  # the register in which ur_rtde says what kind of register it has written
 
 
 @dataclass
@@ -29,6 +31,7 @@ class Session:
 
     outputs: list[str] = field(default_factory=list)
     layout: dict[str, tuple[int, struct.Struct]] = field(default_factory=dict)
+    size: int = 0  # bytes of one data package
     asked: list[list[str]] = field(default_factory=list)  # inputs whose answer is awaited
     inputs: dict[int, tuple[list[str], struct.Struct, list[int]]] = field(default_factory=dict)
 
@@ -89,12 +92,24 @@ class RtdeDecoder(Decoder):
                 form = struct.Struct(">" + SIZES.get(wire_type, "0s"))
                 layout[name] = (at, form)
                 at += form.size
-            session.layout = layout
+            session.layout, session.size = layout, 3 + at
         elif kind == "I" and session.asked:
             names = session.asked.pop(0)
             forms = [SIZES.get(wire_type, "0s") for wire_type in types]
             counts = [int(form[:-1] or 1) if len(form) > 1 else 1 for form in forms]
             session.inputs[body[0]] = (names, struct.Struct(">" + "".join(forms)), counts)
+
+    def patch(self, message: bytes, what: str, change: Change) -> bytes:
+        """See Decoder.patch."""
+        name = FIELDS[what]
+        for session in tuple(self._sessions.values()):
+            if message[2:3] != b"U" or len(message) != session.size or name not in session.layout:
+                continue
+            at, form = session.layout[name]
+            data = bytearray(message)
+            form.pack_into(data, 3 + at, *change(list(form.unpack_from(data, 3 + at))))
+            return bytes(data)
+        return message
 
     # -- data -------------------------------------------------------------------------------------
 
@@ -174,4 +189,4 @@ def _ours(name: str) -> bool:
     kind, _, number = name.rpartition("_")
     if kind == "input_double_register":
         return number in ("18", "19", "20", "21", "22")
-    return kind == "input_int_register" and number in ("18", "19", "20", "21")
+    return kind == "input_int_register" and number in ("18", "19", "20", "21", LIBRARY)

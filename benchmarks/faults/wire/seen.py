@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -43,6 +44,9 @@ class Write:
     state: int
 
 
+Change = Callable[[list[float]], list[float]]
+
+
 class Decoder(ABC):
     """Decodes one link, all its connections."""
 
@@ -51,3 +55,11 @@ class Decoder(ABC):
         self, time: float, connection: int, port: str, up: bool, message: bytes, state: int
     ) -> list[Fresh | Write]:
         """Return what a message tells; nothing for most."""
+
+    @abstractmethod
+    def patch(self, message: bytes, what: str, change: Change) -> bytes:
+        """Return a message to the client with the numbers of ``what`` changed, if it has them.
+
+        ``what``: ``q`` (rad), ``qd`` (rad/s) or ``clock`` (s), as far as the wire has it. What was
+        seen before has to have been fed: layouts are agreed on at the start of a connection.
+        """

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import struct
 
-from benchmarks.faults.wire.seen import Decoder, Fresh, Write
+from benchmarks.faults.wire.seen import Change, Decoder, Fresh, Write
 
 UNIT = math.radians(0.001)
 FEEDBACK = {0x2A5: 0, 0x2A6: 2, 0x2A7: 4}
@@ -72,3 +72,22 @@ class PiperDecoder(Decoder):
             return [Write(time, "broken", (), where, state)]
         q = tuple(self._written[i] for i in range(6))
         return [Write(time, "joints", q, where, state)]
+
+    def patch(self, message: bytes, what: str, change: Change) -> bytes:
+        """See Decoder.patch: two joints a frame, one motor's speed a frame; there is no clock."""
+        words = message.decode("ascii", "replace").strip("<> ").split()
+        if words[:1] != ["frame"] or len(words) < 4:
+            return message
+        identifier, data = int(words[1], 16), bytearray.fromhex("".join(words[3:]))
+        if what == "q" and identifier in FEEDBACK:
+            first = FEEDBACK[identifier]
+            q = [0.0] * 6
+            q[first : first + 2] = [v * UNIT for v in struct.unpack(">ii", data)]
+            changed = change(q)[first : first + 2]
+            struct.pack_into(">ii", data, 0, *(round(v / UNIT) for v in changed))
+        elif what == "qd" and 0x251 <= identifier <= 0x256:
+            speed = change([0.0] * 6)[identifier - 0x251]
+            struct.pack_into(">h", data, 0, round(speed * 1e3))
+        else:
+            return message
+        return f"< frame {words[1]} {words[2]} {data.hex().upper()} >".encode()

@@ -164,9 +164,9 @@ function showFigures() {
   const share = now.missed / Math.max(now.cycles + now.missed, 1);
   tile('missed', count(now.missed), `${(100 * share).toFixed(2)} %`, share > 0.002);
   tile('late', count(now.late));
-  tile('written', count(now.written), 'setpoints');
+  tile('setpoints sent', count(now.written));
   const held = Object.values(now.clamped).reduce((a, b) => a + b, 0);
-  tile('held back', count(held), 'by limits');
+  tile('held back', count(held));
 }
 
 function gauge(id, size, limit, unit) {
@@ -183,6 +183,9 @@ function showGauges() {
   const limits = seen.about.limits;
   gauge('gauge-offset', size(['offset_x', 'offset_y', 'offset_z']), limits.offset, 'mm');
   gauge('gauge-rotation', size(['offset_rx', 'offset_ry', 'offset_rz']), limits.offset_rotation, 'mrad');
+  text($('offset-caption'), ['compensating', 'holding'].includes(seen.now.state)
+    ? 'mm in base; the shaded range is the envelope that no setpoint leaves'
+    : 'mm in base, what would be corrected: nothing is written now; shaded: the envelope');
   text($('force-caption'), seen.now.sensor === 'ft_raw_wrench'
     ? 'N, flange sensor and axes; predicted: weight of the payload and pull on the tool'
     : 'N, pull on the tool in base; no flange sensor here, so nothing to predict');
@@ -204,11 +207,13 @@ function showHealth() {
   rows.push(row('heartbeat of the loop', now.heartbeat < 0.5 ? 'now' : `${duration(now.heartbeat)} ago`,
     now.heartbeat >= 0.5));
   rows.push(row('loop restarts', count(loop.restarts ?? 0), (loop.restarts ?? 0) > 0));
-  for (const [reason, times] of Object.entries(link.dropped || {})) {
-    rows.push(row(`dropped: ${reason}`, count(times), times > 0));
+  const dropped = Object.entries(link.dropped || {}).filter(([, times]) => times > 0);
+  if (!dropped.length) rows.push(row('samples dropped', '0'));
+  for (const [reason, times] of dropped) {
+    rows.push(row(`dropped: ${reason.replace(/_/g, ' ')}`, count(times), true));
   }
   for (const [name, times] of Object.entries(now.clamped)) {
-    if (times) rows.push(row(`held back: ${name.replace('_', ' ')}`, count(times)));
+    if (times) rows.push(row(`held back: ${name.replace(/_/g, ' ')}`, count(times)));
   }
   for (const [name, side] of Object.entries(status.sides || {})) {
     const dead = !side.pid;
@@ -216,13 +221,13 @@ function showHealth() {
     rows.push(row(name, `${dead ? 'not running' : 'running'}${again}`, dead || side.restarts > 0));
   }
   for (const [kind, times] of Object.entries(status.counts || {})) {
-    if (/fault|refused|failed/i.test(kind) && times) rows.push(row(kind, count(times), true));
+    if (times && kind !== 'late' && !kind.startsWith('dropped_')) {
+      rows.push(row(kind.replace(/_/g, ' '), count(times), true));
+    }
   }
   if (status.recording) rows.push(row('recording', String(status.recording).split('/').pop()));
-  if (status.recorder && status.recorder.lost !== undefined) {
-    rows.push(row('rows not recorded', count(status.recorder.lost), status.recorder.lost > 0));
-  } else if (status.lost_rows !== undefined) {
-    rows.push(row('rows not recorded', count(status.lost_rows), status.lost_rows > 0));
+  if (status.lost_rows !== undefined) {
+    rows.push(row('cycles not recorded', count(status.lost_rows), status.lost_rows > 0));
   }
   if (now.lost) rows.push(row('cycles this page did not see', count(now.lost)));
   $('health').replaceChildren(...rows);

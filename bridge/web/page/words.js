@@ -40,23 +40,28 @@ export function clock(epoch) {
 const KNOWN = new Set(['time', 'monotonic', 'sequence', 'kind', 'from', 'to', 'cause', 'detail',
   'cycle', 'session', 'text']);
 
+const SENTENCES = new Set(['failure', 'fault', 'ended', 'reason']);
+
+// a path by its last part: the rest only says where on that machine
+const shorter = (words) => words.replace(/(?:\/[^\s;,:/]+){2,}\/([^\s;,:/]+)/g, '…/$1').slice(0, 600);
+
 export function inWords(event) {
   const found = { title: event.kind || 'event', text: '', look: '' };
   if (event.to) {
     const to = String(event.to).toLowerCase();
     found.title = to;
     found.look = `to-${to}`;
-    found.text = [event.cause, event.detail].filter(Boolean).join(': ');
+    found.text = shorter([event.cause, event.detail].filter(Boolean).join(': '));
     return found;
   }
-  const told = [event.detail, event.text && String(event.text).length < 200 ? event.text : ''];
-  for (const [key, value] of Object.entries(event)) {
+  // the detail is a sentence already; what has none is told key by key
+  const told = event.detail ? [event.detail] : [];
+  for (const [key, value] of Object.entries(event.detail ? {} : event)) {
     if (KNOWN.has(key) || value === null || value === '') continue;
     const plain = typeof value === 'object' ? JSON.stringify(value) : String(value);
-    const speaks = typeof value === 'string' && ['failure', 'fault', 'ended', 'reason', 'words', 'message'];
-    told.push(speaks && speaks.includes(key) ? plain : `${key.replace(/_/g, ' ')} ${plain}`);
+    told.push(SENTENCES.has(key) ? plain : `${key.replace(/_/g, ' ')} ${plain}`);
   }
-  found.text = told.filter(Boolean).join('; ');
+  found.text = shorter(told.join('; '));
   if (['fault', 'refused'].includes(event.kind) || event.failure || event.fault) found.look = 'bad';
   return found;
 }

@@ -62,7 +62,7 @@ class Wire:
     keys: dict[str, Any] = field(default_factory=dict)
 
     def settings(self, **more: Any) -> FtSensorSettings:
-        keys = {**self.keys, **more}
+        keys = {"when_lost": "stop", **self.keys, **more}
         if isinstance(self.device, Ft300Device):
             keys["port"] = self.device.path
         return settings_of(**keys)

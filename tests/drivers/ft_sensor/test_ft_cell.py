@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 from bridge.cell import load_cell
+from bridge.recording.export import export
 from core.errors import InputError
 from drivers.simulated.settings import BENCH_PORT
 
@@ -94,8 +95,10 @@ def run_python(code: str, *arguments: object) -> dict[str, Any]:
 
 def recorded(folder: Path) -> list[dict[str, str]]:
     """Return the rows of the one recording there."""
-    (recording,) = (folder / "recordings").glob("run-*.csv")
-    with recording.open(encoding="utf-8") as lines:
+    (recording,) = (folder / "recordings").glob("run-*.mcap")
+    log = recording.with_suffix(".csv")
+    export(recording, log)
+    with log.open(encoding="utf-8") as lines:
         return list(csv.DictReader(lines))
 
 

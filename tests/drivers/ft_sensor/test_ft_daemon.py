@@ -13,7 +13,7 @@ import pytest
 BRIDGE = str(Path(__file__).resolve().parents[2] / "bridge")
 sys.path.insert(0, BRIDGE)
 
-from daemon_cell import Robot, Run, wait_for  # noqa: E402
+from daemon_cell import Robot, Run, offsets, wait_for  # noqa: E402
 from sensor_wires import Felt  # noqa: E402
 
 from bridge.supervisor import State  # noqa: E402
@@ -38,11 +38,11 @@ def sensor(robot: Robot) -> Iterator[RobotousNode]:
             yield node
 
 
-def cell_of(robot: Robot, sensor: RobotousNode, max_age: float = 0.1) -> Path:
+def cell_of(robot: Robot, sensor: RobotousNode, when_lost: str = "stop") -> Path:
     return robot.cell(
         ", state_timeout: 0.25",
         ft_sensor=f"{{driver: robotous_rft, interface: socketcand, host: {robot.host}, "
-        f"port: {sensor._settings.port}, max_age: {max_age}}}",
+        f"port: {sensor._settings.port}, max_age: 0.1, when_lost: {when_lost}}}",
     )
 
 
@@ -55,6 +55,9 @@ def test_a_silent_sensor_is_a_fault_and_its_return_is_observed(
         sensor.silent = True
         assert run.wait(State.FAULT) < 1.5
         sensor.silent = False
+        time.sleep(0.3)
+        if run.daemon.state == State.FAULT:  # else the link was given up and is a new one
+            run.daemon.disarm()
         run.wait(State.OBSERVING)
         time.sleep(0.3)
         run.end()
@@ -90,3 +93,28 @@ def test_overload_stops_the_writing(robot: Robot, sensor: RobotousNode) -> None:
         wait_for(lambda: run.daemon.state != State.COMPENSATING, 1.0, "no longer compensating")
         run.end()
     assert any("overload" in line for line in run.said), run.said
+
+
+def test_a_lost_sensor_drops_the_force_and_the_angles_stay_corrected(
+    robot: Robot, sensor: RobotousNode
+) -> None:
+    with Run(cell_of(robot, sensor, "degrade"), arm=True) as run:
+        run.wait(State.COMPENSATING)
+        time.sleep(1.0)
+        sensor.silent = True
+        wait_for(lambda: any("max_age" in line for line in run.said), 2.0, "the event")
+        time.sleep(0.5)
+        sensor.silent = False
+        wait_for(lambda: "the sensor is back" in run.said, 5.0, "the sensor")
+        time.sleep(0.3)
+        assert run.daemon.state == State.COMPENSATING
+        status = run.daemon.status()
+        summary = run.end()
+        cycles = run.cycles()
+    assert status["counts"]["sensor_lost"] == 1
+    assert summary.restarts == 0
+    lost = np.isnan(cycles["ft_raw_wrench_0"])
+    assert 0.3 < lost.mean() * summary.cycles / 500 < 3.0
+    moved = offsets(cycles)[:, :3]
+    assert np.linalg.norm(moved[lost], axis=1).min() > 1e-4  # the payload's part stays
+    assert np.linalg.norm(np.diff(moved, axis=0), axis=1).max() <= 0.05 * 0.002 * 5.001

@@ -1,0 +1,54 @@
+"""``python -m benchmarks.faults``: the matrix of faults and random sequences of them."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import click
+
+from benchmarks.faults.links import LINKS
+from benchmarks.faults.matrix import run_matrix
+from benchmarks.faults.report import PAGE, fill, matrix
+from benchmarks.faults.sequences import run_sequences
+from benchmarks.faults.table import ROWS
+
+
+@click.command()
+@click.option("--repeat", default=3, show_default=True, help="How often each fault is made.")
+@click.option("--link", "links", multiple=True, type=click.Choice(list(LINKS)), help="Only these.")
+@click.option("--row", "keys", multiple=True, type=click.Choice([r.key for r in ROWS]))
+@click.option("--rate", type=float, help="Hz, of the UR links; left out: their usual one.")
+@click.option("--sequences", default=0, show_default=True, help="Random sequences, over all links.")
+@click.option("--seed", default=1, show_default=True, help="Of the random sequences.")
+@click.option("--minutes", default=120.0, show_default=True, help="No fault is begun after them.")
+@click.option("--page", is_flag=True, help="Write the tables of docs/reliability.md.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder of cells, logs and results.")
+def main(
+    repeat: int, links: tuple[str, ...], keys: tuple[str, ...], rate: float | None,
+    sequences: int, seed: int, minutes: float, page: bool, out: Path | None,
+) -> None:  # fmt: skip
+    """Make every fault on every link where it can happen, and see what comes of it."""
+    folder = out or Path(tempfile.mkdtemp(prefix="faults-"))
+    chosen, begun = links or tuple(LINKS), time.monotonic()
+    wrong = 0
+    if repeat:
+        results = run_matrix(chosen, keys, repeat, folder, rate, click.echo, 60.0 * minutes)
+        wrong += sum(bool(result.wrong) for result in results)
+        click.echo(f"{len(results)} faults, {wrong} not as expected")
+        if page:
+            fill(PAGE, "matrix", matrix(ROWS, results))
+    if sequences:
+        left = 60.0 * minutes - (time.monotonic() - begun)
+        tally = run_sequences(chosen, sequences, seed, folder, rate, click.echo, left)
+        wrong += tally.violated + tally.stuck
+        click.echo(tally.words())
+        if page:
+            fill(PAGE, "sequences", tally.table())
+    sys.exit(1 if wrong else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Families of faults, one a file; table.py lists them all."""

@@ -1,0 +1,93 @@
+"""Making one fault on a running rig, and seeing what becomes of it."""
+
+from __future__ import annotations
+
+import time
+
+from benchmarks.faults.rig import Rig
+from benchmarks.faults.row import Result, Row
+from bridge.supervisor import State
+
+POLL = 0.001  # s
+AFTERWARDS = 0.25  # s for which the end state must stay
+END_LIMIT = 25.0  # s
+
+
+def make_fault(rig: Rig, row: Row) -> Result:
+    """Make a row's fault while the daemon compensates; returns what became of it."""
+    assert row.inject is not None
+    rig.compensate()
+    found = rig.found
+    found.largest_step, before = 0.0, found.violated
+    counts = rig.run.page.counts()
+    moment = time.time()
+    row.inject(rig)
+    detected = _await(rig, row, moment, counts)
+    rig.pass_time(row.lasting)
+    rig.heal()
+    if row.after is not None:
+        row.after(rig)
+    end = _settle(rig, row)
+    found = rig.found
+    wrong = _judge(rig, row, detected, end) + found.violations[-(found.violated - before) or 9999 :]
+    bounds = rig.checker.bounds
+    return Result(
+        row.key, rig.link.name, rig.link.cycle, detected, end, found.largest_step,
+        bounds.offset_rate * bounds.cycle, tuple(wrong),
+    )  # fmt: skip
+
+
+def _await(rig: Rig, row: Row, moment: float, before: dict[str, int]) -> float | None:
+    """Return how long after ``moment`` the fault was detected, s."""
+    until = time.monotonic() + row.within(rig.link) + 2.0
+    while time.monotonic() < until:
+        if row.sign == "none":
+            return 0.0
+        seen = _left(rig, moment) if row.sign == "left" else _counted(rig, row, before)
+        if seen is not None:
+            return seen - moment
+        rig.pass_time(POLL)
+    return None
+
+
+def _left(rig: Rig, moment: float) -> float | None:
+    """Return when compensating ended, by the loop's own word or by the end of its process."""
+    for event in rig.run.since(moment):
+        if event.get("from") == "COMPENSATING" or event["kind"] in ("fault", "failure"):
+            return float(event["time"])
+    return None
+
+
+def _counted(rig: Rig, row: Row, before: dict[str, int]) -> float | None:
+    names = row.sign.split("|")
+    now = rig.run.page.counts()
+    return time.time() if any(now[name] > before[name] for name in names) else None
+
+
+def _settle(rig: Rig, row: Row) -> str:
+    """Return the state in which the daemon comes to rest without a person."""
+    until = time.monotonic() + END_LIMIT
+    since, state = time.monotonic(), rig.run.state
+    while time.monotonic() < until:
+        now = rig.run.state
+        if now != state:
+            since, state = time.monotonic(), now
+        rests = state.name.lower() in row.end and state != State.HOLDING
+        if rests and time.monotonic() - since > AFTERWARDS:
+            break
+        rig.pass_time(POLL)
+    return state.name.lower()
+
+
+def _judge(rig: Rig, row: Row, detected: float | None, end: str) -> list[str]:
+    wrong = []
+    limit = row.within(rig.link)
+    if detected is None:
+        wrong.append(f"not detected ({rig.run.last_words()})")
+    elif detected > limit:
+        wrong.append(f"detected after {detected:.3f} s, allowed {limit:.3f}")
+    if end not in row.end:
+        wrong.append(f"ended {end}, expected {' or '.join(row.end)} ({rig.run.last_words()})")
+    if rig.run.error is not None:
+        wrong.append(f"the daemon ended: {rig.run.error}")
+    return wrong

@@ -1,0 +1,92 @@
+"""Runs the rows of the table, link by link, on one rig a link where that is possible."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from benchmarks.faults.injection import make_fault
+from benchmarks.faults.links import LINKS, Link
+from benchmarks.faults.rig import Rig
+from benchmarks.faults.row import Result, Row
+from benchmarks.faults.table import rows_of
+
+Say = Callable[[str], None]
+
+
+def run_matrix(
+    links: Sequence[str], keys: Sequence[str], repeat: int, folder: Path, rate: float | None,
+    say: Say, limit: float,
+) -> list[Result]:  # fmt: skip
+    """Make every fault ``repeat`` times on each of its links; returns what became of each.
+
+    ``keys``: rows, none for all. ``limit``: s, after which no further fault is begun.
+    """
+    until = time.monotonic() + limit
+    found: list[Result] = []
+    for name in links:
+        link = LINKS[name](rate if name.startswith("ur_") else None)
+        rows = [row for row in rows_of(name) if not keys or row.key in keys]
+        for result in _on_one_rig(link, rows * repeat, folder / name, until, say):
+            found.append(result)
+            _keep(folder, result)
+        for row in rows_of(name, apart=True) * repeat:
+            if (keys and row.key not in keys) or time.monotonic() > until:
+                continue
+            assert row.apart is not None
+            result = row.apart(row, link, folder / f"{name}-{row.key.replace(' ', '-')}")
+            found.append(result)
+            say(line(result))
+            _keep(folder, result)
+    return found
+
+
+def _on_one_rig(
+    link: Link, rows: Sequence[Row], folder: Path, until: float, say: Say
+) -> Iterator[Result]:
+    """Make faults one after the other; a rig that is beyond recovery is replaced by a new one."""
+    left = list(rows)
+    while left and time.monotonic() < until:
+        with Rig(link, folder) as rig:
+            while left and time.monotonic() < until:
+                row = left.pop(0)
+                try:
+                    result = make_fault(rig, row)
+                except Exception as error:
+                    result = _failed(rig, row, error)
+                say(line(result))
+                yield result
+                if rig.run.error is not None or not rig.run.alive:
+                    break
+
+
+def _failed(rig: Rig, row: Row, error: Exception) -> Result:
+    """Return the result of a fault after which the rig could not go on."""
+    traceback.print_exc(file=sys.stderr)
+    bounds = rig.checker.bounds
+    return Result(
+        row.key, rig.link.name, rig.link.cycle, None, rig.run.state.name.lower(),
+        rig.checker.found.largest_step, bounds.offset_rate * bounds.cycle,
+        (f"{type(error).__name__}: {error}",),
+    )  # fmt: skip
+
+
+def _keep(folder: Path, result: Result) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "results.jsonl").open("a", encoding="utf-8") as file:
+        file.write(json.dumps(asdict(result)) + "\n")
+
+
+def line(result: Result) -> str:
+    """Return a result in one line."""
+    after = "not detected"
+    if result.detected is not None:
+        after = f"after {result.cycles:.1f} cycles ({1e3 * result.detected:.0f} ms)"
+    step = f"largest step {1e6 * result.largest_step:.0f} um"
+    words = f"{result.link:15} {result.row:24} {after:34} {step:24} end {result.end}"
+    return words + "".join(f"\n    NOT AS EXPECTED: {wrong}" for wrong in result.wrong)

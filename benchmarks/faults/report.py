@@ -1,0 +1,58 @@
+"""The results as tables in docs/reliability.md, between marks; nothing else of the page changes."""
+
+from __future__ import annotations
+
+import statistics
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from benchmarks.faults.row import Result, Row
+
+PAGE = Path(__file__).parents[2] / "docs" / "reliability.md"
+
+
+def fill(page: Path, mark: str, text: str) -> None:
+    """Put ``text`` between the marks of a page. Raises ValueError where it has none."""
+    begin, end = f"<!-- {mark}: begin -->", f"<!-- {mark}: end -->"
+    before, found, rest = page.read_text(encoding="utf-8").partition(begin)
+    _, ended, after = rest.partition(end)
+    if not (found and ended):
+        raise ValueError(f"{page}: found no marks of {mark!r}")
+    page.write_text(f"{before}{begin}\n{text}\n{end}{after}", encoding="utf-8")
+
+
+def matrix(rows: Iterable[Row], results: Sequence[Result]) -> str:
+    """Return the matrix of faults, a line for each row and link."""
+    by_case: dict[tuple[str, str], list[Result]] = defaultdict(list)
+    for result in results:
+        by_case[result.row, result.link].append(result)
+    lines = [
+        "| fault | how it is made | link | times | detected after, cycles: median, worst (ms) "
+        "| largest step, µm (one cycle's allowance) | end | not as expected |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for row in rows:
+        for (key, link), found in by_case.items():
+            if key == row.key:
+                lines.append(_line(row, link, found))
+    return "\n".join(lines)
+
+
+def _line(row: Row, link: str, found: Sequence[Result]) -> str:
+    cycles = [r.cycles for r in found if r.cycles is not None and row.sign != "none"]
+    detected = "not to be detected: tolerated" if row.sign == "none" else "-"
+    if cycles:
+        worst = max(r.detected or 0.0 for r in found)
+        detected = f"{statistics.median(cycles):.1f}, {max(cycles):.1f} ({1e3 * worst:.0f})"
+    step = 1e6 * max(r.largest_step for r in found)
+    ends = ", ".join(
+        f"{end} {count}" if len({r.end for r in found}) > 1 else end
+        for end, count in Counter(r.end for r in found).most_common()
+    )
+    wrong = sum(bool(r.wrong) for r in found)
+    allowed = 1e6 * found[0].step_allowed
+    return (
+        f"| {row.fault} | {row.how} | {link} | {len(found)} | {detected} | "
+        f"{step:.0f} ({allowed:.0f}) | {ends} | {wrong or 'none'} |"
+    )
