@@ -65,8 +65,7 @@ def _following(model: Model, motion: Motion, rows: Index) -> Predict:
 
     @lru_cache(maxsize=REMEMBERED)
     def joint_under(joint: int, own: tuple[Term, ...]) -> Array:
-        whole: Array = predict_tracking(model, motion, own)
-        return whole[rows, joint - 1]
+        return np.asarray(predict_tracking(model, motion, own)[rows, joint - 1])
 
     def predict(terms: Sequence[Term]) -> Array:
         told = plain.copy()
