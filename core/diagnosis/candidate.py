@@ -45,6 +45,11 @@ class Candidate:
         return self.family != "smooth"
 
     @property
+    def of_no_quantity(self) -> bool:
+        """Return whether this is an unnamed cause that goes by no column of the log."""
+        return not self.named and not self.quantity
+
+    @property
     def by_own_angle(self) -> bool:
         """Return whether this is a smooth function of the very joint that it moves."""
         return bool(self.target) and self.target == own_target(self.quantity)

@@ -18,6 +18,7 @@ SMOOTH_TERMS = 2  # more unnamed functions than that tell nothing more
 LINES = 4  # periodic lines a joint may have
 MORE_LINES = 8  # where the log is as large as this
 MANY_ROWS = 1500  # rows of the sample space
+DEPENDENT = 1e-5  # share of a block below which a direction counts as given by its others
 
 
 @dataclass
@@ -55,23 +56,24 @@ def clash(space: Space, chosen: Sequence[int], new: int) -> bool:
 
 def grow(space: Space, state: State, new: int, score: float) -> State:
     """Return the state with one more term."""
-    block = state.P[:, space.start[new] : space.start[new + 1]]
-    unit = np.sqrt(np.einsum("ij,ij->j", block, block)) + 1e-300
-    U, s, _ = np.linalg.svd(block / unit, full_matrices=False)
-    U = U[:, s > 1e-5]
+    U = _directions(state.P[:, space.start[new] : space.start[new + 1]])
     P = state.P - U @ (U.T @ state.P)
     r = state.r - U @ (U.T @ state.r)
     return State((*state.chosen, new), P, r, float(r @ r), score)
+
+
+def _directions(block: Array) -> Array:
+    """Return an orthonormal basis of columns (m, r), nearly dependent ones left out."""
+    unit = np.sqrt(np.einsum("ij,ij->j", block, block)) + 1e-300
+    U, s, _ = np.linalg.svd(block / unit, full_matrices=False)
+    return np.asarray(U[:, s > DEPENDENT])
 
 
 def projected(space: Space, chosen: Sequence[int]) -> State:
     """Return the state of a whole set."""
     if not chosen:
         return State((), space.X, space.y, float(space.y @ space.y), 0.0)
-    block = space.columns(chosen)
-    unit = np.sqrt(np.einsum("ij,ij->j", block, block)) + 1e-300
-    U, s, _ = np.linalg.svd(block / unit, full_matrices=False)
-    U = U[:, s > 1e-5]
+    U = _directions(space.columns(chosen))
     r = space.y - U @ (U.T @ space.y)
     return State(tuple(chosen), space.X - U @ (U.T @ space.X), r, float(r @ r), 0.0)
 
@@ -113,13 +115,13 @@ def beam_search(
     states, best, waited = [empty], empty.score, 0
     met: dict[frozenset[int], Found] = {frozenset(): Found((), empty.score, rss)}
     for _ in range(allowed_depth):
-        children: dict[frozenset[int], tuple[float, int, int]] = {}
+        born: dict[frozenset[int], tuple[float, int, int]] = {}
         for s, state in enumerate(states):
             for score, c in offspring(space, state, max(2 * beam, 12), named_only):
                 key = frozenset((*state.chosen, c))
-                if key not in children or score < children[key][0]:
-                    children[key] = (score, s, c)
-        ranked = sorted(children.values())[: max(2 * beam, 12)]
+                if key not in born or score < born[key][0]:
+                    born[key] = (score, s, c)
+        ranked = sorted(born.values())[: max(2 * beam, 12)]
         checked = []
         for _, s, c in ranked:
             found = fit(space, (*states[s].chosen, c))

@@ -90,7 +90,7 @@ def joined_sets(space: Space, found: Found) -> list[Found]:
     Named causes that together imitate something unknown fall away where it is given its own term;
     where they stand in each other's way, the set grows from that term anew.
     """
-    unnamed = {c for c, k in enumerate(space.candidates) if not (k.named or k.quantity)}
+    unnamed = {c for c, k in enumerate(space.candidates) if k.of_no_quantity}
     joiners = unnamed | {c for _, c in children(space, found.chosen, 4)}
     new = sorted(joiners - set(found.chosen))
     sets = [pruned(space, fit(space, (*found.chosen, c))) for c in new]

@@ -73,7 +73,7 @@ def _kind(candidate: Candidate) -> str:
     """Return among how many of its like a candidate was tried: usual lines are few."""
     if candidate.family == "transmission_error" and (candidate.site.order or 0) in USUAL_ORDERS:
         return "usual lines"
-    if not candidate.named and not candidate.quantity:
+    if candidate.of_no_quantity:
         return "rivals"
     return candidate.family
 

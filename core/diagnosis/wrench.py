@@ -48,7 +48,8 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     def predict(terms: Sequence[Term]) -> Array:
         return predict_wrench(model, motion, terms)
 
-    noise = _noise(measured[whole.rows], whole, value, predict(()), motion)
+    expected = predict(())
+    noise = _noise(measured[whole.rows], whole, value, expected, motion)
     return Observation(
         channel="wrench",
         unit="N",
@@ -58,7 +59,7 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
         weight=np.repeat([1.0, torque_weight(noise, value)], 3),
         sigma=0.0,
         sigma_is_whole=False,
-        quantities=quantities(log, motion) | _readings(predict(())),
+        quantities=quantities(log, motion) | _readings(expected),
         groups=conditions(motion),
         rows=motion.rows,
         axes=AXES,
