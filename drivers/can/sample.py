@@ -21,8 +21,12 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One complete sample, SI units; (n,) each, NaN where a joint has not told yet."""
+    """One complete sample, SI units; (n,) each, NaN where a joint has not told yet.
 
+    All quantities are rows of ``table`` (q, n), the position first, then ``others`` in order.
+    """
+
+    table: Vector
     position: Vector  # rad
     others: dict[str, Vector]  # velocity rad/s, torque Nm, temperature °C
     stamp: float  # s, clock of the bus, of its last frame
@@ -162,4 +166,4 @@ class Assembler:
     def _sample(self, stamp: float, received: float) -> Sample:
         table = self._plan.table()
         others = dict(zip(self._plan.names[1:], table[1:], strict=True))
-        return Sample(table[0], others, stamp, received, self._began)
+        return Sample(table, table[0], others, stamp, received, self._began)
