@@ -199,6 +199,7 @@ class Daemon:
 
     def _run_loop(self, arm: bool, duration: float | None) -> None:
         """Run one process of the loop to its end."""
+        self._last_state = State.DISCONNECTED
         self._failure = {}
         loop = self.loop = LoopProcess(
             self.settings, self.page, arm, self.may_write, self.output, self.restarts,

@@ -7,8 +7,10 @@ was compensating before and the new cell says itself that it arms.
 from __future__ import annotations
 
 import threading
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bridge.cell.cell import complaints
 from bridge.owner_lock import address_of
 from bridge.run_settings import Configuration, read_configuration
 from bridge.shared_page import Command, Phase
@@ -67,7 +69,8 @@ class Reload:
             self._next = self._fitting(found)
         except GapbridgeError as error:
             daemon.manager.ready()
-            self._tell(False, f"the cell file was not taken, the old one stays: {error}")
+            words = "; ".join(_all_of(daemon.settings.cell, error))
+            self._tell(False, f"the cell file was not taken, the old one stays: {words}")
             return
         self._rearm = state == State.COMPENSATING and found.settings.setpoints.arm
         changed = [
@@ -99,3 +102,11 @@ class Reload:
         self._daemon.book.add(
             {"kind": "configuration", "ok": fine, "hash": hashed, "detail": words}
         )
+
+
+def _all_of(cell: Path, error: GapbridgeError) -> list[str]:
+    """Return everything that is wrong with a cell file, where it is more than one thing."""
+    try:
+        return complaints(cell) or [str(error)]
+    except GapbridgeError:
+        return [str(error)]

@@ -259,6 +259,7 @@ class Compensator:
     def forget(self) -> None:
         """Begin the next correction from nothing, whatever was solved last."""
         self._offset[:] = 0.0
+        self._shape[:] = 0.0
 
     def _solve_conditioned(self, nominal: Array, loads: Loads, q: Array) -> tuple[float, int]:
         """Solve where effects in the model look at the joint angles anew in each step."""

@@ -33,7 +33,7 @@ class Rig:
         self.checker = Checker(link.bounds(self.cell))
         self._runs: list[Running] = []
         self.decoder = link.decoder()
-        self.tap = Tap(self.decoder, self._state_word)
+        self.tap = Tap(self.decoder, link.ports(), self._state_word)
         self.proxy = Proxy(self.front, self.back, link.ports(), self.tap.tell)
 
     def _state_word(self) -> int:

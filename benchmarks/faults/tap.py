@@ -7,17 +7,20 @@ called, in another thread.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
-from benchmarks.faults.proxy import UP
+from benchmarks.faults.proxy import UP, Port
+from benchmarks.faults.splitting import Splitter
 from benchmarks.faults.wire.seen import Decoder, Fresh, Write
 
 
 class Tap:
     """Messages of one link; ``state`` gives the supervisor's state at this moment."""
 
-    def __init__(self, decoder: Decoder, state: Callable[[], int]) -> None:
+    def __init__(self, decoder: Decoder, ports: Iterable[Port], state: Callable[[], int]) -> None:
         self.state = state
+        self._splitters = {port.name: port.splitter for port in ports}
+        self._whole: dict[int, Splitter] = {}  # by connection: what came in pieces
         self._decoder = decoder
         self._kept: deque[tuple[float, int, str, bool, bytes, int]] = deque()
         self.messages = 0
@@ -36,5 +39,12 @@ class Tap:
         """Return what has been seen since the last call, in ``most`` messages at most."""
         found: list[Fresh | Write] = []
         for _ in range(len(self._kept) if most is None else min(most, len(self._kept))):
-            found += self._decoder.feed(*self._kept.popleft())
+            time, connection, port, up, message, state = self._kept.popleft()
+            for whole in (message,) if up else self._joined(connection, port, message):
+                found += self._decoder.feed(time, connection, port, up, whole, state)
         return found
+
+    def _joined(self, connection: int, port: str, piece: bytes) -> list[bytes]:
+        """Return the messages that are whole for the client: harm may have split them."""
+        splitter = self._whole.setdefault(connection, self._splitters[port]())
+        return splitter.feed(piece)

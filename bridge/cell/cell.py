@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from bridge.cell.document import Document, read_document
 from bridge.cell.effects import compliance_terms, term_of
-from bridge.cell.message import message
+from bridge.cell.message import message, messages
 from bridge.cell.robot import build_arm
 from bridge.cell.schema import CellFile, Frame, Simulation
 from bridge.metrics.settings import MetricsSettings
@@ -117,6 +117,16 @@ def load_cell(path: Path | str) -> Cell:
     except ValidationError as error:
         raise CellError(message(document, CellFile, error)) from None
     return cell_of(file, document)
+
+
+def complaints(path: Path) -> list[str]:
+    """Return a line for everything that is wrong with a cell file's keys; none where they fit."""
+    document = read_document(path)
+    try:
+        CellFile.model_validate({k: v for k, v in document.data.items() if v is not None})
+    except ValidationError as error:
+        return messages(document, CellFile, error)
+    return []
 
 
 def cell_of(file: CellFile, document: Document) -> Cell:

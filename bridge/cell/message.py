@@ -55,8 +55,16 @@ def message(document: Document, schema: type[BaseModel], error: ValidationError)
 
     Unknown keys come first: a misspelt key is also a missing one.
     """
+    return messages(document, schema, error)[0]
+
+
+def messages(document: Document, schema: type[BaseModel], error: ValidationError) -> list[str]:
+    """Return a line for everything that is wrong, unknown keys first; see message."""
     details = sorted(error.errors(), key=lambda d: d["type"] != "extra_forbidden")
-    worst = details[0]
+    return [_line(document, schema, detail) for detail in details]
+
+
+def _line(document: Document, schema: type[BaseModel], worst: ErrorDetails) -> str:
     if worst["type"] == "invalid_key":
         return f"{document.path}: found a key {worst['input']!r}, expected a word"
     keys, model = _own_keys(schema, worst["loc"])

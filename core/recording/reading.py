@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -53,10 +54,13 @@ def files_of(path: Path) -> list[Path]:
     """
     if path.is_file():
         return [path]
-    found = sorted(path.parent.glob(f"{path.name}-[0-9]*{SUFFIX}")) if path.name else []
+    name = re.compile(rf"{re.escape(path.name)}-(\d{{3,}}){re.escape(SUFFIX)}")
+    folder = path.parent
+    matches = [name.fullmatch(one.name) for one in folder.iterdir()] if folder.is_dir() else []
+    found = sorted((int(match[1]), match[0]) for match in matches if match)
     if not found:
         raise LogError(f"{path}: file not found, expected a recording of the daemon (MCAP)")
-    return found
+    return [folder / one for _, one in found]
 
 
 def read_batches(path: Path) -> Iterator[Batch]:

@@ -56,6 +56,7 @@ class CanDriver(Driver):
         self._slot = 0.0  # s, when an arm that must be asked is asked next
         self._changed = 0.0  # s, monotonic: when the joints last changed
         self._q: Vector | None = None
+        self._angles: list[float] = []  # the same, as they were told in the last sample
         self._broken = 0  # samples dropped, as far as they were told
         self._kept: Sample | None = None  # came before a dropped one was told
         self._listening = 0.0  # s, monotonic: since when other commanders would be heard
@@ -168,11 +169,13 @@ class CanDriver(Driver):
     def _check_frozen(self, sample: Sample) -> None:
         """Refuse joints that stand still bit by bit though they were sent elsewhere."""
         now, target = sample.received, self.writer.target
-        if self._q is None or (sample.position != self._q).any():
-            self._q, self._changed = sample.position, now
+        # plain numbers: arrays of six cost more
+        q = sample.position.tolist()
+        if q != self._angles:
+            self._q, self._angles, self._changed = sample.position, q, now
         if self._armed_at is None or target is None:
             return
-        away = float(np.abs(target - sample.position).max())
+        away = max(abs(goal - angle) for goal, angle in zip(target.tolist(), q, strict=True))
         if away < self.settings.frozen_distance:
             self._changed = now
         elif now - self._changed > self.settings.frozen_after:
@@ -229,7 +232,7 @@ class CanDriver(Driver):
             self._ask()
             sample = self.reader.listen(min(max(left, 0.001), 1.0 / self.rate))
             if sample is not None and np.isfinite(sample.position).all():
-                self._q = sample.position
+                self._q, self._angles = sample.position, sample.position.tolist()
             if seconds == 0.0:
                 return
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.can.plan import Reading
 from drivers.can.profile import CanProfile, Incoming, Key
 
 Vector = NDArray[np.float64]
@@ -20,8 +21,12 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One complete sample, SI units; (n,) each, NaN where a joint has not told yet."""
+    """One complete sample, SI units; (n,) each, NaN where a joint has not told yet.
 
+    All quantities are rows of ``table`` (q, n), the position first, then ``others`` in order.
+    """
+
+    table: Vector
     position: Vector  # rad
     others: dict[str, Vector]  # velocity rad/s, torque Nm, temperature °C
     stamp: float  # s, clock of the bus, of its last frame
@@ -35,11 +40,14 @@ class Assembler:
     def __init__(self, profile: CanProfile) -> None:
         self._profile = profile
         self._members = frozenset(profile.sample)
-        self._held: dict[Key, dict[str, float]] = {}
+        # messages that carry nothing but joints are taken apart together, once a sample is whole
+        self._plan = Reading(profile)
+        self._slots = self._plan.slots
+        self._held: dict[Key, dict[str, float] | bytes] = {}
         self._first = 0.0  # s, bus clock
         self._began = 0.0  # s, monotonic
         self._count: float | None = None
-        self._values = {name: np.full(profile.n, np.nan) for name in profile.quantities}
+        self._values = self._plan.wire
         self.dropped: Counter[str] = Counter()  # reason -> frames or sets
         self.status: dict[tuple[Key, str], tuple[float, str, bool]] = {}
         self.enabled: dict[tuple[Key, str], bool] = {}
@@ -74,6 +82,14 @@ class Assembler:
         if self._seen.get(key) == data:  # the same bytes say the same: most of an arm's status
             self.heard[key] = received
             return None
+        slot = self._slots.get(key)
+        if slot is not None and len(data) == incoming.length:
+            self.heard[key] = received
+            if key in self._members:
+                return self._collect(incoming, data, stamp, received)
+            self._seen[key] = data
+            self._plan.put(slot, data)
+            return None
         try:
             values = incoming.decode(data)
         except ValueError:
@@ -107,7 +123,7 @@ class Assembler:
             self._values[reading.quantity][reading.joint] = values[reading.signal]
 
     def _collect(
-        self, incoming: Incoming, values: dict[str, float], stamp: float, received: float
+        self, incoming: Incoming, values: dict[str, float] | bytes, stamp: float, received: float
     ) -> Sample | None:
         profile, key = self._profile, incoming.key
         if self._held and self._breaks(incoming, values, stamp):
@@ -123,26 +139,31 @@ class Assembler:
         if len(self._held) < len(self._members):
             return None
         held, self._held = self._held, {}
-        if incoming.counter is not None:
+        if incoming.counter is not None and not isinstance(values, bytes):
             if values[incoming.counter] == self._count:
                 self.dropped["repeated"] += 1
                 return None
             self._count = values[incoming.counter]
         for member, found in held.items():
-            self._read(profile.incoming[member], found)
+            if isinstance(found, bytes):
+                self._plan.put(self._slots[member], found)
+            else:
+                self._read(profile.incoming[member], found)
         return self._sample(stamp, received)
 
-    def _breaks(self, incoming: Incoming, values: dict[str, float], stamp: float) -> bool:
+    def _breaks(self, incoming: Incoming, values: dict[str, float] | bytes, stamp: float) -> bool:
         """Return whether a frame cannot belong to the sample that has been begun."""
         if incoming.key in self._held or not 0.0 <= stamp - self._first <= self._profile.window:
             return True
         if self._profile.ordered and self._profile.sample[len(self._held)] != incoming.key:
             return True
-        if incoming.counter is None:
+        counter = incoming.counter
+        if counter is None or isinstance(values, bytes):
             return False
-        return any(v[incoming.counter] != values[incoming.counter] for v in self._held.values())
+        count = values[counter]
+        return any(isinstance(v, bytes) or v[counter] != count for v in self._held.values())
 
     def _sample(self, stamp: float, received: float) -> Sample:
-        joints = self._profile.joints
-        found = {name: joints.to_si(name, value) for name, value in self._values.items()}
-        return Sample(found.pop("position"), found, stamp, received, self._began)
+        table = self._plan.table()
+        others = dict(zip(self._plan.names[1:], table[1:], strict=True))
+        return Sample(table, table[0], others, stamp, received, self._began)

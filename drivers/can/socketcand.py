@@ -21,10 +21,13 @@ class SocketcandBus(SocketCanDaemonBus):
     """A bus served by socketcand; raises CanOperationError when the server has left."""
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        before = time.monotonic()
+        at_once = timeout is None or timeout <= 0.0
+        before = 0.0 if at_once else time.monotonic()
         message, filtered = super()._recv_internal(timeout)  # type: ignore[no-untyped-call]
-        early = timeout is None or time.monotonic() - before < timeout or timeout <= 0.0
-        if message is None and early and self._ended():
+        if message is not None:
+            return message, filtered
+        early = at_once or timeout is None or time.monotonic() - before < timeout
+        if early and self._ended():
             raise can.CanOperationError("the socketcand server has closed the connection")
         return message, filtered
 

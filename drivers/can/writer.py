@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from core.errors import PartialWriteError, WriteError
 from drivers.can.bus import first_line
+from drivers.can.plan import Writing
 from drivers.can.profile import Action, CanProfile, Key, Outgoing
 from drivers.can.settings import CanSettings
 
@@ -24,6 +25,7 @@ class FrameWriter:
     def __init__(self, settings: CanSettings, profile: CanProfile) -> None:
         self._settings, self._profile = settings, profile
         self.bus: Any = None
+        self._plan = Writing(profile)
         self._last: Frames | None = None  # the setpoint that got out whole
         self.target: Vector | None = None  # rad, the same as joints
         self.mended = 0  # setpoints that had to be taken back
@@ -70,6 +72,9 @@ class FrameWriter:
 
     def _encode(self, q: Vector) -> Frames:
         """Return all frames before any is sent. Raises WriteError."""
+        plan = self._plan
+        if plan.able and q.shape == (self._profile.n,) and (frames := plan.frames(q)) is not None:
+            return frames
         if q.shape != (self._profile.n,) or not np.isfinite(q).all():
             raise WriteError(f"{self._profile.name}: found {q}, expected finite joints")
         wire: list[float] = self._profile.joints.to_wire(q).tolist()

@@ -178,7 +178,7 @@ def test_words_from_the_robot_are_shown_and_never_run(browser, feed):
         live(page)
         feed.tell(kind="fault", detail="<img src=x onerror=document.title='run'>")
         page.wait_for_function(
-            "document.querySelector('#events').textContent.includes('<img')", timeout=3000
+            "() => document.querySelector('#events').textContent.includes('<img')", timeout=3000
         )
         assert page.locator("#events img").count() == 0
         assert complaints == []

@@ -10,9 +10,11 @@ import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from jsonschema import Draft202012Validator, validate
 from mcap.reader import NonSeekingReader, SeekingReader
 from recorded import SESSION, Array, Desk, publish, same_bits
 
+from bridge.recording.folder import new_session, segments
 from core.errors import LogError
 from core.recording.reading import (
     files_of,
@@ -23,6 +25,12 @@ from core.recording.reading import (
     read_documents,
 )
 from core.recording.records import chunk_offsets, is_whole
+
+EVENTS: list[dict[str, object]] = [
+    {"kind": "transition", "from": "OBSERVING", "to": "FAULT", "cause": "silence", "detail": "-"},
+    {"kind": "status", "state": "fault", "since": 3.0, "why": ""},
+    {"kind": "note", "detail": "a word"},
+]
 
 
 @pytest.fixture
@@ -45,8 +53,13 @@ def test_every_number_of_every_cycle_comes_back_bit_for_bit(desk: Desk) -> None:
 
 
 def test_mcaps_own_readers_and_protobufs_own_decoder_read_the_same(desk: Desk) -> None:
-    rows = desk.record(120)
-    (path,) = desk.files
+    desk.recorder().close()
+    recorder = desk.recorder()
+    rows = publish(desk.page, 120)
+    for event in EVENTS:
+        recorder.take({"time": 5.0, "monotonic": 1.0, "sequence": 1, **event})
+    recorder.close()
+    path = desk.files[-1]
     for reader in (SeekingReader, NonSeekingReader):
         with path.open("rb") as file:
             seen: dict[str, list[object]] = {}
@@ -61,8 +74,10 @@ def test_mcaps_own_readers_and_protobufs_own_decoder_read_the_same(desk: Desk) -
                     seen.setdefault(channel.topic, []).append(kind.FromString(message.data))
                 else:
                     assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
-                    assert json.loads(schema.data)["type"] == "object"
-                    json.loads(message.data)
+                    rules = json.loads(schema.data)
+                    assert rules["type"] == "object"
+                    Draft202012Validator.check_schema(rules)
+                    validate(json.loads(message.data), rules)
         assert {topic: len(found) for topic, found in seen.items()} == {
             "/state": 120, "/setpoint": 120, "/loop": 120,
         }  # fmt: skip
@@ -186,6 +201,16 @@ def test_another_file_is_one_clear_line(tmp_path: Path) -> None:
     assert read_columns(tmp_path / "empty.mcap") == {}
 
 
+def test_the_files_of_a_run_are_its_own_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    ours = ["run-1-002.mcap", "run-1-999.mcap", "run-1-1000.mcap"]
+    others = ["run-1-2-001.mcap", "run-1.loop.log", "run-10-001.mcap", "run-1-003.mcap.part"]
+    for name in ours + others:
+        (tmp_path / name).touch()
+    assert [path.name for path in files_of(tmp_path / "run-1")] == ours
+    assert [path.name for path in files_of(tmp_path / "run-1-2")] == ["run-1-2-001.mcap"]
+    assert segments(tmp_path, "run-1") == files_of(tmp_path / "run-1")
+
+
 def test_files_change_by_size_and_a_run_reads_as_a_whole(tmp_path: Path) -> None:
     desk = Desk(tmp_path, segment_size=0.02)
     rows = desk.record(*[60] * 8)
@@ -225,6 +250,16 @@ def test_the_oldest_files_make_room(tmp_path: Path) -> None:
     ours = [path for path in desk.files if path != foreign]
     assert len(ours) > 1
     assert sum(path.stat().st_size for path in ours) < 0.1e6 + 2 * 60_000
+
+
+def test_a_session_is_named_anew_while_its_name_is_taken(tmp_path: Path) -> None:
+    names = set()
+    for _ in range(3):
+        name = new_session(tmp_path)
+        names.add(name)
+        (tmp_path / f"{name}-001.mcap").touch()
+    assert len(names) == 3
+    assert new_session(None).startswith("run-")
 
 
 def test_every_so_manieth_cycle_is_counted_over_files(tmp_path: Path) -> None:

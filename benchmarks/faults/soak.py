@@ -1,0 +1,160 @@
+"""Faults every few seconds for a long while: ``python -m benchmarks.faults.soak --rate 500``.
+
+Prints what was written, what was missed outside faults, and how the memory of each process grew.
+"""
+
+from __future__ import annotations
+
+import random
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import click
+import numpy as np
+import psutil
+
+from benchmarks.faults.links import LINKS
+from benchmarks.faults.report import PAGE, fill
+from benchmarks.faults.rig import Rig
+from benchmarks.faults.table import rows_of
+
+QUIET = 1.0  # s after a fault, until the daemon compensates again, that do not count as quiet
+SAMPLE = 1.0  # s between two looks at the memory
+
+
+@dataclass
+class Memory:
+    """Resident memory over time, by process: (s, MB)."""
+
+    points: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+
+    def look(self, rig: Rig, begun: float) -> None:
+        """Take down what each process of the daemon holds now."""
+        pids = {f"loop {rig.run.daemon.loop_pid}": rig.run.daemon.loop_pid}
+        pids |= {f"{name}": side["pid"] for name, side in rig.run.daemon.sides.status().items()}
+        for name, pid in pids.items():
+            if pid is None:
+                continue
+            try:
+                size = psutil.Process(pid).memory_info().rss / 1e6
+            except psutil.Error:
+                continue
+            self.points.setdefault(name, []).append((time.monotonic() - begun, size))
+
+    def slope(self, prefix: str) -> tuple[float, float, float]:
+        """Return MB a minute of the process seen longest, its last MB, and for how long, s.
+
+        The first fifth of its life is left out: what is loaded once is no leak.
+        """
+        series = [points for name, points in self.points.items() if name.startswith(prefix)]
+        if not series:
+            return 0.0, 0.0, 0.0
+        longest = np.array(max(series, key=lambda points: points[-1][0] - points[0][0]))
+        kept = longest[len(longest) // 5 :]
+        span = float(longest[-1, 0] - longest[0, 0])
+        rate = float(np.polyfit(kept[:, 0], kept[:, 1], 1)[0]) * 60.0 if len(kept) > 2 else 0.0
+        return rate, float(longest[-1, 1]), span
+
+
+@dataclass
+class Quiet:
+    """Cycles while nothing was wrong: how many there were, how many were missed."""
+
+    cycles: int = 0
+    missed: int = 0
+
+    @property
+    def share(self) -> float:
+        """Return the share missed, in percent."""
+        return 100.0 * self.missed / max(self.cycles + self.missed, 1)
+
+
+def soak(
+    link: str, rate: float | None, minutes: float, every: float, seed: int, folder: Path,
+    severe: float,
+) -> tuple[Rig, Quiet, Memory, dict[str, int]]:  # fmt: skip
+    """Make a fault every ``every`` s for ``minutes``; ``severe``: share that restarts processes."""
+    draw, memory, quiet = random.Random(seed), Memory(), Quiet()
+    made: dict[str, int] = {}
+    rows = [row for row in rows_of(link) if row.inject is not None]
+    with Rig(LINKS[link](rate), folder, RECORDED) as rig:
+        begun = time.monotonic()
+        reader = rig.run.page.reader()
+        at = rig.run.page.slices["missed"].start
+        while time.monotonic() - begun < 60.0 * minutes:
+            rig.compensate()
+            rig.pass_time(0.3)
+            reader.drain()
+            until, looked = time.monotonic() + draw.uniform(0.5, 1.5) * every, 0.0
+            while time.monotonic() < until:
+                rig.pass_time(0.1)
+                missed = reader.drain()
+                quiet.cycles += len(missed)
+                quiet.missed += int(missed[:, at].sum())
+                if time.monotonic() - looked > SAMPLE:
+                    looked = time.monotonic()
+                    memory.look(rig, begun)
+            choice = [row for row in rows if row.slow == (draw.random() < severe)] or rows
+            row = draw.choice(choice)
+            assert row.inject is not None
+            row.inject(rig)
+            made[row.key] = made.get(row.key, 0) + 1
+            rig.pass_time(min(row.lasting, 0.5))
+        rig.recover()
+        rig.check()
+    return rig, quiet, memory, made
+
+
+RECORDED = ""  # sections of the daemon's cell in place of the usual ones
+
+
+@click.command()
+@click.option("--link", type=click.Choice(list(LINKS)), default="ur_servoj", show_default=True)
+@click.option("--rate", type=float, help="Hz; left out: the link's usual one.")
+@click.option("--minutes", default=10.0, show_default=True)
+@click.option("--every", default=3.0, show_default=True, help="s between two faults, on average.")
+@click.option("--severe", default=0.03, show_default=True, help="Share that restarts processes.")
+@click.option("--seed", default=1, show_default=True)
+@click.option("--page", is_flag=True, help="Add a line to docs/reliability.md.")
+def main(
+    link: str, rate: float | None, minutes: float, every: float, severe: float, seed: int,
+    page: bool,
+) -> None:  # fmt: skip
+    """Make faults every few seconds, and see that nothing grows, is missed or gets out."""
+    folder = Path(tempfile.mkdtemp(prefix="soak-"))
+    rig, quiet, memory, made = soak(link, rate, minutes, every, seed, folder, severe)
+    found, bounds = rig.checker.found, rig.checker.bounds
+    slope, size, span = memory.slope("loop")
+    step = f"{1e6 * found.largest_step:.0f}"
+    click.echo(
+        f"{rig.link.name}, {rig.link.rate:g} Hz, {minutes:g} min, {sum(made.values())} faults"
+    )
+    click.echo(f"  {found.frames} frames written, {found.writes} setpoints, {found.violated} wrong")
+    click.echo(f"  largest offset {1e3 * found.largest_offset:.3f} mm, largest step {step} um")
+    click.echo(f"  oldest state behind a setpoint {1e3 * found.oldest_state:.1f} ms")
+    click.echo(
+        f"  missed outside faults: {quiet.missed} of {quiet.cycles + quiet.missed} cycles, "
+        f"{quiet.share:.3f} %"
+    )
+    click.echo(f"  loop: {size:.0f} MB, {slope:+.2f} MB a minute over {span:.0f} s")
+    for name in rig.run.daemon.sides.status():
+        slope, size, span = memory.slope(name)
+        click.echo(f"  {name}: {size:.0f} MB, {slope:+.2f} MB a minute over {span:.0f} s")
+    for words in found.violations[:20]:
+        click.echo(f"  VIOLATION: {words}")
+    if page:
+        slope, size, span = memory.slope("loop")
+        fill(PAGE, f"soak {rig.link.rate:g}", (
+            f"| {rig.link.name} | {rig.link.rate:g} | {minutes:g} | {sum(made.values())} | "
+            f"{found.frames} | {found.violated or 'none'} | {step} "
+            f"({1e6 * bounds.offset_rate * bounds.cycle:.0f}) | {quiet.share:.3f} | "
+            f"{slope:+.2f} |"
+        ))  # fmt: skip
+    sys.exit(1 if found.violated else 0)
+
+
+if __name__ == "__main__":
+    main()
