@@ -15,7 +15,7 @@ from core.diagnosis.held_out import HeldOut
 from core.diagnosis.judgement import Judgement, holding, judge, pure_error
 from core.diagnosis.location import Where, locate
 from core.diagnosis.observation import NotObservable, Observation, thinned
-from core.diagnosis.selection import Selection, select
+from core.diagnosis.selection import Selection, select, standing
 from core.diagnosis.separation import Measurement, next_measurements
 from core.diagnosis.simulation import joined, predicted_by
 from core.diagnosis.suspicion import check_units, findings
@@ -37,6 +37,7 @@ CHANNELS: Mapping[str, Observe] = {
 }
 
 
+NEEDLESS = 0.05  # share by which more may be left without a cause that seemed needless
 # samples that a diagnosis looks at: more cost time and tell hardly more
 MOST = {"position": 1200, "wrench": 300, "tracking": 300, "torque": 300}
 
@@ -195,7 +196,7 @@ def _channel(
 ) -> ChannelDiagnosis:  # fmt: skip
     selection = select(seen, model, withhold, progress)
     held = HeldOut(selection)
-    verdict = holding(selection, judge(selection), held)
+    selection, verdict = _judged(selection, held, model)
     chosen = [selection.term_index[p] for p in verdict.accused]
     gap, remaining = gaps(selection, chosen)
     k = 3 if seen.channel in ("position", "wrench") else gap.shape[1]
@@ -221,6 +222,24 @@ def _channel(
         selection=selection, judgement=verdict, gap=gap, remaining=remaining,
         held_out=np.sqrt(held.squares(chosen)) if held.possible else None,
     )  # fmt: skip
+
+
+def _judged(selection: Selection, held: HeldOut, model: Model) -> tuple[Selection, Judgement]:
+    """Return the judgement, and the selection with the values of what it leaves accused.
+
+    An accusation that seemed needless stays where the others, fitted exactly, cannot do without.
+    """
+    judged = judge(selection)
+    kept = holding(selection, judged, held)
+    stood = standing(selection, model.arm, kept.accused)
+    if kept.accused != judged.accused and _left(stood) > (1 + NEEDLESS) * _left(selection):
+        return standing(selection, model.arm, judged.accused), judged
+    return stood, kept
+
+
+def _left(selection: Selection) -> float:
+    """Return the rms of what the terms leave of the kept samples."""
+    return float(np.sqrt(np.mean(selection.residual[selection.kept] ** 2)))
 
 
 def gaps(selection: Selection, chosen: Sequence[int]) -> tuple[Array, Array]:

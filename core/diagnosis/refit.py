@@ -60,7 +60,9 @@ def refit(
             scale = np.array([p.scale for p in freed[index[k]].parameters])
             moved = max(moved, float(np.abs(parts[k] / scale).max()))
         if observation.rebase is not None:
-            work.observation = observation.rebase(parts[-1])
+            moved_terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
+            left = observation.measured - observation.predict(moved_terms)
+            work.observation = observation.rebase(_along(extra, nuisance, left, work))
         residual_ss = float(np.sum((b - A @ step) ** 2))
         variance = max(residual_ss / max(len(b) - A.shape[1], 1), space.floor)
         inverse = np.linalg.pinv((A * unit).T @ (A * unit), rcond=1e-13, hermitian=True)
@@ -73,11 +75,15 @@ def refit(
     gap = work.observation.measured - work.observation.predict(terms)
     nuisance = work.observation.nuisance
     if nuisance.shape[2]:
-        A = np.hstack([extra, flat(nuisance, work)])
-        b = flat(gap[..., None], work)[:, 0]
-        solution = np.linalg.lstsq(A, b, rcond=1e-12)[0]
-        gap = gap - nuisance @ solution[extra.shape[1] :]
+        gap = gap - nuisance @ _along(extra, flat(nuisance, work), gap, work)
     return terms, index, tuple(covariance), gap
+
+
+def _along(extra: Array, nuisance: Array, gap: Array, work: Work) -> Array:
+    """Return what of the nuisance (p,) a gap (N, k) asks for, unnamed functions beside it."""
+    b = flat(gap[..., None], work)[:, 0]
+    solution = np.linalg.lstsq(np.hstack([extra, nuisance]), b, rcond=1e-12)[0]
+    return np.asarray(solution[extra.shape[1] :])
 
 
 def _pull(

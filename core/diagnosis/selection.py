@@ -6,12 +6,13 @@ prediction, frames and all), wild readings looked at again; until the set stays 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from core.arm import Arm
 from core.diagnosis.bent import straightened
 from core.diagnosis.candidate import (
     Candidate,
@@ -34,6 +35,7 @@ from core.model import Model
 
 Array = NDArray[np.float64]
 ROUNDS = 5
+FORBIDDEN = 1e9  # a price that no fit is worth
 BENDING = ("axial_compliance", "radial_compliance", "stiffness_nonlinearity",
            "link_flexibility", "base_compliance", "payload")  # fmt: skip
 
@@ -114,11 +116,12 @@ def select(
                 work, columns, base, smooth, (space, raw, nuisance, target, best)
             )
         counted, whitened_by = work.kept.copy(), work.noise
+        framed = work.observation
         try:
             terms, index, covariance, residual = refit(work, space, best)
         except InputError:  # absurd flexibilities: the arm would buckle
-            stiff = [c for c in best.chosen if space.candidates[c].family not in BENDING]
-            best = fit(space, stiff)
+            work.observation = framed  # not the frame that went astray with them
+            best = _stiff(space, best, inside)
             terms, index, covariance, residual = refit(work, space, best)
         straight = straightened(space, best.chosen, index, terms, covariance)
         if straight is not None:
@@ -143,31 +146,66 @@ def select(
     )  # fmt: skip
 
 
+def _stiff(space: Space, best: Found, inside: list[int]) -> Found:
+    """Return the best set without anything that gives way: what was found makes no arm."""
+    gives_way = np.array([c.family in BENDING for c in space.candidates])
+    stiff = replace(space, price=np.where(gives_way, FORBIDDEN, space.price))
+    start = {*inside, *best.chosen} - {int(c) for c in np.flatnonzero(gives_way)}
+    return screened_search(stiff, base=sorted(start))
+
+
 def _less_smooth(
     work: Work, space: Space, best: Found, smooth: list[tuple[Candidate, Array]], residual: Array
 ) -> Array:
     """Return the residual (N, k) less what the set's unnamed functions take of it.
 
-    They are part of the explanation: what they account for is no noise.
+    They are part of the explanation: what they account for is no noise. Not so in a large log of
+    poses, where causes and a function of time share out the same: the causes stand alone there.
     """
     named = len(work.candidates)
     columns = [smooth[c - named][1] for c in best.chosen if c >= named]
-    if not columns:
+    poses = work.observation.channel == "position" and len(space.y) >= LARGE
+    if not columns or poses:
         return residual
     both = np.concatenate([*columns, work.observation.nuisance], axis=2)
     rows, target = flat(both, work), flat(residual[..., None], work)[:, 0]
     return np.asarray(residual - both @ np.linalg.lstsq(rows, target, rcond=1e-9)[0])
 
 
+def standing(selection: Selection, arm: Arm, accused: Sequence[int]) -> Selection:
+    """Return the selection with some of its terms (positions) refitted as all there is.
+
+    Values that were fitted beside a withdrawn term are not those that stand without it.
+    """
+    if not accused or len(accused) == len(selection.terms):
+        return selection
+    work = Work(selection.observation, arm, [], selection.noise, selection.kept)
+    chosen = [selection.term_index[p] for p in accused]
+    fitted, index, spread, residual = refit(work, selection.space, fit(selection.space, chosen))
+    terms, covariance = list(selection.terms), list(selection.covariance)
+    for c, term, own in zip(index, fitted, spread, strict=True):
+        position = selection.term_index.index(c)
+        terms[position], covariance[position] = term, own
+    return replace(
+        selection, observation=work.observation, terms=tuple(terms),
+        covariance=tuple(covariance), residual=residual,
+    )  # fmt: skip
+
+
 def _bounded(candidate: Candidate, model: Model) -> Candidate:
-    """Return the candidate with bounds that keep the whole model physical (flexibility >= 0)."""
-    if candidate.family not in ("axial_compliance", "radial_compliance"):
+    """Return the candidate with bounds that keep the whole model physical (flexibility >= 0).
+
+    Of a curve the bound holds for what its two parts come to together.
+    """
+    curved = candidate.curve is not None
+    if candidate.family not in ("axial_compliance", "radial_compliance") and not curved:
         return candidate
     axial, radial = model.compliance()
-    own = axial if candidate.family == "axial_compliance" else radial
+    own = radial if candidate.family == "radial_compliance" else axial
     assert candidate.site.joint is not None
     lower = -float(own[candidate.site.joint - 1])
-    return replace(candidate, parameters=(replace(candidate.parameters[0], lower=lower),))
+    bounded = replace(candidate.parameters[0], lower=lower)
+    return replace(candidate, parameters=(bounded, *candidate.parameters[1:]))
 
 
 def _has_what_it_needs(candidate: Candidate, observation: Observation) -> bool:

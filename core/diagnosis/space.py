@@ -129,8 +129,11 @@ def fit(space: Space, chosen: Sequence[int]) -> Found:
 def _plausible(candidate: Candidate, x: Array, s: Array) -> bool:
     if not candidate.named:
         return True
+    if candidate.curve is not None and x.sum() < candidate.parameters[0].lower - s.max():
+        return False
     for parameter, value, deviation in zip(candidate.parameters, x, s, strict=True):
-        if value < parameter.lower - 2.5 * deviation or value > parameter.upper:
+        lower = -np.inf if candidate.curve is not None else parameter.lower
+        if value < lower - 2.5 * deviation or value > parameter.upper:
             return False
         most = (SHARP if parameter.name == "softening" else ABSURD) * parameter.scale
         if parameter.unit not in SENSED and abs(value) - 3 * deviation > most:
