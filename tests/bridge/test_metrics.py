@@ -1,5 +1,6 @@
 """Metrics over the wire: read by Prometheus' own parser, counted from cycles and events."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -98,6 +99,32 @@ def test_faults_transitions_restarts_and_drops_are_told_apart(feed):
     assert value(found, "gapbridge_incidents", kind="stale") == 2
     assert value(found, "gapbridge_recorder_paused") == 1
     assert value(found, "gapbridge_recorder_lost_cycles") == 5
+
+
+def _limit_is(feed, limit):
+    try:
+        return value(families(feed), "gapbridge_offset_limit_meters") == limit
+    except httpx.TransportError:
+        return False
+
+
+def test_a_cell_that_was_read_again_gives_its_limits(feed):
+    assert value(families(feed), "gapbridge_offset_limit_meters") == 0.01
+    feed.change_cell("limits: {offset: 0.004}\n")
+    until = time.monotonic() + 5
+    while value(families(feed), "gapbridge_offset_limit_meters") != 0.004:
+        assert time.monotonic() < until
+        time.sleep(0.1)
+    os.kill(feed.side.pid, 9)  # a process started anew, with the first order, hears of it too
+    until = time.monotonic() + 20
+    while feed.side.restarts == 0 or not _limit_is(feed, 0.004):
+        feed.side.check()
+        assert time.monotonic() < until
+        time.sleep(0.1)
+    # a file that the daemon did not take changes nothing
+    feed.change_cell("limits: {offset: 0.007}\n", ok=False)
+    time.sleep(0.5)
+    assert value(families(feed), "gapbridge_offset_limit_meters") == 0.004
 
 
 def test_nothing_else_is_served(feed):

@@ -173,6 +173,18 @@ def test_it_fits_a_phone(browser, feed, theme):
         assert complaints == []
 
 
+def test_a_cell_that_was_read_again_shows_its_envelope(browser, tmp_path):
+    with Feed(tmp_path, "web") as feed:
+        feed.wait("status")
+        with opened(browser, feed) as (page, _, complaints):
+            live(page)
+            feed.change_cell("limits: {offset: 0.004}\n")
+            gauge = page.locator("#gauge-offset-text")
+            gauge.filter(has_text="of 4.00 mm").wait_for(timeout=5000)
+            assert "the cell was read again" in page.locator("#events").inner_text()
+            assert complaints == []
+
+
 def test_words_from_the_robot_are_shown_and_never_run(browser, feed):
     with opened(browser, feed) as (page, _, complaints):
         live(page)
