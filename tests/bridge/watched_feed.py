@@ -97,7 +97,7 @@ class Feed:
         self.page.close()
         self.log.close()
 
-    def wait(self, path: str = "", limit: float = 20.0, **keys: Any) -> httpx.Response:
+    def wait(self, path: str = "", limit: float = 60.0, **keys: Any) -> httpx.Response:
         """Return the first answer that the process gives."""
         until = time.monotonic() + limit
         while True:
