@@ -49,7 +49,6 @@ HARMS: dict[str, Callable[[Rig], object]] = {
     "no answer to V": answers(b"V", losing),
     "no answer to v": answers(b"v", losing),
     "no answer to O": answers(b"O", losing),
-    "no answer to S": answers(b"S", losing),
     "V refused": answers(b"V", refused),
     "S refused": answers(b"S", refused),
 }
