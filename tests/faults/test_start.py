@@ -39,18 +39,12 @@ def answers(kind: bytes, mischief: Mischief) -> Callable[[Rig], object]:
     return harm
 
 
-def refused(message: bytes) -> list[tuple[float, bytes]]:
-    return [(0.0, message[:3] + b"\x00" + message[4:])]
-
-
 HARMS: dict[str, Callable[[Rig], object]] = {
     "nobody listens": lambda rig: rig.proxy.refuse(),
     "nobody answers": lambda rig: rig.proxy.mute(),
     "no answer to V": answers(b"V", losing),
     "no answer to v": answers(b"v", losing),
     "no answer to O": answers(b"O", losing),
-    "V refused": answers(b"V", refused),
-    "S refused": answers(b"S", refused),
 }
 
 
