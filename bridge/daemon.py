@@ -78,6 +78,7 @@ class Daemon:
         self._refused = False  # writing was asked for and could not begin
         self._seen = False  # a state has been read, by this or a former loop
         self.restarts = 0
+        self._loops = 0  # processes of the loop so far, those of a reload among them
         self._wait = settings.backoff[0]
         self._last_state = State.DISCONNECTED
         self._stopping = threading.Event()
@@ -202,9 +203,10 @@ class Daemon:
         self._last_state = State.DISCONNECTED
         self._failure = {}
         loop = self.loop = LoopProcess(
-            self.settings, self.page, arm, self.may_write, self.output, self.restarts,
+            self.settings, self.page, arm, self.may_write, self.output, self._loops,
             self._status.latched,
         )  # fmt: skip
+        self._loops += 1
         stop_by = first_cycle = None
         try:
             while loop.exit_code is None:

@@ -10,6 +10,7 @@ from bridge.supervisor import State
 
 POLL = 0.001  # s
 AFTERWARDS = 0.25  # s for which the end state must stay
+RESTING, AT_REST = (State.OBSERVING, State.COMPENSATING, State.FAULT), 3.0  # s: stays for good
 END_LIMIT = 25.0  # s
 
 
@@ -73,7 +74,8 @@ def _settle(rig: Rig, row: Row) -> str:
         if now != state:
             since, state = time.monotonic(), now
         rests = state.name.lower() in row.end and state != State.HOLDING
-        if rests and time.monotonic() - since > AFTERWARDS:
+        stays = time.monotonic() - since
+        if (rests and stays > AFTERWARDS) or (state in RESTING and stays > AT_REST):
             break
         rig.pass_time(POLL)
     return state.name.lower()

@@ -24,6 +24,7 @@ from drivers.simulated.plant_arm import plant_arm
 from drivers.ur_rtde.driver import OFFSET_SCRIPT
 
 CONFIG = Path(__file__).parents[2] / "config"
+CONNECT = 3.0  # s that the library may hang in its constructor before its process is ended
 OFFSET, ROTATION, OFFSET_RATE, ROTATION_RATE = 0.002, 0.01, 0.008, 0.08
 LIMITS = f"""
 limits:
@@ -133,7 +134,10 @@ class UrServo(Link):
 
     def section(self, host: str) -> str:
         """See Link.section."""
-        return f"link: {{driver: ur_rtde, host: {host}, mode: {self.mode}, rate: {self.rate:g}}}\n"
+        return (
+            f"link: {{driver: ur_rtde, host: {host}, mode: {self.mode}, rate: {self.rate:g}, "
+            f"state_timeout: {self.hold}, watchdog: 4, connect_timeout: {CONNECT}}}\n"
+        )
 
     def ports(self) -> list[Port]:
         """See Link.ports."""

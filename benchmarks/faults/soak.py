@@ -16,7 +16,7 @@ import click
 import numpy as np
 import psutil
 
-from benchmarks.faults.links import LINKS
+from benchmarks.faults.links import LIMITS, LINKS
 from benchmarks.faults.report import PAGE, fill
 from benchmarks.faults.rig import Rig
 from benchmarks.faults.table import rows_of
@@ -108,7 +108,7 @@ def soak(
     return rig, quiet, memory, made
 
 
-RECORDED = ""  # sections of the daemon's cell in place of the usual ones
+RECORDED = LIMITS.replace("folder: null", "folder: recordings")
 
 
 @click.command()

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bridge.daemon_settings import DaemonSettings
+from bridge.reread import RereadSettings
 from bridge.shared_page import Page
 from core.limits import CLAMPS
 
@@ -42,8 +44,9 @@ class Buckets:
 class Counts:
     """Everything that is counted since this process began to read, and the last of what changes."""
 
-    def __init__(self, page: Page, rate: float) -> None:
-        self._page, self._rate, self._slices = page, rate, page.slices
+    def __init__(self, page: Page, settings: DaemonSettings, text: str | None = None) -> None:
+        self._page, self._slices = page, page.slices
+        self._reread = RereadSettings(settings, text)  # text: the cell file's
         self._reader = page.reader()
         self.cycles = self.missed = self.late = self.written = 0
         self.clamped = dict.fromkeys(CLAMPS, 0)
@@ -56,6 +59,11 @@ class Counts:
         self.status: Mapping[str, Any] = {}
         self.recorder_lost = 0  # cycles
         self.recorder_paused = False
+
+    @property
+    def settings(self) -> DaemonSettings:
+        """Return the settings of the run by now."""
+        return self._reread.settings
 
     @property
     def lost(self) -> int:
@@ -87,7 +95,7 @@ class Counts:
         age = rows[:, s["age"].start]
         self.cycles += len(rows)
         self.missed += int(rows[:, s["missed"].start].sum())
-        self.late += int((age > 1.0 / self._rate).sum())
+        self.late += int((age > 1.0 / self.settings.link.rate).sum())
         self.written += int(rows[:, s["written"].start].sum())
         bits = rows[:, s["clamped"].start].astype(np.int64)
         for bit, name in enumerate(CLAMPS):
@@ -99,6 +107,7 @@ class Counts:
 
     def _hear(self, event: dict[str, Any]) -> None:
         kind = str(event.get("kind", "note"))
+        self._reread.hear(event)
         if kind == "status":
             self.status = event
             return

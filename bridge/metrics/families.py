@@ -17,7 +17,6 @@ from prometheus_client.core import (
 )
 from prometheus_client.registry import Collector
 
-from bridge.daemon_settings import DaemonSettings
 from bridge.metrics.counts import Buckets, Counts
 from bridge.supervisor import State
 
@@ -28,8 +27,8 @@ DROPPED = "dropped_"  # what counts of samples that could not be believed begin 
 class Families(Collector):
     """One scrape: all metrics of a daemon."""
 
-    def __init__(self, settings: DaemonSettings, session: str, counts: Counts) -> None:
-        self._settings, self._session, self._counts = settings, session, counts
+    def __init__(self, session: str, counts: Counts) -> None:
+        self._session, self._counts = session, counts
         self.refused: Mapping[str, int] = {}  # requests, by reason
 
     def collect(self) -> Iterator[Metric]:
@@ -56,8 +55,8 @@ class Families(Collector):
             [],
             {
                 "session": self._session,
-                "cell": self._settings.cell.stem,
-                "driver": self._settings.link.driver,
+                "cell": self._counts.settings.cell.stem,
+                "driver": self._counts.settings.link.driver,
                 "configuration_hash": configuration,
             },
         )
@@ -90,7 +89,7 @@ class Families(Collector):
         yield GaugeMetricFamily(
             "gapbridge_link_rate_hertz",
             "Cycles a second that the link is to have.",
-            self._settings.link.rate,
+            self._counts.settings.link.rate,
         )
         yield GaugeMetricFamily(
             "gapbridge_link_silence_seconds",
@@ -115,7 +114,7 @@ class Families(Collector):
         )
 
     def _offset(self) -> Iterator[Metric]:
-        limits = self._settings.limits
+        limits = self._counts.settings.limits
         offset = GaugeMetricFamily(
             "gapbridge_offset_meters", "TCP offset of the last cycle, in base.", labels=["axis"]
         )

@@ -43,8 +43,8 @@ def run(order: Order) -> None:
     assert settings is not None
     path = settings.token_file
     token = None if path is None else read_token(path, "metrics.token_file")
-    counts = Counts(order.page, order.settings.link.rate)
-    families = Families(order.settings, order.session, counts)
+    counts = Counts(order.page, order.settings, order.extra.get("text"))
+    families = Families(order.session, counts)
     registry = CollectorRegistry(auto_describe=False)
     registry.register(families)
 

@@ -37,7 +37,7 @@ def run(order: Order) -> None:
     assert settings is not None
     path = settings.token_file
     token = None if path is None else read_token(path, "web.token_file")
-    watched = Watched(order.settings, order.n, order.session, order.page)
+    watched = Watched(order.settings, order.n, order.session, order.page, order.extra.get("text"))
     stream = Stream(settings.clients)
 
     def turn() -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.daemon_settings import DaemonSettings
+from bridge.reread import RereadSettings
 from bridge.shared_page import ROWS, Page
 from bridge.supervisor import State
 from bridge.web.history import COLUMNS, STEP, History
@@ -30,9 +31,17 @@ DIGITS = 6  # significant ones of what is drawn
 class Watched:
     """Reads along; ``turn`` returns what is new since the last call."""
 
-    def __init__(self, settings: DaemonSettings, n: int, session: str, page: Page) -> None:
+    def __init__(
+        self,
+        settings: DaemonSettings,
+        n: int,
+        session: str,
+        page: Page,
+        text: str | None = None,
+    ) -> None:
         assert settings.web is not None
-        self._settings, self._session, self._page = settings, session, page
+        self._reread = RereadSettings(settings, text)  # text: the cell file's
+        self._session, self._page = session, page
         self._slices, self._n = page.slices, n
         # whoever comes late still shows what the ring holds
         self._reader = page.reader(max(page.written - ROWS + ROWS // 4, 0))
@@ -49,11 +58,19 @@ class Watched:
         self._last = 0.0  # s, monotonic: when the last state was received
         self._sensor = "actual_TCP_force"
 
+    @property
+    def _settings(self) -> DaemonSettings:
+        return self._reread.settings
+
     # -- in ---------------------------------------------------------------------------------------
 
     def turn(self, events: list[dict[str, Any]]) -> list[Message]:
         """Take what has come; returns messages for the pages that are open."""
         messages = [message for event in events for message in self._hear(event)]
+        changed = [self._reread.hear(event) for event in events]
+        if any(changed):
+            self._prediction = WrenchPrediction(self._settings, self._slices)
+            messages.append(("hello", self.snapshot()))  # limits and rate may be others
         points = self._take(self._reader.drain())
         messages.append(("tick", {**self.now(), "points": plain(points)}))
         if time.monotonic() >= self._timing_at:

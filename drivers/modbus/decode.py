@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from core.errors import InvalidStateError
 from drivers.modbus.map import Block, RegisterMap
+from drivers.modbus.plan import TURN, BlockPlan
 from drivers.modbus.profile import ECHO_WORDS, addresses, turns_of, vectors
 from drivers.modbus.registers import BIT_TABLES, UNITS, Coding
 from drivers.modbus.schema import Condition, Place, ProfileFile, Trouble, Vector
@@ -23,7 +24,6 @@ BOUNDS = {
     "force": 1e5, "moment": 1e5,
 }  # fmt: skip
 """Largest plausible magnitudes, SI."""
-TURN = 2.0 * math.pi
 JITTER = 0.01  # rad beyond what the fastest joint can have come
 
 
@@ -54,7 +54,7 @@ class _Field:
 
 
 class Decoder:
-    """Decodes the blocks of one profile; remembers nothing."""
+    """Decodes the blocks of one profile; what a reading says depends on nothing before it."""
 
     def __init__(self, profile: ProfileFile, compiled: RegisterMap) -> None:
         self._profile, self._map = profile, compiled
@@ -63,7 +63,14 @@ class Decoder:
             for keys, _, entry, count in vectors(profile)
             if keys[0] == "state"
         ]
+        # the block of the joints by its plan; vectors that lie elsewhere one by one
+        self._block = compiled.fast[0]
+        self._plan = BlockPlan(self._block.count)
+        self._others = [field for field in self._fields if not self._planned(field)]
+        self._plan.compile()
         self._conditions = [(self._spot(c), c) for c in profile.status]
+        self._said: list[Sequence[int]] = []  # registers of the conditions, last time
+        self._troubles: tuple[tuple[Trouble, str], ...] = ()
         clock, write = profile.clock, profile.write
         self._motion: list[tuple[str, tuple[Block, int, Coding], Condition]] = []
         if write.mode == "target_trigger":
@@ -82,6 +89,18 @@ class Decoder:
         if write.mode == "mailbox":
             block = compiled.block_of(write.echo_table, write.echo_address, ECHO_WORDS)
             self._echo = (block, write.echo_address - block.first)
+
+    def _planned(self, field: _Field) -> bool:
+        """Add a vector to the block's plan; False where it does not lie there alone."""
+        if field.block != self._block or field.turn_block not in (None, self._block):
+            return False
+        if field.coding.type == "bit":
+            return False
+        plan = self._plan
+        plan.add(field.name, field.indices, field.coding, field.size, BOUNDS[field.name])
+        if field.turn_coding is not None:
+            plan.add_turns(field.turn_indices, field.turn_coding)
+        return True
 
     def _field(self, name: str, entry: Vector, count: int) -> _Field:
         block, indices = self._indices(entry, count)
@@ -120,13 +139,9 @@ class Decoder:
         if clock is not None and not math.isfinite(clock):
             raise InvalidStateError(f"clock: found {clock:g}, expected a finite number")
         return Sample(
-            {field.name: self._vector(field, registers) for field in self._fields},
+            self._vectors(registers),
             clock,
-            tuple(
-                (condition.otherwise, _words(condition, count))
-                for spot, condition in self._conditions
-                if not condition.fine(count := int(_number(registers, spot)))
-            ),
+            self._troubles_of(registers),
             tuple(
                 (name, _words(condition, count))
                 for name, spot, condition in self._motion
@@ -134,6 +149,29 @@ class Decoder:
             ),
             self._echo_of(registers),
         )
+
+    def _vectors(self, registers: Registers) -> dict[str, Array]:
+        found = self._plan.vectors(registers[self._block])
+        if found is None:  # the words for it
+            return {field.name: self._vector(field, registers) for field in self._fields}
+        for field in self._others:
+            found[field.name] = self._vector(field, registers)
+        return found
+
+    def _troubles_of(self, registers: Registers) -> tuple[tuple[Trouble, str], ...]:
+        """Return the conditions that are not met; looked at anew where a register has changed."""
+        said = [
+            registers[block][start : start + coding.words]
+            for (block, start, coding), _ in self._conditions
+        ]
+        if said != self._said:
+            self._troubles = tuple(
+                (condition.otherwise, _words(condition, count))
+                for spot, condition in self._conditions
+                if not condition.fine(count := int(_number(registers, spot)))
+            )
+            self._said = said
+        return self._troubles
 
     def _check_lengths(self, registers: Registers) -> None:
         for block in (*self._map.fast, *self._map.slow):

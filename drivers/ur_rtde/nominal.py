@@ -95,6 +95,7 @@ class Nominal:
         self._row = pack(
             Rows(np.zeros((1, n)), np.ones((1, n)), np.zeros(1), np.zeros((1, 3)), np.zeros((1, 6)))
         )
+        self._offset, self._target = np.zeros(6), np.zeros(n)
         self._shift = np.zeros(n)  # target minus nominal joints of the last sample
         # compiled here: the loop's first offset must not wait for a compiler
         self.tcp(self._shift)
@@ -111,12 +112,13 @@ class Nominal:
 
         Raises InvalidStateError where there are none nearby (at a singularity).
         """
-        if not offset_in_base.any():
+        if not any(offset_in_base.tolist()):
             self._shift[:] = 0.0
             return target_q
         nominal: Vector = np.empty(self._n)
-        offset = np.array(offset_in_base, float)
-        distance = self._search(np.array(target_q, float), offset, nominal)
+        offset, target = self._offset, self._target
+        offset[:], target[:] = offset_in_base, target_q
+        distance = self._search(target, offset, nominal)
         if not distance < TOLERANCE:
             raise InvalidStateError(
                 f"target_q: found no joints {distance:.1e} m nearer to the robot's own path "

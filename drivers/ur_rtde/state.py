@@ -13,9 +13,11 @@ import time
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from core.errors import InvalidStateError, LinkError, StaleStateError
+from core.kernel import JIT
 from core.state import RobotState
 from drivers.ur_rtde.registers import APPLIED, ECHO, PROGRAM
 from drivers.ur_rtde.settings import UrRtdeSettings
@@ -45,6 +47,17 @@ _NAMES = (
     f"output_int_register_{ECHO}", f"output_int_register_{PROGRAM}",
     *(f"output_double_register_{i}" for i in APPLIED),
 )  # fmt: skip
+
+
+@njit(**JIT)
+def _plausible(values, bounds, before, step):  # type: ignore[no-untyped-def]
+    """Return whether values are within bounds, and the first six (joints) near ``before``."""
+    fine = True
+    for i in range(values.shape[0]):
+        fine = fine and abs(values[i]) <= bounds[i]  # NaN is not either
+    for i in range(N):
+        fine = fine and abs(values[i] - before[i]) <= step
+    return fine
 
 
 class StateReader:
@@ -98,6 +111,8 @@ class StateReader:
                 bounds += [bound] * size
                 start += size
         self._bounds = np.array(bounds)
+        # compiled here: the first sample must not wait for a compiler
+        _plausible(self._bounds, self._bounds, self._bounds[:N], 0.0)
         self._payload = "payload" in names
 
     def close(self) -> None:
@@ -186,7 +201,9 @@ class StateReader:
             if len(row) != end - start:
                 raise self._invalid(f"{name}: found {len(row)} numbers, expected {end - start}")
         values = np.array([v for row in rows for v in row])
-        if not (np.abs(values) <= self._bounds).all():  # NaN fails too
+        before = values if self._q is None else self._q
+        fine = _plausible(values, self._bounds, before, FASTEST * gap + JITTER)
+        if not fine and not (np.abs(values) <= self._bounds).all():
             bad = int(np.argmax(~(np.abs(values) <= self._bounds)))
             name, start, _ = next(f for f in self._fields if f[1] <= bad < f[2])
             raise self._invalid(
@@ -196,7 +213,8 @@ class StateReader:
         if payload is not None and not 0.0 <= payload <= 1e3:
             raise self._invalid(f"payload: found {payload:g} kg, expected 0 to 1000")
         found: dict[str, Any] = {n: values[start:end] for n, start, end in self._fields}
-        self._check_motion(found["actual_q"], gap)
+        if not fine:
+            self._check_motion(found["actual_q"], gap)
         self._q = found["actual_q"]
         found.pop("actual_TCP_pose", None)
         current, constants = found.pop("actual_current", None), self._settings.torque_constants
@@ -213,7 +231,6 @@ class StateReader:
         before = self._q
         if before is None:
             return
-        # plain numbers: six of them cost an array more
         way = [abs(now - then) for now, then in zip(q.tolist(), before.tolist(), strict=True)]
         if max(way) > FASTEST * gap + JITTER:
             self._q = None

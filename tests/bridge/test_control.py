@@ -202,6 +202,7 @@ def test_a_daemon_that_only_observes_cannot_be_armed(robot: Robot) -> None:
             ask(cell, "arm")
 
 
+@pytest.mark.slow
 def test_the_commands_tell_in_a_line_and_as_json(robot: Robot) -> None:
     cell = robot.cell(PATIENT)
     with Run(cell) as run:

@@ -102,6 +102,7 @@ def test_two_daemons_on_one_robot_the_second_leaves_with_two(robot: Robot) -> No
         assert run.end().restarts == 0
 
 
+@pytest.mark.slow
 def test_after_kill_nine_the_next_start_works_and_does_not_arm_by_itself(robot: Robot) -> None:
     cell = robot.cell(setpoints="{arm: true}")
     first = gapbridge("run", cell, folder=robot.folder)
@@ -119,7 +120,7 @@ def test_after_kill_nine_the_next_start_works_and_does_not_arm_by_itself(robot: 
     assert err == ""
     assert "did not end in order: not arming by itself" in out
     assert "compensating" not in out
-    third = gapbridge("run", cell, "--duration", "2", folder=robot.folder)
+    third = gapbridge("run", cell, "--duration", "5", folder=robot.folder)
     assert "compensating" in third.communicate(timeout=60)[0]  # the second ended in order
 
 

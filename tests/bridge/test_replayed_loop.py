@@ -53,7 +53,7 @@ class Loops:
         self.loop = LoopProcess(self.settings, self.page, arm, True, -3, self._number)
         self._number += 1
 
-    def until(self, what: Callable[[], bool], limit: float = 40.0) -> None:
+    def until(self, what: Callable[[], bool], limit: float = 120.0) -> None:
         def holds() -> bool:
             self.recorder.step()
             return what()

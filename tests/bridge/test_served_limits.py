@@ -42,7 +42,7 @@ def flood(monkeypatch):
         target=serve, args=(app, settings, "web", over.is_set, lambda: None, 0.05)
     )
     thread.start()
-    until = time.monotonic() + 10
+    until = time.monotonic() + 30
     while True:
         try:
             httpx.get(settings.url)
@@ -71,7 +71,7 @@ def test_a_client_that_takes_nothing_is_cut_off_while_others_are_served(flood):
         begun = time.monotonic()
         while not sent["ended"]:
             assert httpx.get(settings.url).text == "fine"
-            assert time.monotonic() - begun < 8
+            assert time.monotonic() - begun < 20
             time.sleep(0.05)
         assert time.monotonic() - begun > 0.4
         taken = _rest(link)

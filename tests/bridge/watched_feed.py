@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import socket
 import subprocess
@@ -63,6 +64,7 @@ class Feed:
         self.restarts = 0
         self.counts: dict[str, int] = {"late": 1, "stale": 2, "overrun": 0}
         self._sequence = 0
+        self.hash = hashlib.sha256(CELL.encode()).hexdigest()
         self._stop = threading.Event()
         self._lock = threading.Lock()
         self.side: SideProcess | None = None
@@ -73,6 +75,7 @@ class Feed:
     def __enter__(self) -> Self:
         order = {
             "settings": self.settings.model_dump(mode="json"), "n": N, "session": self.session,
+            "extra": {"text": CELL},
         }  # fmt: skip
         self.side = SideProcess(f"bridge.{self.section}.main", order, self.page, self.log)
         self.page.enter(Phase.RUNNING)
@@ -94,7 +97,7 @@ class Feed:
         self.page.close()
         self.log.close()
 
-    def wait(self, path: str = "", limit: float = 20.0, **keys: Any) -> httpx.Response:
+    def wait(self, path: str = "", limit: float = 60.0, **keys: Any) -> httpx.Response:
         """Return the first answer that the process gives."""
         until = time.monotonic() + limit
         while True:
@@ -125,10 +128,18 @@ class Feed:
         self.tell(kind="transition", **{"from": before.name, "to": to.name}, cause=cause,
                   detail=detail)  # fmt: skip
 
+    def change_cell(self, keys: str, ok: bool = True) -> None:
+        """Write the cell file anew and tell that it was taken, or not."""
+        text = CELL + keys
+        self.settings.cell.write_text(text)
+        hashed = hashlib.sha256(text.encode()).hexdigest()
+        self.hash = hashed if ok else self.hash
+        self.tell(kind="configuration", ok=ok, hash=self.hash, detail="the cell was read again")
+
     def status(self) -> dict[str, Any]:
         return {
             "kind": "status", "schema": "gapbridge.status/1", "session": self.session,
-            "cell": "ur10e_press", "pid": 4242, "configuration_hash": "6f1c" * 16,
+            "cell": "ur10e_press", "pid": 4242, "configuration_hash": self.hash,
             "state": self.state.name.lower(), "since": time.time(), "why": "connected",
             "armed_by": "operator", "latched": "", "loop": {"pid": 4243, "restarts": self.restarts},
             "link": {

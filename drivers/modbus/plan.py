@@ -1,0 +1,125 @@
+"""Numbers in registers, worked out when a map is loaded, and compiled code that goes by it.
+
+Takes the vectors of one block apart, all at once. What registers mean is the same as in
+``Coding.decode``, which the tests compare with.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from core.kernel import JIT
+from drivers.modbus.registers import Coding
+
+Array = NDArray[np.float64]
+TURN = 2.0 * math.pi
+UNSIGNED, SIGNED, MAGNITUDE, FLOAT = range(4)
+
+
+@njit(**JIT)
+def _float_of(bits, words):  # type: ignore[no-untyped-def]
+    if words == 2:
+        return np.float64(np.array([np.uint32(bits)]).view(np.float32)[0])
+    return np.array([bits]).view(np.float64)[0]
+
+
+@njit(**JIT)
+def _taken(registers, places, factors, bounds, found):  # type: ignore[no-untyped-def]
+    """Write all numbers, SI; returns whether each is finite and within its bound.
+
+    ``places`` (m, 8): target, kind, words, adds to what is there, then the registers, the high word
+    first; ``factors`` (m,).
+    """
+    for k in range(places.shape[0]):
+        target, kind, words = places[k, 0], places[k, 1], places[k, 2]
+        bits = np.uint64(0)
+        for i in range(words):
+            bits = (bits << np.uint64(16)) | np.uint64(registers[places[k, 4 + i]])
+        top = np.uint64(1) << np.uint64(16 * words - 1)
+        if kind == FLOAT:
+            value = _float_of(bits, words)
+        elif kind == MAGNITUDE and bits & top:
+            value = -np.float64(bits & ~top)
+        elif kind == SIGNED and bits & top:
+            # two's complement; of 64 bits the cast alone is it
+            value = np.float64(np.int64(bits | ~(top | (top - np.uint64(1)))))
+        else:
+            value = np.float64(bits)
+        value *= factors[k]
+        found[target] = found[target] + value if places[k, 3] else value
+    fine = True
+    for i in range(found.shape[0]):
+        fine = fine and -bounds[i] <= found[i] <= bounds[i]  # NaN is not either
+    return fine
+
+
+def kind_of(coding: Coding) -> int:
+    """Return how the bits of a number are meant."""
+    first = coding.type[:1]
+    return MAGNITUDE if coding.type.startswith("sm") else {"i": SIGNED, "f": FLOAT}.get(first, 0)
+
+
+class BlockPlan:
+    """Vectors that lie in one block of registers."""
+
+    def __init__(self, count: int) -> None:
+        self._pack = struct.Struct(f"{count}H")
+        self._memory = bytearray(2 * count)
+        self._registers = np.frombuffer(self._memory, np.uint16)
+        self._rows: list[tuple[int, ...]] = []
+        self._factors: list[float] = []
+        self._limits: list[float] = []
+        self._slices: list[tuple[str, int, int]] = []
+        self._compiled: tuple[NDArray[Any], ...] = ()
+
+    def add(
+        self, name: str, indices: Sequence[int], coding: Coding, size: float, bound: float
+    ) -> None:
+        """Add a vector: its registers, SI units per count, largest magnitude."""
+        start = len(self._limits)
+        self._place(start, indices, coding, size, False)
+        end = start + len(indices) // coding.words
+        self._limits += [bound] * (end - start)
+        self._slices.append((name, start, end))
+
+    def add_turns(self, indices: Sequence[int], coding: Coding) -> None:
+        """Add the whole turns of the vector added last."""
+        self._place(self._slices[-1][1], indices, coding, TURN, True)
+
+    def _place(
+        self, start: int, indices: Sequence[int], coding: Coding, size: float, adds: bool
+    ) -> None:
+        words = coding.words
+        for i in range(len(indices) // words):
+            own = list(indices[i * words : (i + 1) * words])
+            if coding.order == "low_first":
+                own.reverse()
+            row = (start + i, kind_of(coding), words, int(adds), *own, *[0] * (4 - words))
+            self._rows.append(row)
+            self._factors.append(size)
+
+    def compile(self) -> None:
+        """Make ready, once everything has been added: a first sample waits for no compiler."""
+        self._compiled = (
+            np.array(self._rows, np.int64).reshape(-1, 8), np.array(self._factors),
+            np.array(self._limits),
+        )  # fmt: skip
+        self.vectors([0] * (len(self._memory) // 2))
+
+    def vectors(self, registers: Sequence[int]) -> dict[str, Array] | None:
+        """Return the vectors by name, SI; None where a number is not finite or implausible.
+
+        Raises struct.error where there are more or fewer registers, or one of another size.
+        """
+        found = np.empty(len(self._limits))
+        self._pack.pack_into(self._memory, 0, *registers)
+        if not _taken(self._registers, *self._compiled, found):
+            return None
+        return {name: found[start:end] for name, start, end in self._slices}
