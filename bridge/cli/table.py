@@ -6,9 +6,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("bridge.cli.demo:demo", "Do the whole job on a simulated cell, no hardware."),
     "simulate": ("bridge.cli.simulate:simulate", "Serve the simulated controller of a cell."),
     "run": ("bridge.cli.run:run", "Run the on-cell daemon."),
-    "status": ("bridge.cli.status:status", "Tell what running daemons do."),
-    "arm": ("bridge.cli.arm:arm", "Have a running daemon write setpoints."),
-    "disarm": ("bridge.cli.arm:disarm", "Have a running daemon ramp out; acknowledge a fault."),
+    "status": ("bridge.cli.status:status", "Tell what the daemon of a cell does."),
+    "arm": ("bridge.cli.arm:arm", "Have the daemon of a cell write setpoints."),
+    "disarm": ("bridge.cli.arm:disarm", "Have the daemon of a cell ramp out and observe."),
     "export": (
         "bridge.cli.export:export_recording",
         "Turn a recording of the daemon into a log.",
