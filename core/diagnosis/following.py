@@ -23,22 +23,20 @@ SHORTEST = 1e-6  # s: a chord needs a length
 def exact_columns(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> Array:
     """Return a candidate's columns (N, k, d) at the model found so far.
 
-    Of a delay or a lag it is the chord from nothing to the time that the joint comes late: exact
-    there for the one as for its twin, so that both compete on what they really predict.
+    Of a delay or a lag it is the chord from nothing to the whole time that the joint comes late:
+    exact there for the one as for its twin, so that both compete on what they really predict.
     """
-    inside = [t for t in base if t.effect in TRACKING and t.site.joint == candidate.site.joint]
-    if candidate.family not in TRACKING or len(inside) > 1:
+    if candidate.family not in TRACKING:
         return named_columns(observation, candidate, base)
-    others = [t for t in base if t not in inside]
+    inside = [t.values[0] for t in base if t.site.joint == candidate.site.joint]
+    nothing = observation.predict(())
     if inside:
-        time = inside[0].values[0]
+        time = float(np.sum(inside))
     else:
-        slope = named_columns(observation, candidate, base)
-        gap = observation.measured - observation.predict(others)
-        time = float(np.sum(slope[..., 0] * gap) / max(float(np.sum(slope**2)), 1e-300))
-        if time < SHORTEST:
-            return slope
-    time = max(time, SHORTEST)
-    term = candidate.term(np.array([time]))
-    moved = observation.predict([*others, term]) - observation.predict(others)
+        slope = named_columns(observation, candidate, ())[..., 0]
+        gap = observation.measured - nothing
+        time = float(np.sum(slope * gap) / max(float(np.sum(slope**2)), 1e-300))
+    if time < SHORTEST:
+        return named_columns(observation, candidate, ())
+    moved = observation.predict([candidate.term(np.array([time]))]) - nothing
     return np.asarray(moved / time)[..., None]

@@ -118,7 +118,7 @@ def select(
         counted, whitened_by = work.kept.copy(), work.noise
         framed = work.observation
         try:
-            terms, index, covariance, residual = refit(work, space, best)
+            terms, index, covariance, residual = refit(work, space, _exactly(space, best, work))
         except InputError:  # absurd flexibilities: the arm would buckle
             work.observation = framed  # not the frame that went astray with them
             best = _stiff(space, best, inside)
@@ -152,6 +152,17 @@ def _stiff(space: Space, best: Found, inside: list[int]) -> Found:
     stiff = replace(space, price=np.where(gives_way, FORBIDDEN, space.price))
     start = {*inside, *best.chosen} - {int(c) for c in np.flatnonzero(gives_way)}
     return screened_search(stiff, base=sorted(start))
+
+
+def _exactly(space: Space, best: Found, work: Work) -> Found:
+    """Return what of a set is refitted: of delays and lags the named alone.
+
+    Beside them an unnamed function takes up what their curves lack at a first guess, and they would
+    never come to where it is not needed.
+    """
+    if work.observation.channel != "tracking":
+        return best
+    return fit(space, [c for c in best.chosen if space.candidates[c].named])
 
 
 def _less_smooth(

@@ -51,9 +51,10 @@ def sample_space(
     raw = np.empty((int(work.kept.sum()) * observation.measured.shape[1], int(start[-1])))
     for c, block in enumerate([*columns, *(s for _, s in smooth)]):
         raw[:, start[c] : start[c + 1]] = flat(block, work)
-    gap = (observation.measured - observation.predict(base))[..., None]
+    chords = observation.channel == "tracking"  # from nothing: nothing has to be put back
+    gap = (observation.measured - observation.predict(() if chords else base))[..., None]
     # what the terms already in the model explain is put back, in the linear form at hand
-    for term in base:
+    for term in () if chords else base:
         c, x = locate(work.candidates, term)
         gap = gap + columns[c] @ x[:, None]
     target = flat(gap, work)[:, 0]
