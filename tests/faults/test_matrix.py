@@ -14,7 +14,13 @@ from benchmarks.faults.rig import Rig
 from benchmarks.faults.row import Result, Row
 from benchmarks.faults.table import ROWS, rows_of
 
-pytestmark = pytest.mark.slow
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        os.environ.get("GAPBRIDGE_FAULT_MATRIX") != "1",
+        reason="judges by milliseconds on a wire: a quiet machine and GAPBRIDGE_FAULT_MATRIX=1",
+    ),
+]
 BUSY = 1.5  # processes that want to run, per core
 CALM = 125.0  # Hz of the UR links: what a busy machine still keeps up with
 
@@ -52,8 +58,9 @@ def attempt(rigs: Rigs, name: str, row: Row) -> Result:
     """Make a fault; again where a busy machine was late, but never after a violation."""
     for _ in range(3):
         rig = rigs.of(name)
+        before = rig.found.violated
         result = make_fault(rig, row)
-        assert not rig.found.violations
+        assert rig.found.violated == before, rig.found.violations[-3:]
         if not result.wrong:
             return result
     if os.getloadavg()[0] > BUSY * (os.cpu_count() or 1):
