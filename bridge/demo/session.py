@@ -12,18 +12,20 @@ from numpy.typing import NDArray
 
 from bridge.cell import Cell
 from bridge.daemon import Daemon, settings_of
+from bridge.daemon_settings import DaemonSettings
 from bridge.demo.bench import Tracker
 from bridge.demo.links.link import DemoLink
 from bridge.demo.poses import Load
 from bridge.demo.rests import Rests, rests
 from bridge.demo.result import LoopFigures
 from bridge.summary import RunSummary
-from bridge.supervisor import State
+from bridge.supervisor import Cause, State
 from core.errors import LinkError, RunError
 from core.recording.reading import read_columns
 
 Array = NDArray[np.float64]
-ATTEMPTS = 3
+ATTEMPTS = 4
+SLOWEST = 4  # a machine that cannot keep the cell's rate runs at half of it, or at a fourth
 MARGIN = 60.0  # s to connect, arm and end, on top of the trajectory
 
 
@@ -35,13 +37,14 @@ class Session:
         self._folder = folder
         self._tell = tell
         self._runs: list[RunSummary] = []
+        self._slower = 1
 
     def visit(self, cell: Cell, load: Load, poses: Array) -> Rests:
         """Visit poses (M, n) with a load on the arm; returns what was measured at each.
 
         The daemon writes setpoints corrected by the cell's model: a cell without compliance is
-        one without compensation. A run that breaks off is told and repeated from home. Raises
-        RunError where that does not help.
+        one without compensation. A run that breaks off is told and repeated from home, at half the
+        rate where deadlines were missed. Raises RunError where that does not help.
         """
         cell = self._link.declared(cell, load)
         longest = self._link.prepare(self._folder, poses)
@@ -56,13 +59,25 @@ class Session:
                 except (RunError, LinkError) as error:
                     if attempt == ATTEMPTS - 1:
                         raise
-                    self._tell(f"  the run broke off ({error}); once more")
+                    self._tell(f"  the run broke off ({error}); once more{self._slow(error)}")
             raise AssertionError("unreachable")
         finally:
             bench.close()
 
+    def _slow(self, error: Exception) -> str:
+        """Halve the rate from here on where deadlines were missed; return that in words."""
+        if Cause.OVERRUN not in str(error) or self._slower >= SLOWEST:
+            return ""
+        self._slower *= 2
+        return f" at {1 / self._slower:g} of the rate, which this machine may keep"
+
+    def _settings(self, cell: Cell) -> DaemonSettings:
+        given = settings_of(cell)
+        link = given.link.model_copy(update={"rate": given.link.rate / self._slower})
+        return given.model_copy(update={"link": link})
+
     def _run(self, cell: Cell, load: Load, poses: Array, longest: float) -> Rests:
-        daemon = Daemon(settings_of(cell), may_write=True)
+        daemon = Daemon(self._settings(cell), may_write=True)
         over = threading.Event()
         watch = threading.Thread(target=_watch, args=(daemon, over, longest + MARGIN), daemon=True)
         watch.start()

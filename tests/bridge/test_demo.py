@@ -51,8 +51,8 @@ def test_the_demo_shows_what_it_promises(tmp_path: Path) -> None:
     assert error["with"]["rms"] < 1.5 * repeatability
     assert error["with"]["max"] < error["without"]["max"]
     assert 0.01 < repeatability < 0.1
-    assert summary["setpoints_written"] > 20_000
-    assert summary["loop"]["rate_hz"] > 450
+    slower = 2 ** ran.stdout.count("which this machine may keep")
+    assert 0.9 * 500 / slower < summary["loop"]["rate_hz"] < 1.01 * 500
     assert "<script src" not in (out / "report.html").read_text()
     rigid, calibrated = load_cell(out / "cell.yaml"), load_cell(out / "calibrated.yaml")
     assert rigid.model.terms == ()
@@ -60,6 +60,7 @@ def test_the_demo_shows_what_it_promises(tmp_path: Path) -> None:
     diagnosis = json.loads((out / "diagnosis" / "diagnosis.json").read_text())
     assert diagnosis["verdict"] != "no_gap"
     assert diagnosis["channels"][0]["gap_rms"] > 3e-4
+    assert summary["setpoints_written"] > 20_000 / slower
     log = read_log(out / "calibration.csv", 6)
     assert len(log) == summary["samples"]
     assert set(log.require("payload").tolist()) == {5.0, 12.0, 4.0}

@@ -8,11 +8,13 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from bridge.cell import load_cell
 from bridge.demo.page import page
 from bridge.demo.picture import picture
 from bridge.demo.poses import CALIBRATION_LOADS, TEST_LOADS, candidates, plan
 from bridge.demo.rests import Rests, joined, rests, write_log
 from bridge.demo.result import LoopFigures, Result, repeatability
+from bridge.demo.session import Session
 from bridge.demo.terminal import bar
 from bridge.demo.trajectory import ACCELERATION, PERIOD, SPEED, visits, write_trajectory
 from core.arm import builtin_arm
@@ -185,3 +187,61 @@ def test_bars_grow_with_their_share() -> None:
     assert lengths == sorted(lengths)
     assert bar(1.0, 10) == "█" * 10
     assert bar(0.0, 10) != ""
+
+
+class Slow(Session):
+    """A machine that keeps a quarter of the rate only."""
+
+    def __init__(self, kept: float, tell) -> None:
+        super().__init__(None, Path(), tell)
+        self.rates: list[float] = []
+        self.kept = kept
+
+    def _run(self, cell, load, poses, longest):
+        link = self._settings(cell).link
+        self.rates.append(link.rate)
+        if link.rate > self.kept:
+            raise RunError("compensating -> holding (deadlines missed): 28 of 500 cycles missed")
+        return "measured"
+
+
+class Hall:
+    """The link as far as a visit asks for it."""
+
+    home = HOME
+
+    def declared(self, cell, load):
+        return cell
+
+    def prepare(self, folder, poses):
+        return 1.0
+
+    def bench(self):
+        return self
+
+    def hang(self, load): ...
+
+    def go(self, q): ...
+
+    def close(self): ...
+
+
+@pytest.mark.parametrize(("kept", "rates"), [(500, [500]), (125, [500, 250, 125])])
+def test_a_machine_that_misses_deadlines_goes_on_at_a_lower_rate(kept, rates):
+    cell = load_cell(Path(__file__).parents[2] / "config" / "ur10e_simulated.yaml")
+    told: list[str] = []
+    session = Slow(kept, told.append)
+    session._link = Hall()
+    for expected in (rates, rates[-1:]):  # the second visit begins where the first ended
+        session.rates.clear()
+        assert session.visit(cell, TEST_LOADS[0], HOME[None]) == "measured"
+        assert session.rates == expected
+    assert len(told) == len(rates) - 1
+
+
+def test_a_machine_that_cannot_keep_a_fourth_of_the_rate_is_told():
+    cell = load_cell(Path(__file__).parents[2] / "config" / "ur10e_simulated.yaml")
+    session = Slow(50, lambda text: None)
+    session._link = Hall()
+    with pytest.raises(RunError, match="deadlines missed"):
+        session.visit(cell, TEST_LOADS[0], HOME[None])

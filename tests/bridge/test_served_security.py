@@ -72,6 +72,16 @@ def raw(feed, data, limit=3.0):
     return found
 
 
+def answers(feed):
+    """Return whether an honest reader gets through once what hangs there was cut off."""
+    until = time.monotonic() + HEADER_TIME + 10
+    while time.monotonic() < until:
+        with contextlib.suppress(httpx.TransportError):
+            return httpx.get(feed.url + "status").status_code == 200
+        time.sleep(0.1)
+    return False
+
+
 # -- who may be listened to ------------------------------------------------------------------------
 
 
@@ -279,7 +289,7 @@ def test_malformed_and_oversized_requests_get_nothing(plain, data):
     assert b"run-2026" not in found
     assert b"Traceback" not in found
     assert b"root:" not in found
-    assert httpx.get(plain.url + "status").status_code == 200
+    assert answers(plain)
 
 
 def test_noise_brings_nothing_down(plain):
@@ -295,7 +305,7 @@ def test_noise_brings_nothing_down(plain):
             socket.create_connection(("127.0.0.1", plain.port), timeout=2) as link,
         ):
             link.sendall(data)
-    assert httpx.get(plain.url + "status").status_code == 200
+    assert answers(plain)
     assert plain.side.check() is None
     assert plain.side.pid == before
 

@@ -1,0 +1,1 @@
+"""The field calibration session: plan, instruments, capture, fit, report."""

@@ -1,0 +1,1 @@
+"""Many arms, many sessions: fleets."""

@@ -1,0 +1,1 @@
+"""What an instrument tells of the TCP: one base, one file a kind, one table."""

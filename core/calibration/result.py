@@ -1,0 +1,86 @@
+"""What a calibration found, and how far it carries."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.calibration.readings import Readings
+from core.diagnosis.diagnosis import Diagnosis
+from core.model import Model
+from core.registration import Registration
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One parameter, as it is told (CONTRACT's names and signs)."""
+
+    name: str
+    value: float
+    std: float  # 1 sigma
+    unit: str
+    expected_std: float | None = None  # what the plan had promised
+    shown: bool = True  # False: the data do not tell it; it stands where it stood
+    on_bound: bool = False
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Return the 95 % interval."""
+        return self.value - 1.96 * self.std, self.value + 1.96 * self.std
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Error of each reading's prediction: vectors (M, k) in base, m; k = 3, or 1 for distances."""
+
+    vector: Array
+    rows: NDArray[np.int64]  # (M,) rows of the readings
+
+    @property
+    def norm(self) -> Array:
+        """Return the length of each (M,), m."""
+        return np.asarray(np.linalg.norm(self.vector, axis=1))
+
+    @property
+    def rms(self) -> float:
+        """Return the rms of the lengths, m; nan without any."""
+        return float(np.sqrt(np.mean(self.norm**2))) if len(self.vector) else float("nan")
+
+    @property
+    def mean(self) -> float:
+        """Return the mean length, m; nan without any."""
+        return float(self.norm.mean()) if len(self.vector) else float("nan")
+
+    @property
+    def max(self) -> float:
+        """Return the largest length, m; nan without any."""
+        return float(self.norm.max()) if len(self.vector) else float("nan")
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A fit of a whole session. Errors before and after are over the same rows."""
+
+    model: Model  # calibrated
+    nominal: Model  # as the cell had it
+    readings: Readings
+    estimates: tuple[Estimate, ...]
+    covariance: Array  # (p, p) of the estimates that are shown, in their order
+    combinations: tuple[str, ...]  # in words: what cannot be told apart
+    before: Errors  # fitted poses, nominal model
+    after: Errors
+    held_out_before: Errors  # held-out poses
+    held_out_after: Errors
+    outliers: NDArray[np.int64]  # rows of the readings that were weighed down as wild
+    noise: float  # m, 1 sigma of one coordinate: instrument and arm, estimated from the fit
+    repeatability: float  # m, 1 sigma of one coordinate, from repeated poses; nan: none were
+    stations: tuple[Registration, ...]  # frame of each place of the instrument
+    tcp_std: Array  # (M,) m, 1 sigma (3D) of the predicted TCP at the held-out poses
+    diagnosis: Diagnosis | None  # of what is left over; None where the readings do not allow it
+    complete: bool  # True: nothing is left that a further effect could explain
+    verdict: str  # one sentence
+    notes: tuple[str, ...] = field(default=())
