@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from core.loads import Loads
 from core.model import Model, Poses
@@ -203,6 +202,8 @@ def solve(
         [linear.right - linear.matrix[:, ~kept] @ now[~kept], centre[kept] / sigma]
     )
     if nonnegative:
+        from scipy.optimize import nnls  # a quarter of a second, only where something is fitted
+
         found[kept] = nnls(rows, right, maxiter=100 * len(unit))[0] * unit
     else:
         found[kept] = np.linalg.lstsq(rows, right, rcond=1e-12)[0] * unit

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 if TYPE_CHECKING:
     from core.motion import Motion
@@ -28,6 +27,8 @@ def interpolate(time: Array, value: Array, at: Array) -> Array:
     """Return a signal (N,) at other times (M,) by a cubic spline; beyond its ends they hold."""
     if len(time) < 4:
         return np.interp(at, time, value)
+    from scipy.interpolate import CubicSpline  # half a second that few need to wait for
+
     return np.asarray(CubicSpline(time, value)(np.clip(at, time[0], time[-1])))
 
 

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from core.derivatives import differentiate
 from core.errors import LogError
@@ -202,6 +201,13 @@ def _with_derivatives(motion: Motion, given: Array | None) -> Motion:
     return replace(motion, qd=qd, qdd=qdd, valid=valid, stretch=stretch, still=still)
 
 
+def _at(time: Array, value: Array, wanted: Array) -> Array:
+    """Return signals (N, k) at other times (M,) by cubic splines."""
+    from scipy.interpolate import CubicSpline  # half a second that even sampling does not cost
+
+    return np.asarray(CubicSpline(time, value)(wanted))
+
+
 def _derivatives(
     t: Array, step: float, q: Array, given: Array | None
 ) -> tuple[Array, Array, NDArray[np.bool_], Array]:
@@ -209,8 +215,8 @@ def _derivatives(
     grid = np.linspace(t[0], t[-1], max(round((t[-1] - t[0]) / step), 14) + 1)
     even = len(grid) == len(t) and bool(np.abs(grid - t).max() < 1e-2 * step)
     step = float(grid[1] - grid[0])
-    on_grid = q if even else CubicSpline(t, q)(grid)
-    known = given if even or given is None else CubicSpline(t, given)(grid)
+    on_grid = q if even else _at(t, q, grid)
+    known = given if even or given is None else _at(t, given, grid)
     speed = differentiate(on_grid, step, 1)
     for longest in WINDOWS:
         qdd, unsure, edge = _accelerations(on_grid, known, step, longest)
@@ -223,7 +229,7 @@ def _derivatives(
     good[:edge] = good[len(good) - edge :] = False
     qd = speed.value
     if not even:
-        qd, qdd = CubicSpline(grid, qd)(t), CubicSpline(grid, qdd)(t)
+        qd, qdd = _at(grid, qd, t), _at(grid, qdd, t)
         good = np.interp(t, grid, good) > 0.999
     return qd, qdd, good, speed.noise
 
