@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from core.calibration.readings import Readings
 from core.diagnosis.diagnosis import Diagnosis
@@ -26,11 +27,13 @@ class Estimate:
     expected_std: float | None = None  # what the plan had promised
     shown: bool = True  # False: the data do not tell it; it stands where it stood
     on_bound: bool = False
+    freedom: float = np.inf  # degrees of freedom behind std: few make the interval wider
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Return the 95 % interval."""
-        return self.value - 1.96 * self.std, self.value + 1.96 * self.std
+        """Return the 95 % interval (Student's, for the degrees of freedom behind ``std``)."""
+        half = float(stdtrit(self.freedom, 0.975)) * self.std
+        return self.value - half, self.value + half
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""Benchmarks of calibration sessions: planning, coverage, verified error, other programs."""

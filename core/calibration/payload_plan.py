@@ -1,0 +1,118 @@
+"""Which orientations of the flange a short session with the flange sensor needs, and how many."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.calibration.payload_session import NAMES, UNITS, weight_columns
+from core.errors import ExcitationError
+from core.model import Model
+
+Array = NDArray[np.float64]
+WRIST = 3  # joints at the end that turn the flange and hardly move the arm
+CANDIDATES = 600
+ROOM = 0.05  # rad, kept to every joint limit
+USUAL_NOISE = (0.3, 0.02)  # N, Nm, 1 sigma of an averaged reading of a flange sensor
+WANTED = {"payload_mass": 0.02, "payload_cog_x": 2e-3, "payload_cog_y": 2e-3, "payload_cog_z": 2e-3}
+SHORTEST, LONGEST = 6, 20
+
+
+@dataclass(frozen=True)
+class PayloadPlan:
+    """The poses of a session with the flange sensor, in the order of travel."""
+
+    poses: tuple[Array, ...]  # (n,) rad each
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    std: Array  # (10,) expected 1 sigma of each
+    bought: tuple[tuple[int, float, float], ...]  # poses, 1 sigma of mass (kg), of the cog (m)
+
+
+def plan_payload(
+    model: Model,
+    begin: Array,
+    *,
+    poses: int | None = None,
+    mass: float | None = None,
+    noise: tuple[float, float] = USUAL_NOISE,
+    seed: int = 0,
+) -> PayloadPlan:
+    """Return poses around ``begin`` (n,) rad that tell load and sensor bias best (D-optimal).
+
+    Only the last three joints turn, within their limits: whoever stands by sees the tool turn on
+    the spot. ``mass`` (kg; default: the model's) is what is expected to hang there, ``noise``
+    1 sigma of one axis of an averaged reading (N, Nm). ``poses`` None takes as many as bring mass
+    and centre of gravity to 20 g and 2 mm, between 6 and 20. Raises ExcitationError where the
+    limits leave no orientations that tell load from bias.
+    """
+    begin = np.asarray(begin, dtype=float)
+    candidates = _candidates(model, begin, np.random.default_rng(seed))
+    mass = max(model.payload_mass, 0.5) if mass is None else max(mass, 1e-3)
+    sigma = np.repeat(noise, 3)
+    columns = weight_columns(model, candidates) / sigma[None, :, None]
+    columns[:, :, 1:4] *= mass  # the centre of gravity itself, at about this mass
+    scale = np.array([1.0, *[0.1] * 3, *[noise[0]] * 3, *[noise[1]] * 3])
+    chosen = _greedy(columns * scale, LONGEST if poses is None else poses)
+    bought = []
+    std = np.full(10, np.inf)
+    for count in range(SHORTEST if poses is None else min(poses, 4), len(chosen) + 1):
+        std = _std(columns[chosen[:count]])
+        bought.append((count, float(std[0]), float(std[1:4].max())))
+        enough = all(std[NAMES.index(name)] <= want for name, want in WANTED.items())
+        if poses is None and enough:
+            chosen = chosen[:count]
+            break
+    if not np.isfinite(std).all():
+        raise ExcitationError(
+            "payload session: within the joint limits the wrist cannot turn the flange far enough "
+            "to tell load from sensor bias; begin elsewhere"
+        )
+    order = _tour(begin, candidates[chosen])
+    return PayloadPlan(tuple(order), NAMES, UNITS, std, tuple(bought))
+
+
+def _candidates(model: Model, begin: Array, rng: np.random.Generator) -> Array:
+    n = model.arm.n
+    free = np.arange(max(n - WRIST, 0), n)
+    limits = model.arm.limits
+    low = np.maximum(np.where(np.isfinite(limits.lower), limits.lower + ROOM, -np.pi), -np.pi)
+    high = np.minimum(np.where(np.isfinite(limits.upper), limits.upper - ROOM, np.pi), np.pi)
+    candidates = np.tile(begin, (CANDIDATES, 1))
+    candidates[1:, free] = rng.uniform(low[free], high[free], (CANDIDATES - 1, len(free)))
+    return candidates
+
+
+def _greedy(columns: Array, count: int) -> list[int]:
+    """Return the candidates that shrink the volume of what is unknown most, one by one."""
+    information = 1e-6 * np.eye(columns.shape[2])
+    chosen: list[int] = []
+    for _ in range(count):
+        root = np.linalg.inv(information)
+        inner = np.einsum("cip,pq,cjq->cij", columns, root, columns)
+        gain = np.linalg.slogdet(np.eye(columns.shape[1]) + inner)[1]
+        gain[chosen] = -np.inf
+        best = int(np.argmax(gain))
+        chosen.append(best)
+        information = information + columns[best].T @ columns[best]
+    return chosen
+
+
+def _std(columns: Array) -> Array:
+    flat = columns.reshape(-1, columns.shape[2])
+    values, vectors = np.linalg.eigh(flat.T @ flat)
+    if values[0] <= 1e-9 * values[-1]:
+        return np.full(len(values), np.inf)
+    return np.asarray(np.sqrt(np.einsum("ik,ik->i", vectors / values, vectors)))
+
+
+def _tour(begin: Array, poses: Array) -> list[Array]:
+    """Return the poses each next to the one before: the nearest one still to visit."""
+    left, at, order = list(poses), begin, []
+    while left:
+        far = [float(np.abs(q - at).max()) for q in left]
+        at = left.pop(int(np.argmin(far)))
+        order.append(at)
+    return order

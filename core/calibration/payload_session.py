@@ -1,0 +1,179 @@
+"""A short session with the flange sensor: what hangs on the flange, and the sensor's own bias.
+
+At rest the sensor reads the weight of what hangs on it and a constant of its own. Turned against
+gravity the weight turns and the constant does not; both are linear in mass, mass times centre of
+gravity, and bias, so that a handful of orientations tells all ten numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.calibration.result import Estimate
+from core.calibration.robust import weighed
+from core.effects import CATALOGUE, Site, Term
+from core.errors import ExcitationError, InputError
+from core.log import Log
+from core.model import Model
+from core.motion import Motion, motion_of
+
+Array = NDArray[np.float64]
+AXES = ("fx", "fy", "fz", "mx", "my", "mz")
+NAMES = ("payload_mass", *(f"payload_cog_{k}" for k in "xyz"), *(f"ft_bias_{k}" for k in AXES))
+UNITS = ("kg", "m", "m", "m", "N", "N", "N", "Nm", "Nm", "Nm")
+SHAPING = ("ft_misalignment", "ft_gain")  # how the sensor turns and scales what it feels
+RANK = 1e-9
+LIGHT = 3.0  # standard deviations of its mass below which a load has no centre to speak of
+FEWEST = 3
+
+
+@dataclass(frozen=True)
+class PayloadCalibration:
+    """What a session with the flange sensor found."""
+
+    mass: float  # kg, of everything beyond the sensor
+    cog: Array  # (3,) m, flange axes
+    bias: Array  # (6,) N, Nm: what the sensor reads with nothing on it, flange axes
+    estimates: tuple[Estimate, ...]  # in the order of NAMES
+    covariance: Array  # (10, 10)
+    noise: tuple[float, float]  # N and Nm, 1 sigma of one axis of one reading
+    residual: Array  # (N, 6) reading minus prediction
+    outliers: NDArray[np.int64]  # readings weighed down as wild
+    verdict: str  # one sentence
+    notes: tuple[str, ...]
+
+    def applied(self, model: Model) -> Model:
+        """Return the model that carries this load and knows this bias, instead of its own."""
+        kept = tuple(t for t in model.terms if t.effect not in ("payload", "ft_bias"))
+        bias = Term("ft_bias", Site(), tuple(float(v) for v in self.bias))
+        return replace(
+            model, payload_mass=self.mass, payload_cog=self.cog.copy(), terms=(*kept, bias)
+        )
+
+
+def weight_columns(model: Model, q: Array) -> Array:
+    """Return d reading / d (mass, mass x cog, bias) as (N, 6, 10), at rest at ``q`` (N, n).
+
+    The flange stands as the model bends; a sensor that the model knows to be turned or scaled
+    reads accordingly.
+    """
+    poses = model.predict(q)
+    hand = poses.rotation @ model.chain().tool_rotation.T
+    down = np.swapaxes(hand, 1, 2) @ model.gravity
+    columns = np.zeros((len(q), 6, 10))
+    columns[:, :3, 0] = down
+    for k in range(3):
+        columns[:, 3:, 1 + k] = np.cross(np.eye(3)[k], down)
+    shaping = [t for t in model.terms if t.effect in SHAPING]
+    motion = motion_of(Log("readings", {"actual_q": q}, model.arm.n))
+    for k in range(4):
+        columns[:, :, k] = _sensed(model, shaping, columns[:, :, k], motion)
+    columns[:, :, 4:] = np.eye(6)
+    return columns
+
+
+def _sensed(model: Model, shaping: list[Term], wrench: Array, motion: Motion) -> Array:
+    for term in sorted(shaping, key=lambda t: SHAPING.index(t.effect)):
+        wrench = CATALOGUE[term.effect].sense(term, model.arm, wrench, motion)
+    return wrench
+
+
+def calibrate_payload(model: Model, q: Array, wrench: Array) -> PayloadCalibration:
+    """Return mass, centre of gravity and sensor bias from readings at rest.
+
+    ``q`` (N, n) rad, ``wrench`` (N, 6): ``ft_raw_wrench`` as CONTRACT has it, averaged at each
+    pose. Wild readings are weighed down and listed. Raises InputError where the readings do not
+    fit together, ExcitationError where the orientations do not tell load from bias.
+    """
+    q, wrench = np.asarray(q, dtype=float), np.asarray(wrench, dtype=float)
+    _check(model, q, wrench)
+    columns = weight_columns(model, q)
+    _require_turning(columns, len(q))
+    flat, value = columns.reshape(-1, 10), wrench.reshape(-1)
+    unit = np.tile(np.repeat([0, 1], 3), len(q))  # forces and torques have a noise of their own
+    fit = weighed(flat, value, unit, row=np.repeat(np.arange(len(q)), 6))
+    covariance, cog = _told(fit.values, fit.covariance)
+    mass = float(fit.values[0])
+    values = np.concatenate([[mass], cog, fit.values[4:]])
+    std = np.sqrt(np.diag(covariance))
+    estimates = tuple(
+        Estimate(name, float(v), float(s), u, freedom=fit.freedom)
+        for name, v, s, u in zip(NAMES, values, std, UNITS, strict=True)
+    )
+    notes = _notes(mass, float(std[0]), fit.outliers)
+    return PayloadCalibration(
+        mass, cog, fit.values[4:].copy(), estimates, covariance,
+        (float(fit.noise[0]), float(fit.noise[1])),
+        (value - flat @ fit.values).reshape(-1, 6), fit.outliers,
+        _verdict(estimates, notes), notes,
+    )  # fmt: skip
+
+
+def _check(model: Model, q: Array, wrench: Array) -> None:
+    if q.ndim != 2 or q.shape[1] != model.arm.n:
+        raise InputError(f"payload session: found angles {q.shape}, expected (N, {model.arm.n})")
+    if wrench.shape != (len(q), 6):
+        raise InputError(f"payload session: found wrenches {wrench.shape}, expected {len(q), 6}")
+    if not (np.isfinite(q).all() and np.isfinite(wrench).all()):
+        row = int(np.flatnonzero(~np.isfinite(np.hstack([q, wrench])).all(axis=1))[0])
+        raise InputError(f"payload session: reading {row + 1} is not finite, expected numbers")
+    if len(q) < FEWEST:
+        raise ExcitationError(
+            f"payload session: found {len(q)} reading(s), expected {FEWEST} or more orientations"
+        )
+
+
+def _require_turning(columns: Array, count: int) -> None:
+    scaled = columns * np.array([0.1, *[0.1] * 3, 1, 1, 1, 1, 1, 1])  # gravity brought near one
+    size = np.linalg.svd(scaled.reshape(-1, 10), compute_uv=False)
+    # below a turn of about a degree the load would be read off the noise
+    if size[-1] < 0.02 * np.sqrt(count):
+        raise ExcitationError(
+            f"payload session: in {count} readings gravity hardly turns in the flange, so that "
+            "load and sensor bias cannot be told apart; expected orientations tens of degrees "
+            "apart about two axes"
+        )
+
+
+def _told(values: Array, covariance: Array) -> tuple[Array, Array]:
+    """Return the covariance in terms of the centre of gravity itself, and that centre."""
+    mass, moment = float(values[0]), values[1:4]
+    if abs(mass) < LIGHT * np.sqrt(covariance[0, 0]):
+        told = covariance.copy()
+        told[1:4, :] = told[:, 1:4] = 0.0
+        told[1:4, 1:4] = np.diag([np.inf] * 3)
+        return told, np.zeros(3)
+    T = np.eye(10)
+    T[1:4, 1:4] = np.eye(3) / mass
+    T[1:4, 0] = -moment / mass**2
+    return T @ covariance @ T.T, moment / mass
+
+
+def _notes(mass: float, std: float, outliers: NDArray[np.int64]) -> tuple[str, ...]:
+    notes = []
+    if abs(mass) < LIGHT * std:
+        notes.append("nothing that weighs hangs on the sensor: a centre of gravity is not told")
+    elif mass < 0:
+        notes.append(
+            f"the load weighs {mass:.3f} kg: the sensor's signs or axes are not the contract's "
+            "(a mass at rest reads its weight, pointing down, in flange axes)"
+        )
+    if len(outliers):
+        rows = ", ".join(str(int(r) + 1) for r in outliers)
+        notes.append(f"weighed down as wild: reading {rows}")
+    return tuple(notes)
+
+
+def _verdict(estimates: tuple[Estimate, ...], notes: tuple[str, ...]) -> str:
+    mass = estimates[0]
+    if mass.value < 0 or not np.isfinite(estimates[1].std):
+        return notes[0]
+    low, high = mass.interval
+    centre = max(e.std for e in estimates[1:4])
+    return (
+        f"the load weighs {mass.value:.3f} kg ({low:.3f} to {high:.3f}), its centre of gravity is "
+        f"known to {1e3 * centre:.1f} mm (1 sigma)"
+    )

@@ -1,0 +1,129 @@
+"""Sessions with the flange sensor: load and bias against truths made by mechanics of its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from benchmarks.blind.arms import ARMS
+from benchmarks.blind.mechanics import stand
+from benchmarks.calibration.drawings import model_of, real_arm, session_at
+from core.calibration.payload_plan import plan_payload
+from core.calibration.payload_session import calibrate_payload
+from core.errors import ExcitationError, InputError
+from core.model import Model
+
+Array = NDArray[np.float64]
+KIND = ARMS["cobot10"]
+BEGIN = np.array([0.0, -1.5, 1.5, -1.5, -1.5, 0.0])
+FORCE, TORQUE = 0.1, 0.005  # N, Nm
+
+
+def _readings(q: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return what a sensor reads (N, 6), and the truth (10,): mass, cog, bias."""
+    mass, cog = rng.uniform(1, 8), 0.05 * rng.normal(size=3)
+    bias = np.concatenate([3 * rng.normal(size=3), 0.2 * rng.normal(size=3)])
+    shape = stand(real_arm(KIND), session_at(q, mass, cog))
+    weight = mass * np.array([0, 0, -9.80665])
+    force = np.einsum("nji,j->ni", shape.flange_rotation, weight)
+    noise = rng.normal(size=(len(q), 6)) * np.repeat([FORCE, TORQUE], 3)
+    return np.hstack([force, np.cross(cog, force)]) + bias + noise, np.array([mass, *cog, *bias])
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return model_of(real_arm(KIND))
+
+
+def test_intervals_hold_mass_centre_and_bias_in_95_of_100_sessions(model: Model) -> None:
+    held = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        q = rng.uniform(KIND.low, KIND.high, (8, 6))
+        wrench, truth = _readings(q, rng)
+        found = calibrate_payload(model, q, wrench)
+        held += [
+            e.interval[0] <= t <= e.interval[1] for e, t in zip(found.estimates, truth, strict=True)
+        ]
+    assert 0.92 < np.mean(held) < 0.98  # 600 of them
+
+
+def test_a_bumped_sensor_is_listed_and_hardly_changes_the_load(model: Model) -> None:
+    rng = np.random.default_rng(3)
+    q = rng.uniform(KIND.low, KIND.high, (8, 6))
+    wrench, truth = _readings(q, rng)
+    wrench[4, 1] += 30.0
+    found = calibrate_payload(model, q, wrench)
+    assert list(found.outliers) == [4]
+    assert found.mass == pytest.approx(truth[0], abs=0.03)
+    assert "reading 5" in " ".join(found.notes)
+
+
+def test_the_model_carries_the_load_and_the_bias_afterwards(model: Model) -> None:
+    rng = np.random.default_rng(5)
+    q = rng.uniform(KIND.low, KIND.high, (8, 6))
+    wrench, _ = _readings(q, rng)
+    found = calibrate_payload(model, q, wrench)
+    carried = found.applied(model)
+    assert carried.payload_mass == found.mass
+    again = found.applied(carried)
+    assert [t.effect for t in again.terms].count("ft_bias") == 1
+
+
+def test_a_sensor_known_to_be_turned_is_read_as_it_stands(model: Model) -> None:
+    from core.effects import Site, Term
+
+    rng = np.random.default_rng(6)
+    q = rng.uniform(KIND.low, KIND.high, (10, 6))
+    wrench, truth = _readings(q, rng)
+    bias = truth[4:]
+    turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+    sensed = np.hstack([(wrench - bias)[:, :3] @ turn, (wrench - bias)[:, 3:] @ turn]) + bias
+    knowing = model.with_terms([Term("ft_misalignment", Site(), (0.0, 0.0, np.pi / 2))])
+    found = calibrate_payload(knowing, q, sensed)
+    assert found.cog == pytest.approx(truth[1:4], abs=1e-3)
+
+
+def test_orientations_that_hardly_turn_are_refused(model: Model) -> None:
+    rng = np.random.default_rng(7)
+    q = BEGIN + 0.003 * rng.normal(size=(8, 6))
+    wrench, _ = _readings(q, rng)
+    with pytest.raises(ExcitationError, match="orientations tens of degrees"):
+        calibrate_payload(model, q, wrench)
+
+
+def test_readings_that_are_no_numbers_are_named(model: Model) -> None:
+    wrench = np.zeros((4, 6))
+    wrench[2, 1] = np.nan
+    with pytest.raises(InputError, match="reading 3"):
+        calibrate_payload(model, np.tile(BEGIN, (4, 1)), wrench)
+
+
+def test_a_bare_flange_weighs_nothing_and_has_no_centre(model: Model) -> None:
+    rng = np.random.default_rng(8)
+    q = rng.uniform(KIND.low, KIND.high, (8, 6))
+    found = calibrate_payload(model, q, 0.1 * rng.normal(size=(8, 6)))
+    assert "nothing that weighs" in found.verdict
+    assert not np.isfinite(found.estimates[1].std)
+
+
+def test_planned_orientations_tell_what_they_promise(model: Model) -> None:
+    plan = plan_payload(model, BEGIN, mass=2.0, noise=(FORCE, TORQUE))
+    assert all(np.array_equal(q[:3], BEGIN[:3]) for q in plan.poses)
+    assert plan.bought[-1][0] == len(plan.poses)
+    q = np.array(plan.poses)
+    found, rng = [], np.random.default_rng(9)
+    for _ in range(60):
+        wrench, truth = _readings(q, rng)
+        found.append(calibrate_payload(model, q, wrench).mass - truth[0])
+    assert np.std(found) == pytest.approx(plan.std[0], rel=0.3)
+
+
+def test_a_wrist_that_cannot_turn_is_told_when_planning(model: Model) -> None:
+    limits = replace(model.arm.limits, lower=BEGIN - 0.051, upper=BEGIN + 0.051)
+    fixed = replace(model, arm=replace(model.arm, limits=limits))
+    with pytest.raises(ExcitationError, match="cannot turn the flange far enough"):
+        plan_payload(fixed, BEGIN)
