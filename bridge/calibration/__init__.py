@@ -1,1 +1,1 @@
-"""The field calibration session: plan, instruments, capture, fit, report."""
+"""Field calibration sessions: a technician is led from an unknown arm to a calibrated cell."""

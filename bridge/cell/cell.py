@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
+from bridge.calibration.settings import CalibrationSettings
 from bridge.cell.document import Document, read_document
 from bridge.cell.effects import compliance_terms, term_of
 from bridge.cell.message import message, messages
@@ -95,6 +96,16 @@ class Cell:
         """Return section ``metrics``, its paths seen from here; None where the cell has none."""
         given = self.file.metrics
         return None if given is None else given.located(self.path.parent)
+
+    @property
+    def calibration(self) -> CalibrationSettings:
+        """Return section ``calibration``, its paths seen from here."""
+        given, folder = self.file.calibration, self.path.parent
+        return given.model_copy(
+            update={
+                "folder": folder / given.folder, "instrument": given.instrument.located(folder),
+            }
+        )  # fmt: skip
 
     @property
     def simulation(self) -> Simulation:

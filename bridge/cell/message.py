@@ -69,13 +69,19 @@ def _line(document: Document, schema: type[BaseModel], worst: ErrorDetails) -> s
         return f"{document.path}: found a key {worst['input']!r}, expected a word"
     keys, model = _own_keys(schema, worst["loc"])
     if worst["type"] == "union_tag_invalid":
-        keys.append("driver")
+        keys.append(_chooser(str(worst["ctx"].get("discriminator", ""))))
         return _not_one_of(document, keys, worst["ctx"]["tag"], worst["ctx"]["expected_tags"])
     if worst["type"] == "extra_forbidden":
         return _unknown_key(document, keys, model)
     found, expected = _found(worst), _expected(worst, _description(schema, keys))
     where = f"{document.path}, line {document.line(keys)}"
     return f"{where}: {key_path(keys)}: found {found}, expected {expected}"
+
+
+def _chooser(told: str) -> str:
+    """Return the key that chooses between sections; pydantic quotes it, or names a function."""
+    key = told.strip("'")
+    return key if key.isidentifier() else "driver"
 
 
 def _not_one_of(document: Document, keys: list[str | int], found: object, expected: str) -> str:

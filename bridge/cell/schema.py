@@ -6,6 +6,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from bridge.calibration.settings import CalibrationSettings
 from bridge.metrics.settings import MetricsSettings
 from bridge.settings import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
 from bridge.web.settings import WebSettings
@@ -138,4 +139,7 @@ class CellFile(Section):
     recording: RecordingSettings = RecordingSettings()
     web: WebSettings | None = Field(default=None, description="port, ...: the status page")
     metrics: MetricsSettings | None = Field(default=None, description="port, ...: for Prometheus")
+    calibration: CalibrationSettings = Field(
+        default=CalibrationSettings(), description="instrument, loads, ...: of calibration sessions"
+    )
     simulation: Simulation = Simulation()

@@ -9,6 +9,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "status": ("bridge.cli.status:status", "Tell what the daemon of a cell does."),
     "arm": ("bridge.cli.arm:arm", "Have the daemon of a cell write setpoints."),
     "disarm": ("bridge.cli.arm:disarm", "Have the daemon of a cell ramp out and observe."),
+    "calibrate": (
+        "bridge.cli.calibrate:calibrate",
+        "Lead a field calibration session; it can be resumed.",
+    ),
     "export": (
         "bridge.cli.export:export_recording",
         "Turn a recording of the daemon into a log.",

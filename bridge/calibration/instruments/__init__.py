@@ -1,1 +1,30 @@
-"""Instruments of a calibration session: one base, one file a member, one table."""
+"""What measures the tool; an explicit table of instruments."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, cast
+
+if TYPE_CHECKING:
+    from bridge.calibration.instruments.instrument import Instrument, Surroundings
+    from bridge.calibration.instruments.settings import InstrumentSettings
+
+_HERE = "bridge.calibration.instruments"
+INSTRUMENTS: dict[str, str] = {
+    "typed": f"{_HERE}.typed:Typed",
+    "file": f"{_HERE}.file:File",
+    "folder": f"{_HERE}.folder:WatchedFolder",
+    "line_feed": f"{_HERE}.line_feed:LineFeed",
+    "dial_gauge": f"{_HERE}.dial_gauge:DialGauge",
+    "two_balls": f"{_HERE}.two_balls:TwoBalls",
+    "sphere": f"{_HERE}.sphere:Sphere",
+    "simulated_tracker": f"{_HERE}.simulated_tracker:SimulatedTracker",
+}
+"""Name in a cell file (calibration.instrument.kind) -> ``module:Class``, imported on use."""
+
+
+def make_instrument(settings: InstrumentSettings, around: Surroundings) -> Instrument:
+    """Return the instrument that the settings name, not yet open."""
+    module, kind = INSTRUMENTS[settings.kind].split(":")
+    found = getattr(importlib.import_module(module), kind)
+    return cast("Instrument", found(settings, around))

@@ -1,0 +1,45 @@
+"""The instrument that a session uses: the cell's, or the one given on the command line."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import yaml
+from pydantic import TypeAdapter, ValidationError
+
+from bridge.calibration.instruments import INSTRUMENTS
+from bridge.calibration.instruments.settings import InstrumentSettings
+from core.errors import InputError
+
+if TYPE_CHECKING:
+    from bridge.cell import Cell
+
+_SETTINGS: TypeAdapter[InstrumentSettings] = TypeAdapter(InstrumentSettings)
+
+
+def instrument_settings(cell: Cell, given: str | None) -> InstrumentSettings:
+    """Return the settings of an instrument told as ``KIND[,KEY=VALUE...]``; None: the cell's.
+
+    Keys that are left out come from the cell where it has the same kind. Paths are seen from the
+    working folder. Raises InputError.
+    """
+    own = cell.calibration.instrument
+    if given is None:
+        return own
+    kind, *pairs = (part.strip() for part in given.split(","))
+    if kind not in INSTRUMENTS:
+        raise InputError(f"--instrument: found {kind!r}, expected one of {', '.join(INSTRUMENTS)}")
+    keys: dict[str, Any] = own.model_dump() if own.kind == kind else {}
+    keys["kind"] = kind
+    for pair in pairs:
+        name, equals, value = pair.partition("=")
+        if not equals:
+            raise InputError(f"--instrument: found {pair!r}, expected KEY=VALUE")
+        keys[name.strip()] = yaml.safe_load(value)
+    try:
+        return _SETTINGS.validate_python(keys)
+    except ValidationError as error:
+        worst = error.errors()[0]
+        name = ".".join(str(part) for part in worst["loc"][1:])
+        words = str(worst["msg"]).removeprefix("Value error, ")
+        raise InputError(f"--instrument {kind}: {name}: {words[:1].lower()}{words[1:]}") from None

@@ -1,0 +1,172 @@
+"""Section ``calibration.instrument``: what measures, in which unit, and how it is reached.
+
+Small pydantic models without any instrument behind them, so that a cell is read without one.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+LengthUnit = Literal["m", "mm", "um", "in"]
+AngleUnit = Literal["rad", "deg"]
+METRES: dict[str, float] = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
+RADIANS: dict[str, float] = {"rad": 1.0, "deg": 0.017453292519943295}
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class Base(BaseModel):
+    """What every instrument says."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    sigma: Positive | None = Field(
+        default=None, description="m, 1 sigma of one coordinate; default: metrology.sigma"
+    )
+    serial: str = Field(default="", description="of the instrument, for the report")
+
+    @property
+    def measures(self) -> str:
+        """Return the kind of its readings, a key of the calibration's observables."""
+        return "position"
+
+    def located(self, folder: Path) -> Base:
+        """Return the settings with relative paths, which are seen from ``folder``, made whole."""
+        return self
+
+
+class Coordinates(Base):
+    """An instrument that tells a point, or a pose, as numbers in a text."""
+
+    unit: LengthUnit = Field(description="of lengths: m, mm, um or in")
+    pose: bool = Field(default=False, strict=True, description="true: rotation as well")
+    rotation: Literal["rotation_vector", "rpy", "quaternion"] = Field(
+        default="rotation_vector", description="how a pose tells its rotation; quaternion: x y z w"
+    )
+    angle_unit: AngleUnit = Field(default="deg", description="of rotation angles: rad or deg")
+
+    @property
+    def measures(self) -> str:
+        """Return ``pose`` or ``position``."""
+        return "pose" if self.pose else "position"
+
+    @property
+    def width(self) -> int:
+        """Return how many numbers one reading has."""
+        if not self.pose:
+            return 3
+        return 7 if self.rotation == "quaternion" else 6
+
+
+class TypedSettings(Coordinates):
+    """Numbers that are typed, or pasted from the clipboard, at the terminal."""
+
+    kind: Literal["typed"] = "typed"
+
+
+class FileSettings(Coordinates):
+    """A CSV file in which the readings stand, row by row, in the order of the plan."""
+
+    kind: Literal["file"]
+    file: Path = Field(description="the CSV, seen from the cell's folder")
+    columns: tuple[str, ...] | None = Field(
+        default=None, description="names of its columns; default: the last ones of each row"
+    )
+    timeout: Positive = Field(default=600.0, description="s to wait for the next row")
+
+    def located(self, folder: Path) -> FileSettings:
+        """Return the settings with the file seen from here."""
+        return self.model_copy(update={"file": folder / self.file})
+
+
+class FolderSettings(Coordinates):
+    """A folder into which the tracker's software exports one file a reading."""
+
+    kind: Literal["folder"]
+    folder: Path = Field(description="seen from the cell's folder")
+    pattern: str = Field(default="*.csv", description="which files count")
+    columns: tuple[str, ...] | None = Field(
+        default=None, description="names of the columns; default: the last ones of each row"
+    )
+    timeout: Positive = Field(default=600.0, description="s to wait for the next file")
+
+    def located(self, folder: Path) -> FolderSettings:
+        """Return the settings with the folder seen from here."""
+        return self.model_copy(update={"folder": folder / self.folder})
+
+
+class LineFeedSettings(Coordinates):
+    """A TCP port of the tracker's software that sends one reading a line."""
+
+    kind: Literal["line_feed"]
+    host: str = Field(default="127.0.0.1", description="address of the tracker's software")
+    port: int = Field(gt=0, lt=65536, strict=True, description="of the tracker's software")
+    trigger: str = Field(default="", description="line that asks for one reading; none: it streams")
+    timeout: Positive = Field(default=10.0, description="s to wait for a line")
+
+
+class DialGaugeSettings(Base):
+    """A dial gauge, draw wire or ballbar: the distance from a fixed point to the target."""
+
+    kind: Literal["dial_gauge"]
+    unit: LengthUnit = Field(description="of lengths: m, mm, um or in")
+    zero: float = Field(default=0.0, description="distance at which it reads nothing, in its unit")
+
+    @property
+    def measures(self) -> str:
+        """Return ``distance``."""
+        return "distance"
+
+
+class TwoBallsSettings(Base):
+    """Two balls on the tool, both measured at each pose: only their difference counts."""
+
+    kind: Literal["two_balls"]
+    unit: LengthUnit = Field(description="of lengths: m, mm, um or in")
+
+    @property
+    def measures(self) -> str:
+        """Return ``relative``."""
+        return "relative"
+
+
+class SphereSettings(Base):
+    """A fixed sphere that the tool's probe touches: joint angles alone are the reading."""
+
+    kind: Literal["sphere"]
+
+    @property
+    def measures(self) -> str:
+        """Return ``sphere``."""
+        return "sphere"
+
+
+class SimulatedTrackerSettings(Base):
+    """The laser tracker beside `gapbridge simulate`."""
+
+    kind: Literal["simulated_tracker"]
+    host: str | None = Field(default=None, description="loopback address; default: link.host")
+    port: int = Field(default=30100, gt=0, lt=65536, strict=True, description="the bench port")
+    pose: bool = Field(default=False, strict=True, description="true: rotation as well")
+
+    @property
+    def measures(self) -> str:
+        """Return ``pose`` or ``position``."""
+        return "pose" if self.pose else "position"
+
+
+InstrumentSettings = Annotated[
+    TypedSettings
+    | FileSettings
+    | FolderSettings
+    | LineFeedSettings
+    | DialGaugeSettings
+    | TwoBallsSettings
+    | SphereSettings
+    | SimulatedTrackerSettings,
+    Field(discriminator="kind"),
+]
+"""Section ``calibration.instrument``: the settings of the instrument that ``kind`` names."""
