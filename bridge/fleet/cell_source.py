@@ -1,0 +1,123 @@
+"""Which cell a session belongs to: one for all, one beside each log, or a table."""
+
+from __future__ import annotations
+
+import csv
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+
+from bridge.cell import load_cell
+from bridge.fleet.session import Session
+from core.errors import CellError, InputError
+
+BESIDE = "beside"
+NAMES = ("cell.yaml", "cell.yml")
+
+
+class CellSource(ABC):
+    """Says which cell file a session belongs to."""
+
+    @abstractmethod
+    def cell_of(self, session: Session) -> Path:
+        """Return the session's cell file; raises InputError where it has none."""
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return what is to be told before the work begins."""
+        return ()
+
+
+@dataclass(frozen=True)
+class OneCell(CellSource):
+    """The same cell for every session."""
+
+    path: Path
+
+    def cell_of(self, session: Session) -> Path:
+        """Return the cell."""
+        return self.path
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return the cell's own warnings; raises CellError where it cannot be used."""
+        return load_cell(self.path).warnings
+
+
+@dataclass(frozen=True)
+class CellBeside(CellSource):
+    """A cell beside each log: named like it, or ``cell.yaml`` there or in a folder above."""
+
+    folder: Path  # of the fleet: no cell above it is looked at
+
+    def cell_of(self, session: Session) -> Path:
+        """Return the nearest cell."""
+        own = [session.log.with_suffix(suffix) for suffix in (".yaml", ".yml")]
+        top = self.folder.absolute()
+        for place in session.log.absolute().parents:
+            own += [place / name for name in NAMES]
+            if place == top:
+                break
+        for path in own:
+            if path.is_file():
+                return path
+        raise CellError(
+            f"{session.log}: found no cell beside it, expected {own[0].name} or cell.yaml there, "
+            f"or cell.yaml in a folder above up to {self.folder}"
+        )
+
+
+@dataclass(frozen=True)
+class CellTable(CellSource):
+    """A CSV of columns ``arm`` and ``cell``; paths are seen from the table's folder."""
+
+    path: Path
+    cells: dict[str, Path]
+
+    def cell_of(self, session: Session) -> Path:
+        """Return the cell of the session's arm."""
+        try:
+            return self.cells[session.arm]
+        except KeyError:
+            raise CellError(
+                f"{session.log}: {self.path}: found no row for arm {session.arm!r}, expected one"
+            ) from None
+
+
+def cell_source(text: str, folder: Path) -> CellSource:
+    """Return what ``--cell`` says: a cell file, a table (.csv), or the word ``beside``.
+
+    Raises InputError where it is none of them, or the table cannot be used.
+    """
+    if text == BESIDE:
+        return CellBeside(folder)
+    path = Path(text)
+    return _table(path) if path.suffix.lower() == ".csv" else OneCell(path)
+
+
+def _table(path: Path) -> CellTable:
+    if not path.is_file():
+        raise InputError(f"{path}: file not found, expected a table with columns arm and cell")
+    cells: dict[str, Path] = {}
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = csv.DictReader(file)
+            names = rows.fieldnames or []
+            if not {"arm", "cell"} <= set(names):
+                raise InputError(
+                    f"{path}: header: found {', '.join(names) or 'nothing'}, expected columns "
+                    "arm and cell"
+                )
+            for row in rows:
+                arm, cell = (row["arm"] or "").strip(), (row["cell"] or "").strip()
+                if not arm or not cell:
+                    raise InputError(
+                        f"{path}: row {rows.line_num}: found no {'cell' if arm else 'arm'}, "
+                        "expected both"
+                    )
+                if arm in cells:
+                    raise InputError(
+                        f"{path}: row {rows.line_num}: found arm {arm!r} twice, expected once"
+                    )
+                cells[arm] = path.parent / cell
+    except (UnicodeDecodeError, csv.Error):
+        raise InputError(f"{path}: found no readable CSV (UTF-8), expected a table") from None
+    return CellTable(path, cells)

@@ -1,0 +1,68 @@
+"""The work on one session: its diagnosis, as rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from bridge.cell import Cell
+from core.diagnosis.diagnosis import diagnose
+from core.diagnosis.document import document
+from core.log import Log
+
+EPOCH = 1.0e9  # s: timestamps beyond count from 1970, those below from some start
+
+
+def work(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the diagnosis as facts of the session, its channels, and a row per parameter."""
+    found = document(
+        diagnose(cell.model, log, cell.metrology, withhold=options.get("withhold", ()))
+    )
+    rows = [row for channel in found["channels"] for row in _rows(channel)]
+    return {
+        **facts(cell, log),
+        "verdict": found["verdict"],
+        "channels": [_channel(c) for c in found["channels"]],
+        "rows": rows,
+    }
+
+
+def facts(cell: Cell, log: Log) -> dict[str, Any]:
+    """Return what is to be known of a session, whatever is done with it."""
+    time = log.get("timestamp")
+    begin = float(time[0]) if time is not None and time[0] > EPOCH else None
+    return {"type": cell.arm.name, "joints": cell.arm.n, "poses": len(log), "time": begin}
+
+
+def _channel(channel: Mapping[str, Any]) -> dict[str, Any]:
+    names = ("channel", "unit", "verdict", "samples", "gap_rms", "gap_max", "noise_floor_rms",
+             "remaining_rms", "remaining_rms_held_out")  # fmt: skip
+    return {
+        **{name: channel[name] for name in names},
+        "structured": channel["unexplained"]["structured"],
+        "depends_on": [q["quantity"] for q in channel["unexplained"]["depends_on"]],
+    }
+
+
+def _rows(channel: Mapping[str, Any]) -> list[dict[str, Any]]:
+    rows = []
+    for cause in channel["causes"]:
+        low, high = cause["shrink_interval"] or (None, None)
+        shared = {
+            "channel": channel["channel"], "effect": cause["effect"], "accused": True,
+            "joints": cause["joints"], "probability": cause["probability"],
+            "shrink": cause["shrink"], "shrink_low": low, "shrink_high": high,
+            "shrink_alone": cause["shrink_alone"],
+            "indistinguishable_from": cause["indistinguishable_from"],
+        }  # fmt: skip
+        rows += [
+            {**shared, "parameter": p["name"], "value": p["value"], "std": p["std"],
+             "unit": p["unit"]}
+            for p in cause["parameters"]
+        ]  # fmt: skip
+    rows += [
+        {"channel": channel["channel"], "effect": k["effect"], "accused": False,
+         "probability": k["probability"], "shrink_alone": k["shrink_alone"]}
+        for k in channel["considered"] if k["excited"]
+    ]  # fmt: skip
+    return rows

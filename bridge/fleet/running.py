@@ -1,0 +1,88 @@
+"""One run over a fleet: which sessions are to be done, who does them, what came of all."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bridge.fleet.cell_source import CellSource
+from bridge.fleet.journal import Journal
+from bridge.fleet.session import Session
+from bridge.fleet.task import BAD, Outcome, Task, Work, outcome
+from bridge.fleet.workers import Workers
+from core.errors import InputError
+
+FORM = 1  # of the results: another form is another key
+
+
+@dataclass(frozen=True)
+class Done:
+    """What came of a run, in the order of the sessions."""
+
+    outcomes: tuple[Outcome, ...]
+    resumed: int  # taken from an earlier run
+    seconds: float
+    who: str  # did the work
+
+
+def tasks_of(
+    sessions: Sequence[Session], cells: CellSource, work: Work, options: Mapping[str, Any]
+) -> tuple[list[Task], list[Outcome]]:
+    """Return the tasks, and the outcomes of sessions that have no cell or no log."""
+    tasks, bad = [], []
+    for session in sessions:
+        task = Task("", session.arm, session.name, session.log, Path(), work, options)
+        try:
+            cell = cells.cell_of(session)
+            key = _key(session, cell, work, options)
+            tasks.append(Task(key, session.arm, session.name, session.log, cell, work, options))
+        except InputError as error:
+            bad.append(outcome(task, BAD, error=" ".join(str(error).split())))
+        except OSError as error:
+            bad.append(outcome(task, BAD, error=f"{session.log}: {error.strerror}"))
+    return tasks, bad
+
+
+def run(
+    tasks: Sequence[Task],
+    bad: Sequence[Outcome],
+    workers: Workers,
+    journal: Journal,
+    tell: Callable[[Outcome], None],
+) -> Done:
+    """Do all tasks that the journal does not know; every outcome is in the journal as it comes."""
+    begin = time.perf_counter()
+    outcomes: dict[str, Outcome] = {o.session: o for o in bad}
+    left = []
+    for task in tasks:
+        before = journal.known(task.key)
+        if before is None or not before.final:
+            left.append(task)
+        else:
+            outcomes[task.session] = before
+    resumed = len(tasks) - len(left)
+    if left:
+        with workers:
+            for found in workers.run(left):
+                journal.add(found)
+                outcomes[found.session] = found
+                tell(found)
+    ordered = sorted(outcomes.values(), key=lambda o: o.session)
+    return Done(tuple(ordered), resumed, time.perf_counter() - begin, workers.words())
+
+
+def _key(session: Session, cell: Path, work: Work, options: Mapping[str, Any]) -> str:
+    """Return a key that changes when log, cell, work or options do."""
+    stamps = [
+        (str(path.absolute()), (stat := path.stat()).st_size, stat.st_mtime_ns)
+        for path in (session.log, cell)
+        if path.exists()
+    ]
+    told = [FORM, f"{work.__module__}:{work.__qualname__}", session.arm, session.name, stamps,
+            dict(options)]  # fmt: skip
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:24]

@@ -1,0 +1,127 @@
+"""Sessions: which logs there are, and whose they are."""
+
+from __future__ import annotations
+
+import glob
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from core.errors import InputError
+
+LOGS = (".csv", ".parquet", ".pq")
+WILDCARDS = re.compile(r"[*?\[]")
+
+
+@dataclass(frozen=True)
+class Session:
+    """One log of one arm."""
+
+    arm: str
+    name: str  # its path below the fleet's folder, without the suffix: unique
+    log: Path
+
+
+@dataclass(frozen=True)
+class Found:
+    """All sessions, in the order of their names, and the rule that told the arms."""
+
+    folder: Path
+    sessions: tuple[Session, ...]
+    rule: str
+
+    @property
+    def arms(self) -> int:
+        """Return how many arms there are."""
+        return len({s.arm for s in self.sessions})
+
+
+def find_sessions(where: Sequence[str], pattern: str | None = None) -> Found:
+    """Return the sessions of folders, glob patterns and files.
+
+    A log's arm is the first folder below the fleet's; of a log that lies in that folder itself it
+    is the file's name up to its first underscore. ``pattern`` is a regular expression that finds
+    the arm in the path below the fleet's folder instead (its first group, or the whole match).
+    Raises InputError where there is no log, or the pattern does not fit one.
+    """
+    logs = sorted({log for text in where for log in _logs(text)}, key=lambda p: natural(str(p)))
+    folder = _folder(where, logs)
+    expression = _compiled(pattern)
+    sessions = []
+    for log in logs:
+        below = Path(os.path.relpath(log, folder))
+        name = below.with_suffix("").as_posix()
+        sessions.append(Session(_arm(below, expression, pattern), name, log))
+    _require_unique(sessions)
+    rule = f"pattern {pattern!r}" if pattern else _rule(sessions)
+    return Found(folder, tuple(sessions), rule)
+
+
+def natural(text: str) -> list[tuple[int, int, str]]:
+    """Return a key that sorts ``s2`` before ``s10``."""
+    return [
+        (0, int(part), "") if part.isdigit() else (1, 0, part)
+        for part in re.split(r"(\d+)", text)
+        if part
+    ]
+
+
+def _logs(text: str) -> list[Path]:
+    path = Path(text)
+    if path.is_dir():
+        found = [p for p in path.rglob("*") if p.suffix.lower() in LOGS and p.is_file()]
+        if not found:
+            raise InputError(f"{text}: found no log in this folder, expected CSV or Parquet files")
+        return found
+    if path.is_file():
+        return [path]
+    if WILDCARDS.search(text):
+        found = [Path(p) for p in glob.glob(text, recursive=True)]
+        found = [p for p in found if p.is_file() and p.suffix.lower() in LOGS]
+        if not found:
+            raise InputError(f"{text}: found no log that fits, expected CSV or Parquet files")
+        return found
+    raise InputError(f"{text}: not found, expected a folder of logs, a glob pattern or a log")
+
+
+def _folder(where: Sequence[str], logs: Sequence[Path]) -> Path:
+    if len(where) == 1 and Path(where[0]).is_dir():
+        return Path(where[0])
+    return Path(os.path.commonpath([log.absolute().parent for log in logs]))
+
+
+def _compiled(pattern: str | None) -> re.Pattern[str] | None:
+    try:
+        return None if pattern is None else re.compile(pattern)
+    except re.error as error:
+        raise InputError(f"--arm: found {pattern!r}, no regular expression ({error})") from None
+
+
+def _arm(below: Path, expression: re.Pattern[str] | None, pattern: str | None) -> str:
+    if expression is None:
+        return below.parts[0] if len(below.parts) > 1 else below.stem.split("_")[0]
+    match = expression.search(below.as_posix())
+    if match is None:
+        raise InputError(f"--arm: {pattern!r} does not fit {below.as_posix()}")
+    return match.group(1) if expression.groups else match.group()
+
+
+def _require_unique(sessions: Sequence[Session]) -> None:
+    seen: dict[str, Path] = {}
+    for session in sessions:
+        if session.name in seen:
+            raise InputError(
+                f"{session.log}: found beside {seen[session.name].name}, expected one log of a name"
+            )
+        seen[session.name] = session.log
+
+
+def _rule(sessions: Sequence[Session]) -> str:
+    flat = sum("/" not in s.name for s in sessions)
+    if flat == 0:
+        return "the folder says the arm"
+    if flat == len(sessions):
+        return "the file's name up to its first underscore says the arm"
+    return "the folder, or the file's name up to its first underscore, says the arm"

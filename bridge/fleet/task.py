@@ -1,0 +1,103 @@
+"""A task: the work on one session, done in whatever process; and what comes of it."""
+
+from __future__ import annotations
+
+import functools
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bridge.cell import Cell, load_cell
+from bridge.cli.options import open_log
+from core.errors import GapbridgeError
+from core.log import Log
+
+Work = Callable[[Cell, Log, Mapping[str, Any]], dict[str, Any]]
+DONE, BAD, CRASHED, DIED = "done", "bad", "crashed", "died"
+DEATHS = 2  # a session that has taken so many workers along is not tried again
+
+
+@dataclass(frozen=True)
+class Task:
+    """One session's work; it is sent to a worker as it stands."""
+
+    key: str  # of log, cell, work and options: a result under this key is still good
+    arm: str
+    session: str
+    log: Path
+    cell: Path
+    work: Work
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a task; ``result`` holds plain JSON values."""
+
+    key: str
+    arm: str
+    session: str
+    log: str
+    cell: str
+    state: str  # done, bad (input), crashed (an error nobody foresaw), died (took workers along)
+    seconds: float  # the worker's time, reading the log included
+    error: str = ""  # one line
+    details: str = ""  # the traceback of a crash
+    result: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def final(self) -> bool:
+        """Return whether doing it again would come to the same."""
+        return self.state in (DONE, BAD)
+
+    def document(self) -> dict[str, Any]:
+        """Return it as JSON values."""
+        return asdict(self)
+
+
+def outcome(task: Task, state: str, seconds: float = 0.0, **rest: Any) -> Outcome:
+    """Return the outcome of a task."""
+    return Outcome(
+        task.key, task.arm, task.session, str(task.log), str(task.cell), state, seconds, **rest
+    )
+
+
+def died(task: Task) -> Outcome:
+    """Return the outcome of a task that nobody lived through."""
+    return outcome(
+        task,
+        DIED,
+        error=f"{task.log}: {DEATHS} workers died over this session; it is not tried again "
+        "in this run",
+    )
+
+
+def perform(task: Task) -> Outcome:
+    """Do a task; whatever happens but the death of the process becomes an outcome."""
+    begin = time.perf_counter()
+    try:
+        cell = _cell(task.cell, task.cell.stat().st_mtime_ns) if task.cell.is_file() else (
+            load_cell(task.cell)
+        )  # fmt: skip
+        result = task.work(cell, open_log(task.log, cell), task.options)
+    except GapbridgeError as error:
+        text = " ".join(str(error).split())
+        if str(task.log) not in text:
+            text = f"{task.log}: {text}"
+        return outcome(task, BAD, time.perf_counter() - begin, error=text)
+    except Exception as error:
+        text = " ".join(str(error).split()) or "no message"
+        return outcome(
+            task, CRASHED, time.perf_counter() - begin,
+            error=f"{task.log}: {type(error).__name__}: {text}", details=traceback.format_exc(),
+        )  # fmt: skip
+    return outcome(task, DONE, time.perf_counter() - begin, result=result)
+
+
+@functools.lru_cache(maxsize=64)
+def _cell(path: Path, changed: int) -> Cell:
+    """Return a cell, read once by each process."""
+    return load_cell(path)

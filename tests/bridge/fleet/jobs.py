@@ -1,0 +1,48 @@
+"""Works that tests give to real worker processes; the log's name says what is to happen."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from bridge.cell import Cell
+from core.log import Log
+
+
+def count_rows(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the rows of the log and who has read it."""
+    time.sleep(options.get("pause", 0.0))
+    return {"rows": len(log), "process": os.getpid()}
+
+
+def kill_itself(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Die over logs named ``killer``, once only over those named ``once``."""
+    _note(log, options)
+    name = Path(log.path).stem
+    if "killer" in name or ("once" in name and _runs(log, options) == 1):
+        os.kill(os.getpid(), signal.SIGKILL)
+    return count_rows(cell, log, options)
+
+
+def fail(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Fail as nobody foresaw over logs named ``odd``."""
+    if "odd" in Path(log.path).stem:
+        raise ZeroDivisionError("the odd one")
+    return count_rows(cell, log, options)
+
+
+def _note(log: Log, options: Mapping[str, Any]) -> None:
+    with _book(options).open("a") as file:
+        file.write(f"{Path(log.path).stem}\n")
+
+
+def _runs(log: Log, options: Mapping[str, Any]) -> int:
+    return _book(options).read_text().split().count(Path(log.path).stem)
+
+
+def _book(options: Mapping[str, Any]) -> Path:
+    return Path(str(options["book"]))
