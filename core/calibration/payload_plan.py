@@ -55,7 +55,7 @@ def plan_payload(
     columns = weight_columns(model, candidates) / sigma[None, :, None]
     columns[:, :, 1:4] *= mass  # the centre of gravity itself, at about this mass
     scale = np.array([1.0, *[0.1] * 3, *[noise[0]] * 3, *[noise[1]] * 3])
-    chosen = _greedy(columns * scale, LONGEST if poses is None else poses)
+    chosen = greedy(columns * scale, LONGEST if poses is None else poses)
     bought = []
     std = np.full(10, np.inf)
     for count in range(SHORTEST if poses is None else min(poses, 4), len(chosen) + 1):
@@ -70,7 +70,7 @@ def plan_payload(
             "payload session: within the joint limits the wrist cannot turn the flange far enough "
             "to tell load from sensor bias; begin elsewhere"
         )
-    order = _tour(begin, candidates[chosen])
+    order = tour(begin, candidates[chosen])
     return PayloadPlan(tuple(order), NAMES, UNITS, std, tuple(bought))
 
 
@@ -85,8 +85,11 @@ def _candidates(model: Model, begin: Array, rng: np.random.Generator) -> Array:
     return candidates
 
 
-def _greedy(columns: Array, count: int) -> list[int]:
-    """Return the candidates that shrink the volume of what is unknown most, one by one."""
+def greedy(columns: Array, count: int, first: int | None = None) -> list[int]:
+    """Return the ``count`` candidates that shrink the volume of what is unknown most, in turn.
+
+    ``columns`` (C, k, p) are the readings' derivatives over their noise; ``first`` must be taken.
+    """
     information = 1e-6 * np.eye(columns.shape[2])
     chosen: list[int] = []
     for _ in range(count):
@@ -94,7 +97,7 @@ def _greedy(columns: Array, count: int) -> list[int]:
         inner = np.einsum("cip,pq,cjq->cij", columns, root, columns)
         gain = np.linalg.slogdet(np.eye(columns.shape[1]) + inner)[1]
         gain[chosen] = -np.inf
-        best = int(np.argmax(gain))
+        best = first if first is not None and not chosen else int(np.argmax(gain))
         chosen.append(best)
         information = information + columns[best].T @ columns[best]
     return chosen
@@ -108,7 +111,7 @@ def _std(columns: Array) -> Array:
     return np.asarray(np.sqrt(np.einsum("ik,ik->i", vectors / values, vectors)))
 
 
-def _tour(begin: Array, poses: Array) -> list[Array]:
+def tour(begin: Array, poses: Array) -> list[Array]:
     """Return the poses each next to the one before: the nearest one still to visit."""
     left, at, order = list(poses), begin, []
     while left:

@@ -1,0 +1,179 @@
+"""A short session without any instrument: where the tool's tip sits, from joint angles alone.
+
+The tip is brought onto one fixed point from several orientations, or a ball on the tool is held
+against a fixed ball. Flange poses follow from the joint angles and the model; what makes them all
+agree on one point is the tool.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.calibration.result import Estimate
+from core.calibration.robust import Weighed, weighed
+from core.errors import ExcitationError, InputError
+from core.loads import Loads
+from core.model import Model
+
+Array = NDArray[np.float64]
+NAMES = tuple(f"tool_tcp_{k}" for k in "xyz")
+FEWEST = {False: 3, True: 7}  # readings needed: tip on a point, ball on a ball
+TURNED = 0.15  # rad, about: orientations closer together leave a direction of the tool open
+ROUNDS = 30
+SETTLED = 1e-10  # m
+
+
+@dataclass(frozen=True)
+class ToolCalibration:
+    """Where the tool's tip is."""
+
+    tcp: Array  # (3,) m, flange axes
+    point: Array  # (3,) m, base: the fixed point, or the fixed ball's centre
+    estimates: tuple[Estimate, ...]  # tool_tcp_x, _y, _z
+    covariance: Array  # (3, 3)
+    noise: float  # m, 1 sigma of one coordinate of one touch: hand, arm, and what the model lacks
+    residual: Array  # (N,) m, how far each touch is from the fixed point or ball
+    nominal_residual: Array  # (N,) m, the same with the tool that the cell had, point fitted
+    outliers: NDArray[np.int64]  # touches weighed down as wild
+    verdict: str  # one sentence
+    notes: tuple[str, ...]
+
+    def applied(self, model: Model) -> Model:
+        """Return the model with this tool centre point; the tool's axes stay as they are."""
+        kept = tuple(t for t in model.terms if t.effect != "tool_frame")
+        tool = model.tool_in_flange.copy()
+        tool[:3, :3] = model.chain().tool_rotation
+        tool[:3, 3] = self.tcp
+        return replace(model, tool_in_flange=tool, terms=kept)
+
+
+def calibrate_tool(
+    model: Model, q: Array, loads: Loads | None = None, *, distance: float = 0.0
+) -> ToolCalibration:
+    """Return where the tip sits, from joint angles ``q`` (N, n) rad at which it touched.
+
+    ``distance`` (m) is 0 where the tip itself was brought onto a fixed point, else the distance of
+    the two balls' centres when they touch (the sum of their radii). Wild touches are weighed down
+    and listed. Raises InputError where the angles do not fit the arm, ExcitationError where the
+    orientations leave the tool open.
+    """
+    q = np.asarray(q, dtype=float)
+    _check(model, q, distance > 0)
+    position, rotation = flange_poses(model, q, loads)
+    nominal = model.chain().tool_position
+    start = _points(position, rotation, nominal)
+    before = np.concatenate([nominal, start])
+    values, inner = _fitted(position, rotation, before, distance)
+    std = np.sqrt(np.diag(inner.covariance))[:3]
+    estimates = tuple(
+        Estimate(name, float(v), float(s), "m", freedom=inner.freedom)
+        for name, v, s in zip(NAMES, values, std, strict=False)
+    )
+    notes: tuple[str, ...] = ()
+    if len(inner.outliers):
+        rows = ", ".join(str(int(r) + 1) for r in inner.outliers)
+        notes = (f"weighed down as wild: touch {rows}",)
+    return ToolCalibration(
+        values[:3].copy(), values[3:].copy(), estimates, inner.covariance[:3, :3].copy(),
+        float(inner.noise[0]), _off(position, rotation, values, distance),
+        _off(position, rotation, before, distance), inner.outliers,
+        _verdict(nominal, values[:3], std), notes,
+    )  # fmt: skip
+
+
+def flange_poses(model: Model, q: Array, loads: Loads | None = None) -> tuple[Array, Array]:
+    """Return where the flange is (N, 3) and how it is turned (N, 3, 3), base, as the arm bends."""
+    chain = model.chain()
+    poses = model.predict(q, loads)
+    rotation = poses.rotation @ chain.tool_rotation.T
+    return poses.position - rotation @ chain.tool_position, rotation
+
+
+def touch_columns(rotation: Array) -> Array:
+    """Return d (tip - point) / d (tcp, point) as (N, 3, 6), for flange rotations (N, 3, 3)."""
+    fixed = np.broadcast_to(-np.eye(3), rotation.shape)
+    return np.concatenate([rotation, fixed], axis=2)
+
+
+def _check(model: Model, q: Array, ball: bool) -> None:
+    if q.ndim != 2 or q.shape[1] != model.arm.n or not np.isfinite(q).all():
+        raise InputError(
+            f"tool session: found angles {q.shape}, expected finite ones of (N, {model.arm.n})"
+        )
+    if len(q) < FEWEST[ball]:
+        raise ExcitationError(
+            f"tool session: found {len(q)} touch(es), expected {FEWEST[ball]} or more orientations"
+        )
+
+
+def _points(position: Array, rotation: Array, tcp: Array) -> Array:
+    """Return about where all tips meet (3,)."""
+    return np.asarray(np.median(position + rotation @ tcp, axis=0))
+
+
+def _fitted(
+    position: Array, rotation: Array, values: Array, distance: float
+) -> tuple[Array, Weighed]:
+    """Return tool and point (6,), and the weighed fit at rest."""
+    count = len(position)
+    columns = touch_columns(rotation)
+    cells = 1 if distance else 3
+    row = np.repeat(np.arange(count), cells)
+    unit = np.zeros(count * cells, dtype=np.int64)
+    if distance:  # tip near the point alone: the first look ignores the balls' size
+        values = values + weighed(*_flat(columns, position, rotation, values), *_all(count)).values
+    fit: Weighed | None = None
+    for _ in range(ROUNDS):
+        apart = position + rotation @ values[:3] - values[3:]
+        A, b = columns.reshape(-1, 6), -apart.ravel()
+        if distance:
+            length = np.maximum(np.linalg.norm(apart, axis=1), 1e-9)
+            A = np.einsum("ni,nij->nj", apart / length[:, None], columns)
+            b = distance - length
+        _require_turning(A, count)
+        fit = weighed(A, b, unit, row)
+        values = values + fit.values
+        if np.abs(fit.values).max() < SETTLED:
+            break
+    assert fit is not None
+    return values, fit
+
+
+def _flat(columns: Array, position: Array, rotation: Array, values: Array) -> tuple[Array, Array]:
+    apart = position + rotation @ values[:3] - values[3:]
+    return columns.reshape(-1, 6), -apart.ravel()
+
+
+def _all(count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    return np.zeros(3 * count, dtype=np.int64), np.repeat(np.arange(count), 3)
+
+
+def _require_turning(A: Array, count: int) -> None:
+    size = np.linalg.svd(A, compute_uv=False)
+    if size[-1] < TURNED * np.sqrt(count) / 4:
+        raise ExcitationError(
+            f"tool session: in {count} touches the tool hardly turns, or about one axis only, so "
+            "that its tip is not told; expected orientations tens of degrees apart about two axes"
+        )
+
+
+def _off(position: Array, rotation: Array, values: Array, distance: float) -> Array:
+    apart = np.linalg.norm(position + rotation @ values[:3] - values[3:], axis=1)
+    return np.asarray(np.abs(apart - distance))
+
+
+def _verdict(nominal: Array, tcp: Array, std: Array) -> str:
+    moved = float(np.linalg.norm(tcp - nominal))
+    sure = float(np.linalg.norm(std))
+    if moved < 2.5 * sure:
+        return (
+            f"the tool's tip is where the cell says, within {1e3 * sure:.2f} mm (1 sigma of its "
+            "place)"
+        )
+    return (
+        f"the tool's tip sits {1e3 * moved:.2f} mm beside the cell's, known to {1e3 * sure:.2f} mm "
+        "(1 sigma)"
+    )
