@@ -76,17 +76,18 @@ def calibrate(
 ) -> None:
     """Lead a field calibration session; it can be resumed.
 
-    From an unknown arm to a cell that compensates. Plans the poses, says what to mount and where to put the arm, waits until it stands, reads the
-    instrument, checks each reading at once, and keeps it on disk before the next step: the same
-    command goes on after a break, a power cut or Ctrl-C. At the end it fits, verifies on poses that
-    the fit did not see, writes a report, and asks before it writes a new cell. The arm moves only
-    with --move, and then only after a yes for each load.
+    From an unknown arm to a cell that compensates: plans the poses, says what to mount and where to
+    put the arm, waits until it stands, reads the instrument, checks each reading at once, and keeps
+    it on disk before the next step; the same command goes on after a break, a power cut or Ctrl-C.
+    At the end it fits, verifies on poses that the fit did not see, writes a report, and asks before
+    it writes a new cell. The arm moves only with --move, and then only after a yes for each load.
 
     Section `calibration` of the cell says which instrument and loads there are.
 
-    \b
     Example: gapbridge calibrate cell.yaml --plan-only
+
     Example: gapbridge calibrate cell.yaml --session tuesday --apply calibrated.yaml
+
     Example: gapbridge calibrate cell.yaml --instrument typed,unit=mm --poses 20
     """
     given = open_cell(cell)

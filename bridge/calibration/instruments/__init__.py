@@ -6,7 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
-    from bridge.calibration.instruments.instrument import Instrument, Surroundings
+    from bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
     from bridge.calibration.instruments.settings import InstrumentSettings
 
 _HERE = "bridge.calibration.instruments"
@@ -23,8 +23,8 @@ INSTRUMENTS: dict[str, str] = {
 """Name in a cell file (calibration.instrument.kind) -> ``module:Class``, imported on use."""
 
 
-def make_instrument(settings: InstrumentSettings, around: Surroundings) -> Instrument:
+def make_instrument(settings: InstrumentSettings, around: Surroundings) -> AnyInstrument:
     """Return the instrument that the settings name, not yet open."""
     module, kind = INSTRUMENTS[settings.kind].split(":")
     found = getattr(importlib.import_module(module), kind)
-    return cast("Instrument", found(settings, around))
+    return cast("AnyInstrument", found(settings, around))

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bridge.calibration.instruments.instrument import Instrument, ReadingError, Where
+from bridge.calibration.instruments.instrument import Instrument, ReadingError, Samples, Where
 from bridge.calibration.instruments.numbers import FARTHEST, numbers
 from bridge.calibration.instruments.settings import METRES, DialGaugeSettings
 
@@ -20,7 +19,7 @@ class DialGauge(Instrument[DialGaugeSettings]):
         """Return what is typed."""
         return f"distances typed in {self.settings.unit}"
 
-    def read(self, where: Where) -> NDArray[np.float64]:
+    def read(self, where: Where) -> Samples:
         """Return one sample (1, 1), m. Raises ReadingError."""
         given = self.settings
         (dial,) = numbers(self.around.ask(f"dial, {given.unit}"), 1, given.unit)
@@ -30,4 +29,4 @@ class DialGauge(Instrument[DialGaugeSettings]):
                 f"found a distance of {distance:g} m, expected more than 0 and less than "
                 f"{FARTHEST:g}: are unit and zero right?"
             )
-        return np.array([[distance]])
+        return Samples(np.array([[distance]]))

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import TracebackType
-from typing import Generic, Protocol, Self, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,16 +30,24 @@ class Surroundings:
 
     ask: Ask
     link_host: str = ""  # of the cell's controller; empty: none
-    taken: int = 0  # readings that earlier parts of the session have had from it
+    since: float = 0.0  # s, time.time() when the session began: what is older is none of its
 
 
 @dataclass(frozen=True)
 class Where:
     """What is to be measured now."""
 
-    number: int  # of the reading, from 0: how many the instrument has given before
-    samples: int  # how many to average, where it gives more than one
-    ask_again: Callable[[], None] = field(default=lambda: None)
+    stop: int = 1  # number of the stop in the plan, from 1
+    samples: int = 1  # how many to average, where it gives more than one
+    used: frozenset[str] = frozenset()  # sources of readings that have been had before
+
+
+@dataclass(frozen=True)
+class Samples:
+    """What one look through the instrument gave."""
+
+    values: Array  # (M, k) SI, M at least 1
+    source: str = ""  # row or file that it stood in, so that none counts twice
 
 
 class ReadingError(Exception):
@@ -65,17 +72,17 @@ class Instrument(ABC, Generic[S]):
     def name(self) -> str:
         """Return how people call it, with its unit."""
 
-    def open(self) -> None:  # noqa: B027
+    def open(self) -> None:
         """Get ready. Raises InputError or LinkError where it cannot be reached."""
 
     @abstractmethod
-    def read(self, where: Where) -> Array:
-        """Return samples (M, k) in SI, M at least 1, of the target where it is now.
+    def read(self, where: Where) -> Samples:
+        """Return samples of the target where it is now.
 
         Raises ReadingError where what came is no reading, LinkError where it is gone.
         """
 
-    def close(self) -> None:  # noqa: B027
+    def close(self) -> None:
         """Let go of it. Never raises; may be repeated."""
 
     def __enter__(self) -> Self:
@@ -89,3 +96,6 @@ class Instrument(ABC, Generic[S]):
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+AnyInstrument = Instrument[Any]

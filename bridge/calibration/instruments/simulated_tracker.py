@@ -5,9 +5,8 @@ from __future__ import annotations
 import socket
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bridge.calibration.instruments.instrument import Instrument, Where
+from bridge.calibration.instruments.instrument import Instrument, Samples, Where
 from bridge.calibration.instruments.settings import SimulatedTrackerSettings
 from core.errors import LinkError
 
@@ -42,11 +41,11 @@ class SimulatedTracker(Instrument[SimulatedTrackerSettings]):
                 "expected `gapbridge simulate` to serve the cell"
             ) from None
 
-    def read(self, where: Where) -> NDArray[np.float64]:
+    def read(self, where: Where) -> Samples:
         """Return samples (M, 3) or (M, 6). Raises LinkError."""
         samples = [self._measure() for _ in range(where.samples)]
         found = np.array(samples)[:, 1:]
-        return found if self.settings.pose else found[:, :3]
+        return Samples(found if self.settings.pose else found[:, :3])
 
     def _measure(self) -> list[float]:
         assert self._socket is not None

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bridge.calibration.instruments.instrument import Instrument, Where
+from bridge.calibration.instruments.instrument import Instrument, Samples, Where
 from bridge.calibration.instruments.settings import SphereSettings
 
 
@@ -17,7 +16,7 @@ class Sphere(Instrument[SphereSettings]):
         """Return what is done."""
         return "probe on a fixed sphere"
 
-    def read(self, where: Where) -> NDArray[np.float64]:
+    def read(self, where: Where) -> Samples:
         """Return one sample without any number (1, 0), once the probe sits on the sphere."""
         self.around.ask("probe seated on the sphere? Enter")
-        return np.zeros((1, 0))
+        return Samples(np.zeros((1, 0)))

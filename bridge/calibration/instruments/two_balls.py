@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bridge.calibration.instruments.instrument import Instrument, ReadingError, Where
+from bridge.calibration.instruments.instrument import Instrument, ReadingError, Samples, Where
 from bridge.calibration.instruments.numbers import numbers
 from bridge.calibration.instruments.settings import METRES, TwoBallsSettings
 
@@ -22,7 +21,7 @@ class TwoBalls(Instrument[TwoBallsSettings]):
         """Return what is typed."""
         return f"two balls typed in {self.settings.unit}"
 
-    def read(self, where: Where) -> NDArray[np.float64]:
+    def read(self, where: Where) -> Samples:
         """Return one sample (1, 3), m: second ball minus first. Raises ReadingError."""
         unit = self.settings.unit
         points = []
@@ -32,4 +31,4 @@ class TwoBalls(Instrument[TwoBallsSettings]):
         difference = points[1] - points[0]
         if np.linalg.norm(difference) < NEAREST:
             raise ReadingError("found both balls at the same place, expected two")
-        return np.asarray(difference[None])
+        return Samples(difference[None])

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
-from bridge.calibration.instruments.instrument import Instrument, Where
+from bridge.calibration.instruments.instrument import Instrument, Samples, Where
 from bridge.calibration.instruments.numbers import coordinates, numbers
 from bridge.calibration.instruments.settings import TypedSettings
 
@@ -20,9 +17,9 @@ class Typed(Instrument[TypedSettings]):
         """Return what is typed."""
         return f"readings typed in {self.settings.unit}"
 
-    def read(self, where: Where) -> NDArray[np.float64]:
+    def read(self, where: Where) -> Samples:
         """Return one sample (1, 3) or (1, 6). Raises ReadingError."""
         given = self.settings
         what = "x y z" if not given.pose else f"x y z and {given.rotation}"
         line = self.around.ask(f"{what}, {given.unit}")
-        return coordinates(numbers(line, given.width, given.unit), given)[None]
+        return Samples(coordinates(numbers(line, given.width, given.unit), given)[None])

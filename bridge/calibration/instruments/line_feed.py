@@ -1,0 +1,76 @@
+"""A TCP port of the tracker's software that sends one reading a line."""
+
+from __future__ import annotations
+
+import socket
+import time
+
+import numpy as np
+
+from bridge.calibration.instruments.instrument import Instrument, ReadingError, Samples, Where
+from bridge.calibration.instruments.numbers import coordinates, numbers
+from bridge.calibration.instruments.settings import LineFeedSettings
+from core.errors import LinkError
+
+LONGEST_LINE = 4096  # bytes
+CONNECTING = 5.0  # s
+
+
+class LineFeed(Instrument[LineFeedSettings]):
+    """Connects anew for each pose, so that no line is older than the pose."""
+
+    @property
+    def name(self) -> str:
+        """Return the address."""
+        return f"lines from {self.settings.host}:{self.settings.port} in {self.settings.unit}"
+
+    def open(self) -> None:
+        """Connect once, to see that somebody is there. Raises LinkError."""
+        self._connect().close()
+
+    def _connect(self) -> socket.socket:
+        given = self.settings
+        try:
+            return socket.create_connection((given.host, given.port), timeout=CONNECTING)
+        except OSError as error:
+            raise LinkError(
+                f"calibration.instrument {given.host}:{given.port}: {error.strerror or error}; "
+                "expected the tracker's software to listen there"
+            ) from None
+
+    def read(self, where: Where) -> Samples:
+        """Return as many samples as are asked for. Raises ReadingError, LinkError."""
+        given, found, rest = self.settings, [], b""
+        with self._connect() as link:
+            for _ in range(where.samples):
+                if given.trigger:
+                    link.sendall(given.trigger.encode() + b"\n")
+                line, rest = self._line(link, rest)
+                found.append(coordinates(numbers(line, given.width, given.unit), given))
+        return Samples(np.array(found))
+
+    def _line(self, link: socket.socket, rest: bytes) -> tuple[str, bytes]:
+        """Return the next line that is not empty, and what came after it."""
+        given, until = self.settings, time.monotonic() + self.settings.timeout
+        while True:
+            line, end, after = rest.partition(b"\n")
+            if end and line.strip():
+                return line.decode("utf-8", "replace"), after
+            rest = after if end else rest
+            if end:
+                continue
+            left = until - time.monotonic()
+            if left <= 0.0:
+                raise ReadingError(f"found no line within {given.timeout:g} s, expected a reading")
+            link.settimeout(left)
+            try:
+                data = link.recv(LONGEST_LINE)
+            except TimeoutError:
+                continue
+            except OSError as error:
+                raise LinkError(f"{self.name}: {error}") from None
+            if not data:
+                raise LinkError(f"{self.name}: it has hung up")
+            rest += data
+            if len(rest) > LONGEST_LINE and b"\n" not in rest:
+                raise ReadingError(f"found {len(rest)} bytes without the end of a line")
