@@ -1,0 +1,66 @@
+"""Bringing the arm to something that stands still, with joint angles as the only reading."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.calibration.observables.fixed_point import point_of
+from core.calibration.observables.nuisance import Nuisance
+from core.calibration.observables.observable import Observable
+from core.calibration.readings import Readings
+from core.model import Model, Poses
+from core.rotation import skew
+
+Array = NDArray[np.float64]
+NEWTON_ROUNDS = 40
+CLOSED = 1e-10  # m
+MISSED = 1e-6  # m: farther off than this, no pose was found
+LONGEST = 0.3  # rad, of one joint in a step
+
+
+class Closure(Observable):
+    """A kind without an instrument: the target touches where the gap is zero."""
+
+    closes = True
+    unknown = True
+    frame: ClassVar[tuple[int, ...]] = (0, 1, 2)
+    width: ClassVar[int] = 0
+
+    @abstractmethod
+    def directions(self, apart: Array) -> Array:
+        """Return the directions (N, k, 3) along which the gap is told; ``apart`` (N, 3) is seen."""
+
+    def apart(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
+        """Return the way from the place's fixed point to the target (N, 3), base."""
+        points = np.array([point_of(place) for place in nuisance.stations])
+        return np.asarray(self.seen(poses, readings, nuisance) - points[readings.station])
+
+    def reading(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
+        """Return nothing (N, 0): no instrument is read."""
+        return np.zeros((len(readings), 0))
+
+    def brought(self, model: Model, q: Array, readings: Readings, nuisance: Nuisance) -> Array:
+        """Return joints (N, n) near ``q`` that close the gap; rows of nan where none are found.
+
+        Newton with the smallest step in joint space; ``readings`` give load, place and target.
+        """
+        q = q.copy()
+        for _ in range(NEWTON_ROUNDS):
+            poses = model.predict(q, readings.loads)
+            gap = self.gap(poses, readings, nuisance)
+            if np.abs(gap).max(initial=0.0) < CLOSED:
+                return q
+            whole = model.linear_form(q, readings.loads).jacobian
+            lever = np.einsum("nij,nj->ni", poses.rotation, nuisance.targets[readings.target])
+            moving = whole[:, :3] - skew(lever) @ whole[:, 3:]
+            J = self.directions(self.apart(poses, readings, nuisance)) @ moving
+            step = np.einsum("njk,nk->nj", np.linalg.pinv(J, rcond=1e-6), gap)
+            size = np.abs(step).max(axis=1, keepdims=True)
+            q += step * np.minimum(1.0, LONGEST / np.maximum(size, 1e-12))
+        gap = self.gap(model.predict(q, readings.loads), readings, nuisance)
+        q[np.abs(gap).max(axis=1) > MISSED] = np.nan
+        return q

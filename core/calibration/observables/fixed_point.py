@@ -1,0 +1,43 @@
+"""Points that stand still in the cell: spheres fitted to where the targets were."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.registration import Registration
+
+Array = NDArray[np.float64]
+TINY = 1e-9  # m: nearer to the point than this, no direction is known
+
+
+def fixed_at(point: Array) -> Registration:
+    """Return a place whose origin is at a point (3,) of base."""
+    return Registration(np.eye(3), -np.asarray(point, dtype=float))
+
+
+def point_of(place: Registration) -> Array:
+    """Return where the origin of a place is in base (3,)."""
+    return np.asarray(place.in_base(np.zeros((1, 3)))[0])
+
+
+def trilaterated(position: Array, distance: Array) -> Array:
+    """Return the point (3,) at given distances (N,) from positions (N, 3), by linear least squares.
+
+    In |p - c|^2 = d^2 the unknown |c|^2 is taken as a fourth number.
+    """
+    middle = position.mean(axis=0)
+    p = position - middle
+    A = np.column_stack([2 * p, -np.ones(len(p))])
+    right = np.sum(p**2, axis=1) - distance**2
+    return np.asarray(np.linalg.lstsq(A, right, rcond=1e-9)[0][:3] + middle)
+
+
+def sphere_through(position: Array) -> tuple[Array, float]:
+    """Return centre (3,) and radius of the sphere nearest to positions (N, 3), least squares."""
+    middle = position.mean(axis=0)
+    p = position - middle
+    A = np.column_stack([2 * p, np.ones(len(p))])
+    found = np.linalg.lstsq(A, np.sum(p**2, axis=1), rcond=1e-9)[0]
+    radius = float(np.sqrt(max(found[3] + found[:3] @ found[:3], 0.0)))
+    return found[:3] + middle, radius

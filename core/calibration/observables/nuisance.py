@@ -1,0 +1,61 @@
+"""What is unknown beside the arm: where the instrument stands, and where its targets sit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.registration import IDENTITY, Registration
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which numbers of a Nuisance are unknown, in the order of a step."""
+
+    stations: int
+    targets: int
+    frame: tuple[int, ...]  # of the six of a frame's step
+    length: bool  # one length a station
+    first_target: int  # targets before it are known
+
+    @property
+    def size(self) -> int:
+        """Return how many numbers are unknown (m)."""
+        per_station = len(self.frame) + int(self.length)
+        return self.stations * per_station + 3 * max(self.targets - self.first_target, 0)
+
+
+@dataclass(frozen=True)
+class Nuisance:
+    """Frames of the instrument's places, points of the targets, lengths of S places."""
+
+    stations: tuple[Registration, ...]  # measured = rotation @ position_in_base + position
+    targets: Array  # (T, 3) m, TCP axes: each ball seen from the TCP
+    lengths: Array  # (S,) m: radius of a touched sphere, zero of a gauge
+
+    @classmethod
+    def zero(cls, stations: int = 1, targets: int = 1) -> Nuisance:
+        """Return instruments that stand in base, and targets at the TCP."""
+        return cls((IDENTITY,) * stations, np.zeros((targets, 3)), np.zeros(stations))
+
+    def moved(self, step: Array, layout: Layout) -> Nuisance:
+        """Return the nuisance after a step (m,) of what is unknown in it."""
+        stations, targets, lengths = list(self.stations), self.targets.copy(), self.lengths.copy()
+        at, frame = 0, list(layout.frame)
+        for s in range(layout.stations):
+            if frame:
+                whole = np.zeros(6)
+                whole[frame] = step[at : at + len(frame)]
+                stations[s] = stations[s].moved(whole)
+                at += len(frame)
+            if layout.length:
+                lengths[s] += step[at]
+                at += 1
+        for t in range(layout.first_target, layout.targets):
+            targets[t] += step[at : at + 3]
+            at += 3
+        return Nuisance(tuple(stations), targets, lengths)

@@ -1,0 +1,162 @@
+"""The base of the observables: what a reading is, and how it depends on arm and instrument.
+
+A member says what its instrument reads at given poses of the TCP and how a reading differs from
+that; derivatives are taken numerically of the whole prediction, so that every effect of the
+catalogue enters every kind of reading by one and the same code.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.calibration.observables.nuisance import Layout, Nuisance
+from core.calibration.readings import Readings
+from core.errors import ExcitationError
+from core.model import Model, Poses
+
+if TYPE_CHECKING:
+    from core.calibration.parameters import Parameters
+
+Array = NDArray[np.float64]
+STEP = 1e-5  # m and rad, of a nuisance: the gap is all but linear in it
+SHARE = 0.01  # of a parameter's usual size, as its step
+SETTLED = 1e-9  # m and rad: a smaller step moves nothing that anybody measures
+ROUNDS = 30
+
+
+class Observable(ABC):
+    """One kind of reading. Members are frozen dataclasses with a field ``registered``."""
+
+    kind: ClassVar[str]
+    width: ClassVar[int]  # numbers of a reading (Readings.value)
+    equations: ClassVar[int]  # numbers in which a reading is compared with its prediction (k)
+    frame: ClassVar[tuple[int, ...]]  # what of a place's frame the readings depend on
+    unknown: ClassVar[bool] = False  # the places are unknown whether registered or not
+    closes: ClassVar[bool] = False  # the arm was brought to something: no instrument reads a value
+    first_target: ClassVar[int] = 1  # target 0 is the TCP; those from here on are unknown points
+    registered: bool
+
+    @property
+    def sigmas(self) -> Array:
+        """Return the noise of each equation (k,) in units of the instrument's sigma (m)."""
+        return np.ones(self.equations)
+
+    @property
+    def free_length(self) -> bool:
+        """Return whether one length a place is unknown."""
+        return False
+
+    @abstractmethod
+    def gap(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
+        """Return measured minus predicted (N, k), base axes, for TCP poses of the readings."""
+
+    @abstractmethod
+    def reading(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
+        """Return what the instrument would read (N, width), in its own frame."""
+
+    @abstractmethod
+    def guess(self, poses: Poses, readings: Readings) -> Nuisance:
+        """Return a nuisance to start from, for predicted TCP poses of the readings."""
+
+    def layout(self, readings: Readings) -> Layout:
+        """Return which numbers beside the arm's are unknown in these readings."""
+        frame = () if self.registered and not self.unknown else self.frame
+        stations = int(readings.station.max(initial=0)) + 1
+        return Layout(
+            stations, self.targets_of(readings), frame, self.free_length, self.first_target
+        )
+
+    def targets_of(self, readings: Readings) -> int:
+        """Return how many targets the readings tell of."""
+        return int(readings.target.max(initial=0)) + 1
+
+    def predict(self, model: Model, readings: Readings, nuisance: Nuisance) -> Array:
+        """Return what the instrument would read (N, width), in its own frame."""
+        return self.reading(model.predict(readings.q, readings.loads), readings, nuisance)
+
+    def residual(self, model: Model, readings: Readings, nuisance: Nuisance) -> Array:
+        """Return measured minus predicted (N, k), base axes."""
+        return self.gap(model.predict(readings.q, readings.loads), readings, nuisance)
+
+    def columns(
+        self, parameters: Parameters, values: Array, readings: Readings, nuisance: Nuisance
+    ) -> tuple[Array, Array]:
+        """Return J (N*k, p) and F (N*k, m): residual(new) = residual - J step - F nuisance step."""
+        poses = parameters.model(values).predict(readings.q, readings.loads)
+        J = np.empty((len(readings) * self.equations, len(values)))
+        for i in range(len(values)):
+            step = np.zeros(len(values))
+            step[i] = SHARE * parameters.scales[i]
+            ends = [
+                parameters.model(values + way * step).predict(readings.q, readings.loads)
+                for way in (1, -1)
+            ]
+            one, other = (self.gap(end, readings, nuisance) for end in ends)
+            J[:, i] = (other - one).ravel() / (2 * step[i])
+        return J, self.nuisance_columns(poses, readings, nuisance)
+
+    def nuisance_columns(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
+        """Return F (N*k, m) for TCP poses of the readings."""
+        layout = self.layout(readings)
+        F = np.empty((len(readings) * self.equations, layout.size))
+        for i in range(layout.size):
+            step = np.zeros(layout.size)
+            step[i] = STEP
+            one = self.gap(poses, readings, nuisance.moved(step, layout))
+            other = self.gap(poses, readings, nuisance.moved(-step, layout))
+            F[:, i] = (other - one).ravel() / (2 * STEP)
+        return F
+
+    def start(self, model: Model, readings: Readings) -> Nuisance:
+        """Return the nuisance that fits best to the model as it stands, wild readings or not.
+
+        Raises ExcitationError where there are too few readings to know where the instrument is.
+        """
+        self._require(readings)
+        poses = model.predict(readings.q, readings.loads)
+        return self.settled(poses, readings, self.guess(poses, readings))
+
+    def settled(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Nuisance:
+        """Return the nuisance moved to where it fits best (Gauss-Newton, Cauchy weights)."""
+        layout = self.layout(readings)
+        if not layout.size:
+            return nuisance
+        for _ in range(ROUNDS):
+            gap = self.gap(poses, readings, nuisance) / self.sigmas
+            distance = np.linalg.norm(gap, axis=1)
+            scale = max(2 * float(np.median(distance)), 1e-12)
+            root = np.repeat(1 / np.sqrt(1 + (distance / scale) ** 2), self.equations)
+            F = self.nuisance_columns(poses, readings, nuisance)
+            F = F / np.tile(self.sigmas, len(readings))[:, None]
+            step = np.linalg.lstsq(F * root[:, None], gap.ravel() * root, rcond=1e-10)[0]
+            nuisance = nuisance.moved(step, layout)
+            if np.abs(step).max() < SETTLED:
+                break
+        return nuisance
+
+    def brought(self, model: Model, q: Array, readings: Readings, nuisance: Nuisance) -> Array:
+        """Return joints (N, n) near ``q`` at which a reading can be taken; here ``q`` itself."""
+        return q
+
+    def seen(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
+        """Return where each reading's target is (N, 3), base."""
+        offset = nuisance.targets[readings.target]
+        return np.asarray(poses.position + np.einsum("nij,nj->ni", poses.rotation, offset))
+
+    def _require(self, readings: Readings) -> None:
+        if len(readings) and readings.value.shape[1] != self.width:
+            raise ExcitationError(
+                f"{self.kind} readings: found {readings.value.shape[1]} numbers a reading, "
+                f"expected {self.width}"
+            )
+        layout = self.layout(readings)
+        found, needed = len(readings) * self.equations, layout.size
+        if not len(readings) or found < needed:
+            raise ExcitationError(
+                f"{self.kind} readings: found {len(readings)}, expected at least "
+                f"{max(-(-needed // self.equations), 1)} to know where the instrument stands"
+            )

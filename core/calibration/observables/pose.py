@@ -1,0 +1,85 @@
+"""Whole poses of the tool: a tracker with a six-axis probe, a camera that sees a marker board."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.calibration.observables.nuisance import Nuisance
+from core.calibration.observables.observable import Observable
+from core.calibration.observables.position import (
+    FEWEST,
+    in_instrument,
+    measured_in_base,
+    station_frame,
+    with_targets,
+)
+from core.calibration.readings import Readings
+from core.model import Poses
+from core.registration import Registration
+from core.rotation import rotation_matrix, rotation_vector
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Pose(Observable):
+    """Position of a target (m) and rotation vector of the tool (rad), in the place's frame."""
+
+    registered: bool = False
+    lever: float = 0.1  # m: 1 sigma of a rotation is that of a coordinate over this
+    kind: ClassVar[str] = "pose"
+    width: ClassVar[int] = 6
+    equations: ClassVar[int] = 6
+    frame: ClassVar[tuple[int, ...]] = (0, 1, 2, 3, 4, 5)
+
+    @property
+    def sigmas(self) -> Array:
+        """Return one for positions (m), 1/lever for rotations (rad)."""
+        return np.array([1.0, 1, 1, *[1 / self.lever] * 3])
+
+    def gap(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
+        """Return measured minus predicted (N, 6): position, then the turn between them."""
+        shift = measured_in_base(readings, nuisance) - self.seen(poses, readings, nuisance)
+        measured = rotation_matrix(readings.value[:, 3:])
+        for s, frame in enumerate(nuisance.stations):
+            own = readings.station == s
+            measured[own] = frame.rotation_in_base(measured[own])
+        return np.hstack([shift, rotation_vector(measured @ np.swapaxes(poses.rotation, 1, 2))])
+
+    def reading(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
+        """Return position and rotation vector in the instrument's frame (N, 6)."""
+        position = in_instrument(self.seen(poses, readings, nuisance), readings, nuisance)
+        rotation = np.empty((len(readings), 3, 3))
+        for s, frame in enumerate(nuisance.stations):
+            own = readings.station == s
+            rotation[own] = frame.rotation @ poses.rotation[own]
+        return np.hstack([position, rotation_vector(rotation)])
+
+    def guess(self, poses: Poses, readings: Readings) -> Nuisance:
+        """Return frames from the positions of each place, or from its rotations if too few."""
+        layout = self.layout(readings)
+        nuisance = Nuisance.zero(layout.stations, layout.targets)
+        if layout.frame:
+            frames = []
+            for s in range(layout.stations):
+                own = readings.station == s
+                few = own.sum() <= FEWEST
+                found = _turned(poses, readings, own) if few else station_frame(poses, readings, s)
+                frames.append(found)
+            nuisance = Nuisance(tuple(frames), nuisance.targets, nuisance.lengths)
+        return with_targets(poses, readings, nuisance)
+
+
+def _turned(poses: Poses, readings: Readings, own: NDArray[np.bool_]) -> Registration:
+    """Return the frame that the measured rotations of some readings tell."""
+    if not own.any():
+        return Registration(np.eye(3), np.zeros(3))
+    turns = rotation_matrix(readings.value[own, 3:]) @ np.swapaxes(poses.rotation[own], 1, 2)
+    U, _, Vt = np.linalg.svd(turns.sum(axis=0))
+    rotation = U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    position = np.median(readings.value[own, :3] - poses.position[own] @ rotation.T, axis=0)
+    return Registration(rotation, position)

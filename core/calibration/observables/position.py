@@ -1,0 +1,86 @@
+"""Positions of a target, as a laser tracker or a photogrammetry system reads them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.calibration.observables.nuisance import Nuisance
+from core.calibration.observables.observable import Observable
+from core.calibration.readings import Readings
+from core.model import Poses
+from core.registration import Registration, register_robustly
+
+Array = NDArray[np.float64]
+FEWEST = 3  # points that fix a frame
+
+
+@dataclass(frozen=True)
+class Position(Observable):
+    """Where a target is (m), in the frame of the instrument's place."""
+
+    registered: bool = False
+    kind: ClassVar[str] = "position"
+    width: ClassVar[int] = 3
+    equations: ClassVar[int] = 3
+    frame: ClassVar[tuple[int, ...]] = (0, 1, 2, 3, 4, 5)
+
+    def gap(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
+        """Return measured minus predicted position (N, 3), base axes."""
+        return measured_in_base(readings, nuisance) - self.seen(poses, readings, nuisance)
+
+    def reading(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
+        """Return the position in the instrument's frame (N, 3)."""
+        return in_instrument(self.seen(poses, readings, nuisance), readings, nuisance)
+
+    def guess(self, poses: Poses, readings: Readings) -> Nuisance:
+        """Return frames from the readings of each place, then the targets' points."""
+        layout = self.layout(readings)
+        nuisance = Nuisance.zero(layout.stations, layout.targets)
+        if layout.frame:
+            frames = [station_frame(poses, readings, s) for s in range(layout.stations)]
+            nuisance = Nuisance(tuple(frames), nuisance.targets, nuisance.lengths)
+        return with_targets(poses, readings, nuisance)
+
+
+def measured_in_base(readings: Readings, nuisance: Nuisance) -> Array:
+    """Return measured positions (N, 3) in base."""
+    found = np.empty((len(readings), 3))
+    for s, frame in enumerate(nuisance.stations):
+        own = readings.station == s
+        found[own] = frame.in_base(readings.value[own, :3])
+    return found
+
+
+def in_instrument(position: Array, readings: Readings, nuisance: Nuisance) -> Array:
+    """Return positions in base (N, 3) as the frame of each reading's place has them."""
+    found = np.empty((len(readings), 3))
+    for s, frame in enumerate(nuisance.stations):
+        own = readings.station == s
+        found[own] = position[own] @ frame.rotation.T + frame.position
+    return found
+
+
+def station_frame(poses: Poses, readings: Readings, station: int) -> Registration:
+    """Return the frame of one place, from target 0 where it was read often enough."""
+    own = readings.station == station
+    first = own & (readings.target == 0)
+    use = first if first.sum() >= FEWEST else own
+    if not use.any():
+        return Registration(np.eye(3), np.zeros(3))
+    return register_robustly(readings.value[use, :3], poses.position[use])
+
+
+def with_targets(poses: Poses, readings: Readings, nuisance: Nuisance) -> Nuisance:
+    """Return the nuisance with the points of the targets beyond the first."""
+    targets = nuisance.targets.copy()
+    gap = measured_in_base(readings, nuisance) - poses.position
+    in_tool = np.einsum("nji,nj->ni", poses.rotation, gap)
+    for t in range(1, len(targets)):
+        own = readings.target == t
+        if own.any():
+            targets[t] = np.median(in_tool[own], axis=0)
+    return Nuisance(nuisance.stations, targets, nuisance.lengths)

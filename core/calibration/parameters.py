@@ -1,0 +1,193 @@
+"""The parameters of a calibration: which effects at which sites are to be found.
+
+Those that no readings of the kind at hand can tell from the others are left out by rank, the rest
+are base parameters: they carry what the left-out ones would add (Gautier, Khalil, IEEE Trans.
+Robotics and Automation 6 (1990) 368).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.calibration.observables.observable import Observable
+from core.calibration.redundancy import Redundancy, redundancy
+from core.effects import CATALOGUE, Site, Term, effect_named
+from core.errors import InputError
+from core.model import Model
+
+Array = NDArray[np.float64]
+DEFAULT = (
+    "tool_frame",
+    "joint_offset",
+    "link_geometry",
+    "axial_compliance",
+    "radial_compliance",
+)
+ORDERS = (1.0, 2.0)  # cycles a turn at which a transmission error is looked for
+PRIOR = 10.0  # usual sizes
+NONNEGATIVE = ("axial_compliance", "radial_compliance", "link_flexibility")
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """The p numbers of a calibration: what the arm has beyond the nominal model."""
+
+    nominal: Model
+    terms: tuple[Term, ...]  # one a site, all values zero
+    place: tuple[tuple[int, int], ...]  # (p) number of the term, number of the value in it
+    names: tuple[str, ...]  # (p) CONTRACT's
+    units: tuple[str, ...]
+    scales: Array  # (p,) a usual size of each
+    lower: Array  # (p,) bounds; the whole flexibility, the nominal model's with it, is 0 or more
+    upper: Array  # (p,)
+    begin: Array  # (p,) where a fit begins, and where plans are made
+    redundant: tuple[str, ...] = ()  # in words: what was left out, and what stands for it
+
+    @classmethod
+    def of(
+        cls,
+        model: Model,
+        effects: Sequence[str] = DEFAULT,
+        *,
+        observable: Observable,
+        pulls: bool = False,
+        seed: int = 0,
+    ) -> Parameters:
+        """Return the parameters of some effects, redundant ones left out, earlier effects first.
+
+        ``effects`` are identifiers of the catalogue's position channel, for all sites or for one
+        joint (``backlash_2``). ``pulls``: the session pulls at the tool sideways too, not by
+        weights alone. Raises InputError for an effect that positions do not show.
+        """
+        every = cls.every(model, effects)
+        found = redundancy(every, observable, pulls=pulls, seed=seed)
+        return every.part(found)
+
+    @classmethod
+    def every(cls, model: Model, effects: Sequence[str] = DEFAULT) -> Parameters:
+        """Return all parameters of some effects, the redundant ones among them."""
+        terms = tuple(_terms(model, effects))
+        names, units, place = [], [], []
+        numbers: list[tuple[float, float, float, float]] = []
+        for t, term in enumerate(terms):
+            effect = CATALOGUE[term.effect]
+            had = _had(model, term)
+            for k, parameter in enumerate(effect.parameters(model.arm, term.site)):
+                place.append((t, k))
+                names.append(_name(term, effect.label(term.site, parameter), parameter.name))
+                units.append(parameter.unit)
+                low = 0.0 if term.effect in NONNEGATIVE else parameter.lower
+                start = parameter.scale if term.effect == "stiffness_nonlinearity" else 0.0
+                bounds = low - had[k], parameter.upper - had[k]
+                numbers.append((parameter.scale, *bounds, start))
+        scales, lower, upper, begin = np.array(numbers).T
+        return cls(
+            model, terms, tuple(place), tuple(names), tuple(units), scales, lower, upper, begin
+        )
+
+    def __len__(self) -> int:
+        """Return the number of parameters (p)."""
+        return len(self.names)
+
+    def part(self, found: Redundancy) -> Parameters:
+        """Return the parameters that stay."""
+        kept = found.kept
+        return replace(
+            self,
+            place=tuple(self.place[i] for i in kept),
+            names=tuple(self.names[i] for i in kept),
+            units=tuple(self.units[i] for i in kept),
+            scales=self.scales[kept],
+            lower=self.lower[kept],
+            upper=self.upper[kept],
+            begin=self.begin[kept],
+            redundant=found.told,
+        )
+
+    def model(self, values: Array) -> Model:
+        """Return the nominal model with ``values`` (p,) beyond it.
+
+        What the nominal model has of the same effect at the same site is added to.
+        """
+        numbers = [list(term.values) for term in self.terms]
+        for (t, k), value in zip(self.place, values, strict=True):
+            numbers[t][k] += float(value)
+        added = {(t.effect, t.site): (t, v) for t, v in zip(self.terms, numbers, strict=True)}
+        terms = []
+        for term in self.nominal.terms:
+            _, more = added.pop((term.effect, term.site), (term, [0.0] * len(term.values)))
+            whole = [*term.values, *[0.0] * (len(more) - len(term.values))]
+            sums = np.array(whole) + np.array([*more, *[0.0] * (len(whole) - len(more))])
+            terms.append(term.with_values(sums))
+        new = [term.with_values(np.array(v)) for term, v in added.values() if any(v)]
+        return replace(self.nominal, terms=(*terms, *new))
+
+    @property
+    def prior(self) -> Array:
+        """Return 1 sigma (p,) that weakly holds each at the nominal model: ten usual sizes."""
+        return PRIOR * self.scales
+
+    def joints(self, effect: str) -> tuple[int, ...]:
+        """Return the joints (from 1) at which an effect is to be found."""
+        found = {self.terms[t].site.joint for t, _ in self.place if self.terms[t].effect == effect}
+        return tuple(sorted(j for j in found if j is not None))
+
+
+def _terms(model: Model, effects: Sequence[str]) -> Iterator[Term]:
+    """Yield a term of zeros for each site of each effect."""
+    stiffening = {
+        site.joint
+        for named in effects
+        for effect, site in _sites(model, named)
+        if effect == "stiffness_nonlinearity"
+    }
+    seen = set()
+    for named in effects:
+        for effect, site in _sites(model, named):
+            instead = effect == "axial_compliance" and site.joint in stiffening
+            if instead or (effect, site) in seen:
+                continue
+            seen.add((effect, site))
+            count = len(CATALOGUE[effect].parameters(model.arm, site))
+            yield Term(effect, site, (0.0,) * count)
+
+
+def _sites(model: Model, named: str) -> list[tuple[str, Site]]:
+    """Return effect and sites of ``effect`` or ``effect_JOINT``."""
+    stem, _, number = named.rpartition("_")
+    joint = int(number) if number.isdigit() and stem in CATALOGUE else None
+    effect = effect_named(named if joint is None else stem)
+    if "position" not in effect.channels:
+        raise InputError(
+            f"effect: found {named!r}, expected one that measured positions show: "
+            + ", ".join(e for e, member in CATALOGUE.items() if "position" in member.channels)
+        )
+    sites = [s for s in effect.sites(model.arm) if joint is None or s.joint == joint]
+    if not sites:
+        raise InputError(
+            f"effect: found {named!r}, expected a joint of this arm of {model.arm.n} joints"
+        )
+    if effect.identifier == "transmission_error":
+        sites = [replace(s, order=order) for s in sites for order in ORDERS]
+    return [(effect.identifier, site) for site in sites]
+
+
+def _had(model: Model, term: Term) -> Array:
+    """Return what the nominal model has of the effect at the site."""
+    had = np.zeros(len(term.values))
+    for other in model.terms:
+        if (other.effect, other.site) == (term.effect, term.site):
+            size = min(len(had), len(other.values))
+            had[:size] += other.values[:size]
+    return had
+
+
+def _name(term: Term, label: str, parameter: str) -> str:
+    """Return the public name; a period has its order in it."""
+    if term.site.order is None:
+        return label
+    return f"{term.effect}_{term.site.joint}_order{term.site.order:g}_{parameter}"

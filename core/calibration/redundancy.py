@@ -1,0 +1,105 @@
+"""Which parameters no readings can tell from the others, whatever the poses.
+
+Parameters are taken one after the other; one stays if it changes readings at random poses in a way
+that the frames of the instrument and those before it do not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.calibration.foreseen import foreseen, somewhere
+from core.calibration.observables.nuisance import Nuisance
+from core.calibration.observables.observable import Observable
+from core.calibration.readings import Readings
+from core.loads import Loads
+from core.model import Model
+
+if TYPE_CHECKING:
+    from core.calibration.parameters import Parameters
+
+Array = NDArray[np.float64]
+POSES = 120
+VISIBLE = 3e-7  # m, rms: a usual size that changes readings by less shows nothing
+APART = 2e-3  # share of what a parameter changes that the others must leave over
+MEMBER = 0.1  # share from which a parameter is named as one that stands for another
+USUAL_PAYLOAD = 5.0  # kg, where the arm's rating is unknown
+
+
+@dataclass(frozen=True)
+class Redundancy:
+    """What stays, and why the rest does not."""
+
+    kept: list[int]
+    told: tuple[str, ...]
+
+
+def redundancy(
+    parameters: Parameters, observable: Observable, *, pulls: bool, seed: int
+) -> Redundancy:
+    """Return which parameters readings of this kind can show at all."""
+    readings, nuisance = _anywhere(parameters.nominal, observable, pulls, seed)
+    J, F = observable.columns(parameters, parameters.begin, readings, nuisance)
+    weight = np.tile(1 / observable.sigmas, len(readings))[:, None]
+    J, F = J * parameters.scales * weight, F * weight
+    base = list(np.linalg.svd(F, full_matrices=False)[0].T[: np.linalg.matrix_rank(F)])
+    kept: list[int] = []
+    told = []
+    limit = VISIBLE * np.sqrt(len(J))
+    for i in range(J.shape[1]):
+        Q = np.array(base).reshape(-1, len(J))
+        left = J[:, i] - Q.T @ (Q @ J[:, i])
+        left -= Q.T @ (Q @ left)  # once more: rounding of the first pass
+        size, whole = float(np.linalg.norm(left)), float(np.linalg.norm(J[:, i]))
+        if size > max(limit, APART * whole):
+            kept.append(i)
+            base.append(left / size)
+        elif whole <= limit:
+            told.append(f"{parameters.names[i]}: nothing that is hung or read here shows it")
+        else:
+            names = [parameters.names[k] for k in kept]
+            told.append(f"{parameters.names[i]}: {_stand_in(J[:, i], F, J[:, kept], names)}")
+    return Redundancy(kept, tuple(told))
+
+
+def _stand_in(column: Array, F: Array, J: Array, names: list[str]) -> str:
+    """Return what acts like one parameter: others (columns J), and where the instrument stands."""
+    every = np.hstack([F, J])
+    share = np.linalg.lstsq(every, column, rcond=1e-9)[0]
+    reach = np.abs(share[F.shape[1] :]) * np.linalg.norm(J, axis=0) / np.linalg.norm(column)
+    stand = [names[k] for k in np.argsort(-reach)[:3] if reach[k] > MEMBER]
+    if F.shape[1]:
+        fixed = np.linalg.norm(F @ share[: F.shape[1]]) / np.linalg.norm(column)
+        stand += ["where instrument or target stand"] if fixed > MEMBER else []
+    return f"the same as {' and '.join(stand)}; what it adds is found there"
+
+
+def _anywhere(
+    model: Model, observable: Observable, pulls: bool, seed: int
+) -> tuple[Readings, Nuisance]:
+    """Return readings at random poses under random loads, taken by an instrument somewhere."""
+    random = np.random.default_rng(seed)
+    arm, n = model.arm, model.arm.n
+    low, high = np.maximum(arm.limits.lower, -np.pi), np.minimum(arm.limits.upper, np.pi)
+    low, high = np.minimum(low, high - 1e-3), high
+    q = random.uniform(low, high, (POSES, n))
+    heaviest = arm.payload if np.isfinite(arm.payload) else USUAL_PAYLOAD
+    loads = Loads(
+        payload_mass=random.uniform(0, heaviest, POSES),
+        payload_cog=random.normal(0, 0.05, (POSES, 3)),
+        wrench=random.normal(0, 5 * heaviest, (POSES, 6)) * [1, 1, 1, 0, 0, 0] if pulls else None,
+        temperature=random.uniform(15, 45, (POSES, n)),
+        approach=random.choice([-1.0, 1.0], (POSES, n)),
+    )
+    zeros = np.zeros(POSES, dtype=np.int64)
+    target = zeros + (1 if observable.kind == "relative" else 0)
+    readings = Readings(
+        observable.kind, q, np.zeros((POSES, observable.width)), np.full(POSES, np.nan), loads,
+        zeros, zeros, target, np.zeros(POSES, dtype=bool), np.arange(POSES),
+    )  # fmt: skip
+    nuisance = somewhere(model, observable, readings, seed)
+    return foreseen(observable, model, readings, nuisance), nuisance

@@ -1,0 +1,116 @@
+"""Parameters: which are to be found, which are redundant, and the model that they make."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from core.arm import builtin_arm
+from core.calibration.observables import make_observable
+from core.calibration.parameters import DEFAULT, Parameters
+from core.effects import Site, Term
+from core.errors import InputError
+from core.loads import Loads
+from core.model import Model
+
+POSITION = make_observable("position")
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    tool = np.eye(4)
+    tool[:3, 3] = [0.03, 0.02, 0.18]
+    return Model(builtin_arm("ur10e"), tool)
+
+
+@pytest.fixture(scope="module")
+def parameters(model: Model) -> Parameters:
+    return Parameters.of(model, observable=POSITION)
+
+
+def test_redundant_ones_are_left_out_and_named(parameters: Parameters) -> None:
+    told = dict(line.split(": ", 1) for line in parameters.redundant)
+    assert "joint_offset_1" in told and "instrument" in told["joint_offset_1"]
+    assert "joint_offset_6" in told and "tool_frame" in told["joint_offset_6"]
+    assert "link_geometry_3_d" in told and "link_geometry_2_d" in told["link_geometry_3_d"]
+    assert "nothing" in told["axial_compliance_1"]  # weights do not turn a vertical joint
+    assert not set(told) & set(parameters.names)
+
+
+def test_what_is_left_is_told_apart_by_readings(parameters: Parameters) -> None:
+    # a UR has 4 geometric parameters a joint less the redundant ones (three parallel axes), a
+    # tool point, and no more than 6 of the frame; every compliance that weight excites
+    geometric = [name for name in parameters.names if "compliance" not in name]
+    assert len(geometric) == 21
+    assert parameters.joints("radial_compliance") == (1, 2, 3, 4, 5, 6)
+    assert set(parameters.joints("axial_compliance")) >= {2, 3, 4, 5}
+
+
+def test_rank_of_the_kept_is_full_and_of_all_is_not_more(model: Model) -> None:
+    from core.calibration.redundancy import _anywhere
+
+    observable = make_observable("pose")
+    every = Parameters.every(model)
+    kept = Parameters.of(model, observable=observable)
+    readings, nuisance = _anywhere(model, observable, False, 5)
+    ranks = []
+    for parameters in (every, kept):
+        J, F = observable.columns(parameters, parameters.begin, readings, nuisance)
+        whole = np.hstack([J * parameters.scales, F])
+        s = np.linalg.svd(whole / np.maximum(np.linalg.norm(whole, axis=0), 1e-9))[1]
+        ranks.append(int((s > 1e-5 * s[0]).sum()) - 6)
+    assert ranks[1] == len(kept)
+    assert len(every) > len(kept)
+
+
+def test_a_registered_instrument_shows_the_first_joints_zero(model: Model) -> None:
+    registered = Parameters.of(model, observable=make_observable("position", registered=True))
+    assert "joint_offset_1" in registered.names
+
+
+def test_sideways_pulls_show_what_weights_do_not(model: Model) -> None:
+    pulled = Parameters.of(model, observable=POSITION, pulls=True)
+    assert 1 in pulled.joints("axial_compliance")
+
+
+def test_no_values_are_the_nominal_model(model: Model, parameters: Parameters) -> None:
+    assert parameters.model(np.zeros(len(parameters))) == model
+
+
+def test_values_stand_beyond_what_the_model_already_has(model: Model) -> None:
+    soft = model.with_terms([Term("axial_compliance", Site(2), (1e-5,))])
+    parameters = Parameters.of(soft, ("axial_compliance",), observable=POSITION)
+    i = parameters.names.index("axial_compliance_2")
+    values = np.zeros(len(parameters))
+    values[i] = 2e-5
+    changed = parameters.model(values)
+    assert [t for t in changed.terms if t.site.joint == 2] == [
+        Term("axial_compliance", Site(2), (pytest.approx(3e-5),))
+    ]
+    assert parameters.lower[i] == pytest.approx(-1e-5)  # the whole flexibility is 0 or more
+    q, loads = np.full((1, 6), 0.4), Loads(payload_mass=np.array([8.0]))
+    lower = changed.predict(q, loads).position[0, 2]
+    assert lower < soft.predict(q, loads).position[0, 2]
+
+
+def test_effects_are_chosen_by_name_and_joint(model: Model) -> None:
+    chosen = (*DEFAULT, "backlash_2", "transmission_error_3", "stiffness_nonlinearity_2")
+    parameters = Parameters.of(model, chosen, observable=POSITION)
+    assert parameters.joints("backlash") == (2,)
+    assert "transmission_error_3_order1_sine" in parameters.names
+    assert "axial_compliance_2" not in parameters.names  # the stiffening joint holds it
+    assert parameters.begin[parameters.names.index("stiffness_nonlinearity_2_softening")] > 0
+
+
+@pytest.mark.parametrize(
+    ("effect", "expected"),
+    [
+        ("backlsh", "did you mean 'backlash'"),
+        ("ft_bias", "expected one that measured positions show"),
+        ("backlash_9", "a joint of this arm of 6 joints"),
+    ],
+)
+def test_unusable_effects_are_declined_in_one_line(model: Model, effect, expected) -> None:
+    with pytest.raises(InputError, match=expected) as caught:
+        Parameters.of(model, (effect,), observable=POSITION)
+    assert "\n" not in str(caught.value)
