@@ -1,1 +1,6 @@
-"""The report of a calibration, for the customer."""
+"""Reports of calibration sessions, for customers: one HTML file and a PDF."""
+
+from bridge.calibration.report.facts import InstrumentFacts, SessionFacts
+from bridge.calibration.report.report import write_report
+
+__all__ = ["InstrumentFacts", "SessionFacts", "write_report"]

@@ -1,0 +1,43 @@
+"""Facts of a calibration session that stand in no reading: who, where, when, with what."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class InstrumentFacts:
+    """The instrument, as its data sheet, its certificate and the technician describe it."""
+
+    name: str
+    kind: str = "position"  # key of core.calibration.observables.OBSERVABLES
+    serial: str = ""
+    certificate: str = ""  # number or date of its own calibration
+    sigma: float = 2.0e-5  # m, 1 sigma of one coordinate of a single reading, as declared
+    error: float | None = None  # m, largest permissible error; None: nobody has stated it
+    error_per_metre: float = 0.0  # m per m of distance, on top of ``error``
+    distance: float = 0.0  # m, usual distance from the instrument to the target
+
+
+@dataclass(frozen=True)
+class SessionFacts:
+    """One session; what is left empty is left out of the report."""
+
+    cell: str  # name of the cell
+    arm: str
+    instrument: InstrumentFacts
+    folder: Path  # of the session
+    started: datetime
+    ended: datetime
+    readings: int  # taken, those that were undone left out
+    undone: int = 0  # taken back by the technician
+    serial: str = ""  # of the arm
+    operator: str = ""
+    customer: str = ""
+    place: str = ""
+    temperature: tuple[float, float] | None = None  # °C of the air, at the start and at the end
+    payload_error: float | None = None  # kg, largest error of the loads' masses; None: not stated
+    environment: str = ""  # anything else worth knowing, in words
+    remarks: tuple[str, ...] = field(default=())  # what happened on the way, in words

@@ -1,0 +1,71 @@
+"""What the sections of a calibration's report are made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.calibration.report.facts import SessionFacts
+from core.calibration.budget import Budget, Stated, budget
+from core.calibration.plan import Plan
+from core.calibration.result import Calibration, Errors
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Material:
+    """A calibration with its plan and the facts of its session."""
+
+    calibration: Calibration
+    plan: Plan | None
+    session: SessionFacts
+
+    @cached_property
+    def judged(self) -> tuple[Errors, Errors]:
+        """Return the errors before and after by which the calibration is judged.
+
+        Those of the held-out poses; of the fitted ones where none were held out.
+        """
+        c = self.calibration
+        if len(c.held_out_before.vector):
+            return c.held_out_before, c.held_out_after
+        return c.before, c.after
+
+    @property
+    def held_out(self) -> bool:
+        """Return whether poses were kept out of the fit."""
+        return bool(len(self.calibration.held_out_before.vector))
+
+    @property
+    def judged_words(self) -> str:
+        """Return which poses the errors are judged on."""
+        if self.held_out:
+            return "poses that the fit never saw"
+        return "the poses of the fit themselves (none were kept out)"
+
+    @cached_property
+    def budget(self) -> Budget:
+        """Return the uncertainty budget."""
+        facts = self.session
+        error = facts.instrument.error
+        if error is not None:
+            error += facts.instrument.error_per_metre * facts.instrument.distance
+        air = facts.temperature
+        span = None if air is None else abs(air[1] - air[0])
+        return budget(self.calibration, Stated(error, span, facts.payload_error))
+
+    @cached_property
+    def tip(self) -> Array:
+        """Return where the calibrated model puts the TCP of every reading (N, 3), m, in base."""
+        readings = self.calibration.readings
+        return self.calibration.model.predict(readings.q, readings.loads).position
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Return what the coordinates of an error are called."""
+        width = self.judged[0].vector.shape[1]
+        return ("x", "y", "z") if width == 3 else ("distance",) if width == 1 else ()

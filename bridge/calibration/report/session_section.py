@@ -1,0 +1,103 @@
+"""The session: who measured what, where, when and with what."""
+
+from __future__ import annotations
+
+from bridge.calibration.report.blocks import Block, Bullets, Heading, Pairs
+from bridge.calibration.report.facts import SessionFacts
+from bridge.calibration.report.material import Material
+from bridge.calibration.report.section import Section
+from bridge.report.words import number, told
+
+KINDS = {
+    "position": "position of a target on the tool, three coordinates",
+    "pose": "position and orientation of a target on the tool",
+    "distance": "distance from a fixed point to a target on the tool",
+    "sphere": "the tool brought onto a fixed sphere, joint angles alone",
+    "relative": "one target on the tool against another",
+}
+
+
+class SessionSection(Section[Material]):
+    """Who, where, when, with what."""
+
+    key, title = "session", "Session and instrument"
+
+    def blocks(self, material: Material) -> list[Block]:
+        """Return the facts as on the front of a certificate."""
+        c, facts = material.calibration, material.session
+        counts = [
+            ("poses", _poses_words(material)),
+            ("readings", _readings_words(material)),
+            ("loads", _loads_words(material)),
+        ]
+        blocks: list[Block] = [
+            Pairs(tuple(_front(facts) + counts)),
+            Heading("Instrument"),
+            Pairs(tuple(_instrument(facts, len(c.stations)))),
+        ]
+        remarks = [*facts.remarks, *c.notes, *(material.plan.notes if material.plan else ())]
+        if remarks:
+            blocks += [Heading("Remarks"), Bullets(tuple(remarks))]
+        return blocks
+
+
+def _front(facts: SessionFacts) -> list[tuple[str, str]]:
+    start, end = facts.started, facts.ended
+    minutes = round((end - start).total_seconds() / 60)
+    last = f"{end:%H:%M}" if end.date() == start.date() else f"{end:%Y-%m-%d %H:%M}"
+    temperature = ""
+    if facts.temperature:
+        low, high = facts.temperature
+        temperature = f"{number(low)} °C at the start, {number(high)} °C at the end"
+    given = [
+        ("customer", facts.customer), ("cell", facts.cell), ("arm", facts.arm),
+        ("serial number", facts.serial), ("place", facts.place),
+        ("measured", f"{start:%Y-%m-%d %H:%M} to {last} ({minutes} min)"),
+        ("by", facts.operator), ("air", temperature), ("surroundings", facts.environment),
+        ("data", str(facts.folder)),
+    ]  # fmt: skip
+    return [(name, text) for name, text in given if text]
+
+
+def _instrument(facts: SessionFacts, stations: int) -> list[tuple[str, str]]:
+    tool = facts.instrument
+    error = ""
+    if tool.error is not None:
+        error = f"± {told(tool.error, 'm')}"
+        if tool.error_per_metre:
+            error += f" and {told(tool.error_per_metre, 'm')} per metre of distance"
+    given = [
+        ("instrument", tool.name), ("serial number", tool.serial),
+        ("its own calibration", tool.certificate),
+        ("measures", KINDS.get(tool.kind, tool.kind)),
+        ("noise, declared", f"{told(tool.sigma, 'm')} (1 sigma of one coordinate)"),
+        ("largest permissible error", error),
+        ("distance", f"{number(tool.distance)} m" if tool.distance else ""),
+        ("places", f"{stations}" if stations > 1 else ""),
+    ]  # fmt: skip
+    return [(name, text) for name, text in given if text]
+
+
+def _poses_words(material: Material) -> str:
+    readings = material.calibration.readings
+    held = len(set(readings.pose[readings.held_out].tolist()))
+    fitted = len(set(readings.pose[~readings.held_out].tolist()))
+    return f"{fitted} to fit, {held} kept out of the fit to check it"
+
+
+def _readings_words(material: Material) -> str:
+    facts, wild = material.session, len(material.calibration.outliers)
+    text = f"{facts.readings}"
+    if facts.undone:
+        text += f"; {facts.undone} were taken back"
+    if wild:
+        text += f"; {wild} {'was' if wild == 1 else 'were'} wild and weighed down"
+    return text
+
+
+def _loads_words(material: Material) -> str:
+    plan = material.plan
+    if plan is None:
+        return str(len(set(material.calibration.readings.load.tolist())))
+    told_loads = [f"{p.name + ': ' if p.name else ''}{number(p.mass)} kg" for p in plan.loads]
+    return "; ".join(told_loads)

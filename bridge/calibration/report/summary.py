@@ -1,0 +1,48 @@
+"""The result: verdict, large figures, the front of the certificate."""
+
+from __future__ import annotations
+
+from bridge.calibration.report.blocks import (
+    BAD,
+    DOUBTFUL,
+    GOOD,
+    Badge,
+    Block,
+    Paragraph,
+    Tile,
+    Tiles,
+    Verdict,
+)
+from bridge.calibration.report.material import Material
+from bridge.calibration.report.section import Section
+from bridge.report.words import told
+
+
+class Summary(Section[Material]):
+    """What came out, on half a page."""
+
+    key, title = "result", "Result"
+
+    def blocks(self, material: Material) -> list[Block]:
+        """Return the verdict and the large figures."""
+        c = material.calibration
+        before, after = material.judged
+        badge = Badge("Complete", GOOD) if c.complete else Badge("Not complete", DOUBTFUL)
+        if not after.mean < before.mean:
+            badge = Badge("No improvement", BAD)
+        tiles = [
+            Tile("mean error before", told(before.mean, "m"), f"at most {told(before.max, 'm')}"),
+            Tile("mean error after", told(after.mean, "m"), f"at most {told(after.max, 'm')}"),
+            Tile("smaller by", _times(before.mean, after.mean), f"over {len(after.norm)} readings"),
+            Tile("expanded uncertainty (k = 2)", f"± {told(material.budget.expanded, 'm')}",
+                 "of one coordinate of the tool"),
+        ]  # fmt: skip
+        text = (
+            f"Errors are those of {material.judged_words}: the distance between where the tool "
+            "was measured and where the model said it would be."
+        )
+        return [Verdict(badge, c.verdict), Tiles(tuple(tiles)), Paragraph(text, "note")]
+
+
+def _times(before: float, after: float) -> str:
+    return f"{before / after:.1f} times" if after > 0 else "unknown"

@@ -1,0 +1,211 @@
+"""The uncertainty of one coordinate of the TCP after a calibration (GUM, JCGM 100:2008).
+
+The measurand is the distance, along one axis of the base, between the place where the calibrated
+model puts the TCP and the place where it is. Standard uncertainties combine in squares with their
+sensitivities (5.1.2); correlated parameters of the model go in together, as one input, through
+their covariance (5.2); degrees of freedom combine by Welch and Satterthwaite (G.4.1).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from core.calibration.pose_accuracy import repeats
+from core.calibration.result import Calibration
+
+Array = NDArray[np.float64]
+COVERAGE = 2.0  # k
+PROBABILITY = 0.9545  # of a normal distribution within two standard deviations
+ALUMINIUM = 23e-6  # 1/K; steel grows half as much
+LENGTH_95 = 2.796  # length of a 3D normal vector that 95 % stay below, in sigmas of a coordinate
+
+
+@dataclass(frozen=True)
+class Stated:
+    """What people, data sheets and certificates say (type B); None: nobody has said it."""
+
+    error: float | None = None  # m, largest permissible error of the instrument, where it measured
+    temperature_range: float | None = None  # K, of the air during the session
+    payload_error: float | None = None  # kg, largest error of the loads' declared mass
+
+
+@dataclass(frozen=True)
+class Input:
+    """One input of the budget."""
+
+    name: str
+    kind: str  # "A": from readings of this session; "B": from anything else
+    distribution: str  # "normal" or "rectangular"
+    std: float  # standard uncertainty, in ``unit``
+    unit: str
+    sensitivity: float  # m per ``unit``
+    freedom: float  # degrees of freedom; inf: taken as known
+    source: str  # where the figure is from, in words
+
+    @property
+    def contribution(self) -> float:
+        """Return what it makes of the result's standard uncertainty, m."""
+        return abs(self.sensitivity) * self.std
+
+
+@dataclass(frozen=True)
+class Budget:
+    """A whole budget, for one coordinate."""
+
+    inputs: tuple[Input, ...]
+    combined: float  # m
+    freedom: float  # effective degrees of freedom
+    needed_factor: float  # of Student's distribution, for 95.45 %
+    inside: int  # held-out coordinates whose error is within the bound
+    looked_at: int  # held-out coordinates
+    bound: float  # m: k times combined uncertainty and measurement of one reading
+    missing: tuple[str, ...]  # inputs that nobody has stated, in words
+
+    @property
+    def expanded(self) -> float:
+        """Return the expanded uncertainty, k = 2, m."""
+        return COVERAGE * self.combined
+
+    @property
+    def expanded_length(self) -> float:
+        """Return the distance from its place that the TCP keeps to in 95 % of all poses, m."""
+        return LENGTH_95 * self.combined
+
+
+def budget(calibration: Calibration, stated: Stated) -> Budget:
+    """Return the budget of a calibration."""
+    reading = _reading_noise(calibration)
+    repeatability = _repeatability(calibration, reading)
+    found = [_parameters(calibration), repeatability]
+    found.append(_remainder(calibration, found[0].std, np.hypot(repeatability.std, reading)))
+    missing = []
+    for part, words in (
+        (_instrument(stated), "largest permissible error of the instrument"),
+        (_temperature(calibration, stated), "temperature of the air during the session"),
+        (_payload(calibration, stated), "how well the masses of the loads are known"),
+    ):
+        if part is None:
+            missing.append(words)
+        else:
+            found.append(part)
+    combined = float(np.sqrt(sum(i.contribution**2 for i in found)))
+    freedom = _effective(found, combined)
+    bound = COVERAGE * float(np.hypot(combined, reading))
+    errors = np.abs(calibration.held_out_after.vector).ravel()
+    return Budget(
+        tuple(found), combined, freedom, _factor(freedom), int((errors <= bound).sum()),
+        len(errors), bound, tuple(missing),
+    )  # fmt: skip
+
+
+def _reading_noise(calibration: Calibration) -> float:
+    """Return 1 sigma of one coordinate of an averaged reading, m: the instrument alone."""
+    scatter = calibration.readings.scatter
+    known = scatter[np.isfinite(scatter)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else 0.0
+
+
+def _parameters(calibration: Calibration) -> Input:
+    """Return what the fit leaves unsure, all parameters together with their correlations."""
+    width = 3 if calibration.readings.kind != "distance" else 1
+    std = float(np.sqrt(np.mean(calibration.tcp_std**2) / 3)) if len(calibration.tcp_std) else 0.0
+    rows = len(calibration.after.vector) * width
+    count = len(calibration.covariance)
+    return Input(
+        "parameters of the model", "A", "normal", std, "m", 1.0, float(max(rows - count - 6, 1)),
+        f"covariance of {count} parameters from {rows} coordinates, carried to the tool",
+    )  # fmt: skip
+
+
+def _repeatability(calibration: Calibration, reading: float) -> Input:
+    """Return the spread of repeated visits, without the part of the instrument."""
+    groups = repeats(calibration.readings)
+    name = "repeatability of the arm"
+    if np.isfinite(calibration.repeatability):
+        freedom = sum(3 * (len(g) - 1) for g in groups)
+        return Input(
+            name, "A", "normal", calibration.repeatability, "m", 1.0, float(max(freedom, 1)),
+            f"{len(groups)} poses visited again, {sum(len(g) for g in groups)} readings",
+        )  # fmt: skip
+    std = float(np.sqrt(max(calibration.noise**2 - reading**2, 0.0)))
+    rows = 3 * len(calibration.after.vector)
+    return Input(
+        name, "A", "normal", std, "m", 1.0, float(max(rows, 1)),
+        "no pose was repeated: scatter of the fit without the instrument's share",
+    )  # fmt: skip
+
+
+def _remainder(calibration: Calibration, parameters: float, noise: float) -> Input:
+    """Return what the held-out poses show beyond parameters, arm and instrument."""
+    errors = calibration.held_out_after.vector
+    held_out = len(errors) > 0
+    if not held_out:
+        errors = calibration.after.vector
+    excess = float(np.mean(errors**2)) - noise**2 - (parameters**2 if held_out else 0.0)
+    std = float(np.sqrt(max(excess, 0.0)))
+    where = "held-out poses" if held_out else "fitted poses (none were held out)"
+    told = "nothing found beyond the lines above" if std == 0 else "what is beyond the lines above"
+    return Input(
+        "what the model does not explain", "A", "normal", std, "m", 1.0, float(errors.size),
+        f"{errors.size} coordinates of the {where}: {told}",
+    )  # fmt: skip
+
+
+def _instrument(stated: Stated) -> Input | None:
+    if stated.error is None:
+        return None
+    return Input(
+        "error of the instrument", "B", "rectangular", stated.error / np.sqrt(3), "m", 1.0, np.inf,
+        "largest permissible error at the distance measured, divided by √3",
+    )  # fmt: skip
+
+
+def _temperature(calibration: Calibration, stated: Stated) -> Input | None:
+    if stated.temperature_range is None:
+        return None
+    readings = calibration.readings
+    tip = calibration.model.predict(readings.q, readings.loads).position
+    reach = float(np.sqrt(np.mean(tip**2)))
+    return Input(
+        "growth with temperature", "B", "rectangular", stated.temperature_range / 2 / np.sqrt(3),
+        "K", ALUMINIUM * reach, np.inf,
+        "half the range of the air during the session, divided by √3; aluminium, 23 ppm/K",
+    )  # fmt: skip
+
+
+def _payload(calibration: Calibration, stated: Stated) -> Input | None:
+    if stated.payload_error is None:
+        return None
+    return Input(
+        "mass of the load", "B", "rectangular", stated.payload_error / np.sqrt(3), "kg",
+        _payload_sensitivity(calibration), np.inf, "largest error stated, divided by √3",
+    )  # fmt: skip
+
+
+def _payload_sensitivity(calibration: Calibration) -> float:
+    """Return rms over poses and axes of d TCP / d payload mass, m/kg."""
+    readings = calibration.readings
+    model, step = calibration.model, 0.1
+    mass = readings.loads.payload_mass
+    mass = np.full(len(readings), model.payload_mass) if mass is None else mass
+    from dataclasses import replace
+
+    more = replace(readings.loads, payload_mass=mass + step)
+    change = model.predict(readings.q, more).position
+    change = change - model.predict(readings.q, replace(more, payload_mass=mass)).position
+    return float(np.sqrt(np.mean(change**2))) / step
+
+
+def _effective(inputs: list[Input], combined: float) -> float:
+    weight = sum(i.contribution**4 / i.freedom for i in inputs if np.isfinite(i.freedom))
+    return float(combined**4 / weight) if weight > 0 else float("inf")
+
+
+def _factor(freedom: float) -> float:
+    if not np.isfinite(freedom):
+        return COVERAGE
+    return float(stdtrit(freedom, 0.5 + PROBABILITY / 2))

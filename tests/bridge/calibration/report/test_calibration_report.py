@@ -1,0 +1,54 @@
+"""The report of a calibration: one page and one PDF of the same document."""
+
+import re
+
+import pypdfium2
+import pytest
+from calibration_report_cases import calibration, plan, session
+
+from bridge.calibration.report import write_report
+from bridge.calibration.report.sections import CALIBRATION
+from bridge.report.words import told
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    return write_report(calibration(), plan(), session(), tmp_path_factory.mktemp("report"))
+
+
+def text_of(path):
+    """Return the words of a PDF."""
+    pages = pypdfium2.PdfDocument(path)
+    return "\n".join(page.get_textpage().get_text_bounded() for page in pages)
+
+
+def test_two_files_hold_every_section(written):
+    page, paper = written
+    assert sorted(p.name for p in page.parent.iterdir()) == ["calibration.html", "calibration.pdf"]
+    html, words = page.read_text("utf-8"), text_of(paper)
+    for section in CALIBRATION:
+        assert f'<section id="{section.key}"><h2>{section.title}</h2>' in html
+        assert section.title in words
+
+
+def test_the_figures_of_the_calibration_stand_in_both(written):
+    page, paper = written
+    html, words = page.read_text("utf-8"), text_of(paper)
+    for errors in (calibration().held_out_before, calibration().held_out_after):
+        for figure in (errors.mean, errors.max, errors.rms):
+            assert told(figure, "m") in html
+            assert told(figure, "m") in words
+
+
+def test_names_are_written_as_they_are_and_nothing_of_them_is_markup(written):
+    page, paper = written
+    assert "Beispiel &amp; Söhne &lt;Werk 2&gt;" in page.read_text("utf-8")
+    words = text_of(paper)
+    assert "Beispiel & Söhne <Werk 2>" in words
+    assert "M. Łukasik" in words
+
+
+def test_nothing_is_loaded_from_outside(written):
+    html = written[0].read_text("utf-8")
+    assert "<script" not in html
+    assert not re.findall(r"""(?:src|href)=["']?https?:|url\(""", html)
