@@ -24,7 +24,7 @@ from bridge.loop_writing import Writing
 from bridge.setpoint_source.source import Source, Told
 from bridge.setpoint_stream import SetpointStream
 from bridge.shared_page import Command, Page, Phase
-from bridge.state_watch import StateWatch
+from bridge.state_watch import StateWatch, hold_time
 from bridge.supervisor import Cause, State, Supervisor
 from core.errors import InvalidStateError, LinkError
 from core.loads import Loads
@@ -72,7 +72,7 @@ class Loop:
         self._loads = LiveLoads(
             model.arm.n, settings.setpoints.use_force, settings.setpoints.force_filter
         )
-        self._clock = ControllerClock(driver.rate)
+        self._clock = ControllerClock(driver.rate, hold_time(driver.rate))
         self._supervisor = Supervisor(self._changed)
         patience = settings.link.state_timeout
         self._watch = StateWatch(
@@ -191,8 +191,9 @@ class Loop:
         except InvalidStateError as error:
             self._watch.doubt(str(error))
             return
-        self._watch.believe()
         missed = self._clock.take(state)
+        expiry = self._clock.expiry(state)
+        is_fresh = self._watch.believe(expiry)
         self._page.tell_seen()
         if self._checks.begin(state, missed):
             self._loads.forget()
@@ -202,12 +203,14 @@ class Loop:
             writing.ready = False  # its own watchdog, or a person, has the robot
         loads = self._loads.update(state)
         seen = time.monotonic()
-        if supervisor.state == State.ARMED and writing.start(state, own):
+        if is_fresh and supervisor.state == State.ARMED and writing.start(state, own):
             self._record(state, missed, own, loads, None, at=seen)
             return  # the state is old by now
         holding = supervisor.state == State.HOLDING
         writes = supervisor.state.writes
-        written = writing.write(state, own, loads) if writes else None
+        written = None
+        if writes:
+            written = writing.write(state, own, loads, expiry if is_fresh else -np.inf)
         if writes and writing.ramps_out:
             self._checks.flags |= RAMPING_OUT
         setpoint = writing.unsent if writes and written is None else written

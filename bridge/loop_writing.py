@@ -21,6 +21,7 @@ from core.errors import (
     IneffectiveWriteError,
     LimitError,
     PartialWriteError,
+    StaleStateError,
     WriteError,
 )
 from core.loads import Loads
@@ -107,13 +108,32 @@ class Writing:
         self.release()
         self._supervisor.take(Cause.START_REFUSED, detail)
 
-    def write(self, state: RobotState, own: Vector, loads: Loads) -> Setpoint | None:
-        """Send one setpoint; returns it, or None where none has left."""
+    def write(
+        self, state: RobotState, own: Vector, loads: Loads, expiry: float = np.inf
+    ) -> Setpoint | None:
+        """Send one setpoint; returns it, or None where none has left.
+
+        ``expiry`` (s, monotonic): later than that nothing may leave that is made of this state.
+        """
+        stream, self.unsent = self._stream, None
+        self.ramps_out = self._supervisor.state == State.HOLDING
+        if time.monotonic() > expiry:
+            stream.forget()
+            return None
         source_q = self._next(state, own)
-        self.unsent, self.ramps_out = None, self._supervisor.state == State.HOLDING
-        stream = self._stream
+        self.ramps_out = self._supervisor.state == State.HOLDING
+        goal = 0.0 if self.ramps_out else 1.0
         try:
-            setpoint = stream.advance(state, source_q, loads, 0.0 if self.ramps_out else 1.0)
+            self._driver.keep_alive()  # may wait for the robot: before the state's age is judged
+            setpoint = stream.advance(state, source_q, loads, goal, expiry)
+        except StaleStateError:
+            stream.forget()
+            self._page.count(Count.LATE)
+            return None
+        except WriteError as error:
+            stream.forget()
+            self._fail(error)
+            return None
         except LimitError as error:
             stream.forget()
             self._end(Count.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))

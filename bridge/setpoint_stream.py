@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +11,7 @@ from bridge.nominal_stream import NominalStream
 from bridge.settings import LimitSettings
 from core.arm import Arm
 from core.compensation import Compensator, Correction
+from core.errors import StaleStateError
 from core.limits import LONGEST_GAP, Limiter, Limits
 from core.loads import Loads
 from core.model import Model
@@ -82,12 +85,14 @@ class SetpointStream:
         self._last = timestamp - self.limiter.limits.cycle
 
     def advance(
-        self, state: RobotState, source_q: Vector | None, loads: Loads, goal: float
-    ) -> Setpoint:
+        self, state: RobotState, source_q: Vector | None, loads: Loads, goal: float,
+        expiry: float = np.inf,
+    ) -> Setpoint:  # fmt: skip
         """Return the next setpoint; ``source_q`` None: the motion brakes.
 
         ``goal`` is where the ramp goes: 1 in, 0 out. The setpoint's arrays hold until the next
-        call. Raises LimitError: then nothing has changed and nothing may leave.
+        call. Raises LimitError, and StaleStateError where it is later than ``expiry`` (s,
+        monotonic) by now: then nothing has changed and nothing may leave.
         """
         gap = state.timestamp - self._last
         usable = min(max(gap, 0.0), self._longest_gap)
@@ -102,9 +107,12 @@ class SetpointStream:
         if not self.residual < SOLVED:
             self.unsolved += 1
             corrected, offset = nominal, _NOTHING
+        if time.monotonic() > expiry:
+            raise StaleStateError("the state was too old before its setpoint could leave")
         limited = self.limiter.limit(nominal, corrected, offset, ramp, state.actual_q, gap)
         if source_q is not None:
             stream.follow(source_q, gap)
+            self._since_start += usable
         self._ramp, self._last, self.clamped = ramp, state.timestamp, limited.clamped
         return Setpoint(limited.q, nominal, limited.offset_in_base, state.timestamp, state.received)
 
@@ -126,8 +134,7 @@ class SetpointStream:
         """Return the source's setpoint, led over to from where the arm stood: no first jump."""
         if self._start_gap is None:
             self._start_gap = self._nominal.q - source_q
-        self._since_start += gap
-        share = self._since_start / self._ramp_time
+        share = (self._since_start + gap) / self._ramp_time
         if share >= 1.0:
             return source_q
         left = 1.0 - share * share * (3.0 - 2.0 * share)

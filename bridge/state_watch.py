@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -16,6 +17,7 @@ from core.state import RobotState
 from drivers.driver import Driver
 
 INVALID_IN_A_ROW = 3  # states that cannot be believed, after which they count as silence
+OLD_IN_A_ROW = 2  # states too old to write by, after which they count as none
 SILENCE = 0.2  # s without a state: a fault
 LOST = 3.0  # s without a state: the link is lost
 LOST_AFTER_WRITING = 0.5  # s: the library's writing half does not survive a break
@@ -49,7 +51,7 @@ class StateWatch:
         self._hold = hold_time(driver.rate)
         self._patience = max(patience, self._hold)  # s that one reading takes at most
         self._check = SampleCheck(arm)
-        self._invalid = 0
+        self._invalid = self._old = 0
         self._left = 0.0  # s, monotonic: when the last reading ended
         self._stale = self._silent = False  # has been told since the last believable state
         self._told: dict[Count, float] = {}  # s, monotonic
@@ -86,10 +88,24 @@ class StateWatch:
             self.doubt(doubt.words, doubt.count)
         return None
 
-    def believe(self) -> None:
-        """Take note of a state that is fine."""
-        self._heard, self._invalid = time.monotonic(), 0
+    def believe(self, expiry: float = math.inf) -> bool:
+        """Take note of a state that is fine; returns whether it is fresh enough to write by.
+
+        One that was too old (``expiry``, s monotonic) when it could be used is late, and several
+        in a row are a link on which nothing fresh comes any more.
+        """
+        now = time.monotonic()
+        self._old = self._old + 1 if now > expiry else 0
+        self._invalid = 0
+        if self._old >= OLD_IN_A_ROW:
+            self._stand_still(f"states are {now - expiry + self._hold:.3f} s old as they come")
+            return False
+        if self._old:
+            self._page.count(Count.LATE)
+            return False
+        self._heard = now
         self._stale = self._silent = False
+        return True
 
     def forget(self) -> None:
         """Take note that nobody asked for states meanwhile."""

@@ -86,6 +86,12 @@ class Driver(ABC):
         ``state`` is the sample last read; states read before are stale afterwards.
         """
 
+    def keep_alive(self) -> None:
+        """Feed the robot's own watchdog where that may wait; before each setpoint.
+
+        Raises WriteError.
+        """
+
     def release(self) -> None:
         """Stop writing: the arm comes to rest and the controller is as before ``arm``.
 

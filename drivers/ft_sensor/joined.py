@@ -70,6 +70,10 @@ class DriverWithSensor(Driver):
         force = self._tcp_force.of(raw, state)
         return replace(state, ft_raw_wrench=raw, actual_TCP_force=force)
 
+    def keep_alive(self) -> None:
+        """See Driver.keep_alive."""
+        self._arm.keep_alive()
+
     def write_setpoint(self, setpoint: Setpoint) -> None:
         """Send one setpoint to the arm."""
         self._arm.write_setpoint(setpoint)

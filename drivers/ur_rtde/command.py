@@ -34,6 +34,9 @@ class Writer(Protocol):
     def arm(self, state: RobotState) -> None:
         """Make ready; moves nothing. Raises WriteError."""
 
+    def keep_alive(self) -> None:
+        """Feed the robot's watchdog, which may wait for the robot. Raises WriteError."""
+
     def write(self, setpoint: Setpoint, state: RobotState) -> None:
         """Send one setpoint; ``state`` is the sample last read. Raises WriteError."""
 
@@ -117,21 +120,33 @@ class ServoWriter:
             time.sleep(0.01)
         time.sleep(0.05)
 
-    def write(self, setpoint: Setpoint, state: RobotState) -> None:
-        """Send one setpoint. Raises WriteError where the robot does not obey."""
-        control, settings = self._control, self._settings
-        if control is None:
-            raise WriteError(f"{settings.host}: found no control script, expected arm() first")
-        if not control.isConnected() or not control.isProgramRunning():
-            raise WriteError(
-                f"{settings.host}: the control script has ended (watchdog, a stop, or a person)"
-            )
-        self._check_following(setpoint, state)
+    def keep_alive(self) -> None:
+        """Kick the watchdog, which waits until the script has heard it.
+
+        Before servoJ, which writes the same register: the command must be what stays in it.
+        """
         now = time.monotonic()
         if now - self._kicked > KICK:
-            # before servoJ, which writes the same register: the command must be what stays in it
-            control.kickWatchdog()
+            self._running().kickWatchdog()
             self._kicked = now
+
+    def _running(self) -> Any:
+        """Return the library's object while its script runs. Raises WriteError."""
+        control, host = self._control, self._settings.host
+        if control is None:
+            raise WriteError(f"{host}: found no control script, expected arm() first")
+        if not control.isConnected() or not control.isProgramRunning():
+            raise WriteError(
+                f"{host}: the control script has ended (watchdog, a stop, or a person)"
+            )
+        return control
+
+    def write(self, setpoint: Setpoint, state: RobotState) -> None:
+        """Send one setpoint. Raises WriteError where the robot does not obey."""
+        control, settings = self._running(), self._settings
+        if time.monotonic() - self._kicked > 0.4 / self._settings.watchdog:
+            self.keep_alive()  # for who does not call it
+        self._check_following(setpoint, state)
         if not control.servoJ(
             setpoint.q.tolist(), 0.0, 0.0, self._period, settings.lookahead, settings.gain
         ):
@@ -217,6 +232,9 @@ class OffsetWriter:
         # a number that the program cannot take for the one it has seen last
         self._sequence = (self.echo + registers.LAST_SEQUENCE // 4) % registers.LAST_SEQUENCE
         self._awaited = 0
+
+    def keep_alive(self) -> None:
+        """Do nothing: the sequence number of each offset is the heartbeat."""
 
     def write(self, setpoint: Setpoint, state: RobotState) -> None:
         """Send one offset. Raises WriteError where the program stopped taking them."""

@@ -81,6 +81,10 @@ class UrRtdeDriver(Driver):
                 "cell's: set the same TCP in both (tool.tcp in the cell file)"
             )
 
+    def keep_alive(self) -> None:
+        """Feed the watchdog of the control script; see Driver.keep_alive."""
+        self._writer.keep_alive()
+
     def write_setpoint(self, setpoint: Setpoint) -> None:
         """Send one setpoint; needs ``arm`` before."""
         state = self._state

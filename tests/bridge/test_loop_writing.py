@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -125,6 +126,30 @@ def test_a_correction_that_is_no_number_never_leaves_and_is_a_fault(bench: Bench
     assert len(bench.driver.sent) == sent
     assert bench.driver.released == 1
     assert bench.count("bad_output") == 1
+
+
+def test_nothing_leaves_that_is_made_of_an_old_state_and_the_next_step_is_no_larger(
+    bench: Bench,
+) -> None:
+    bench.cycles(50)
+    sent, offset = len(bench.driver.sent), bench.stream.limiter.offset_in_base
+    state = bench.state()
+    for expiry in (-np.inf, time.monotonic() - 1e-6):
+        assert bench.writing.write(state, Q, bench.loads.update(state), expiry) is None
+    assert len(bench.driver.sent) == sent
+    assert (bench.stream.limiter.offset_in_base == offset).all()
+    bench.cycles(1)
+    assert len(bench.driver.sent) == sent + 1
+    assert bench.supervisor.state == State.COMPENSATING
+
+
+def test_what_takes_the_watchdog_too_long_to_hear_lets_nothing_old_leave(bench: Bench) -> None:
+    bench.driver.keep_alive = lambda: time.sleep(0.03)  # type: ignore[method-assign]
+    state = bench.state()
+    expiry = time.monotonic() + 0.02
+    assert bench.writing.write(state, Q, bench.loads.update(state), expiry) is None
+    assert not bench.driver.sent
+    assert bench.count("late") == 1
 
 
 def test_a_setpoint_that_left_in_part_is_followed_by_a_whole_one(bench: Bench) -> None:
