@@ -1,0 +1,103 @@
+"""Where the arm stands, and how a session learns it: one base, a member for each way."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.calibration.instruments.instrument import Ask, ReadingError
+from bridge.calibration.instruments.numbers import numbers
+from core.calibration.plan import PlannedPose
+from core.errors import RunError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Stand:
+    """The arm at rest; a field that nobody tells is None."""
+
+    q: Array  # (n,) rad
+    temperature: Array | None = None  # (n,) °C
+    wrench: Array | None = None  # (6,) N, Nm: actual_TCP_force
+    raw_wrench: Array | None = None  # (6,) N, Nm: ft_raw_wrench
+    payload: float | None = None  # kg, declared in the controller
+    approach: Array | None = None  # (n,) sign of each joint's last motion
+
+
+class JointSource(ABC):
+    """Tells where the arm stands. The constructor opens nothing."""
+
+    drives = False  # whether ``drive`` works
+    watches = False  # whether ``arrived`` can tell of itself
+
+    def open(self) -> None:
+        """Get ready. Raises InputError or LinkError."""
+
+    def close(self) -> None:
+        """Let go. Never raises."""
+
+    def arrived(self, pose: PlannedPose) -> Stand | None:
+        """Return where the arm rests, once it does so near the pose; None before."""
+        return None
+
+    def now(self) -> Array | None:
+        """Return the joints (n,) at this moment, None where nobody knows."""
+        return None
+
+    @abstractmethod
+    def stand(self, pose: PlannedPose) -> Stand:
+        """Return where the arm stands, at rest. Raises ReadingError where it does not."""
+
+    def still(self, stand: Stand) -> bool:
+        """Return whether the arm has not moved since."""
+        return True
+
+    def drive(self, pose: PlannedPose) -> None:
+        """Move the arm to a pose. Raises RunError."""
+        raise RunError("this session does not move the arm")
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class PlannedJoints(JointSource):
+    """The arm's own program brings it exactly to the planned poses."""
+
+    def stand(self, pose: PlannedPose) -> Stand:
+        """Return the planned joints."""
+        return Stand(pose.q)
+
+
+class TypedJoints(JointSource):
+    """A person reads the pendant, in degrees."""
+
+    def __init__(self, ask: Ask) -> None:
+        self._ask = ask
+
+    def stand(self, pose: PlannedPose) -> Stand:
+        """Return what is typed; Enter alone: exactly as planned. Raises ReadingError."""
+        n = len(pose.q)
+        line = self._ask(f"joints J1..J{n}, deg (Enter: exactly as planned)")
+        if not line:
+            return Stand(pose.q)
+        given = np.array(numbers(line, n, "deg"))
+        if np.abs(given).max() > 720.0:
+            raise ReadingError(f"found {np.abs(given).max():g} deg, expected at most two turns")
+        if np.abs(given).max() < 2.0 * np.pi and np.abs(given - pose.q).max() < 0.1:
+            raise ReadingError("found what look like radians, expected degrees")
+        return Stand(np.radians(given))

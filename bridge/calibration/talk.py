@@ -1,0 +1,169 @@
+"""The terminal of a session: what is said, what is asked, and the words that work everywhere."""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TypeVar
+
+from rich.console import Console
+from rich.status import Status
+
+T = TypeVar("T")
+LOOK = 0.1  # s between two looks at what is waited for
+WORDS = {
+    "undo": "take the last reading back and measure that pose again",
+    "back": "measure an earlier pose again: has the instrument or the target moved?",
+    "moved": "the instrument stands elsewhere from the next reading on",
+    "slipped": "the target sits elsewhere on the tool from the next reading on",
+    "skip": "leave this pose out",
+    "note": "write a note into the journal: note TEXT",
+    "quit": "end here; the same command goes on later",
+}
+_SHORT = {"u": "undo", "b": "back", "q": "quit", "exit": "quit", "h": "?", "help": "?"}
+
+
+class Word(Exception):
+    """A person typed one of WORDS instead of an answer."""
+
+    def __init__(self, word: str, rest: str = "") -> None:
+        super().__init__(word)
+        self.word, self.rest = word, rest
+
+
+class InputEnded(Exception):
+    """Nobody is there to answer: the input has come to its end."""
+
+
+class Talk:
+    """One terminal. ``note`` is told every note that a person writes."""
+
+    def __init__(self, note: Callable[[str], None] = lambda _: None) -> None:
+        self.console = Console(highlight=False, soft_wrap=True)
+        self.note = note
+        self._typed = _Lines()
+
+    def say(self, text: str = "", style: str | None = None) -> None:
+        """Print a line."""
+        self.console.print(text, style=style, markup=False)
+
+    def warn(self, text: str) -> None:
+        """Print a line that must be seen."""
+        self.say(f"! {text}", "bold yellow")
+
+    def ask(self, question: str) -> str:
+        """Return what is typed; raises Word for a word of the session, InputEnded at the end."""
+        while True:
+            line = self._heard(question, lambda: None)
+            assert isinstance(line, str)
+            if not self._is_help(line):
+                return self._answer(line)
+
+    def ask_unless(self, question: str, look: Callable[[], T | None]) -> str | T:
+        """Return what is typed, or what ``look`` finds meanwhile, whichever comes first."""
+        while True:
+            heard = self._heard(question, look)
+            if not isinstance(heard, str):
+                return heard
+            if not self._is_help(heard):
+                return self._answer(heard)
+
+    def confirm(self, question: str) -> bool:
+        """Return whether a person says yes; asks until it is yes or no."""
+        while True:
+            answer = self.ask(f"{question} [yes/no]").lower()
+            if answer in ("y", "yes", "n", "no"):
+                return answer.startswith("y")
+            self.say(f"found {answer!r}, expected yes or no")
+
+    def choose(self, question: str, answers: dict[str, str]) -> str:
+        """Return the key of one of the answers; Enter is the first."""
+        for key, text in answers.items():
+            self.say(f"    {key or 'Enter':<6} {text}")
+        while True:
+            answer = self.ask(question).lower()
+            found = [k for k in answers if k == answer or (answer and k.startswith(answer))]
+            if found:
+                return found[0]
+            self.say(f"found {answer!r}, expected {_either([k or 'Enter' for k in answers])}")
+
+    @contextmanager
+    def waiting(self, text: str) -> Iterator[Callable[[str], None]]:
+        """Show what is waited for while the block lasts; gives a function that changes it."""
+        if not self.console.is_terminal:
+            yield lambda text: None
+            return
+        with Status(text, console=self.console) as shown:
+            yield lambda text: shown.update(text)
+
+    def _heard(self, question: str, look: Callable[[], T | None]) -> str | T:
+        if not self._typed.ready:
+            self.console.print(f"{question} > ", end="", markup=False, style="bold")
+            self.console.file.flush()
+        while True:
+            line = self._typed.line(LOOK)
+            if line is not None:
+                if not sys.stdin.isatty():
+                    self.say(line)  # the terminal shows what is typed, a pipe does not
+                return line.strip()
+            if self._typed.ended:
+                raise InputEnded
+            found = look()
+            if found is not None:
+                self.say()
+                return found
+
+    def _is_help(self, line: str) -> bool:
+        word, _, rest = line.partition(" ")
+        word = _SHORT.get(word.lower(), word.lower())
+        if word == "?":
+            self.say("  Enter    go on")
+            for name, text in WORDS.items():
+                self.say(f"  {name:<8} {text}")
+            return True
+        if word == "note":
+            if rest.strip():
+                self.note(rest.strip())
+            self.say("noted" if rest.strip() else "found no text, expected note TEXT")
+            return True
+        return False
+
+    def _answer(self, line: str) -> str:
+        word, _, rest = line.partition(" ")
+        name = _SHORT.get(word.lower(), word.lower())
+        if name in WORDS:
+            raise Word(name, rest.strip())
+        return line
+
+
+def _either(words: list[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
+
+
+class _Lines:
+    """Lines of the standard input, without ever waiting longer than asked."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+        self.ended = False
+
+    @property
+    def ready(self) -> bool:
+        """Return whether a line is there that has been pasted with one before."""
+        return b"\n" in self._rest
+
+    def line(self, wait: float) -> str | None:
+        """Return the next line, None where none comes within ``wait`` s."""
+        fd = sys.stdin.fileno()
+        if not self.ready and not self.ended and select.select([fd], [], [], wait)[0]:
+            data = os.read(fd, 4096)
+            self.ended = not data
+            self._rest += data
+        line, end, rest = self._rest.partition(b"\n")
+        if not end:
+            return None
+        self._rest = rest
+        return line.decode("utf-8", "replace")
