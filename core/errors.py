@@ -7,7 +7,8 @@
     │   ├── ArmError          an arm table, URDF or DH list
     │   ├── CellError         a cell file
     │   ├── LogError          a log or a trajectory
-    │   └── ExcitationError   the data cannot speak about what was asked of it
+    │   ├── ExcitationError   the data cannot speak about what was asked of it
+    │   └── PlanError         no poses can be planned for what was asked
     └── RunError              something failed while running: exit 1, one clear line
         ├── LinkError         a controller cannot be reached, or broke off
         │   ├── StaleStateError     no fresh state in time
@@ -48,6 +49,10 @@ class LogError(InputError):
 
 class ExcitationError(InputError):
     """The data cannot speak about what was asked of it; the message names what is missing."""
+
+
+class PlanError(InputError):
+    """No poses can be planned for what was asked; the message names what stands in the way."""
 
 
 class RunError(GapbridgeError):
