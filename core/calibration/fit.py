@@ -1,0 +1,150 @@
+"""The fit of a whole session: staged, then everything together, held-out poses never touched."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from core.calibration.observables import make_observable
+from core.calibration.observables.nuisance import Nuisance
+from core.calibration.observables.observable import Observable
+from core.calibration.parameters import Parameters
+from core.calibration.plan import Expectation
+from core.calibration.readings import Readings
+from core.calibration.remainder import carried, diagnosed, repeatability_of
+from core.calibration.rest import Problem, Rest, come_to_rest
+from core.calibration.result import Calibration, Errors, Estimate
+from core.calibration.staging import at_odds
+from core.calibration.telling import combinations, notes_of, verdict_of
+from core.errors import ExcitationError
+from core.metrology import Metrology
+from core.model import Model
+
+Array = NDArray[np.float64]
+Progress = Callable[[str], None]
+TELLING = 1.0  # usual sizes: a parameter that is known no better is not shown
+TCP_STEP = 1e-3  # share of a parameter's scale, for derivatives of the predicted TCP
+
+
+def calibrate(
+    model: Model,
+    readings: Readings,
+    parameters: Parameters,
+    metrology: Metrology | None = None,
+    *,
+    observable: Observable | None = None,
+    expected: Expectation | None = None,
+    diagnose: bool = True,
+    progress: Progress | None = None,
+) -> Calibration:
+    """Return the calibration of an arm from a session's readings.
+
+    ``parameters`` say what is to be found (``Parameters.of(model, ...)``), ``metrology`` what is
+    known of the instrument; ``observable`` may be left out for kinds without options. Readings
+    marked as held out are never fitted. ``expected`` is the plan's promise, told beside what came.
+    ``diagnose`` runs the diagnosis on what is left over (positions and poses), which takes seconds.
+    Raises ExcitationError where the readings are too few, InputError where they do not fit the arm.
+    """
+    metrology = metrology or Metrology()
+    tell = progress or (lambda text: None)
+    how = observable or make_observable(readings.kind, registered=metrology.registered)
+    to_fit = np.flatnonzero(~readings.held_out)
+    if not len(to_fit):
+        raise ExcitationError("found no readings to fit: all are held out, expected others")
+    with threadpool_limits(1, "blas"):  # matrices of this size gain nothing from threads
+        problem, rest = come_to_rest(parameters, how, readings[to_fit], metrology, tell)
+        tell("judging")
+        found = parameters.model(rest.values)
+        remainder = carried(problem, rest, found, readings, metrology)
+        told = diagnosed(found, readings, rest, metrology, tell) if diagnose else None
+    estimates = _estimates(parameters, rest, expected)
+    shown = np.array([e.shown for e in estimates], dtype=bool)
+    errors = _errors(model, found, how, readings, rest.nuisance)
+    odds = _stages_at_odds(problem, rest)
+    complete = remainder.calm and (told is None or told.verdict == "no_gap")
+    notes = notes_of(problem, rest, remainder, odds, estimates)
+    return Calibration(
+        model=found, nominal=model, readings=readings, estimates=estimates,
+        covariance=rest.covariance[np.ix_(shown, shown)],
+        combinations=(*parameters.redundant, *combinations(parameters, rest, shown)),
+        before=errors[0], after=errors[1],
+        held_out_before=errors[2], held_out_after=errors[3],
+        outliers=to_fit[~rest.calm], noise=rest.noise.coordinate(),
+        repeatability=repeatability_of(problem, rest, found, readings),
+        stations=rest.nuisance.stations,
+        tcp_std=tcp_deviation(parameters, rest, readings[readings.held_out]),
+        diagnosis=told, complete=complete,
+        verdict=verdict_of(errors, remainder, told, rest, complete), notes=notes,
+    )  # fmt: skip
+
+
+def _estimates(
+    parameters: Parameters, rest: Rest, expected: Expectation | None
+) -> tuple[Estimate, ...]:
+    promised = {} if expected is None else dict(
+        zip(expected.names, expected.std, strict=True)
+    )  # fmt: skip
+    std = np.sqrt(np.diag(rest.covariance))
+    told = []
+    for i, name in enumerate(parameters.names):
+        promise = promised.get(name)
+        told.append(
+            Estimate(
+                name, float(rest.values[i]), float(std[i]), parameters.units[i],
+                None if promise is None else float(promise),
+                shown=bool(std[i] < TELLING * parameters.scales[i]),
+                on_bound=bool(rest.stuck[i]), freedom=rest.freedom,
+            )
+        )  # fmt: skip
+    return tuple(told)
+
+
+def _errors(
+    model: Model, found: Model, observable: Observable, readings: Readings, nuisance: Nuisance
+) -> tuple[Errors, Errors, Errors, Errors]:
+    """Return errors before and after over the fitted poses, then over the held-out ones.
+
+    Before, the instrument's place is the one that suits the nominal model best.
+    """
+    fitted, held = np.flatnonzero(~readings.held_out), np.flatnonzero(readings.held_out)
+    placed = observable.start(model, readings[fitted])
+    told = []
+    for rows in (fitted, held):
+        for one, place in ((model, placed), (found, nuisance)):
+            gap = np.zeros((0, min(observable.equations, 3)))
+            if len(rows):
+                gap = observable.residual(one, readings[rows], place)[:, :3]
+            told.append(Errors(gap, rows))
+    return told[0], told[1], told[2], told[3]
+
+
+def _stages_at_odds(problem: Problem, rest: Rest) -> float | None:
+    return at_odds(
+        rest.system, problem.stages, rest.covariance, problem.bounds,
+        problem.observable.equations, np.sqrt(rest.weights),
+    )  # fmt: skip
+
+
+def tcp_deviation(parameters: Parameters, rest: Rest, readings: Readings) -> Array:
+    """Return 1 sigma (3D, m) of the predicted TCP at readings (M,): the parameters' part alone."""
+    if not len(readings):
+        return np.zeros(0)
+    J = tcp_columns(parameters, rest.values, readings)
+    return np.asarray(np.sqrt(np.einsum("nki,ij,nkj->n", J, rest.covariance, J)))
+
+
+def tcp_columns(parameters: Parameters, values: Array, readings: Readings) -> Array:
+    """Return d TCP position / d parameters (N, 3, p), base axes."""
+    J = np.empty((len(readings), 3, len(values)))
+    for i in range(len(values)):
+        step = np.zeros(len(values))
+        step[i] = TCP_STEP * parameters.scales[i]
+        ends = [
+            parameters.model(values + way * step).predict(readings.q, readings.loads).position
+            for way in (1, -1)
+        ]
+        J[:, :, i] = (ends[0] - ends[1]) / (2 * step[i])
+    return J

@@ -1,0 +1,138 @@
+"""What a calibration leaves over: on poses that it never saw, between repeats, to the diagnosis."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import f as fisher
+
+from core.calibration.noise import presumed
+from core.calibration.readings import Readings
+from core.calibration.rest import Problem, Rest
+from core.diagnosis.diagnosis import Diagnosis, diagnose
+from core.errors import InputError
+from core.log import Log
+from core.metrology import Metrology
+from core.model import Model
+from core.rotation import rotation_matrix, rotation_vector
+
+Array = NDArray[np.float64]
+SURPRISE = 1e-3  # chance below which held-out poses are no longer like the fitted ones
+FEWEST_TO_DIAGNOSE = 12
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """How poses that the fit never saw stand against what it promises of them."""
+
+    held_out: int  # readings
+    ratio: float  # mean square over what was promised; nan without held-out readings
+    chance: float  # of so large a ratio were all well; 1 without
+    wild: NDArray[np.int64]  # rows of held-out readings far beyond the promise
+
+    @property
+    def calm(self) -> bool:
+        """Return whether nothing in them speaks against the fit."""
+        return self.chance > SURPRISE
+
+
+def carried(
+    problem: Problem, rest: Rest, found: Model, readings: Readings, metrology: Metrology
+) -> Remainder:
+    """Return how the held-out readings stand against the fit, noise and uncertainty counted."""
+    rows = np.flatnonzero(readings.held_out)
+    if not len(rows):
+        return Remainder(0, float("nan"), 1.0, rows)
+    part, observable = readings[rows], problem.observable
+    left = observable.residual(found, part, rest.nuisance)
+    shape, _ = presumed(found, part, observable, rest.nuisance, metrology)
+    sizes = rest.noise.sizes
+    V = np.asarray(sum(s**2 * one for s, one in zip(sizes, shape.shapes, strict=True)))
+    J, F = observable.columns(problem.parameters, rest.values, part, rest.nuisance)
+    N, k = left.shape
+    X = np.hstack([J, F]).reshape(N, k, -1)
+    V = V + X @ joint_covariance(problem, rest) @ np.swapaxes(X, 1, 2)
+    square = np.einsum("ni,ni->n", left, np.linalg.solve(V, left[..., None])[..., 0])
+    wild = square > 30 + 5 * k
+    kept = square[~wild] if (~wild).sum() >= 3 else square
+    ratio = float(kept.sum() / (k * len(kept)))
+    chance = float(fisher.sf(ratio, k * len(kept), rest.freedom))
+    return Remainder(len(rows), ratio, chance, rows[wild])
+
+
+def joint_covariance(problem: Problem, rest: Rest) -> Array:
+    """Return the covariance of parameters and nuisances together (p + m, p + m)."""
+    system, held = rest.system, problem.bounds.held
+    A = np.hstack([system.J, system.F])
+    size = np.concatenate([1 / held, np.maximum(np.linalg.norm(system.F, axis=0), 1e-300)])
+    A = A / size
+    ridge = np.concatenate([np.ones(len(held)), np.zeros(system.F.shape[1])])
+    core = np.linalg.pinv(A.T @ A + np.diag(ridge), rcond=1e-14, hermitian=True)
+    return np.asarray(core / np.outer(size, size))
+
+
+def repeatability_of(problem: Problem, rest: Rest, found: Model, readings: Readings) -> float:
+    """Return the arm's 1 sigma of one coordinate from repeated poses (m); nan without repeats.
+
+    The instrument's own noise is taken off.
+    """
+    left = problem.observable.residual(found, readings, rest.nuisance)[:, :3]
+    wild = np.zeros(len(readings), dtype=bool)
+    wild[np.flatnonzero(~readings.held_out)[~rest.calm]] = True
+    keys = np.column_stack([readings.pose, readings.load, readings.station, readings.target])
+    _, group = np.unique(keys, axis=0, return_inverse=True)
+    group = group.reshape(-1)
+    square, freedom = 0.0, 0
+    for one in np.unique(group[~wild]):
+        own = left[(group == one) & ~wild]
+        if len(own) > 1:
+            square += float(np.sum((own - own.mean(axis=0)) ** 2))
+            freedom += own.shape[1] * (len(own) - 1)
+    if freedom < 3:
+        return float("nan")
+    return float(np.sqrt(max(square / freedom - rest.noise.instrument**2, 0.0)))
+
+
+def diagnosed(
+    found: Model, readings: Readings, rest: Rest, metrology: Metrology,
+    progress: Callable[[str], None],
+) -> Diagnosis | None:  # fmt: skip
+    """Return the diagnosis of what the calibrated model leaves over, or None where it has no log.
+
+    Positions and poses of the first target alone; all places are brought into base as the fit has
+    them, and one common frame stays free.
+    """
+    use = readings.target == 0
+    if readings.kind not in ("position", "pose") or use.sum() < FEWEST_TO_DIAGNOSE:
+        return None
+    part = readings[use]
+    position, rotation = np.empty((len(part), 3)), np.empty((len(part), 3, 3))
+    for s, frame in enumerate(rest.nuisance.stations):
+        own = part.station == s
+        position[own] = frame.in_base(part.value[own, :3])
+        if readings.kind == "pose":
+            rotation[own] = frame.rotation_in_base(rotation_matrix(part.value[own, 3:]))
+    columns = {"actual_q": part.q, "measured_position": position} | _acting(part)
+    if readings.kind == "pose":
+        columns["measured_rotation"] = rotation_vector(rotation)
+    log = Log("the session's readings", columns, part.q.shape[1])
+    progress("diagnosing what is left")
+    instrument = Metrology(metrology.registered, rest.noise.instrument, metrology.repeatability)
+    try:
+        return diagnose(found, log, instrument, progress=progress)
+    except InputError:
+        return None
+
+
+def _acting(readings: Readings) -> dict[str, Array]:
+    """Return what acted on the arm, as a log names it."""
+    loads = readings.loads
+    given = {
+        "payload": loads.payload_mass, "payload_cog": loads.payload_cog,
+        "actual_TCP_force": loads.wrench, "joint_temperatures": loads.temperature,
+        "approach": loads.approach,
+    }  # fmt: skip
+    return {name: value for name, value in given.items() if value is not None}

@@ -1,0 +1,97 @@
+"""A calibration in words: its verdict, what cannot be told apart, what deserves a second look."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.calibration.parameters import Parameters
+from core.calibration.remainder import Remainder
+from core.calibration.rest import Problem, Rest
+from core.calibration.result import Errors, Estimate
+from core.calibration.staging import DOUBT
+from core.diagnosis.diagnosis import Diagnosis
+
+Array = NDArray[np.float64]
+CLOSE = 0.98  # correlation from which two parameters count as one combination
+MEMBER = 0.35  # share of a combination from which a parameter is named in it
+
+
+def combinations(parameters: Parameters, rest: Rest, shown: NDArray[np.bool_]) -> tuple[str, ...]:
+    """Return what these readings do not tell, or only together."""
+    told = []
+    names = parameters.names
+    std = np.sqrt(np.diag(rest.covariance))
+    correlation = rest.covariance / np.outer(std, std)
+    for i in np.flatnonzero(~shown):
+        partners = [int(j) for j in np.argsort(-np.abs(correlation[i])) if j != i]
+        best = partners[0] if partners else -1
+        if best >= 0 and abs(correlation[i, best]) > CLOSE:
+            what = "difference" if correlation[i, best] > 0 else "sum"
+            told.append(f"{names[i]}: these readings tell only its {what} with {names[best]}")
+        else:
+            told.append(f"{names[i]}: these readings hardly show it; it stays near its beginning")
+    for i in np.flatnonzero(shown):
+        for j in np.flatnonzero(shown):
+            if j > i and abs(correlation[i, j]) > CLOSE:
+                what = "difference" if correlation[i, j] > 0 else "sum"
+                told.append(
+                    f"{names[i]} and {names[j]}: mostly their {what} is known "
+                    f"(correlation {correlation[i, j]:+.3f})"
+                )
+    return tuple(told)
+
+
+def notes_of(
+    problem: Problem, rest: Rest, remainder: Remainder, odds: float | None,
+    estimates: tuple[Estimate, ...],
+) -> tuple[str, ...]:  # fmt: skip
+    """Return what deserves a second look."""
+    notes = []
+    bound = [e.name for e in estimates if e.on_bound]
+    if bound:
+        notes.append(f"on their bound: {', '.join(bound)}")
+    wild = np.flatnonzero(~rest.calm)
+    if len(wild):
+        notes.append(f"{len(wild)} wild reading(s) weighed down")
+    if len(remainder.wild):
+        rows = ", ".join(str(int(r) + 1) for r in remainder.wild)
+        notes.append(f"held-out reading(s) far beyond what the fit promises: row {rows}")
+    if odds is not None and odds < DOUBT:
+        notes.append(
+            "what differs between loads and all readings together disagree on the flexibilities: "
+            "something else changes with the load, or came between the loads (a wrong payload, a "
+            "tool that slipped, an instrument that moved)"
+        )
+    if not problem.stages.possible and problem.stages.elastic.any():
+        notes.append(
+            "no pose was measured under two loads: flexibilities rest on geometry and load together"
+        )
+    return tuple(notes)
+
+
+def verdict_of(
+    errors: tuple[Errors, ...], remainder: Remainder, diagnosis: Diagnosis | None, rest: Rest,
+    complete: bool,
+) -> str:  # fmt: skip
+    """Return the calibration in one sentence."""
+    held = len(errors[2].rows) > 0
+    before, after = (errors[2], errors[3]) if held else (errors[0], errors[1])
+    where = "on poses that the fit never saw" if held else "on the fitted poses (none held out)"
+    text = (
+        f"the error falls from {1e3 * before.rms:.3f} to {1e3 * after.rms:.3f} mm rms {where}; "
+        f"noise of instrument and arm is {1e3 * rest.noise.coordinate():.3f} mm a coordinate"
+    )
+    if complete:
+        return f"{text}; nothing is left that a further effect could explain"
+    left = [] if diagnosis is None else sorted(
+        {cause.effect for c in diagnosis.channels for cause in c.causes}
+    )  # fmt: skip
+    if left:
+        return f"{text}; not complete: {', '.join(left)} is left to be added"
+    if diagnosis is not None and diagnosis.verdict != "no_gap":
+        return f"{text}; not complete: structure is left that no effect of the catalogue explains"
+    return (
+        f"{text}; not complete: held-out poses are {np.sqrt(remainder.ratio):.1f} times as far off "
+        "as promised"
+    )
