@@ -26,7 +26,7 @@ WORDS = {
 _SHORT = {"u": "undo", "b": "back", "q": "quit", "exit": "quit", "h": "?", "help": "?"}
 
 
-class Word(Exception):
+class Word(Exception):  # noqa: N818 - an answer, no failure
     """A person typed one of WORDS instead of an answer."""
 
     def __init__(self, word: str, rest: str = "") -> None:
@@ -34,7 +34,7 @@ class Word(Exception):
         self.word, self.rest = word, rest
 
 
-class InputEnded(Exception):
+class InputEnded(Exception):  # noqa: N818
     """Nobody is there to answer: the input has come to its end."""
 
 

@@ -1,0 +1,273 @@
+"""The arm through the daemon: it is watched all the time, and moved only by ``drive``.
+
+Every run of the daemon that writes follows one trajectory, from where the arm stands to the next
+pose, through the one limiter, without corrections; once it rests there the daemon only observes.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.calibration.instruments.instrument import ReadingError
+from bridge.calibration.move import write_move
+from bridge.calibration.stand import JointSource, Stand
+from bridge.cell import Cell, load_cell
+from bridge.daemon import Daemon, settings_of
+from bridge.daemon_settings import DaemonSettings
+from bridge.recording.settings import RecordingSettings
+from bridge.settings import SetpointSettings
+from bridge.shared_page import PageReader
+from bridge.supervisor import State
+from core.calibration.plan import PlannedPose
+from core.errors import GapbridgeError, LinkError, RunError
+
+Array = NDArray[np.float64]
+STILL = 0.003  # rad/s: slower than this, the arm stands
+NEAR = 0.05  # rad: an arm that rests this near to the pose has arrived
+MOVED = 2e-4  # rad: farther than this from where it stood, it has moved
+STEADY = 1.0  # N: the force may drift by this over the time of settling, beside its noise
+KEPT = 20.0  # s of cycles that are kept
+STEP = 1e-5  # rad: a joint that has come this far has moved, in that direction
+PATIENCE = 30.0  # s for a connection, on top of the link's own
+FOREVER = 1e9  # s
+SLOWEST = 4.0  # a move may take this many times as long as planned
+
+
+def uncorrected(path: Path) -> Cell:
+    """Return a cell whose model has no effects: poses of a session are written as planned."""
+    from dataclasses import replace
+
+    cell = load_cell(path)
+    return replace(cell, model=cell.model.without_terms())
+
+
+class LinkedJoints(JointSource):
+    """Reads the arm over the cell's link; drives it where ``move`` allows."""
+
+    watches = True
+
+    def __init__(self, cell: Cell, settle: float, speed: float, folder: Path, move: bool) -> None:
+        self._settle, self._speed, self._folder = settle, speed, folder
+        self.drives = move
+        self._settings = settings_of(cell).model_copy(
+            update={
+                "recording": RecordingSettings(folder=None), "web": None, "metrics": None,
+                "setpoints": SetpointSettings(source="target"),
+                "model_source": "bridge.calibration.linked_joints:uncorrected",
+            }
+        )  # fmt: skip
+        self._run: _Run | None = None
+
+    def open(self) -> None:
+        """Watch the arm. Raises LinkError where it cannot be reached."""
+        self._start(self._settings, write=False)
+
+    def close(self) -> None:
+        """Leave the link."""
+        run, self._run = self._run, None
+        if run is not None:
+            run.end()
+
+    def now(self) -> Array | None:
+        """Return the joints (n,) of the newest cycle."""
+        rows = self._rows(0.1)
+        return None if not len(rows) else np.asarray(rows[-1, self._part("actual_q")])
+
+    def arrived(self, pose: PlannedPose) -> Stand | None:
+        """Return where the arm rests, once it does so near the pose."""
+        now = self.now()
+        if now is None or np.abs(now - pose.q).max() > NEAR or not self._rests():
+            return None
+        return self._standing()
+
+    def stand(self, pose: PlannedPose) -> Stand:
+        """Return where the arm rests. Raises ReadingError where it moves or is pulled at."""
+        until = time.monotonic() + max(5.0, 4.0 * self._settle)
+        while time.monotonic() < until:
+            if self._rests() and self._steady():
+                return self._standing()
+            time.sleep(0.02)
+        why = "the force at the tool is not steady" if self._rests() else "the arm moves"
+        raise ReadingError(f"{why}, expected it at rest for {self._settle:g} s")
+
+    def still(self, stand: Stand) -> bool:
+        """Return whether the arm stands where it stood."""
+        rows = self._rows(0.1)
+        here = rows[:, self._part("actual_q")].mean(axis=0)
+        return bool(np.abs(here - stand.q).max() < MOVED)
+
+    def drive(self, pose: PlannedPose) -> None:
+        """Move the arm to a pose, slowly, and wait until it rests there. Raises RunError."""
+        if not self.drives:
+            return super().drive(pose)
+        begin = self.now()
+        if begin is None:
+            raise LinkError("the arm tells no joints, expected where it stands before a move")
+        file = self._folder / "move.csv"
+        length = write_move(file, begin, pose.q, self._speed)
+        moving = SetpointSettings(source="trajectory", file=file.resolve())
+        self.close()
+        self._start(self._settings.model_copy(update={"setpoints": moving}), write=True)
+        self._follow(pose, length)
+        return None
+
+    def _follow(self, pose: PlannedPose, length: float) -> None:
+        """Wait until the arm rests at the pose, then have the daemon observe."""
+        run = self._require()
+        until = time.monotonic() + SLOWEST * length + PATIENCE
+        begun = False
+        while True:
+            state = run.daemon.state
+            begun |= state == State.COMPENSATING
+            if begun and not state.writes:
+                raise RunError(f"the move broke off: {run.words() or state.name.lower()}")
+            now = self.now()
+            there = now is not None and np.abs(now - pose.q).max() < NEAR / 10
+            if begun and there and run.daemon.page.ended and self._rests():
+                break
+            if time.monotonic() > until:
+                run.end()
+                raise RunError(f"the arm did not arrive within {SLOWEST * length + PATIENCE:.0f} s")
+            time.sleep(0.02)
+        run.daemon.disarm()
+        while run.daemon.state.writes and time.monotonic() < until:
+            time.sleep(0.02)
+
+    # -- the watched arm --------------------------------------------------------------------------
+
+    def _start(self, settings: DaemonSettings, write: bool) -> None:
+        self._run = run = _Run(settings, write)
+        until = time.monotonic() + settings.link.connect_timeout + PATIENCE
+        while not len(self._rows(1.0)):
+            if time.monotonic() > until:
+                raise LinkError("the arm tells nothing, expected its joints")
+            time.sleep(0.02)
+        run.ready = True
+
+    def _require(self) -> _Run:
+        if self._run is None:
+            raise LinkError("the link to the arm is closed")
+        self._run.check()
+        return self._run
+
+    def _part(self, name: str) -> slice:
+        return self._require().slices[name]
+
+    def _rows(self, span: float) -> Array:
+        """Return the cycles (M, width) of the last ``span`` s."""
+        run = self._require()
+        run.take()
+        rows = run.rows
+        if not len(rows):
+            return rows
+        time_at = rows[:, run.slices["timestamp"].start]
+        return np.asarray(rows[time_at >= time_at[-1] - span])
+
+    def _rests(self) -> bool:
+        """Return whether the arm has stood still for the time of settling."""
+        rows, at = self._rows(self._settle), self._part("timestamp").start
+        whole = self._require().rows
+        if whole[-1, at] - whole[0, at] < self._settle:
+            return False
+        return bool(np.abs(rows[:, self._part("actual_qd")]).max() < STILL)
+
+    def _steady(self) -> bool:
+        """Return whether the force at the tool does not drift; True where there is none."""
+        force = self._rows(self._settle)[:, self._part("actual_TCP_force")][:, :3]
+        if not np.isfinite(force).all() or len(force) < 8:
+            return True
+        first, last = np.array_split(force, 2)
+        noise = force.std(axis=0) * np.sqrt(4.0 / len(force))
+        drift = np.abs(last.mean(axis=0) - first.mean(axis=0))
+        return bool((drift < STEADY + 3.0 * noise).all())
+
+    def _standing(self) -> Stand:
+        rows, run = self._rows(self._settle), self._require()
+
+        def mean(name: str) -> Array | None:
+            found = rows[:, run.slices[name]].mean(axis=0)
+            return found if np.isfinite(found).all() else None
+
+        q, payload = mean("actual_q"), mean("payload")
+        assert q is not None
+        return Stand(
+            q=q,
+            temperature=mean("joint_temperatures"),
+            wrench=mean("actual_TCP_force"),
+            raw_wrench=mean("ft_raw_wrench"),
+            payload=None if payload is None else float(payload[0]),
+            approach=run.approach.copy(),
+        )
+
+
+class _Run:
+    """One run of the daemon in a thread of its own."""
+
+    def __init__(self, settings: DaemonSettings, write: bool) -> None:
+        self.daemon = Daemon(settings, may_write=write, say=self._say)
+        self.slices = self.daemon.page.slices
+        self.rows = np.empty((0, self.daemon.page.width))
+        self.approach = np.zeros(self.daemon.page.n)
+        self.ready = False
+        self._turned_at: Array | None = None
+        self._reader: PageReader | None = self.daemon.page.reader()
+        self._said: list[str] = []
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._main, args=(write,), daemon=True)
+        self._thread.start()
+
+    def _say(self, text: str) -> None:
+        self._said.append(text)
+
+    def _main(self, write: bool) -> None:
+        try:
+            self.daemon.run(arm=write, duration=FOREVER, by="--arm")
+        except BaseException as error:
+            self._error = error
+
+    def words(self) -> str:
+        """Return what the daemon said last."""
+        return self._said[-1] if self._said else ""
+
+    def check(self) -> None:
+        """Raise what ended the run."""
+        if self._thread.is_alive():
+            return
+        if isinstance(self._error, GapbridgeError):
+            raise self._error
+        raise LinkError(f"the link to the arm ended: {self._error or self.words() or 'no reason'}")
+
+    def take(self) -> None:
+        """Take the cycles over that came since the last call."""
+        if self._reader is None:
+            return
+        try:
+            new = self._reader.drain()
+        except (IndexError, ValueError):  # the page was closed meanwhile
+            return
+        if not len(new):
+            return
+        at = self.slices["timestamp"].start
+        self._follow_motion(new[:, self.slices["actual_q"]])
+        rows = np.vstack([self.rows, new])
+        self.rows = rows[rows[:, at] >= rows[-1, at] - KEPT]
+
+    def _follow_motion(self, q: Array) -> None:
+        before = q[0].copy() if self._turned_at is None else self._turned_at
+        for row in q:
+            way = row - before
+            moved = np.abs(way) > STEP
+            self.approach[moved] = np.sign(way[moved])
+            before[moved] = row[moved]
+        self._turned_at = before
+
+    def end(self) -> None:
+        """End the run."""
+        self._reader = None
+        self.daemon.stop()
+        self._thread.join(20.0)
