@@ -31,7 +31,7 @@ class RotorInertia(JointEffect):
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the inertia at the joint's side of the gear."""
-        scale = max(1e-3 * joint_scale(arm, site), 1e-3)
+        scale = max(1e-2 * joint_scale(arm, site), 1e-3)
         return (Parameter("", "kg m2", scale, 0.0, np.inf),)
 
     def drive(
