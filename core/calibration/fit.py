@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from core.calibration.noise import Noise
 from core.calibration.observables import make_observable
 from core.calibration.observables.nuisance import Nuisance
 from core.calibration.observables.observable import Observable
@@ -78,6 +79,8 @@ def calibrate(
         tcp_std=tcp_deviation(parameters, rest, readings[readings.held_out]),
         diagnosis=told, complete=complete,
         verdict=verdict_of(errors, remainder, told, rest, complete), notes=notes,
+        instrument_noise=rest.noise.instrument, turn_noise=_turn_noise(how, rest.noise),
+        joint_noise=rest.noise.joint, freedom=rest.freedom, whole_covariance=rest.covariance,
     )  # fmt: skip
 
 
@@ -119,6 +122,13 @@ def _errors(
                 gap = observable.residual(one, readings[rows], place)[:, :3]
             told.append(Errors(gap, rows))
     return told[0], told[1], told[2], told[3]
+
+
+def _turn_noise(observable: Observable, noise: Noise) -> float:
+    """Return 1 sigma of a measured rotation (rad); nan where none is measured."""
+    if len(noise.sizes) < 3:
+        return float("nan")
+    return float(noise.sizes[1] * observable.sigmas[3])
 
 
 def _stages_at_odds(problem: Problem, rest: Rest) -> float | None:
