@@ -8,19 +8,21 @@ their covariance (5.2); degrees of freedom combine by Welch and Satterthwaite (G
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
+from scipy.special import bdtr, stdtr, stdtrit
 
 from core.calibration.pose_accuracy import repeats
 from core.calibration.result import Calibration
+from core.calibration.sensitivity import Sensitivities, sensitivities
 
 Array = NDArray[np.float64]
 COVERAGE = 2.0  # k
 PROBABILITY = 0.9545  # of a normal distribution within two standard deviations
 ALUMINIUM = 23e-6  # 1/K; steel grows half as much
+RARE = 0.01  # a chance below which the held-out poses speak against the budget
 LENGTH_95 = 2.796  # length of a 3D normal vector that 95 % stay below, in sigmas of a coordinate
 
 
@@ -59,7 +61,7 @@ class Budget:
     inputs: tuple[Input, ...]
     combined: float  # m
     freedom: float  # effective degrees of freedom
-    needed_factor: float  # of Student's distribution, for 95.45 %
+    parameters: Sensitivities | None  # what stands behind the first input, parameter by parameter
     inside: int  # held-out coordinates whose error is within the bound
     looked_at: int  # held-out coordinates
     bound: float  # m: k times combined uncertainty and measurement of one reading
@@ -71,6 +73,27 @@ class Budget:
         return COVERAGE * self.combined
 
     @property
+    def coverage(self) -> float:
+        """Return the share of cases that k = 2 holds, by Student's distribution."""
+        return _coverage(self.freedom)
+
+    @property
+    def needed_factor(self) -> float:
+        """Return the factor that 95.45 % ask for, by Student's distribution."""
+        if not np.isfinite(self.freedom):
+            return COVERAGE
+        return float(stdtrit(self.freedom, 0.5 + PROBABILITY / 2))
+
+    @property
+    def doubtful(self) -> bool:
+        """Return whether fewer held-out coordinates are inside the bound than chance allows."""
+        if not self.looked_at:
+            return False
+        # errors of one pose go together: they count as one look in three
+        looks, found = self.looked_at / 3, self.inside / 3
+        return bool(bdtr(np.floor(found), round(looks), self.coverage) < RARE)
+
+    @property
     def expanded_length(self) -> float:
         """Return the distance from its place that the TCP keeps to in 95 % of all poses, m."""
         return LENGTH_95 * self.combined
@@ -80,7 +103,8 @@ def budget(calibration: Calibration, stated: Stated) -> Budget:
     """Return the budget of a calibration."""
     reading = _reading_noise(calibration)
     repeatability = _repeatability(calibration, reading)
-    found = [_parameters(calibration), repeatability]
+    behind = sensitivities(calibration)
+    found = [_parameters(calibration, behind), repeatability]
     found.append(_remainder(calibration, found[0].std, np.hypot(repeatability.std, reading)))
     missing = []
     for part, words in (
@@ -97,7 +121,7 @@ def budget(calibration: Calibration, stated: Stated) -> Budget:
     bound = COVERAGE * float(np.hypot(combined, reading))
     errors = np.abs(calibration.held_out_after.vector).ravel()
     return Budget(
-        tuple(found), combined, freedom, _factor(freedom), int((errors <= bound).sum()),
+        tuple(found), combined, freedom, behind, int((errors <= bound).sum()),
         len(errors), bound, tuple(missing),
     )  # fmt: skip
 
@@ -109,14 +133,15 @@ def _reading_noise(calibration: Calibration) -> float:
     return float(np.sqrt(np.mean(known**2))) if len(known) else 0.0
 
 
-def _parameters(calibration: Calibration) -> Input:
+def _parameters(calibration: Calibration, behind: Sensitivities | None) -> Input:
     """Return what the fit leaves unsure, all parameters together with their correlations."""
-    width = 3 if calibration.readings.kind != "distance" else 1
-    std = float(np.sqrt(np.mean(calibration.tcp_std**2) / 3)) if len(calibration.tcp_std) else 0.0
-    rows = len(calibration.after.vector) * width
-    count = len(calibration.covariance)
+    std = behind.combined if behind else 0.0
+    if len(calibration.tcp_std):
+        std = float(np.sqrt(np.mean(calibration.tcp_std**2) / 3))
+    rows, count = calibration.after.vector.size, len(calibration.covariance)
+    freedom = max(rows - count - 6 * len(calibration.stations), 1)
     return Input(
-        "parameters of the model", "A", "normal", std, "m", 1.0, float(max(rows - count - 6, 1)),
+        "parameters of the model", "A", "normal", std, "m", 1.0, float(freedom),
         f"covariance of {count} parameters from {rows} coordinates, carried to the tool",
     )  # fmt: skip
 
@@ -192,8 +217,6 @@ def _payload_sensitivity(calibration: Calibration) -> float:
     model, step = calibration.model, 0.1
     mass = readings.loads.payload_mass
     mass = np.full(len(readings), model.payload_mass) if mass is None else mass
-    from dataclasses import replace
-
     more = replace(readings.loads, payload_mass=mass + step)
     change = model.predict(readings.q, more).position
     change = change - model.predict(readings.q, replace(more, payload_mass=mass)).position
@@ -205,7 +228,5 @@ def _effective(inputs: list[Input], combined: float) -> float:
     return float(combined**4 / weight) if weight > 0 else float("inf")
 
 
-def _factor(freedom: float) -> float:
-    if not np.isfinite(freedom):
-        return COVERAGE
-    return float(stdtrit(freedom, 0.5 + PROBABILITY / 2))
+def _coverage(freedom: float) -> float:
+    return float(1 - 2 * stdtr(freedom if np.isfinite(freedom) else 1e9, -COVERAGE))

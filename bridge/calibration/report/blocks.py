@@ -119,6 +119,7 @@ class Part:
     title: str
     about: str
     blocks: tuple[Block, ...]
+    folded: bool = False  # True: the page shows it only when asked to
 
 
 @dataclass(frozen=True)

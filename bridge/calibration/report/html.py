@@ -49,6 +49,8 @@ def _own(package: str) -> str:
 
 def _part(part: Part) -> str:
     blocks = "".join(_block(block) for block in part.blocks)
+    if part.folded:
+        blocks = f"<details><summary>Show</summary>{blocks}</details>"
     return (
         f'<section id="{part.key}"><h2>{escape(part.title)}</h2>'
         f'<p class="about">{escape(part.about)}</p>{blocks}</section>'

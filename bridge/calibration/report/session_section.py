@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from bridge.calibration.report.blocks import Block, Bullets, Heading, Pairs
 from bridge.calibration.report.facts import SessionFacts
+from bridge.calibration.report.figures import load_words, mm, plain
 from bridge.calibration.report.material import Material
 from bridge.calibration.report.section import Section
-from bridge.report.words import number, told
 
 KINDS = {
     "position": "position of a target on the tool, three coordinates",
@@ -48,7 +48,7 @@ def _front(facts: SessionFacts) -> list[tuple[str, str]]:
     temperature = ""
     if facts.temperature:
         low, high = facts.temperature
-        temperature = f"{number(low)} °C at the start, {number(high)} °C at the end"
+        temperature = f"{plain(low)} °C at the start, {plain(high)} °C at the end"
     given = [
         ("customer", facts.customer), ("cell", facts.cell), ("arm", facts.arm),
         ("serial number", facts.serial), ("place", facts.place),
@@ -63,16 +63,16 @@ def _instrument(facts: SessionFacts, stations: int) -> list[tuple[str, str]]:
     tool = facts.instrument
     error = ""
     if tool.error is not None:
-        error = f"± {told(tool.error, 'm')}"
+        error = f"± {mm(tool.error)}"
         if tool.error_per_metre:
-            error += f" and {told(tool.error_per_metre, 'm')} per metre of distance"
+            error += f" and {mm(tool.error_per_metre)} per metre of distance"
     given = [
         ("instrument", tool.name), ("serial number", tool.serial),
         ("its own calibration", tool.certificate),
         ("measures", KINDS.get(tool.kind, tool.kind)),
-        ("noise, declared", f"{told(tool.sigma, 'm')} (1 sigma of one coordinate)"),
+        ("noise, declared", f"{mm(tool.sigma)} (1 sigma of one coordinate)"),
         ("largest permissible error", error),
-        ("distance", f"{number(tool.distance)} m" if tool.distance else ""),
+        ("distance", f"{plain(tool.distance)} m" if tool.distance else ""),
         ("places", f"{stations}" if stations > 1 else ""),
     ]  # fmt: skip
     return [(name, text) for name, text in given if text]
@@ -99,5 +99,4 @@ def _loads_words(material: Material) -> str:
     plan = material.plan
     if plan is None:
         return str(len(set(material.calibration.readings.load.tolist())))
-    told_loads = [f"{p.name + ': ' if p.name else ''}{number(p.mass)} kg" for p in plan.loads]
-    return "; ".join(told_loads)
+    return "; ".join(load_words(p.mass, p.name) for p in plan.loads)

@@ -13,9 +13,9 @@ from bridge.calibration.report.blocks import (
     Tiles,
     Verdict,
 )
+from bridge.calibration.report.figures import mm
 from bridge.calibration.report.material import Material
 from bridge.calibration.report.section import Section
-from bridge.report.words import told
 
 
 class Summary(Section[Material]):
@@ -31,10 +31,10 @@ class Summary(Section[Material]):
         if not after.mean < before.mean:
             badge = Badge("No improvement", BAD)
         tiles = [
-            Tile("mean error before", told(before.mean, "m"), f"at most {told(before.max, 'm')}"),
-            Tile("mean error after", told(after.mean, "m"), f"at most {told(after.max, 'm')}"),
+            Tile("mean error before", mm(before.mean), f"at most {mm(before.max)}"),
+            Tile("mean error after", mm(after.mean), f"at most {mm(after.max)}"),
             Tile("smaller by", _times(before.mean, after.mean), f"over {len(after.norm)} readings"),
-            Tile("expanded uncertainty (k = 2)", f"± {told(material.budget.expanded, 'm')}",
+            Tile("expanded uncertainty (k = 2)", f"± {mm(material.budget.expanded)}",
                  "of one coordinate of the tool"),
         ]  # fmt: skip
         text = (
