@@ -135,7 +135,9 @@ class ServoWriter:
         control, host = self._control, self._settings.host
         if control is None:
             raise WriteError(f"{host}: found no control script, expected arm() first")
-        if not control.isConnected() or not control.isProgramRunning():
+        if not control.isConnected():
+            raise WriteError(f"{host}: the library's connection for writing has ended")
+        if not control.isProgramRunning():
             raise WriteError(
                 f"{host}: the control script has ended (watchdog, a stop, or a person)"
             )
