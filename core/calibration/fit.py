@@ -61,7 +61,7 @@ def calibrate(
         found = parameters.model(rest.values)
         remainder = carried(problem, rest, found, readings, metrology)
         told = diagnosed(found, readings, rest, metrology, tell) if diagnose else None
-    estimates = _estimates(parameters, rest, expected)
+    estimates = estimates_of(parameters, rest, expected)
     shown = np.array([e.shown for e in estimates], dtype=bool)
     errors = _errors(model, found, how, readings, rest.nuisance)
     odds = _stages_at_odds(problem, rest)
@@ -84,9 +84,10 @@ def calibrate(
     )  # fmt: skip
 
 
-def _estimates(
+def estimates_of(
     parameters: Parameters, rest: Rest, expected: Expectation | None
 ) -> tuple[Estimate, ...]:
+    """Return the parameters as they are told, beside what was ``expected`` of them."""
     promised = {} if expected is None else dict(
         zip(expected.names, expected.std, strict=True)
     )  # fmt: skip
