@@ -28,8 +28,9 @@ REACH = 10.0  # s to reach the scheduler, and to wait for its first worker
 class DaskWorkers(Workers):
     """The workers behind a scheduler's address."""
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, reach: float = REACH) -> None:
         self.address = address
+        self.reach = reach
         self._client: Client | None = None
         self._run = uuid.uuid4().hex[:12]
 
@@ -49,7 +50,7 @@ class DaskWorkers(Workers):
         # its workers come and go: what matters of that is told by the outcomes
         logging.getLogger("distributed").setLevel(logging.CRITICAL)
         try:
-            self._client = Client(self.address, timeout=REACH, set_as_default=False)
+            self._client = Client(self.address, timeout=self.reach, set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:
             self._client = None
             raise RunError(
@@ -57,11 +58,11 @@ class DaskWorkers(Workers):
                 f"({' '.join(str(error).split())[:200]})"
             ) from None
         try:
-            self._client.wait_for_workers(1, timeout=REACH)
+            self._client.wait_for_workers(1, timeout=self.reach)
         except TimeoutError:
             self.stop()
             raise RunError(
-                f"--scheduler: {self.address}: found no worker within {REACH:g} s, expected one"
+                f"--scheduler: {self.address}: found no worker within {self.reach:g} s, expected one"
             ) from None
 
     def stop(self) -> None:
@@ -78,7 +79,7 @@ class DaskWorkers(Workers):
         assert client is not None
         source = iter(tasks)
         waiting: dict[str, Task] = {}
-        coming = as_completed(with_results=False)
+        coming = as_completed(loop=client.loop)
         for _ in range(self._ahead(client)):
             self._send(client, next(source, None), waiting, coming)
         while waiting:
@@ -89,7 +90,7 @@ class DaskWorkers(Workers):
             self._send(client, next(source, None), waiting, coming)
 
     def _ahead(self, client: Client) -> int:
-        threads = sum(client.nthreads().values())
+        threads = int(sum(client.nthreads().values()))
         return max(FEWEST_AHEAD, AHEAD * threads)
 
     def _send(
