@@ -20,7 +20,7 @@ from rich.table import Table
 
 from benchmarks.blind.arms import ARMS
 from benchmarks.calibration.drawings import model_of, real_arm
-from benchmarks.calibration.sessions import (
+from benchmarks.calibration.laid_out import (
     Layout,
     arm_with,
     draw_values,
