@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.calibration.parameters import Parameters
+from core.calibration.promise import effects_of
 from core.calibration.result import Calibration
-from core.effects import CATALOGUE
 from core.errors import InputError
 
 Array = NDArray[np.float64]
@@ -49,23 +49,24 @@ def sensitivities(calibration: Calibration) -> Sensitivities | None:
 
     None where a parameter's name does not say which effect it belongs to.
     """
-    shown = [e for e in calibration.estimates if e.shown]
+    shown, covariance = list(calibration.estimates), calibration.whole_covariance
+    if len(covariance) != len(shown):
+        shown, covariance = [e for e in shown if e.shown], calibration.covariance
     J = _columns(calibration, [e.name for e in shown])
-    if J is None or len(calibration.covariance) != len(shown):
+    if J is None or len(covariance) != len(shown):
         return None
     each = tuple(
         Sensitivity(e.name, e.unit, e.std, float(np.sqrt(np.mean(J[:, :, i] ** 2))))
         for i, e in enumerate(shown)
     )
-    variance = np.einsum("nip,pq,niq->n", J, calibration.covariance, J)
+    variance = np.einsum("nip,pq,niq->n", J, covariance, J)
     return Sensitivities(each, float(np.sqrt(max(np.mean(variance), 0.0) / 3)))
 
 
 def _columns(calibration: Calibration, names: list[str]) -> Array | None:
     """Return d TCP / d parameter (M, 3, p), central differences around the calibrated model."""
-    effects = sorted({_effect(name) for name in names})
     try:
-        every = Parameters.every(calibration.model, effects)
+        every = Parameters.every(calibration.model, effects_of(names))
     except InputError:
         return None
     places = {name: i for i, name in enumerate(every.names)}
@@ -82,7 +83,3 @@ def _columns(calibration: Calibration, names: list[str]) -> Array | None:
         ]
         columns.append((ends[0] - ends[1]) / (2 * step[places[name]]))
     return np.stack(columns, axis=2) if columns else None
-
-
-def _effect(name: str) -> str:
-    return max((e for e in CATALOGUE if name.startswith(e)), key=len, default=name)

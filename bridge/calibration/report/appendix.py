@@ -25,10 +25,9 @@ class Appendix(Section[Material]):
         """Return one long table."""
         readings = material.calibration.readings
         before, after = (_by_row(e.rows, e.norm, len(readings)) for e in material.both)
-        wild = set(material.calibration.outliers.tolist())
         rows: list[list[Cell]] = []
         for i in range(len(readings)):
-            used = "wild" if i in wild else "check" if readings.held_out[i] else "fit"
+            used = "wild" if i in material.wild else "check" if readings.held_out[i] else "fit"
             rows.append([
                 str(i + 1), str(int(readings.pose[i]) + 1), str(int(readings.load[i]) + 1),
                 degrees(readings.q[i]), used, _told(before[i]), _told(after[i]),

@@ -65,7 +65,7 @@ def estimate_words(e: Estimate) -> tuple[str, str, str, str]:
 
 def degrees(q: object) -> str:
     """Return joint angles (rad) in degrees, with one decimal."""
-    return "  ".join(fixed(math.degrees(float(v)), 1) for v in q)  # type: ignore[attr-defined]
+    return ", ".join(fixed(math.degrees(float(v)), 1) for v in q)  # type: ignore[attr-defined]
 
 
 def counted(count: int, one: str, many: str = "") -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from bridge.calibration.report.blocks import (
     DOUBTFUL,
     GOOD,
@@ -16,6 +18,7 @@ from bridge.calibration.report.blocks import (
 )
 from bridge.calibration.report.figures import degrees, plain
 from bridge.calibration.report.material import Material
+from bridge.calibration.report.names import sentence
 from bridge.calibration.report.section import Section
 from bridge.report.answer import one_line, sentences
 from bridge.report.material import chosen_channel
@@ -45,8 +48,13 @@ class LeftoverSection(Section[Material]):
         others = [ch for ch in c.diagnosis.channels if ch is not main]
         blocks += [Paragraph(f"{CHANNELS[ch.channel]}: {one_line(ch)}") for ch in others]
         if c.diagnosis.findings:
-            blocks.append(Bullets(tuple(c.diagnosis.findings)))
+            blocks.append(Bullets(tuple(_finding(f) for f in c.diagnosis.findings)))
         return [*blocks, *([] if c.complete else _next(c.diagnosis))]
+
+
+def _finding(text: str) -> str:
+    """Return a finding without the rows of a file that nobody has."""
+    return sentence(re.sub(r" \(row [^)]*of the file\)", "", text))
 
 
 def _next(diagnosis: Diagnosis) -> list[Block]:

@@ -19,11 +19,11 @@ class LoadsSection(Section[Material]):
     """How the errors go with the load."""
 
     key, title = "loads", "Over the load"
-    about = "Errors of all readings, by what hung on the flange."
+    about = "Errors by what hung on the flange; wild readings are left out."
 
     def blocks(self, material: Material) -> list[Block]:
         """Return a picture and a table, one column and one row a load."""
-        before, _ = material.both
+        before, _ = material.calm
         load = material.calibration.readings.load[before.rows]
         numbers = [int(k) for k in np.unique(load)]
         return [
@@ -34,7 +34,7 @@ class LoadsSection(Section[Material]):
 
 
 def _picture(material: Material, load: Index, numbers: list[int]) -> Drawing:
-    before, after = material.both
+    before, after = material.calm
     labels = [f"{plain(_mass(material, k))} kg" for k in numbers]
     chart = Chart(
         "Error by load", named("load on the flange", labels),
@@ -64,7 +64,7 @@ def _mass(material: Material, number: int) -> float:
 
 
 def _table(material: Material, load: Index, numbers: list[int]) -> Table:
-    before, after = material.both
+    before, after = material.calm
     plan, rows = material.plan, []
     for k in numbers:
         old, new = before.norm[load == k], after.norm[load == k]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.calibration.report.facts import SessionFacts
-from core.calibration.budget import Budget, Stated, budget
+from core.calibration.budget import Budget, Stated, budget, wild_readings
 from core.calibration.plan import Plan
 from core.calibration.pose_accuracy import PoseAccuracy, pose_accuracies
 from core.calibration.result import Calibration, Errors
@@ -43,9 +43,24 @@ class Material:
         return _joined(c.before, c.held_out_before), _joined(c.after, c.held_out_after)
 
     @cached_property
+    def calm(self) -> tuple[Errors, Errors]:
+        """Return the errors before and after of all readings but the wild ones."""
+        before, after = self.both
+        kept = np.array([int(r) not in self.wild for r in before.rows], dtype=bool)
+        return (
+            Errors(before.vector[kept], before.rows[kept]),
+            Errors(after.vector[kept], after.rows[kept]),
+        )
+
+    @cached_property
     def accuracies(self) -> tuple[PoseAccuracy, ...]:
         """Return AP and RP of the poses that were visited more than once."""
         return pose_accuracies(self.calibration)
+
+    @cached_property
+    def wild(self) -> frozenset[int]:
+        """Return the rows of readings that are blunders."""
+        return frozenset(int(r) for r in wild_readings(self.calibration))
 
     @property
     def predicted_std(self) -> float:

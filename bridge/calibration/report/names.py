@@ -9,18 +9,18 @@ from core.effects import CATALOGUE
 
 PATTERNS = {
     "joint_offset": "zero of joint {joint}",
-    "axial_compliance": "joint {joint}: twist about its axis, per torque",
-    "radial_compliance": "joint {joint}: tilt of its axis, per moment",
-    "link_flexibility": "link {joint}: bending under load",
-    "link_geometry": "link {joint}: {part}",
-    "tool_frame": "tool: {part}",
-    "backlash": "joint {joint}: play",
-    "base_compliance": "foundation: {part}",
-    "transmission_error": "joint {joint}: periodic gear error, {part}",
-    "tool_tcp": "tool centre point: {part}",
-    "payload_mass": "load: mass",
-    "payload_cog": "load: centre of gravity, {part}",
-    "ft_bias": "sensor reading without load: {part}",
+    "axial_compliance": "twist of joint {joint} per torque",
+    "radial_compliance": "tilt of joint {joint} per moment",
+    "link_flexibility": "bending of link {joint}",
+    "link_geometry": "{part} of link {joint}",
+    "tool_frame": "tool {part}",
+    "backlash": "play of joint {joint}",
+    "base_compliance": "yielding of the foundation about {part}",
+    "transmission_error": "gear error of joint {joint} ({part})",
+    "tool_tcp": "tool centre {part}",
+    "payload_mass": "mass of the load",
+    "payload_cog": "centre of gravity {part}",
+    "ft_bias": "sensor zero of {part}",
 }
 PARTS = {
     "a": "length a", "d": "offset d", "alpha": "twist alpha", "beta": "twist beta",
@@ -38,6 +38,8 @@ def effect_of(name: str) -> str:
 def parameter_words(name: str) -> str:
     """Return a parameter's public name in words; the name itself where there are none."""
     effect = effect_of(name)
+    if name == effect and effect in CATALOGUE:
+        return effect_words(effect)
     match = re.fullmatch(r"(?:_(\d+))?(?:_(.+))?", name.removeprefix(effect))
     if not effect or match is None:
         return name
@@ -47,4 +49,22 @@ def parameter_words(name: str) -> str:
     if pattern is None:
         where = f", joint {joint}" if joint else ""
         return f"{effect_words(effect)}{where}{', ' + part if part else ''}"
-    return pattern.format(joint=joint, part=part).rstrip(", :")
+    return pattern.format(joint=joint, part=part).strip()
+
+
+def spoken(text: str) -> str:
+    """Return a text with public names of parameters and effects in words instead."""
+    names = "|".join(sorted((*CATALOGUE, *PATTERNS), key=len, reverse=True))
+    return re.sub(rf"\b(?:{names})(?:_[A-Za-z0-9_.]*\w)?\b", _in_words, text)
+
+
+def sentence(text: str) -> str:
+    """Return a text that begins with a capital and ends with a full stop."""
+    text = spoken(text).strip()
+    end = "" if text.endswith((".", "!", "?")) else "."
+    return text[:1].upper() + text[1:] + end
+
+
+def _in_words(match: re.Match[str]) -> str:
+    # words of the language are names too ("payload", "backlash"): only what has a _ is a name
+    return parameter_words(match[0]) if "_" in match[0] else match[0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from bridge.calibration.report.blocks import Block, Bullets, Cell, Heading, Paragraph, Table
 from bridge.calibration.report.figures import decimals_of, estimate_words, fixed
 from bridge.calibration.report.material import Material
-from bridge.calibration.report.names import parameter_words
+from bridge.calibration.report.names import parameter_words, spoken
 from bridge.calibration.report.section import Section
 from bridge.report.words import unit_of
 from core.calibration.result import Estimate
@@ -29,8 +29,13 @@ class ParametersSection(Section[Material]):
             blocks.append(Paragraph(text, "note"))
         if c.combinations or hidden:
             blocks.append(Heading("What these readings cannot tell"))
-            items = list(c.combinations)
-            items += [f"{name}: not shown; it stands where it stood" for name in hidden]
+            items = [spoken(text) for text in c.combinations]
+            # the combinations speak of most of them
+            items += [
+                f"{name}: these readings do not show it; it stays near where it stood"
+                for name in hidden
+                if not any(text.startswith(name) for text in items)
+            ]
             blocks.append(Bullets(tuple(items)))
         return blocks
 

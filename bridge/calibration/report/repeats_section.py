@@ -48,8 +48,8 @@ def _table(found: tuple[PoseAccuracy, ...]) -> Table:
     rows = []
     for p in found:
         before, after = p.accuracy
-        row = [str(p.pose + 1), str(p.load + 1), str(p.visits), mm(before), mm(after), _axes(p),
-               mm(p.repeatability)]  # fmt: skip
+        row = [f"pose {p.pose + 1}", str(p.load + 1), str(p.visits), mm(before), mm(after)]
+        row += [_axes(p), mm(p.repeatability)]
         if turning:
             row.append("–" if p.angles is None else mrad(float(np.max(p.angles))))
         rows.append(row)

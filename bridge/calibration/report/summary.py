@@ -15,7 +15,9 @@ from bridge.calibration.report.blocks import (
 )
 from bridge.calibration.report.figures import mm
 from bridge.calibration.report.material import Material
+from bridge.calibration.report.names import sentence
 from bridge.calibration.report.section import Section
+from bridge.report.words import listed
 
 
 class Summary(Section[Material]):
@@ -41,7 +43,14 @@ class Summary(Section[Material]):
             f"Errors are those of {material.judged_words}: the distance between where the tool "
             "was measured and where the model said it would be."
         )
-        return [Verdict(badge, c.verdict), Tiles(tuple(tiles)), Paragraph(text, "note")]
+        wild = [r for r in material.judged[1].rows if r in material.wild]
+        if wild and material.held_out:
+            rows = listed([str(int(r) + 1) for r in wild])
+            text += (
+                f" Among them {'is reading' if len(wild) == 1 else 'are readings'} {rows}, far "
+                "beyond all others: to be measured again. The uncertainty does not count it."
+            )
+        return [Verdict(badge, sentence(c.verdict)), Tiles(tuple(tiles)), Paragraph(text, "note")]
 
 
 def _times(before: float, after: float) -> str:

@@ -26,7 +26,7 @@ class WorkspaceSection(Section[Material]):
 
     def blocks(self, material: Material) -> list[Block]:
         """Return the errors as arrows, from two sides, and a table of zones."""
-        before, after = material.both
+        before, after = material.calm
         tip = material.tip[before.rows]
         zones = _zones(tip, before, after)
         if before.vector.shape[1] != 3:
@@ -40,10 +40,14 @@ class WorkspaceSection(Section[Material]):
                 title = f"{name}, {view}"
                 drawings.append(_view(title, axes, tip, errors.vector * factor, colour))
         caption = (
-            f"All readings. Errors before are drawn {factors[0]:,.0f} times as long as they are, "
+            f"{_all(material)} Errors before are drawn {factors[0]:,.0f} times as long as they are, "
             f"errors after {factors[1]:,.0f} times. Axes of the base; the square is the base."
         )
         return [Pictures(tuple(drawings), caption), zones]
+
+
+def _all(material: Material) -> str:
+    return "All readings but the wild ones." if material.wild else "All readings."
 
 
 def _factor(errors: Errors, size: float) -> float:
