@@ -69,9 +69,13 @@ class FittedSoFar:
         spread = last @ covariance @ last.T + np.diag((sigma * observable.sigmas) ** 2)
         return cls(parameters.model(values), observable, nuisance, spread)
 
+    def gap(self, new: Readings) -> Array:
+        """Return measured minus expected (k,) of one reading."""
+        return np.asarray(self.observable.residual(self.model, here(new), self.nuisance)[0])
+
     def compare(self, new: Readings) -> tuple[float, float, bool]:
         """Return how far a reading is off, how far it may be (m), and whether it is too far."""
-        left = self.observable.residual(self.model, here(new), self.nuisance)[0]
+        left = self.gap(new)
         distance = float(left @ np.linalg.solve(self.spread, left))
         limit = float(chi2.isf(RARE, len(left)))
         off = float(np.linalg.norm(left[:3]))

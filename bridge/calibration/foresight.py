@@ -20,7 +20,7 @@ from core.calibration.plan import Payload
 from core.calibration.readings import Readings
 from core.errors import GapbridgeError
 from core.metrology import Metrology
-from core.model import Model
+from core.model import Model, Poses
 
 Array = NDArray[np.float64]
 REPEATABILITY = 1e-4  # m, 1 sigma of one coordinate: of an arm of which nobody knows it
@@ -78,6 +78,24 @@ class Foresight:
             return Verdict(off, allowed, False)
         reasons, instead = self._reasons(state, new, typed, joints)
         return Verdict(off, allowed, True, tuple(reasons), instead)
+
+    def shift(self, old: Readings, new: Readings, before: Readings) -> Array:
+        """Return how far a pose's reading has gone (k,), m, base axes where they are known.
+
+        The way that the arm itself has gone between the two is taken off.
+        """
+        same = before[(before.station == old.station[0]) & (before.target == old.target[0])]
+        try:
+            state = self._fitted(same, old)
+        except GapbridgeError:
+            state = None
+        if state is None:
+            return np.asarray((new.value - old.value)[0, :3])
+        return state.gap(new)[:3] - state.gap(old)[:3]
+
+    def poses(self, readings: Readings) -> Poses:
+        """Return where the cell's model has the TCP at some readings."""
+        return self._model.predict(readings.q, readings.loads)
 
     def _fitted(self, before: Readings, new: Readings) -> FittedSoFar | None:
         registered = self._metrology.registered and int(new.station[0]) == 0
