@@ -62,7 +62,8 @@ class DaskWorkers(Workers):
         except TimeoutError:
             self.stop()
             raise RunError(
-                f"--scheduler: {self.address}: found no worker within {self.reach:g} s, expected one"
+                f"--scheduler: {self.address}: found no worker within {self.reach:g} s, expected "
+                "one"
             ) from None
 
     def stop(self) -> None:
