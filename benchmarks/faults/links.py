@@ -181,8 +181,6 @@ class UrOffset(UrServo):
 
     name, usual_rate, moves_arm, mode = "ur_rtde offset", 125.0, False, "offset"
     grain, grain_rotation = 2e-8, 2e-8
-    # the library sends nine small packets a cycle, and at first each waits for a delayed ACK
-    burst = 0.05
 
     def prepare(self, peer: Peer, host: str, writing: bool = False) -> None:
         """Have the robot's own program run."""
