@@ -7,6 +7,7 @@ from datetime import datetime
 from pathlib import Path
 
 import numpy as np
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from bridge.calibration.book import Book
@@ -14,7 +15,7 @@ from bridge.calibration.log_of import write_log
 from bridge.calibration.order import Order
 from bridge.calibration.planning import effects_of, metrology_of, observable_of
 from bridge.calibration.talk import Talk
-from bridge.calibration.words import millimetres, parameter
+from bridge.calibration.words import TOLD_IN, figure, millimetres
 from bridge.cell import Cell, save_cell
 from bridge.output_file import require_writable, write_text
 from core.calibration.fit import calibrate
@@ -22,6 +23,7 @@ from core.calibration.parameters import Parameters
 from core.calibration.promise import document_of
 from core.calibration.result import Calibration, Errors
 
+LEAST_TOLD = 2e-6  # m: a repeatability below this is none that was seen
 DIAGNOSED = ("position", "pose")  # kinds whose remainder the diagnosis can judge
 
 
@@ -65,7 +67,11 @@ def _tell(talk: Talk, found: Calibration) -> None:
             talk.say(f"  {name}: {_errors(before)} before, {_errors(after)} after")
     noise = f"  noise {millimetres(found.noise)} a coordinate"
     if np.isfinite(found.repeatability):
-        noise += f", the arm repeats to {millimetres(found.repeatability)}"
+        small = found.repeatability < LEAST_TOLD
+        noise += ", the arm repeats " + (
+            "better than the instrument tells" if small
+            else f"to {millimetres(found.repeatability)}"
+        )  # fmt: skip
     talk.say(noise)
     talk.console.print(_table(found))
     for row in found.outliers:
@@ -82,15 +88,20 @@ def _errors(errors: Errors) -> str:
 
 
 def _table(found: Calibration) -> Table:
-    table = Table(title="what the arm has beyond the cell's model", title_justify="left")
-    table.add_column("parameter")
-    for name in ("value", "± 1 sigma", "expected"):
-        table.add_column(name, justify="right")
+    table = Table(
+        title="what the arm has beyond the cell's model (± 1 sigma)", title_justify="left",
+        box=SIMPLE_HEAD, padding=(0, 1),
+    )  # fmt: skip
+    table.add_column("parameter", no_wrap=True)
+    for name in ("value", "±", "planned ±"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("", no_wrap=True)
     for e in found.estimates:
-        expected = "" if e.expected_std is None else parameter(e.name, e.expected_std, e.unit)
-        value = parameter(e.name, e.value, e.unit)
-        spread = parameter(e.name, e.std, e.unit) if e.shown else "not shown"
-        table.add_row(e.name, value + (" (bound)" if e.on_bound else ""), spread, expected)
+        unit, factor = TOLD_IN.get(e.unit, (e.unit, 1.0))
+        planned = "" if e.expected_std is None else figure(e.expected_std * factor)
+        spread = figure(e.std * factor) if e.shown else "not shown"
+        bound = " (bound)" if e.on_bound else ""
+        table.add_row(e.name, figure(e.value * factor), spread, planned, unit + bound)
     return table
 
 

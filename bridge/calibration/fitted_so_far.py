@@ -22,6 +22,7 @@ USUAL = 3.0  # usual sizes: 1 sigma at which parameters are held
 ROUNDS = 3
 CALM = 4.0  # noises: a reading that is off by more counts the less
 STEP = 1e-5  # rad
+DOUBT = 12.0  # degrees of freedom by which the noise is held at what was thought of it
 AXES = "xyz"
 
 
@@ -51,10 +52,10 @@ class FittedSoFar:
         every, frames = observable.columns(parameters, values, both, nuisance)
         J, k = every[: count * observable.equations], observable.equations
         layout = observable.layout(both)
-        scale = np.tile(observable.sigmas, count) * sigma
         prior = np.concatenate([1 / held**2, np.zeros(layout.size)])
         covariance = np.diag(np.concatenate([held**2, np.zeros(layout.size)]))
         for _ in range(ROUNDS if count else 0):
+            scale = np.tile(observable.sigmas, count) * sigma
             poses = parameters.model(values).predict(before.q, before.loads)
             left = observable.gap(poses, before, nuisance).ravel() / scale
             F = observable.nuisance_columns(poses, before, nuisance)
@@ -65,6 +66,7 @@ class FittedSoFar:
             step = covariance @ pull
             values = values + step[:p]
             nuisance = nuisance.moved(step[p:], layout)
+            sigma *= _quieter(left - A @ step, A, covariance)
         last = np.hstack([every[-k:], frames[-k:]])
         spread = last @ covariance @ last.T + np.diag((sigma * observable.sigmas) ** 2)
         return cls(parameters.model(values), observable, nuisance, spread)
@@ -150,6 +152,13 @@ def _inverse(A: Array, prior: Array, held: Array) -> Array:
     size = np.concatenate([held, 1 / free])
     inner = (A * size).T @ (A * size) + np.diag(prior * size**2)
     return np.asarray(np.linalg.pinv(inner, rcond=1e-13, hermitian=True) * np.outer(size, size))
+
+
+def _quieter(left: Array, A: Array, covariance: Array) -> float:
+    """Return by which share the noise is other than thought; with few readings, hardly."""
+    freedom = len(left) - float(np.einsum("ij,jk,ik->", A, covariance, A))
+    square = (float(left @ left) + DOUBT) / (max(freedom, 0.0) + DOUBT)
+    return float(np.clip(np.sqrt(square), 0.5, 2.0))
 
 
 def _calm(left: Array) -> Array:

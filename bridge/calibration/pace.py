@@ -35,5 +35,5 @@ def header(book: Book, stop: int, minutes_per_load: float) -> str:
         more.append("to verify, not fitted")
     return " · ".join(
         [f"{drawn:<{WIDTH}} stop {stop + 1} of {count}", f"load {pose.load + 1}", *more,
-         f"about {duration(seconds_left(book, minutes_per_load))} left"]
+         f"{duration(seconds_left(book, minutes_per_load))} left"]
     )  # fmt: skip

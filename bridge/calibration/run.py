@@ -93,7 +93,7 @@ def _tell_plan(talk: Talk, plan: Plan, book: Book, minutes: float) -> None:
     again = sum(p.repeat > 0 for p in plan.poses)
     talk.say(
         f"plan: {fitted} poses to fit, {held} to verify, {again} once more for the repeatability: "
-        f"{len(plan.poses)} stops, about {duration(seconds_left(book, minutes) + plan.travel)}"
+        f"{len(plan.poses)} stops, {duration(seconds_left(book, minutes) + plan.travel)}"
     )
     for i, load in enumerate(plan.loads):
         talk.say(f"  load {i + 1}: {load_text(load)}")
@@ -105,7 +105,7 @@ def _tell_plan(talk: Talk, plan: Plan, book: Book, minutes: float) -> None:
     told = ", ".join(f"{n}: {millimetres(s)}" for n, s in plan.bought)
     talk.say(f"  what n poses buy: {told}")
     weak = [
-        f"{n} ±{parameter(n, s, u)}"
+        f"{n} ±{parameter(s, u)}"
         for n, u, s, p in zip(
             expected.names, expected.units, expected.std, expected.prior, strict=True
         )
