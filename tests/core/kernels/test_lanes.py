@@ -8,7 +8,7 @@ import pytest
 from core import kernel
 from core.arm import builtin_arm
 from core.kernel import Chain, Rows
-from core.kernels import plain
+from core.kernels import many, plain, threads
 from core.kernels.factor import factor_blocks, normal_blocks, regressor_blocks
 from core.kernels.layout import LANES
 from core.kernels.predict import linear_blocks, predict_blocks
@@ -111,3 +111,28 @@ def test_products_and_regressor_are_those_of_the_stored_rows():
     stored = np.concatenate([expected, gap[..., None]], axis=2).reshape(-1, 13)
     products = np.tril(stored.T @ stored)
     np.testing.assert_allclose(np.tril(G)[:13, :13], products, atol=1e-12 * products.max())
+
+
+def test_threads_and_rows_that_do_not_settle_change_nothing(monkeypatch):
+    chain, rows = case(stiff=False, count=6 * LANES + 3)
+    rows.wrench[100, 0] = 3e5  # bends too far for the blocks, not for the single row
+    expected, singly = forms(len(rows.q)), forms(len(rows.q))
+    kernel.regressor_rows(chain, rows, *expected)
+    monkeypatch.setattr(threads, "FEWEST", LANES)
+    monkeypatch.setattr(threads, "processors", lambda: 3)
+    many.linear_form(chain, rows, *singly)
+    for one, other in zip(singly, expected, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-12 * np.abs(other).max())
+
+
+def test_what_goes_wrong_in_a_thread_is_told(monkeypatch):
+    monkeypatch.setattr(threads, "FEWEST", LANES)
+    monkeypatch.setattr(threads, "processors", lambda: 2)
+
+    def work(first: int, last: int) -> int:
+        if first:
+            raise ValueError(f"{first} to {last}")
+        return first
+
+    with pytest.raises(ValueError, match="128 to 256"):
+        threads.in_ranges(work, 4 * LANES)
