@@ -14,27 +14,36 @@ class ControllerClock:
 
     The age of a state counts from when its sample could have been here at the earliest, so that
     late packets, late wake-ups and long computing all count. The shortest way over the wire, which
-    one clock alone cannot tell, does not. ``hold``: s without a sample after which the two clocks
-    are tied anew, because the controller's may have stood still.
+    one clock alone cannot tell, does not. ``hold``: s after which a state is too old to write by.
+    Where all samples after a silence are older than that for as long, the controller's clock has
+    stood still, and the two are tied anew; what a stalled link hands on at once is old for a
+    moment only.
     """
 
     def __init__(self, rate: float, hold: float = 1.0) -> None:
         self._rate, self._hold = rate, hold
         self._lead: float | None = None  # s: monotonic minus controller time, quickest sample
         self._last: float | None = None  # s, controller clock
-        self._received = 0.0  # s, monotonic: of the last sample
+        self._old_since: float | None = None  # s, monotonic: all samples have been old since
 
     def take(self, state: RobotState) -> int:
         """Take a new sample; returns the cycles missed since the one before."""
         lead, before = state.received - state.timestamp, self._last
-        silence, self._received = state.received - self._received, state.received
         self._last = state.timestamp
         gap = 0.0 if before is None else state.timestamp - before
-        if self._lead is None or silence > self._hold:
-            self._lead = lead
+        if self._lead is None or self._stood_still(lead, state.received):
+            self._lead, self._old_since = lead, None
         else:
             self._lead = min(lead, self._lead + DRIFT * gap)
         return 0 if before is None else max(round(gap * self._rate) - 1, 0)
+
+    def _stood_still(self, lead: float, now: float) -> bool:
+        """Return whether samples have come too old for long enough."""
+        if self._lead is None or lead - self._lead <= self._hold:
+            self._old_since = None
+        elif self._old_since is None:
+            self._old_since = now
+        return self._old_since is not None and now - self._old_since > self._hold
 
     def skip(self) -> None:
         """Do not count what the loop does not see now as missed: it does something else."""

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core import kernel
 from core.arm import Arm
 from core.effects import CATALOGUE, Site, Term
 from core.effects.effect import Effect
 from core.errors import InputError
 from core.kernel import Chain, Rows
+from core.kernels import many
 from core.loads import Loads
 from core.rotation import rotation_vector
 
@@ -143,7 +143,7 @@ class Model:
         chain, rows = self.chain(), self.rows(np.atleast_2d(q), loads)
         count = len(rows.q)
         position, rotation = np.empty((count, 3)), np.empty((count, 3, 3))
-        _require_equilibrium(kernel.predict_rows(chain, rows, position, rotation))
+        _require_equilibrium(many.predict(chain, rows, position, rotation))
         return Poses(position, rotation)
 
     def rigid_pose(self, q: Array) -> Poses:
@@ -162,7 +162,7 @@ class Model:
             np.zeros((count, 6, 2 * n)), np.zeros((count, 6, n)), np.zeros((count, n, 3))
         )
         _require_equilibrium(
-            kernel.regressor_rows(chain, rows, form.regressor, form.jacobian, form.moment)
+            many.linear_form(chain, rows, form.regressor, form.jacobian, form.moment)
         )
         return form
 

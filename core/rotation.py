@@ -61,13 +61,11 @@ def rotation_vector(matrix: Array) -> Array:
 def skew(vector: Array) -> Array:
     """Return the matrices (..., 3, 3) whose product with b is vector (..., 3) x b."""
     v = np.asarray(vector, dtype=float)
-    zero = np.zeros_like(v[..., 0])
-    rows = [
-        np.stack([zero, -v[..., 2], v[..., 1]], -1),
-        np.stack([v[..., 2], zero, -v[..., 0]], -1),
-        np.stack([-v[..., 1], v[..., 0], zero], -1),
-    ]
-    return np.stack(rows, axis=-2)
+    out = np.zeros((*v.shape, 3))
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -z, y, -x
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = z, -y, x
+    return out
 
 
 def transform(rotation: Array, position: Array) -> Array:

@@ -6,12 +6,13 @@ import time
 
 from benchmarks.faults.rig import Rig
 from benchmarks.faults.row import Result, Row
-from bridge.supervisor import State
+from bridge.supervisor import Cause, State
 
 POLL = 0.001  # s
 AFTERWARDS = 0.25  # s for which the end state must stay
 RESTING, AT_REST = (State.OBSERVING, State.COMPENSATING, State.FAULT), 3.0  # s: stays for good
 END_LIMIT = 25.0  # s
+BUSY = (Cause.OVERRUN.value, Cause.RESYNC.value)
 
 
 def make_fault(rig: Rig, row: Row) -> Result:
@@ -34,8 +35,16 @@ def make_fault(rig: Rig, row: Row) -> Result:
     bounds = rig.checker.bounds
     return Result(
         row.key, rig.link.name, rig.link.cycle, detected, end, found.largest_step,
-        bounds.offset_rate * bounds.cycle, tuple(wrong),
+        bounds.offset_rate * bounds.cycle, tuple(wrong), found.violated > before,
+        not found.violated > before and _disturbed(rig, row, moment),
     )  # fmt: skip
+
+
+def _disturbed(rig: Rig, row: Row, moment: float) -> bool:
+    """Return whether the machine was too busy meanwhile: the loop missed deadlines by itself."""
+    if "overrun" in row.sign:
+        return False
+    return any(event.get("cause") in BUSY for event in rig.run.since(moment))
 
 
 def _await(rig: Rig, row: Row, moment: float, before: dict[str, int]) -> float | None:

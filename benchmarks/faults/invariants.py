@@ -17,11 +17,12 @@ from drivers.simulated.plant_arm import Frame, PlantArm
 
 WRITING = (3, 4)  # compensating, holding
 GRACE = 0.03  # s: a write seen so long after the state has changed was on its way
+SURE = 0.002  # s: the same where the loop's own word says when it changed
 GAP = 5.0  # cycles: a longer gap allows no larger step
 WINDOW = 12  # writes over which the rate is checked
 ZEROS = (0.0,) * 6
 START_AWAY = 0.03  # rad: how far a stream may begin from where the arm was seen
-AHEAD = 4  # writes that may follow one state: samples that the client had not read yet
+AHEAD = 4  # states that the client may have been sent and not read yet, on top of ``fresh``
 LONGEST_LIST = 50
 
 
@@ -30,7 +31,7 @@ class Bounds:
     """What a cell allows: m, rad, m/s, rad/s, s.
 
     ``grain`` is what the wire's rounding can add to an offset, ``fresh`` how old a state may be
-    behind a write.
+    behind a write, ``lag`` how far a client may be behind what it was sent.
     """
 
     arm: PlantArm
@@ -44,6 +45,7 @@ class Bounds:
     grain_rotation: float = 1e-8
     fresh: float = 0.04
     burst: float = 0.0  # s for which the transport may hold small packets back
+    lag: float = 0.04
 
 
 @dataclass
@@ -68,20 +70,38 @@ class Found:
             self.violations.append(f"{words} [{before}]" if before else words)
 
 
+@dataclass
+class Stream:
+    """What is known of a stream of setpoints between its begin and its end."""
+
+    offset: Numbers = ZEROS
+    nominal: Frame | None = None  # where a stream of joints began
+    joints: tuple[Numbers, Numbers] = ((), ZEROS)  # the last ones, and their offset
+    recent: deque[tuple[float, Numbers]] = field(default_factory=lambda: deque(maxlen=WINDOW))
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """A write that was seen in a state that forbids it; the loop's word will say more."""
+
+    earliest: float
+    time: float
+    state: int
+
+
 class Checker:
     """Follows one link's states and writes in the order of the wire."""
 
     def __init__(self, bounds: Bounds) -> None:
         self.bounds = bounds
         self.found = Found()
+        self.doubts: list[Doubt] = []
         self._fresh: Fresh | None = None
         self._unsafe_since: float | None = None
         self._last_writing = -math.inf  # s: when the supervisor was last in a state that writes
-        self._nominal: Frame | None = None  # where the stream of joints began
-        self._offset: Numbers = ZEROS
-        self._recent: deque[tuple[float, Numbers]] = deque(maxlen=WINDOW)
-        self._since_fresh = 0
-        self._joints: tuple[Numbers, Numbers] = ((), ZEROS)
+        self._stream, self._ended = Stream(), Stream()
+        self._ended_at = -math.inf  # s
+        self._unused = 0.0  # states that no write has followed yet
 
     def take(self, seen: Sequence[Fresh | Write]) -> None:
         """Check what the tap has seen next."""
@@ -89,23 +109,31 @@ class Checker:
             what = "state" if isinstance(item, Fresh) else item.kind
             self.found.recent.append(f"{item.time:.3f} {what} in {item.state}")
             if item.state in WRITING:
-                self._last_writing = item.time
-            elif item.time - self._last_writing > GRACE:
-                self._end_stream()
+                self._last_writing = max(self._last_writing, item.time)
+            elif item.early - self._last_writing > GRACE:
+                self._end_stream(item.early)
             if isinstance(item, Fresh):
                 self._learn(item)
             else:
                 self._check(item)
 
-    def _end_stream(self) -> None:
+    def settle(self, spans: Sequence[tuple[float, float]]) -> None:
+        """Judge what was in doubt by when the loop was writing, s monotonic."""
+        doubts, self.doubts = self.doubts, []
+        for doubt in doubts:
+            if not any(a - SURE <= doubt.time and doubt.earliest <= b + SURE for a, b in spans):
+                late = min((doubt.earliest - b for _, b in spans if b < doubt.time), default=0.0)
+                self.found.add(f"write in state {doubt.state}, {late:.3f} s after the last allowed")
+
+    def _end_stream(self, time: float) -> None:
         """Nothing is being written: the next stream begins without an offset, wherever it is."""
-        if self._recent or self._nominal is not None:
-            self._offset, self._nominal, self._joints = ZEROS, None, ((), ZEROS)
-            self._recent.clear()
+        if self._stream.recent or self._stream.nominal is not None:
+            self._ended, self._ended_at, self._stream = self._stream, time, Stream()
 
     def _learn(self, fresh: Fresh) -> None:
         self._fresh = fresh
-        self._since_fresh = 0
+        b = self.bounds
+        self._unused = min(self._unused + 1.0, AHEAD + (b.lag + b.burst) / b.cycle)
         if fresh.safe or not fresh.safe_known:
             self._unsafe_since = None
         elif self._unsafe_since is None:
@@ -126,6 +154,8 @@ class Checker:
         if write.kind == "joints" and write.state not in WRITING and self._holds(write):
             return
         found.writes += 1
+        if write.time < self._ended_at and not self._stream.recent:
+            self._stream, self._ended_at = self._ended, -math.inf  # it was only seen late
         self._check_state(write)
         self._check_fresh(write)
         offset = self._offset_of(write)
@@ -146,44 +176,42 @@ class Checker:
         return away < START_AWAY and write.state == 2
 
     def _check_state(self, write: Write) -> None:
-        late = write.time - self._last_writing
-        if late > GRACE:
-            self.found.add(f"write in state {write.state}, {late:.3f} s after the last that writes")
-        since = self._unsafe_since
-        if since is not None and write.time - since > GRACE + self.bounds.cycle:
+        if write.state not in WRITING:
+            self.doubts.append(Doubt(write.early, write.time, write.state))
+        since, b = self._unsafe_since, self.bounds
+        if since is not None and write.early - since > max(b.fresh, GRACE + b.cycle):
             self.found.add(
-                f"write {write.time - since:.3f} s after the robot said it must not move"
+                f"write {write.early - since:.3f} s after the robot said it must not move"
             )
 
     def _check_fresh(self, write: Write) -> None:
         if self._fresh is None:
             self.found.add("write before any state")
             return
-        age = write.time - self._fresh.time
-        self._since_fresh += 1
+        age = write.early - self._fresh.time
+        self._unused -= 1.0
         self.found.oldest_state = max(self.found.oldest_state, age)
         if age > self.bounds.fresh:
             self.found.add(f"write {age:.3f} s after the last fresh state")
-        elif self._since_fresh > AHEAD + self.bounds.burst / self.bounds.cycle:
-            self.found.add(f"{self._since_fresh} writes after one state")
+        elif self._unused < 0.0:
+            self._unused = 0.0
+            self.found.add("more writes than states")
 
     def _offset_of(self, write: Write) -> Numbers:
         """Return the TCP offset (6,) of a write, base axes, m and rad."""
         if write.kind == "offset":
             return write.values
-        b = self.bounds
-        if self._nominal is None:
-            self._nominal = tcp_in_base(b.arm, write.values, b.tool)
+        b, stream = self.bounds, self._stream
+        if stream.nominal is None:
+            stream.nominal = tcp_in_base(b.arm, write.values, b.tool)
             if self._fresh is not None:
                 away = max(abs(x - y) for x, y in zip(write.values, self._fresh.q, strict=True))
                 if away > START_AWAY:
                     self.found.add(f"a stream began {away:.4f} rad from where the arm was")
-        if self._joints[0] != write.values or self._joints[1] is ZEROS:
-            self._joints = (
-                write.values,
-                gap(self._nominal, tcp_in_base(b.arm, write.values, b.tool)),
-            )
-        return self._joints[1]
+        if stream.joints[0] != write.values or stream.joints[1] is ZEROS:
+            now = tcp_in_base(b.arm, write.values, b.tool)
+            stream.joints = (write.values, gap(stream.nominal, now))
+        return stream.joints[1]
 
     def _check_size(self, write: Write, offset: Numbers) -> None:
         b = self.bounds
@@ -195,29 +223,39 @@ class Checker:
             self.found.add(f"offset of {turn:.6f} rad, allowed {b.rotation:g}")
 
     def _check_step(self, write: Write, offset: Numbers) -> None:
-        b, found = self.bounds, self.found
-        shift, turn = _apart(offset, self._offset)
-        found.largest_step, found.largest_turn = (
-            max(found.largest_step, shift),
-            max(found.largest_turn, turn),
-        )
+        b, found, stream = self.bounds, self.found, self._stream
+        shift, turn = _apart(offset, stream.offset)
+        found.largest_step = max(found.largest_step, shift)
+        found.largest_turn = max(found.largest_turn, turn)
         if shift > b.offset_rate * GAP * b.cycle * 1.001 + 2.0 * b.grain:
             found.add(f"step of {1e3 * shift:.4f} mm at once")
         if turn > b.rotation_rate * GAP * b.cycle * 1.001 + 2.0 * b.grain_rotation:
             found.add(f"step of {turn:.6f} rad at once")
-        stamp = write.time
-        if self._fresh is not None and math.isfinite(self._fresh.stamp):
-            stamp = self._fresh.stamp
-        for then, before in self._recent:
-            # a client may still write for a sample that is not the last one that it was sent
-            slack = (GAP + 3.0) * b.cycle if stamp is not write.time else GRACE
-            allowed = stamp - then + slack + b.burst
+        since, until = self._moments(write)
+        for then, before in stream.recent:
+            allowed = until - then + b.lag + b.burst
             shift, turn = _apart(offset, before)
             if shift > b.offset_rate * allowed * 1.001 + 2.0 * b.grain:
-                found.add(f"{1e3 * shift:.4f} mm within {1e3 * (stamp - then):.1f} ms")
+                found.add(f"{1e3 * shift:.4f} mm within {1e3 * (until - then):.1f} ms")
                 break
-        self._recent.append((stamp, offset))
-        self._offset = offset
+            if turn > b.rotation_rate * allowed * 1.001 + 2.0 * b.grain_rotation:
+                found.add(f"{turn:.6f} rad within {1e3 * (until - then):.1f} ms")
+                break
+        stream.recent.append((since, offset))
+        stream.offset = offset
+
+    def _moments(self, write: Write) -> tuple[float, float]:
+        """Return from when and until when the time of a write's state can be, s.
+
+        Rates hold over the time of the states that setpoints are made of: the controller's where
+        the wire has it, else the time between the state's arrival and the write.
+        """
+        fresh = self._fresh
+        if fresh is None:
+            return write.early, write.time
+        if math.isfinite(fresh.stamp):
+            return fresh.stamp, fresh.stamp
+        return fresh.early, write.time
 
 
 def _apart(a: Numbers, b: Numbers) -> tuple[float, float]:

@@ -73,6 +73,7 @@ class Link(ABC):
     hold = 0.1
     grain, grain_rotation = 1e-8, 1e-8
     burst = 0.0
+    behind = True  # a client may have been sent more than it has read; not where it has to ask
 
     def __init__(self, rate: float | None = None) -> None:
         self.rate = rate or self.usual_rate
@@ -81,6 +82,11 @@ class Link(ABC):
     def cycle(self) -> float:
         """Return the duration of a cycle, s."""
         return 1.0 / self.rate
+
+    @property
+    def fresh(self) -> float:
+        """Return how old the state behind a write may be, s: the daemon's promise."""
+        return max(0.04, 5.0 / self.rate)
 
     @abstractmethod
     def section(self, host: str) -> str:
@@ -94,8 +100,11 @@ class Link(ABC):
     def decoder(self) -> Decoder:
         """Return a decoder of what goes over the wire."""
 
-    def prepare(self, peer: Peer, host: str) -> None:
-        """Do what a person does at the robot before it can be armed (again)."""
+    def prepare(self, peer: Peer, host: str, writing: bool = False) -> None:
+        """Do what a person does at the robot before it can be armed (again).
+
+        ``writing``: the daemon compensates, so that nothing needs to be done to programs.
+        """
 
     def write_cells(self, folder: Path, front: str, back: str, more: str) -> tuple[Path, Path]:
         """Write the daemon's cell, whose controller is at ``front``, and the peer's.
@@ -121,7 +130,7 @@ class Link(ABC):
         return Bounds(
             plant_arm(found.arm), tool, limits.offset, limits.offset_rotation, limits.offset_rate,
             limits.offset_rotation_rate, 1.0 / self.rate, self.grain, self.grain_rotation,
-            max(0.04, 5.0 / self.rate), self.burst,
+            self.fresh, self.burst, self.fresh if self.behind else 0.0,
         )  # fmt: skip
 
 
@@ -150,11 +159,11 @@ class UrServo(Link):
         """See Link.decoder."""
         return RtdeDecoder(servoj=self.mode == "servoj")
 
-    def prepare(self, peer: Peer, host: str) -> None:
+    def prepare(self, peer: Peer, host: str, writing: bool = False) -> None:
         """Leave the robot without a program and ready to move."""
-        self._make_ready(peer, host)
+        self._make_ready(peer, host, writing)
 
-    def _make_ready(self, peer: Peer, host: str) -> None:
+    def _make_ready(self, peer: Peer, host: str, writing: bool) -> None:
         peer.bench("thaw")
         peer.bench("release")
         peer.bench("unlock")
@@ -163,7 +172,7 @@ class UrServo(Link):
             time.sleep(0.05)
             dashboard(host, "brake release")
             time.sleep(0.05)
-        if self.mode == "servoj" and "true" in dashboard(host, "running"):
+        if self.mode == "servoj" and not writing and "true" in dashboard(host, "running"):
             dashboard(host, "stop")
 
 
@@ -172,12 +181,10 @@ class UrOffset(UrServo):
 
     name, usual_rate, moves_arm, mode = "ur_rtde offset", 125.0, False, "offset"
     grain, grain_rotation = 2e-8, 2e-8
-    # the library sends nine small packets a cycle, and at first each waits for a delayed ACK
-    burst = 0.05
 
-    def prepare(self, peer: Peer, host: str) -> None:
+    def prepare(self, peer: Peer, host: str, writing: bool = False) -> None:
         """Have the robot's own program run."""
-        self._make_ready(peer, host)
+        self._make_ready(peer, host, writing)
         if "true" not in dashboard(host, "running"):
             self.start_program(host)
 
@@ -196,6 +203,7 @@ class Modbus(Link):
     hold = 0.2
     port = 15020
     grain, grain_rotation = 2e-6, 2e-6
+    behind = False
 
     def section(self, host: str) -> str:
         """See Link.section."""
@@ -212,7 +220,7 @@ class Modbus(Link):
         """See Link.decoder."""
         return ModbusDecoder()
 
-    def prepare(self, peer: Peer, host: str) -> None:
+    def prepare(self, peer: Peer, host: str, writing: bool = False) -> None:
         """Clear stops; have the mailbox program run."""
         for line in ("thaw", "release", "unlock", "program 1"):
             peer.bench(line)
@@ -241,7 +249,7 @@ class CanPiper(Link):
         """See Link.decoder."""
         return PiperDecoder()
 
-    def prepare(self, peer: Peer, host: str) -> None:
+    def prepare(self, peer: Peer, host: str, writing: bool = False) -> None:
         """Clear stops."""
         for line in ("thaw", "release", "unlock", "resume"):
             peer.bench(line)

@@ -1,7 +1,8 @@
 """A TCP proxy between the real client and its peer that does harm, and tells a tap of it all.
 
 One thread serves every port. Messages from the client are told before anything is done to them:
-that is what was written. Messages to the client are told as they leave: that is what it could know.
+that is what was written, with the time at which the kernel had it (arrival.py). Messages to the
+client are told as they have left: that is what it could know.
 """
 
 from __future__ import annotations
@@ -20,13 +21,15 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Self
 
+from benchmarks.faults.arrival import note_arrivals, receive
 from benchmarks.faults.mischief import Mischief, passing
+from benchmarks.faults.punctual import be_punctual
 from benchmarks.faults.splitting import Splitter
 
 UP, DOWN = "up", "down"  # from the client, to the client
 RESET = struct.pack("ii", 1, 0)  # SO_LINGER: closing sends RST
-Tell = Callable[[float, int, str, str, bytes], None]
-"""s monotonic, connection, name of the port, direction, message."""
+Tell = Callable[[float, float, int, str, str, bytes], None]
+"""Between which times (s, monotonic), connection, name of the port, direction, message."""
 
 
 @dataclass
@@ -47,6 +50,7 @@ class Connection:
     ends: dict[str, socket.socket]  # by the direction that is read from it
     splitters: dict[str, Splitter] = field(default_factory=dict)
     out: dict[str, bytearray] = field(default_factory=lambda: {UP: bytearray(), DOWN: bytearray()})
+    arrived: float = 0.0  # s, monotonic: the last message of the client
 
 
 class Proxy:
@@ -107,7 +111,7 @@ class Proxy:
         def put() -> None:
             for connection in self._connections:
                 if connection.port.name == port:
-                    self._send(connection, direction, data, time.monotonic())
+                    self._send(connection, direction, [data])
 
         self._order_thread(put)
 
@@ -156,10 +160,13 @@ class Proxy:
         self._listeners = []
 
     def _serve(self) -> None:
+        be_punctual()
         while not self._stopping:
             now = time.monotonic()
             wait = min(self._due[0][0] - now, 0.5) if self._due else 0.5
-            for key, _ in self._selector.select(max(wait, 0.0)):
+            ready = self._selector.select(max(wait, 0.0))
+            # what was written goes first: it cannot be an answer to what is handed on now
+            for key, _ in sorted(ready, key=_comes_last):
                 if key.fileobj == self._wake_out:
                     os.read(self._wake_out, 64)
                 elif isinstance(key.data, Port):
@@ -182,6 +189,7 @@ class Proxy:
         except OSError:
             return
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        note_arrivals(client)
         ends = {UP: client}
         if not self._mute:
             try:
@@ -202,43 +210,51 @@ class Proxy:
         if connection not in self._connections:
             return
         try:
-            data = connection.ends[direction].recv(65536)
+            data, arrived = receive(connection.ends[direction])
         except BlockingIOError:
             return
         except OSError:
-            data = b""
+            data, arrived = b"", 0.0
         if not data:
             self._drop(connection, reset=False)
             return
         self._send_due()  # what was held back goes first
-        port, now, at_once = connection.port.name, time.monotonic(), b""
-        for message in connection.splitters[direction].feed(data):
+        port, now = connection.port.name, time.monotonic()
+        messages = connection.splitters[direction].feed(data)
+        at_once: list[bytes] = []
+        for i, message in enumerate(messages):
             if direction == UP:
-                self._tell(now, connection.number, port, UP, message)
+                # the kernel knows the time of the last one; the others came since the one before
+                earliest = arrived if i == len(messages) - 1 else connection.arrived
+                self._tell(earliest, arrived, connection.number, port, UP, message)
             mischief = self._mischief.get((port, direction), passing)
             for asked, made in mischief(message):
                 delay = max(asked, self._stalled_until - now)
                 if delay > 0.0:
                     item = (now + delay, next(self._order), connection, direction, made)
                     heapq.heappush(self._due, item)
-                    continue
-                if direction == DOWN:
-                    self._tell(now, connection.number, port, DOWN, made)
-                at_once += made
-        if at_once:
-            self._push(connection, direction, at_once)
+                else:
+                    at_once.append(made)
+        if direction == UP:
+            connection.arrived = arrived
+        self._send(connection, direction, at_once)
 
     def _send_due(self) -> None:
         now = time.monotonic()
         while self._due and self._due[0][0] <= now:
             _, _, connection, direction, message = heapq.heappop(self._due)
             if connection in self._connections:
-                self._send(connection, direction, message, now)
+                self._send(connection, direction, [message])
 
-    def _send(self, connection: Connection, direction: str, message: bytes, now: float) -> None:
+    def _send(self, connection: Connection, direction: str, messages: list[bytes]) -> None:
+        if not messages:
+            return
+        before = time.monotonic()
+        self._push(connection, direction, b"".join(messages))
         if direction == DOWN:
-            self._tell(now, connection.number, connection.port.name, DOWN, message)
-        self._push(connection, direction, message)
+            after = time.monotonic()
+            for message in messages:
+                self._tell(before, after, connection.number, connection.port.name, DOWN, message)
 
     def _push(self, connection: Connection, direction: str, message: bytes) -> None:
         end = connection.ends.get(DOWN if direction == UP else UP)
@@ -272,3 +288,9 @@ class Proxy:
             if reset:
                 end.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
             end.close()
+
+
+def _comes_last(ready: tuple[selectors.SelectorKey, int]) -> bool:
+    """Return whether a socket that is ready is the peer's."""
+    data = ready[0].data
+    return isinstance(data, tuple) and data[1] == DOWN

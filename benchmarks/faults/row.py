@@ -26,6 +26,11 @@ class Result:
     largest_step: float  # m, on the wire
     step_allowed: float  # m, in one cycle
     wrong: tuple[str, ...] = ()  # what is not as it must be
+    violated: bool = False  # an invariant did not hold on the wire
+    disturbed: bool = (
+        False  # the machine itself was late: to be made again, if it is not as it must
+    )
+    again: int = 0  # times that it was made before, on a disturbed machine
 
     @property
     def cycles(self) -> float | None:

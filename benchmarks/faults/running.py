@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from bridge.summary import RunSummary
 from bridge.supervisor import State
 
 BACKOFF = (0.1, 0.5)  # s before a restart: not to wait long between faults
+WRITES = tuple(state.name for state in State if state.writes)
 Event = dict[str, Any]
 
 
@@ -54,6 +56,21 @@ class Running:
             return self.page.state
         except (IndexError, ValueError):
             return -1
+
+    def writing_spans(self) -> list[tuple[float, float]]:
+        """Return from when until when the loop was in a state that writes, s monotonic."""
+        spans, begun = [], None
+        for event in list(self.events):
+            if event["kind"] == "transition":
+                if event["to"] in WRITES:
+                    begun = event["monotonic"] if begun is None else begun
+                    continue
+            elif event["kind"] not in ("failure", "fault"):
+                continue
+            if begun is not None:
+                spans.append((begun, event["monotonic"]))
+                begun = None
+        return spans if begun is None else [*spans, (begun, math.inf)]
 
     def last_words(self) -> str:
         """Return the last events in short."""

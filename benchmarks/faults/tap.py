@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 from benchmarks.faults.proxy import UP, Port
 from benchmarks.faults.splitting import Splitter
@@ -22,13 +23,17 @@ class Tap:
         self._splitters = {port.name: port.splitter for port in ports}
         self._whole: dict[int, Splitter] = {}  # by connection: what came in pieces
         self._decoder = decoder
-        self._kept: deque[tuple[float, int, str, bool, bytes, int]] = deque()
+        self._kept: deque[tuple[float, float, int, str, bool, bytes, int]] = deque()
         self.messages = 0
 
-    def tell(self, time: float, connection: int, port: str, direction: str, message: bytes) -> None:
+    def tell(
+        self, earliest: float, time: float, connection: int, port: str, direction: str,
+        message: bytes,
+    ) -> None:  # fmt: skip
         """Keep a message; called by the proxy."""
         self.messages += 1
-        self._kept.append((time, connection, port, direction == UP, message, self.state()))
+        state = self.state()
+        self._kept.append((earliest, time, connection, port, direction == UP, message, state))
 
     @property
     def waiting(self) -> int:
@@ -39,9 +44,10 @@ class Tap:
         """Return what has been seen since the last call, in ``most`` messages at most."""
         found: list[Fresh | Write] = []
         for _ in range(len(self._kept) if most is None else min(most, len(self._kept))):
-            time, connection, port, up, message, state = self._kept.popleft()
+            earliest, time, connection, port, up, message, state = self._kept.popleft()
             for whole in (message,) if up else self._joined(connection, port, message):
-                found += self._decoder.feed(time, connection, port, up, whole, state)
+                seen = self._decoder.feed(time, connection, port, up, whole, state)
+                found += (replace(item, earliest=earliest) for item in seen)
         return found
 
     def _joined(self, connection: int, port: str, piece: bytes) -> list[bytes]:

@@ -34,8 +34,8 @@ class Taken:
     doubted: bool = False  # kept by the person though it did not fit
 
     def entry(self) -> dict[str, Any]:
-        """Return it for the journal."""
-        return {k: v for k, v in asdict(self).items() if v is not None}
+        """Return it for the journal, which gives it its time."""
+        return {k: v for k, v in asdict(self).items() if v is not None and k != "time"}
 
     @classmethod
     def of(cls, entry: dict[str, Any]) -> Taken:

@@ -100,14 +100,13 @@ class Talk:
             yield lambda text: shown.update(text)
 
     def _heard(self, question: str, look: Callable[[], T | None]) -> str | T:
-        if not self._typed.ready:
-            self.console.print(f"{question} > ", end="", markup=False, style="bold")
-            self.console.file.flush()
+        self.console.print(f"{question} > ", end="", markup=False, style="bold")
+        self.console.file.flush()
         while True:
             line = self._typed.line(LOOK)
             if line is not None:
-                if not sys.stdin.isatty():
-                    self.say(line)  # the terminal shows what is typed, a pipe does not
+                if self._typed.pasted or not sys.stdin.isatty():
+                    self.say(line)  # the terminal has shown it earlier, or never
                 return line.strip()
             if self._typed.ended:
                 raise InputEnded
@@ -149,16 +148,17 @@ class _Lines:
     def __init__(self) -> None:
         self._rest = b""
         self.ended = False
+        self.pasted = False  # the last line came together with one before it
 
     @property
-    def ready(self) -> bool:
-        """Return whether a line is there that has been pasted with one before."""
+    def _ready(self) -> bool:
         return b"\n" in self._rest
 
     def line(self, wait: float) -> str | None:
         """Return the next line, None where none comes within ``wait`` s."""
         fd = sys.stdin.fileno()
-        if not self.ready and not self.ended and select.select([fd], [], [], wait)[0]:
+        self.pasted = self._ready
+        if not self._ready and not self.ended and select.select([fd], [], [], wait)[0]:
             data = os.read(fd, 4096)
             self.ended = not data
             self._rest += data

@@ -45,12 +45,21 @@ def duration(seconds: float) -> str:
     if minutes < 1.0:
         return "less than a minute"
     if minutes < 90.0:
-        return f"{minutes:.0f} min"
-    return f"{int(minutes // 60)} h {round(minutes % 60 / 5) * 5:02d} min"
+        return f"about {minutes:.0f} min"
+    return f"about {int(minutes // 60)} h {round(minutes % 60 / 5) * 5:02d} min"
 
 
-def parameter(name: str, value: float, unit: str) -> str:
+TOLD_IN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3), "rad/Nm": ("µrad/Nm", 1e6)}
+
+
+def figure(value: float) -> str:
+    """Return a number with three or four digits that count."""
+    if not np.isfinite(value):
+        return "not known"
+    return f"{value:.3f}" if abs(value) < 10.0 else f"{value:.1f}"
+
+
+def parameter(value: float, unit: str) -> str:
     """Return a value as it is told, m as mm, rad as mrad."""
-    scaled = {"m": ("mm", 1e3), "rad": ("mrad", 1e3), "rad/Nm": ("1e-6 rad/Nm", 1e6)}
-    shown, factor = scaled.get(unit, (unit, 1.0))
-    return f"{value * factor:.4g} {shown}"
+    shown, factor = TOLD_IN.get(unit, (unit, 1.0))
+    return f"{figure(value * factor)} {shown}"

@@ -24,6 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Correct the setpoint of every row of a log.",
     ),
     "diagnose": ("bridge.cli.diagnose:diagnose", "Diagnose the sim-to-real gap of a log."),
+    "fleet": ("bridge.cli.fleet:fleet", "Diagnose or fit many arms over many sessions."),
     "blind": ("bridge.cli.blind:blind", "Run the blind benchmark of the diagnosis."),
     "explain": ("bridge.cli.explain:explain", "Explain an effect of the catalogue."),
 }

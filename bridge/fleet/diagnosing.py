@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
 from typing import Any
+
+import numpy as np
 
 from bridge.cell import Cell
 from core.diagnosis.diagnosis import diagnose
@@ -31,7 +34,15 @@ def facts(cell: Cell, log: Log) -> dict[str, Any]:
     """Return what is to be known of a session, whatever is done with it."""
     time = log.get("timestamp")
     begin = float(time[0]) if time is not None and time[0] > EPOCH else None
-    return {"type": cell.arm.name, "joints": cell.arm.n, "poses": len(log), "time": begin}
+    return {"type": arm_type(cell), "joints": cell.arm.n, "poses": len(log), "time": begin}
+
+
+def arm_type(cell: Cell) -> str:
+    """Return the name of the arm's type; of DH rows, which have none, one made from them."""
+    arm = cell.arm
+    if arm.name != "dh":
+        return arm.name
+    return f"dh {zlib.crc32(np.round(arm.link_in_link, 9).tobytes()):08x}"
 
 
 def _channel(channel: Mapping[str, Any]) -> dict[str, Any]:

@@ -65,6 +65,7 @@ def run(
             left.append(task)
         else:
             outcomes[task.session] = before
+            tell(before)
     resumed = len(tasks) - len(left)
     if left:
         with workers:

@@ -38,15 +38,25 @@ class Found:
         return len({s.arm for s in self.sessions})
 
 
-def find_sessions(where: Sequence[str], pattern: str | None = None) -> Found:
+def find_sessions(
+    where: Sequence[str], pattern: str | None = None, without: Path | None = None
+) -> Found:
     """Return the sessions of folders, glob patterns and files.
 
     A log's arm is the first folder below the fleet's; of a log that lies in that folder itself it
     is the file's name up to its first underscore. ``pattern`` is a regular expression that finds
     the arm in the path below the fleet's folder instead (its first group, or the whole match).
+    Nothing below ``without``, the results' folder, counts as a log.
     Raises InputError where there is no log, or the pattern does not fit one.
     """
-    logs = sorted({log for text in where for log in _logs(text)}, key=lambda p: natural(str(p)))
+    every = {log for text in where for log in _logs(text)}
+    own = None if without is None else without.absolute()
+    logs = sorted(
+        (log for log in every if own is None or own not in log.absolute().parents),
+        key=lambda p: natural(str(p)),
+    )
+    if not logs:
+        raise InputError(f"{' '.join(where)}: found no log beside those in {without}")
     folder = _folder(where, logs)
     expression = _compiled(pattern)
     sessions = []

@@ -8,19 +8,24 @@ their covariance (5.2); degrees of freedom combine by Welch and Satterthwaite (G
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
+from scipy.special import bdtr, stdtr, stdtrit
 
 from core.calibration.pose_accuracy import repeats
 from core.calibration.result import Calibration
+from core.calibration.sensitivity import Sensitivities, sensitivities
 
 Array = NDArray[np.float64]
 COVERAGE = 2.0  # k
 PROBABILITY = 0.9545  # of a normal distribution within two standard deviations
 ALUMINIUM = 23e-6  # 1/K; steel grows half as much
+ENOUGH = 12  # degrees of freedom from which repeats alone tell the arm's scatter
+FAR = 8.0  # times the median error: a held-out reading beyond is a blunder
+FEW = 0.05  # share of the held-out readings that may be blunders
+RARE = 0.01  # a chance below which the held-out poses speak against the budget
 LENGTH_95 = 2.796  # length of a 3D normal vector that 95 % stay below, in sigmas of a coordinate
 
 
@@ -59,7 +64,7 @@ class Budget:
     inputs: tuple[Input, ...]
     combined: float  # m
     freedom: float  # effective degrees of freedom
-    needed_factor: float  # of Student's distribution, for 95.45 %
+    parameters: Sensitivities | None  # what stands behind the first input, parameter by parameter
     inside: int  # held-out coordinates whose error is within the bound
     looked_at: int  # held-out coordinates
     bound: float  # m: k times combined uncertainty and measurement of one reading
@@ -71,6 +76,27 @@ class Budget:
         return COVERAGE * self.combined
 
     @property
+    def coverage(self) -> float:
+        """Return the share of cases that k = 2 holds, by Student's distribution."""
+        return _coverage(self.freedom)
+
+    @property
+    def needed_factor(self) -> float:
+        """Return the factor that 95.45 % ask for, by Student's distribution."""
+        if not np.isfinite(self.freedom):
+            return COVERAGE
+        return float(stdtrit(self.freedom, 0.5 + PROBABILITY / 2))
+
+    @property
+    def doubtful(self) -> bool:
+        """Return whether fewer held-out coordinates are inside the bound than chance allows."""
+        if not self.looked_at:
+            return False
+        # errors of one pose go together: they count as one look in three
+        looks, found = self.looked_at / 3, self.inside / 3
+        return bool(bdtr(np.floor(found), round(looks), self.coverage) < RARE)
+
+    @property
     def expanded_length(self) -> float:
         """Return the distance from its place that the TCP keeps to in 95 % of all poses, m."""
         return LENGTH_95 * self.combined
@@ -80,7 +106,8 @@ def budget(calibration: Calibration, stated: Stated) -> Budget:
     """Return the budget of a calibration."""
     reading = _reading_noise(calibration)
     repeatability = _repeatability(calibration, reading)
-    found = [_parameters(calibration), repeatability]
+    behind = sensitivities(calibration)
+    found = [_parameters(calibration, behind), repeatability]
     found.append(_remainder(calibration, found[0].std, np.hypot(repeatability.std, reading)))
     missing = []
     for part, words in (
@@ -95,59 +122,83 @@ def budget(calibration: Calibration, stated: Stated) -> Budget:
     combined = float(np.sqrt(sum(i.contribution**2 for i in found)))
     freedom = _effective(found, combined)
     bound = COVERAGE * float(np.hypot(combined, reading))
-    errors = np.abs(calibration.held_out_after.vector).ravel()
+    held = calibration.held_out_after
+    errors = np.abs(held.vector[~np.isin(held.rows, wild_readings(calibration))]).ravel()
     return Budget(
-        tuple(found), combined, freedom, _factor(freedom), int((errors <= bound).sum()),
+        tuple(found), combined, freedom, behind, int((errors <= bound).sum()),
         len(errors), bound, tuple(missing),
     )  # fmt: skip
 
 
+def wild_readings(calibration: Calibration) -> NDArray[np.int64]:
+    """Return the rows of readings that no budget can speak for: blunders, not uncertainty.
+
+    Those that the fit weighed down, and single held-out ones far beyond all others.
+    """
+    held = calibration.held_out_after
+    usual = float(np.median(held.norm)) if len(held.rows) else 0.0
+    far = held.rows[held.norm > FAR * usual]
+    if len(far) > max(1, FEW * len(held.rows)):
+        far = far[:0]  # so many are no blunders: the model is wrong there
+    return np.unique(np.concatenate([calibration.outliers, far])).astype(np.int64)
+
+
 def _reading_noise(calibration: Calibration) -> float:
     """Return 1 sigma of one coordinate of an averaged reading, m: the instrument alone."""
+    if np.isfinite(calibration.instrument_noise):
+        return calibration.instrument_noise
     scatter = calibration.readings.scatter
     known = scatter[np.isfinite(scatter)]
     return float(np.sqrt(np.mean(known**2))) if len(known) else 0.0
 
 
-def _parameters(calibration: Calibration) -> Input:
+def _parameters(calibration: Calibration, behind: Sensitivities | None) -> Input:
     """Return what the fit leaves unsure, all parameters together with their correlations."""
-    width = 3 if calibration.readings.kind != "distance" else 1
-    std = float(np.sqrt(np.mean(calibration.tcp_std**2) / 3)) if len(calibration.tcp_std) else 0.0
-    rows = len(calibration.after.vector) * width
-    count = len(calibration.covariance)
+    std = behind.combined if behind else 0.0
+    if len(calibration.tcp_std):
+        std = float(np.sqrt(np.mean(calibration.tcp_std**2) / 3))
+    rows, count = calibration.after.vector.size, len(calibration.covariance)
     return Input(
-        "parameters of the model", "A", "normal", std, "m", 1.0, float(max(rows - count - 6, 1)),
+        "parameters of the model", "A", "normal", std, "m", 1.0, _fit_freedom(calibration),
         f"covariance of {count} parameters from {rows} coordinates, carried to the tool",
     )  # fmt: skip
 
 
 def _repeatability(calibration: Calibration, reading: float) -> Input:
-    """Return the spread of repeated visits, without the part of the instrument."""
+    """Return the scatter of the arm, without the part of the instrument."""
     groups = repeats(calibration.readings)
-    name = "repeatability of the arm"
-    if np.isfinite(calibration.repeatability):
-        freedom = sum(3 * (len(g) - 1) for g in groups)
+    name, freedom = "repeatability of the arm", sum(3 * (len(g) - 1) for g in groups)
+    if np.isfinite(calibration.repeatability) and freedom >= ENOUGH:
         return Input(
-            name, "A", "normal", calibration.repeatability, "m", 1.0, float(max(freedom, 1)),
+            name, "A", "normal", calibration.repeatability, "m", 1.0, float(freedom),
             f"{len(groups)} poses visited again, {sum(len(g) for g in groups)} readings",
         )  # fmt: skip
     std = float(np.sqrt(max(calibration.noise**2 - reading**2, 0.0)))
-    rows = 3 * len(calibration.after.vector)
     return Input(
-        name, "A", "normal", std, "m", 1.0, float(max(rows, 1)),
-        "no pose was repeated: scatter of the fit without the instrument's share",
+        name, "A", "normal", std, "m", 1.0, _fit_freedom(calibration),
+        "too few repeats: scatter of the fit without the instrument's share",
     )  # fmt: skip
+
+
+def _fit_freedom(calibration: Calibration) -> float:
+    if np.isfinite(calibration.freedom):
+        return max(calibration.freedom, 1.0)
+    spent = len(calibration.covariance) + 6 * len(calibration.stations)
+    return float(max(calibration.after.vector.size - spent, 1))
 
 
 def _remainder(calibration: Calibration, parameters: float, noise: float) -> Input:
     """Return what the held-out poses show beyond parameters, arm and instrument."""
-    errors = calibration.held_out_after.vector
-    held_out = len(errors) > 0
-    if not held_out:
-        errors = calibration.after.vector
+    held_out = len(calibration.held_out_after.vector) > 0
+    chosen = calibration.held_out_after if held_out else calibration.after
+    wild = wild_readings(calibration)
+    errors = chosen.vector[~np.isin(chosen.rows, wild)]
     excess = float(np.mean(errors**2)) - noise**2 - (parameters**2 if held_out else 0.0)
     std = float(np.sqrt(max(excess, 0.0)))
     where = "held-out poses" if held_out else "fitted poses (none were held out)"
+    if len(wild):
+        rows = ", ".join(str(int(r) + 1) for r in wild)
+        where += f", wild readings left out ({rows})"
     told = "nothing found beyond the lines above" if std == 0 else "what is beyond the lines above"
     return Input(
         "what the model does not explain", "A", "normal", std, "m", 1.0, float(errors.size),
@@ -192,8 +243,6 @@ def _payload_sensitivity(calibration: Calibration) -> float:
     model, step = calibration.model, 0.1
     mass = readings.loads.payload_mass
     mass = np.full(len(readings), model.payload_mass) if mass is None else mass
-    from dataclasses import replace
-
     more = replace(readings.loads, payload_mass=mass + step)
     change = model.predict(readings.q, more).position
     change = change - model.predict(readings.q, replace(more, payload_mass=mass)).position
@@ -205,7 +254,5 @@ def _effective(inputs: list[Input], combined: float) -> float:
     return float(combined**4 / weight) if weight > 0 else float("inf")
 
 
-def _factor(freedom: float) -> float:
-    if not np.isfinite(freedom):
-        return COVERAGE
-    return float(stdtrit(freedom, 0.5 + PROBABILITY / 2))
+def _coverage(freedom: float) -> float:
+    return float(1 - 2 * stdtr(freedom if np.isfinite(freedom) else 1e9, -COVERAGE))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from core.calibration.noise import Noise
 from core.calibration.observables import make_observable
 from core.calibration.observables.nuisance import Nuisance
 from core.calibration.observables.observable import Observable
@@ -60,7 +61,7 @@ def calibrate(
         found = parameters.model(rest.values)
         remainder = carried(problem, rest, found, readings, metrology)
         told = diagnosed(found, readings, rest, metrology, tell) if diagnose else None
-    estimates = _estimates(parameters, rest, expected)
+    estimates = estimates_of(parameters, rest, expected)
     shown = np.array([e.shown for e in estimates], dtype=bool)
     errors = _errors(model, found, how, readings, rest.nuisance)
     odds = _stages_at_odds(problem, rest)
@@ -78,12 +79,15 @@ def calibrate(
         tcp_std=tcp_deviation(parameters, rest, readings[readings.held_out]),
         diagnosis=told, complete=complete,
         verdict=verdict_of(errors, remainder, told, rest, complete), notes=notes,
+        instrument_noise=rest.noise.instrument, turn_noise=_turn_noise(how, rest.noise),
+        joint_noise=rest.noise.joint, freedom=rest.freedom, whole_covariance=rest.covariance,
     )  # fmt: skip
 
 
-def _estimates(
+def estimates_of(
     parameters: Parameters, rest: Rest, expected: Expectation | None
 ) -> tuple[Estimate, ...]:
+    """Return the parameters as they are told, beside what was ``expected`` of them."""
     promised = {} if expected is None else dict(
         zip(expected.names, expected.std, strict=True)
     )  # fmt: skip
@@ -119,6 +123,13 @@ def _errors(
                 gap = observable.residual(one, readings[rows], place)[:, :3]
             told.append(Errors(gap, rows))
     return told[0], told[1], told[2], told[3]
+
+
+def _turn_noise(observable: Observable, noise: Noise) -> float:
+    """Return 1 sigma of a measured rotation (rad); nan where none is measured."""
+    if len(noise.sizes) < 3:
+        return float("nan")
+    return float(noise.sizes[1] * observable.sigmas[3])
 
 
 def _stages_at_odds(problem: Problem, rest: Rest) -> float | None:

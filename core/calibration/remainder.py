@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,19 +48,22 @@ def carried(
         return Remainder(0, float("nan"), 1.0, rows)
     part, observable = readings[rows], problem.observable
     left = observable.residual(found, part, rest.nuisance)
+    k = left.shape[1]
     shape, _ = presumed(found, part, observable, rest.nuisance, metrology)
-    sizes = rest.noise.sizes
-    V = np.asarray(sum(s**2 * one for s, one in zip(sizes, shape.shapes, strict=True)))
-    J, F = observable.columns(problem.parameters, rest.values, part, rest.nuisance)
-    N, k = left.shape
-    X = np.hstack([J, F]).reshape(N, k, -1)
-    V = V + X @ joint_covariance(problem, rest) @ np.swapaxes(X, 1, 2)
+    V = replace(shape, sizes=rest.noise.sizes).variance + predicted(problem, rest, part)
     square = np.einsum("ni,ni->n", left, np.linalg.solve(V, left[..., None])[..., 0])
     wild = square > 30 + 5 * k
     kept = square[~wild] if (~wild).sum() >= 3 else square
     ratio = float(kept.sum() / (k * len(kept)))
     chance = float(fisher.sf(ratio, k * len(kept), rest.freedom))
     return Remainder(len(rows), ratio, chance, rows[wild])
+
+
+def predicted(problem: Problem, rest: Rest, readings: Readings) -> Array:
+    """Return the covariance (N, k, k) of what the fit predicts of readings, noise left aside."""
+    J, F = problem.observable.columns(problem.parameters, rest.values, readings, rest.nuisance)
+    X = np.hstack([J, F]).reshape(len(readings), problem.observable.equations, -1)
+    return np.asarray(X @ joint_covariance(problem, rest) @ np.swapaxes(X, 1, 2))
 
 
 def joint_covariance(problem: Problem, rest: Rest) -> Array:

@@ -87,3 +87,8 @@ class Calibration:
     complete: bool  # True: nothing is left that a further effect could explain
     verdict: str  # one sentence
     notes: tuple[str, ...] = field(default=())
+    instrument_noise: float = float("nan")  # m, 1 sigma of one coordinate, the instrument alone
+    turn_noise: float = float("nan")  # rad, 1 sigma of a measured rotation; nan: none were
+    joint_noise: float = float("nan")  # rad, 1 sigma of one joint's repeatability
+    freedom: float = float("inf")  # degrees of freedom that the fit left
+    whole_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # of all estimates

@@ -124,6 +124,10 @@ class ModbusDriver(Driver):
         except StaleStateError:
             self.transport.open()  # raises LinkError where nobody is there any more
             return None
+        except InvalidStateError:
+            if not self.transport.is_open:
+                self.transport.open()
+            raise
 
     def _read_blocks(self) -> dict[Block, Sequence[int]]:
         """Return the registers of one cycle: one block, where the profile's map allows it."""

@@ -92,6 +92,11 @@ class Transport:
             )  # fmt: skip
         return ModbusTcpClient(settings.host, port=self._port, timeout=settings.timeout, retries=0)
 
+    @property
+    def is_open(self) -> bool:
+        """Return whether there is a socket to ask through."""
+        return self._client is not None
+
     def close(self) -> None:
         """Close the socket, which the library leaves open after some errors; may be repeated."""
         client, self._client = self._client, None
@@ -187,8 +192,12 @@ class Transport:
     def _ask(self, call: Any, *arguments: Any, **keys: Any) -> ModbusPDU:
         try:
             answer: ModbusPDU = call(*arguments, **keys)
-        except ModbusIOException:
+        except ModbusIOException as error:
             self._fresh_socket()
+            if "but received" in str(error):  # the library's words for another device's or number
+                raise InvalidStateError(
+                    f"{self.name}: found the answer to another request"
+                ) from None
             raise StaleStateError(
                 f"{self.name}: no answer within {self._settings.timeout:g} s"
             ) from None

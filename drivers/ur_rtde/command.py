@@ -17,6 +17,7 @@ from core.setpoint import Setpoint
 from core.state import RobotState
 from drivers.ur_rtde import registers
 from drivers.ur_rtde.allowed import AllowedControl, AllowedInputs
+from drivers.ur_rtde.no_delay import send_at_once
 from drivers.ur_rtde.registers import Program
 from drivers.ur_rtde.settings import UrRtdeSettings
 
@@ -106,6 +107,7 @@ class ServoWriter:
             flags |= NO_REMOTE_CHECK
         try:
             library = RTDEControlInterface(settings.host, settings.rate, flags)
+            send_at_once()
             return AllowedControl(settings.host, library)
         except Exception as error:
             words = str(error).strip().splitlines() or [type(error).__name__]
@@ -135,7 +137,9 @@ class ServoWriter:
         control, host = self._control, self._settings.host
         if control is None:
             raise WriteError(f"{host}: found no control script, expected arm() first")
-        if not control.isConnected() or not control.isProgramRunning():
+        if not control.isConnected():
+            raise WriteError(f"{host}: the library's connection for writing has ended")
+        if not control.isProgramRunning():
             raise WriteError(
                 f"{host}: the control script has ended (watchdog, a stop, or a person)"
             )
@@ -226,6 +230,7 @@ class OffsetWriter:
                 from rtde_io import RTDEIOInterface
 
                 self._io = AllowedInputs(host, RTDEIOInterface(host))
+                send_at_once()
             except Exception as error:
                 words = str(error).strip().splitlines() or [type(error).__name__]
                 raise WriteError(f"{host}: {words[0].strip()}") from None

@@ -99,14 +99,28 @@ def test_a_clock_that_drifts_is_followed() -> None:
     assert before - last.received - 1e-9 <= age <= time.monotonic() - last.received + 1e-4
 
 
-def test_a_clock_that_stood_still_is_tied_anew_after_the_silence() -> None:
+def test_a_clock_that_stood_still_is_tied_anew_once_nothing_younger_comes() -> None:
     clock = ControllerClock(500.0, hold=0.04)
     now = time.monotonic()
     clock.take(state(1.0, now - 0.3))
-    after = state(1.002, now)  # its clock stood still for 0.298 s
-    clock.take(after)
-    assert clock.age(after) < 0.2
-    assert clock.expiry(after) == pytest.approx(now + 0.04)
+    for k in range(25):  # its clock stood still for 0.25 s, as it seems
+        late = state(1.0 + 0.002 * k, now - 0.05 + 0.002 * k)
+        clock.take(late)
+        if not 19 <= k <= 21:
+            assert (clock.expiry(late) < late.received) == (k < 20)
+
+
+def test_what_a_stalled_link_hands_on_at_once_is_old_until_the_newest_has_come() -> None:
+    clock = ControllerClock(500.0, hold=0.04)
+    now = time.monotonic()
+    clock.take(state(1.0, now - 0.1))
+    fresh = []
+    for k in range(1, 51):  # of 0.1 s, all within 1 ms
+        burst = state(1.0 + 0.002 * k, now + 2e-5 * k)
+        clock.take(burst)
+        fresh.append(clock.expiry(burst) > burst.received)
+    assert not any(fresh[:29])
+    assert all(fresh[31:])
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ UR = ("ur_servoj", "ur_offset")
 
 
 def _late(rig: Rig) -> None:
-    """Delay what comes within a moment by three cycles, all by the same."""
-    rig.proxy.stall(max(3.0 * rig.link.cycle, 0.012))
+    """Delay what comes within a moment, so that one sample or two are missing."""
+    rig.proxy.stall(2.5 * rig.link.cycle)
 
 
 def _stall(duration: float):  # type: ignore[no-untyped-def]
@@ -70,7 +70,7 @@ def _jitter(rig: Rig) -> None:
 
 
 ROWS = (
-    Row("late sample", "single late or missing sample", "proxy holds everything for 3 cycles",
+    Row("late sample", "single late or missing sample", "proxy holds everything for 2.5 cycles",
         _late, sign="late", within=cycles(15, 0.25), end=("compensating",)),
     Row("stale link", "stale link, socket alive", "proxy hands nothing on for 0.12 or 0.3 s",
         lambda rig: rig.proxy.stall(rig.link.hold + (0.02 if rig.link.hold < 0.2 else 0.1)),

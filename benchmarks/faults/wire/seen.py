@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ Kind = Literal["offset", "joints", "release", "other", "broken", "forbidden"]
 
 @dataclass(frozen=True, slots=True)
 class Fresh:
-    """A state that the client can know from ``time`` on (s, monotonic).
+    """A state that the client can know from ``time`` on (s, monotonic), ``earliest`` at best.
 
     ``stamp``: the controller's clock, s, NaN where the wire has none. ``safe``: whether it may
     move; ``safe_known``: whether the wire has said so at all. ``state`` is the supervisor's.
@@ -26,6 +27,12 @@ class Fresh:
     safe: bool
     safe_known: bool
     state: int
+    earliest: float = math.nan
+
+    @property
+    def early(self) -> float:
+        """Return when the client may have known it at the earliest, s."""
+        return self.time if math.isnan(self.earliest) else self.earliest
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +41,8 @@ class Write:
 
     offset: ``values`` (6,) m and rad, in base. joints: ``values`` (n,) rad. other: part of a
     write, watchdogs, enabling. broken: does not pass the receiver's own check. forbidden: nothing
-    that a daemon may write. ``state`` is the supervisor's as the write was seen.
+    that a daemon may write. ``state`` is the supervisor's as the write was seen. It arrived between
+    ``earliest`` and ``time`` (s, monotonic).
     """
 
     time: float
@@ -42,6 +50,12 @@ class Write:
     values: Numbers
     where: str
     state: int
+    earliest: float = math.nan
+
+    @property
+    def early(self) -> float:
+        """Return when it may have arrived at the earliest, s."""
+        return self.time if math.isnan(self.earliest) else self.earliest
 
 
 Change = Callable[[list[float]], list[float]]

@@ -19,7 +19,7 @@ from bridge.calibration.report.drawing import (
     Stroke,
     Text,
 )
-from bridge.report.words import number
+from bridge.calibration.report.figures import plain
 
 WIDTH, HEIGHT = 340.0, 230.0
 LEFT, RIGHT, TOP, BOTTOM = 44.0, 10.0, 30.0, 38.0
@@ -34,20 +34,49 @@ class Scale:
     high: float
     ticks: tuple[float, ...] = ()  # none: no grid
     labels: tuple[str, ...] = ()  # instead of the ticks' numbers
+    log: bool = False
+
+    def share(self, value: float) -> float:
+        """Return how far along the axis a value lies, 0 to 1."""
+        if self.log:
+            low, high = math.log10(self.low), math.log10(self.high)
+            value = math.log10(max(value, self.low))
+            return (value - low) / (high - low)
+        return (value - self.low) / (self.high - self.low)
 
 
-def scale(title: str, values: Sequence[float], *, zero: bool = True, ticks: int = 4) -> Scale:
-    """Return a scale that holds all values, from 0 unless ``zero`` is False, with round ticks."""
+def scale(title: str, values: Sequence[float], *, tight: bool = False, ticks: int = 4) -> Scale:
+    """Return a scale that holds 0 and all values, with round ticks.
+
+    It begins and ends at a tick, or, ``tight``, a little beyond the values.
+    """
     finite = [float(v) for v in values if math.isfinite(v)] or [0.0]
     low, high = min(finite), max(finite)
-    if zero:
-        low, high = min(low, 0.0), max(high, 0.0)
+    low, high = min(low, 0.0), max(high, 0.0)
     if high - low < 1e-12:
         high = low + 1.0
     step = _round_step((high - low) / ticks)
     first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
     places = tuple(k * step for k in range(first, last + 1))
+    if tight:
+        low, high = low - 0.04 * (high - low), high + 0.04 * (high - low)
+        return Scale(title, low, high, tuple(v for v in places if low <= v <= high))
     return Scale(title, places[0], places[-1], places)
+
+
+def logarithmic(title: str, values: Sequence[float]) -> Scale:
+    """Return a scale in powers of ten that holds all values above 0."""
+    positive = [float(v) for v in values if math.isfinite(v) and v > 0] or [1.0]
+    steps = (1.0, 2.0, 5.0)
+    first = math.floor(math.log10(min(positive)))
+    last = math.ceil(math.log10(max(positive)))
+    every = [k * 10.0**e for e in range(first, last + 1) for k in steps]
+    low = max(v for v in every if v <= min(positive) * (1 + 1e-9))
+    high = min((v for v in every if v >= max(positive) and v > low), default=2 * low)
+    kept = tuple(v for v in every if low <= v <= high)
+    if len(kept) > 7:
+        kept = tuple(v for v in kept if abs(math.log10(v) % 1) < 1e-9)
+    return Scale(title, low, high, kept, log=True)
 
 
 def named(title: str, labels: Sequence[str]) -> Scale:
@@ -80,8 +109,8 @@ class Chart:
     def at(self, x: float, y: float) -> Point:
         """Return the place of a value."""
         return (
-            self.left + (x - self.x.low) / (self.x.high - self.x.low) * (self.right - self.left),
-            self.bottom - (y - self.y.low) / (self.y.high - self.y.low) * (self.bottom - self.top),
+            self.left + self.x.share(x) * (self.right - self.left),
+            self.bottom - self.y.share(y) * (self.bottom - self.top),
         )
 
     def points(
@@ -108,6 +137,16 @@ class Chart:
         right, bottom = self.at(x + width / 2, min(y, 0.0))
         self.drawing.add(Rectangle(left, top, right - left, max(bottom - top, 0.5), colour, hint))
 
+    def label(self, x: float, y: float, text: str) -> None:
+        """Write a figure just above a value."""
+        a, b = self.at(x, y)
+        self.drawing.add(Text(a, b - 4, text, 9.5, SOFT, "middle"))
+
+    def square(self, x: float, y: float, colour: str, side: float = 9.0) -> None:
+        """Draw a square of so many pixels around a value."""
+        a, b = self.at(x, y)
+        self.drawing.add(Rectangle(a - side / 2, b - side / 2, side, side, colour))
+
     def level(self, y: float, text: str, colour: str) -> None:
         """Draw a dashed line across, with what it means at its right end."""
         self.line([self.x.low, self.x.high], [y, y], colour, width=1.2, dashed=True)
@@ -132,13 +171,13 @@ class Chart:
     def _axes(self) -> None:
         for k, tick in enumerate(self.x.ticks):
             x, y = self.at(tick, self.y.low)
-            label = self.x.labels[k] if self.x.labels else number(tick)
+            label = self.x.labels[k] if self.x.labels else plain(tick)
             if not self.x.labels:
                 self.drawing.line([(x, self.top), (x, y)], Stroke(GRID, 0.8))
             self.drawing.add(Text(x, y + 14, label, 10, SOFT, "middle"))
         for k, tick in enumerate(self.y.ticks):
             x, y = self.at(self.x.low, tick)
-            label = self.y.labels[k] if self.y.labels else number(tick)
+            label = self.y.labels[k] if self.y.labels else plain(tick)
             if not self.y.labels:
                 self.drawing.line([(x, y), (self.right, y)], Stroke(GRID, 0.8))
             self.drawing.add(Text(x - 5, y + 3.5, label, 10, SOFT, "end"))

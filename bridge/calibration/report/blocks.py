@@ -87,6 +87,14 @@ class Pairs:
     """Names and what belongs to them, as on the front of a certificate."""
 
     pairs: tuple[tuple[str, str], ...]
+    title: str = ""
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Pairs side by side where there is room."""
+
+    columns: tuple[Pairs, ...]
 
 
 @dataclass(frozen=True)
@@ -108,7 +116,7 @@ class Pictures:
     caption: str = ""
 
 
-Block = Verdict | Tiles | Heading | Paragraph | Bullets | Pairs | Table | Pictures
+Block = Verdict | Tiles | Heading | Paragraph | Bullets | Columns | Table | Pictures
 
 
 @dataclass(frozen=True)
@@ -119,6 +127,7 @@ class Part:
     title: str
     about: str
     blocks: tuple[Block, ...]
+    folded: bool = False  # True: the page shows it only when asked to
 
 
 @dataclass(frozen=True)

@@ -4,47 +4,141 @@ from __future__ import annotations
 
 import math
 
-from bridge.calibration.report.blocks import Bar, Block, Bullets, Cell, Heading, Table
+from bridge.calibration.report.blocks import (
+    Bar,
+    Block,
+    Bullets,
+    Cell,
+    Heading,
+    Paragraph,
+    Strong,
+    Table,
+)
+from bridge.calibration.report.figures import fine, mm, plain
 from bridge.calibration.report.material import Material
+from bridge.calibration.report.names import parameter_words
 from bridge.calibration.report.section import Section
-from bridge.report.words import number, told
+from bridge.report.words import number, percent, told, unit_of
 from core.calibration.budget import Budget, Input
+from core.calibration.sensitivity import Sensitivities, Sensitivity
+
+OUTSIDE = (
+    "where the robot's base stands in the hall: everything here is seen from the base",
+    "changes after this session: wear, a collision, a tool that was taken off and put on again",
+)
 
 
 class BudgetSection(Section[Material]):
     """How surely the tool is where the model puts it."""
 
-    key, title = "uncertainty", "Uncertainty"
-    about = "How surely the tool is where the calibrated model puts it, along one axis."
+    key, title = "uncertainty", "Uncertainty budget"
+    about = (
+        "In the manner of the GUM: how surely the tool is where the calibrated model puts it, "
+        "along one axis of the base."
+    )
 
     def blocks(self, material: Material) -> list[Block]:
-        """Return the budget and what it leaves out."""
+        """Return the result, the budget, its check, what stands behind it and what is not in it."""
         given = material.budget
-        blocks: list[Block] = [_table(given)]
-        if given.missing:
-            blocks += [Heading("Not in the budget"), Bullets(given.missing)]
-        return blocks
+        blocks: list[Block] = [Paragraph(_result(given)), _table(given)]
+        blocks.append(Bullets(tuple(f"{i.name}: {i.source}" for i in given.inputs)))
+        blocks.append(Paragraph(_factor(given)))
+        if given.looked_at:
+            blocks += [Heading("Check against the poses kept out of the fit"),
+                       Paragraph(_check(given))]  # fmt: skip
+        if given.parameters is not None:
+            blocks += _behind(given.parameters)
+        missing = tuple(f"{name}: nobody has stated it" for name in given.missing)
+        return [*blocks, Heading("Not in the budget"), Bullets((*missing, *OUTSIDE))]
+
+
+def _result(given: Budget) -> str:
+    return (
+        f"Along each axis the tool is within ± {mm(given.expanded)} of where the calibrated model "
+        f"puts it (expanded uncertainty, k = 2, about {percent(given.coverage)}); in space, "
+        f"95 % of the poses keep within {mm(given.expanded_length)} of their place. This holds "
+        "over the workspace and the loads that were measured."
+    )
 
 
 def _table(given: Budget) -> Table:
     rows: list[list[Cell]] = [_row(i, given.combined) for i in given.inputs]
     rows.append(["combined standard uncertainty", "", "", "", "", _freedom(given.freedom),
-                 told(given.combined, "m"), ""])  # fmt: skip
-    rows.append(["expanded uncertainty, k = 2", "", "", "", "", "",
-                 told(given.expanded, "m"), ""])  # fmt: skip
+                 fine(given.combined), ""])  # fmt: skip
+    rows.append(
+        ["expanded uncertainty, k\u00a0=\u00a02", "", "", "", "", "", fine(given.expanded), ""]
+    )
     heads = ("input", "type", "distribution", "standard uncertainty", "sensitivity",
              "degrees of freedom", "contribution", "share")  # fmt: skip
-    return Table(heads, rows, (2.4, 0.6, 1.1, 1.2, 1.2, 0.9, 1.1, 1.3), (3, 4, 5, 6), sums=2)
+    return Table(heads, rows, (2.5, 0.55, 1.15, 1.15, 1.25, 0.95, 1.15, 1.2), (3, 4, 5, 6), sums=2)
 
 
 def _row(i: Input, combined: float) -> list[Cell]:
     share = (i.contribution / combined) ** 2 if combined else 0.0
-    sensitivity = "1" if i.unit == "m" else f"{number(i.sensitivity * 1e3)} mm/{i.unit}"
+    own = i.unit == "m"
     return [
-        i.name, i.kind, i.distribution, told(i.std, i.unit), sensitivity, _freedom(i.freedom),
-        told(i.contribution, "m"), Bar(share, f"{share * 100:.0f} %"),
+        i.name, i.kind, i.distribution, fine(i.std) if own else f"{number(i.std, 2)} {i.unit}",
+        "1" if own else f"{number(i.sensitivity * 1e3, 2)} mm/{i.unit}", _freedom(i.freedom),
+        fine(i.contribution), Bar(share, f"{share * 100:.0f} %"),
     ]  # fmt: skip
 
 
 def _freedom(freedom: float) -> str:
     return f"{freedom:.0f}" if math.isfinite(freedom) else "∞"
+
+
+def _factor(given: Budget) -> str:
+    text = (
+        "Type A comes from the readings of this session, type B from data sheets, certificates "
+        "and what people stated. The instrument's noise is in the scatter from which type A is "
+        "made, and not counted again."
+    )
+    if math.isfinite(given.freedom):
+        text += (
+            f" Effective degrees of freedom (Welch and Satterthwaite): {given.freedom:.0f}; with "
+            f"them k = 2 covers {given.coverage * 100:.1f} %, and 95.45 % would ask for "
+            f"k = {given.needed_factor:.2f}."
+        )
+    return text
+
+
+def _check(given: Budget) -> str:
+    share = given.inside / given.looked_at
+    text = (
+        f"Of {given.looked_at} coordinates that the fit never saw, {given.inside} "
+        f"({percent(share)}) are within ± {mm(given.bound)}: twice the combined uncertainty and "
+        f"the noise of one reading together. {percent(given.coverage)} were to be expected"
+    )
+    if given.doubtful:
+        return f"{text}; these are fewer than chance allows, so that the budget is too small."
+    return f"{text}: they agree with the budget."
+
+
+def _behind(given: Sensitivities) -> list[Block]:
+    rows: list[list[Cell]] = [
+        _parameter(s) for s in sorted(given.each, key=lambda s: -s.contribution)
+    ]
+    size = math.sqrt(abs(given.correlation))
+    sign = "+" if given.correlation >= 0 else "−"
+    rows.append(["correlations between them", "", "", f"{sign} {fine(size)}"])
+    rows.append([Strong("together"), "", "", fine(given.combined)])
+    heads = ("parameter", "standard uncertainty", "sensitivity", "contribution")
+    note = (
+        "Sensitivity is how far the tool moves along an axis, rms over the poses that judge the "
+        "calibration. Parameters that replace each other have large contributions which their "
+        "correlations take away again; contributions add in squares."
+    )
+    return [
+        Heading("Behind “parameters of the model”"),
+        Table(heads, rows, (3, 1.6, 1.6, 1.2), (1, 2, 3), sums=2),
+        Paragraph(note, "note"),
+    ]
+
+
+def _parameter(s: Sensitivity) -> list[Cell]:
+    unit, factor = unit_of(s.unit)
+    coefficient = plain(float(f"{s.coefficient * 1e3 / factor:.3g}"))
+    return [
+        parameter_words(s.name), told(s.std, s.unit), f"{coefficient} mm per {unit}",
+        fine(s.contribution),
+    ]  # fmt: skip

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from bridge.calibration.report.axes import Chart, named, scale
+from bridge.calibration.report.axes import Chart, logarithmic, named, scale
 from bridge.calibration.report.blocks import Block, Pictures, Table
-from bridge.calibration.report.drawing import AFTER, BEFORE, LIMIT, Drawing
+from bridge.calibration.report.drawing import AFTER, BEFORE, Drawing
+from bridge.calibration.report.figures import fixed, mm
 from bridge.calibration.report.material import Material
 from bridge.calibration.report.section import Section
-from bridge.report.words import told
 from core.calibration.result import Errors
 
 LEGEND = (("before", BEFORE), ("after", AFTER))
@@ -28,13 +28,19 @@ class ErrorsSection(Section[Material]):
             pictures.append(_axes(material))
         return [
             _table(material),
-            Pictures(
-                tuple(pictures), f"Left: share of the readings whose error is at most so large, "
-                f"on {material.judged_words}. Right: rms along each axis of the base."
-                if len(pictures) > 1 else f"Share of the readings whose error is at most so "
-                f"large, on {material.judged_words}."
-            ),
-        ]  # fmt: skip
+            Pictures(tuple(pictures), _caption(material)),
+        ]
+
+
+def _caption(material: Material) -> str:
+    text = (
+        f"On {material.judged_words}. Distribution: the share of the readings whose error is at "
+        "most so large, errors in powers of ten."
+    )
+    if len(material.axes) > 1:
+        noise = mm(material.calibration.noise)
+        text += f" Arm and instrument together scatter by {noise} along an axis (1 sigma)."
+    return text
 
 
 def _table(material: Material) -> Table:
@@ -52,36 +58,35 @@ def _table(material: Material) -> Table:
 
 def _row(name: str, errors: Errors) -> list[str]:
     high = float(np.quantile(errors.norm, 0.95))
-    figures = [told(v, "m") for v in (errors.mean, errors.rms, high, errors.max)]
+    figures = [mm(v) for v in (errors.mean, errors.rms, high, errors.max)]
     return [name, str(len(errors.norm)), *figures]
 
 
 def _distribution(material: Material) -> Drawing:
     before, after = (np.sort(e.norm) * 1e3 for e in material.judged)
     chart = Chart(
-        "Distribution of the error", scale("error, mm", [*before, *after]),
+        "Distribution of the error", logarithmic("error, mm", [*before, *after]),
         scale("share of the readings, %", [0, 100]),
     )  # fmt: skip
     for values, colour in ((before, BEFORE), (after, AFTER)):
         share = np.arange(len(values) + 1) / len(values) * 100
         x = np.repeat(values, 2)
         y = np.repeat(share, 2)[1:-1]
-        chart.line([0.0, *x, chart.x.high], [0.0, *y, 100.0], colour, width=2.0)
+        chart.line([chart.x.low, *x, chart.x.high], [0.0, *y, 100.0], colour, width=2.0)
     chart.legend(LEGEND)
     return chart.drawing
 
 
 def _axes(material: Material) -> Drawing:
     rms = [np.sqrt(np.mean(e.vector**2, axis=0)) * 1e3 for e in material.judged]
-    noise = material.calibration.noise * 1e3
     chart = Chart(
         "Along each axis", named("axis of the base", material.axes),
-        scale("rms error, mm", [*rms[0], *rms[1], noise]),
+        scale("rms error, mm", [*rms[0], *rms[1]]),
     )  # fmt: skip
     for shift, values, colour in ((-0.18, rms[0], BEFORE), (0.18, rms[1], AFTER)):
         for i, value in enumerate(values):
-            hint = f"{material.axes[i]}: {told(value * 1e-3, 'm')}"
+            hint = f"{material.axes[i]}: {mm(value * 1e-3)}"
             chart.column(i + shift, float(value), colour, 0.32, hint)
-    chart.level(noise, "noise of arm and instrument", LIMIT)
+            chart.label(i + shift, float(value), fixed(float(value), 3))
     chart.legend(LEGEND)
     return chart.drawing

@@ -12,6 +12,7 @@ from bridge.calibration.report.blocks import (
     Block,
     Bullets,
     Cell,
+    Columns,
     Document,
     Heading,
     Pairs,
@@ -49,6 +50,8 @@ def _own(package: str) -> str:
 
 def _part(part: Part) -> str:
     blocks = "".join(_block(block) for block in part.blocks)
+    if part.folded:
+        blocks = f"<details><summary>Show</summary>{blocks}</details>"
     return (
         f'<section id="{part.key}"><h2>{escape(part.title)}</h2>'
         f'<p class="about">{escape(part.about)}</p>{blocks}</section>'
@@ -69,12 +72,17 @@ def _block(block: Block) -> str:
         )
     if isinstance(block, Tiles):
         return _tiles(block)
-    if isinstance(block, Pairs):
-        pairs = "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in block.pairs)
-        return f'<dl class="pairs">{pairs}</dl>'
+    if isinstance(block, Columns):
+        return f'<div class="columns">{"".join(_pairs(p) for p in block.columns)}</div>'
     if isinstance(block, Table):
         return _table(block)
     return _pictures(block)
+
+
+def _pairs(block: Pairs) -> str:
+    title = f"<h3>{escape(block.title)}</h3>" if block.title else ""
+    pairs = "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in block.pairs)
+    return f'<div>{title}<dl class="pairs">{pairs}</dl></div>'
 
 
 def _tiles(block: Tiles) -> str:
@@ -102,6 +110,8 @@ def _table(block: Table) -> str:
         + "".join(
             # the label stands beside the cell where a phone shows each row as a card
             f'<td{r} data-label="{escape(h)}"><div>{_cell(c)}</div></td>'
+            if c != ""
+            else "<td></td>"
             for h, c, r in zip(block.heads, cells, right, strict=True)
         )
         + "</tr>"

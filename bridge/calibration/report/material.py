@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.calibration.report.facts import SessionFacts
-from core.calibration.budget import Budget, Stated, budget
+from core.calibration.budget import Budget, Stated, budget, wild_readings
 from core.calibration.plan import Plan
+from core.calibration.pose_accuracy import PoseAccuracy, pose_accuracies
 from core.calibration.result import Calibration, Errors
 
 Array = NDArray[np.float64]
@@ -34,6 +35,38 @@ class Material:
         if len(c.held_out_before.vector):
             return c.held_out_before, c.held_out_after
         return c.before, c.after
+
+    @cached_property
+    def both(self) -> tuple[Errors, Errors]:
+        """Return the errors before and after of all readings, fitted and held out."""
+        c = self.calibration
+        return _joined(c.before, c.held_out_before), _joined(c.after, c.held_out_after)
+
+    @cached_property
+    def calm(self) -> tuple[Errors, Errors]:
+        """Return the errors before and after of all readings but the wild ones."""
+        before, after = self.both
+        kept = np.array([int(r) not in self.wild for r in before.rows], dtype=bool)
+        return (
+            Errors(before.vector[kept], before.rows[kept]),
+            Errors(after.vector[kept], after.rows[kept]),
+        )
+
+    @cached_property
+    def accuracies(self) -> tuple[PoseAccuracy, ...]:
+        """Return AP and RP of the poses that were visited more than once."""
+        return pose_accuracies(self.calibration)
+
+    @cached_property
+    def wild(self) -> frozenset[int]:
+        """Return the rows of readings that are blunders."""
+        return frozenset(int(r) for r in wild_readings(self.calibration))
+
+    @property
+    def predicted_std(self) -> float:
+        """Return 1 sigma (3D, rms) of the predicted TCP at the poses that judge it, m."""
+        std = self.calibration.tcp_std
+        return float(np.sqrt(np.mean(std**2))) if len(std) else float("nan")
 
     @property
     def held_out(self) -> bool:
@@ -69,3 +102,11 @@ class Material:
         """Return what the coordinates of an error are called."""
         width = self.judged[0].vector.shape[1]
         return ("x", "y", "z") if width == 3 else ("distance",) if width == 1 else ()
+
+
+def _joined(first: Errors, second: Errors) -> Errors:
+    if not len(second.vector):
+        return first
+    return Errors(
+        np.concatenate([first.vector, second.vector]), np.concatenate([first.rows, second.rows])
+    )

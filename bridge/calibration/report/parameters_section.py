@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import re
-
 from bridge.calibration.report.blocks import Block, Bullets, Cell, Heading, Paragraph, Table
+from bridge.calibration.report.figures import decimals_of, estimate_words, fixed
 from bridge.calibration.report.material import Material
+from bridge.calibration.report.names import parameter_words, spoken
 from bridge.calibration.report.section import Section
-from bridge.report.words import effect_words, number, unit_of
+from bridge.report.words import unit_of
 from core.calibration.result import Estimate
 
 
@@ -15,44 +15,49 @@ class ParametersSection(Section[Material]):
     """What goes into the model, and how surely."""
 
     key, title = "parameters", "Parameters of the model"
-    about = "What was found of this arm, with 95 % intervals."
+    about = "What this arm has beyond the model that the cell had; intervals of 95 %."
 
     def blocks(self, material: Material) -> list[Block]:
         """Return the table and what the readings do not tell."""
         c = material.calibration
         shown = [e for e in c.estimates if e.shown]
         hidden = [parameter_words(e.name) for e in c.estimates if not e.shown]
-        blocks: list[Block] = [
-            Table(("parameter", "value", "95 % interval", "1 sigma", "1 sigma, planned", "unit"),
-                  [_row(e) for e in shown], (3.2, 1, 1.7, 1, 1.1, 1), (1, 2, 3, 4)),
-        ]  # fmt: skip
+        planned = any(e.expected_std is not None for e in shown)
+        blocks: list[Block] = [estimates_table(shown, planned=planned)]
         if any(e.on_bound for e in shown):
-            blocks.append(
-                Paragraph("* stands on the bound of what is physically possible.", "note")
-            )
+            text = "* stands on the bound of what is physically possible."
+            blocks.append(Paragraph(text, "note"))
         if c.combinations or hidden:
             blocks.append(Heading("What these readings cannot tell"))
-            items = list(c.combinations)
-            items += [f"{name}: not shown; it stands where it stood" for name in hidden]
+            items = [spoken(text) for text in c.combinations]
+            # the combinations speak of most of them
+            items += [
+                f"{name}: these readings do not show it; it stays near where it stood"
+                for name in hidden
+                if not any(text.startswith(name) for text in items)
+            ]
             blocks.append(Bullets(tuple(items)))
         return blocks
 
 
-def parameter_words(name: str) -> str:
-    """Return a parameter's public name in words: "joint zero is off, joint 3"."""
-    match = re.fullmatch(r"([a-z_]+?)(?:_(\d+))?(?:_([a-z]+(?:_\d+)?))?", name)
-    if match is None or effect_words(match[1]) == match[1].replace("_", " "):
-        return name
-    where = f", joint {match[2]}" if match[2] else ""
-    return f"{effect_words(match[1])}{where}{', ' + match[3] if match[3] else ''}"
+def estimates_table(shown: list[Estimate], *, planned: bool) -> Table:
+    """Return values with intervals; ``planned``: beside what the plan expected."""
+    heads: tuple[str, ...]
+    if not planned:
+        heads = ("parameter", "value", "95 % interval", "1 sigma", "unit")
+        return Table(heads, [_row(e) for e in shown], (3.2, 1, 1.8, 1, 0.9), (1, 2, 3))
+    heads = ("parameter", "value", "95 % interval", "1 sigma", "1 sigma, as planned", "unit")
+    rows = [[*_row(e)[:4], _planned(e), _row(e)[4]] for e in shown]
+    return Table(heads, rows, (3.2, 1, 1.8, 0.9, 1.1, 0.9), (1, 2, 3, 4))
 
 
 def _row(e: Estimate) -> list[Cell]:
-    unit, factor = unit_of(e.unit)
-    low, high = (v * factor for v in e.interval)
-    planned = "–" if e.expected_std is None else number(e.expected_std * factor, 2)
-    mark = " *" if e.on_bound else ""
-    return [
-        parameter_words(e.name) + mark, number(e.value * factor),
-        f"{number(low)} to {number(high)}", number(e.std * factor, 2), planned, unit,
-    ]  # fmt: skip
+    value, interval, std, unit = estimate_words(e)
+    return [parameter_words(e.name) + (" *" if e.on_bound else ""), value, interval, std, unit]
+
+
+def _planned(e: Estimate) -> str:
+    if e.expected_std is None:
+        return "–"
+    _, factor = unit_of(e.unit)
+    return fixed(e.expected_std * factor, decimals_of(e.std * factor))

@@ -16,6 +16,7 @@ from reportlab.pdfbase.ttfonts import TTFont
 from reportlab.pdfgen.canvas import Canvas
 from reportlab.platypus import (
     BaseDocTemplate,
+    CondPageBreak,
     Flowable,
     Frame,
     KeepTogether,
@@ -27,9 +28,9 @@ from reportlab.platypus import Paragraph as Text
 from bridge.calibration.report.blocks import (
     Block,
     Bullets,
+    Columns,
     Document,
     Heading,
-    Pairs,
     Paragraph,
     Part,
     Pictures,
@@ -39,10 +40,12 @@ from bridge.calibration.report.blocks import (
 )
 from bridge.calibration.report.pdf_drawing import BOLD, PLAIN, DrawnRow
 from bridge.calibration.report.pdf_style import STYLES, badge_markup
-from bridge.calibration.report.pdf_table import pairs_table, table, tiles_table
+from bridge.calibration.report.pdf_table import columns_table, table, tiles_table
 
 SIDE, TOP, BOTTOM = 18 * mm, 16 * mm, 18 * mm
 WIDTH = A4[0] - 2 * SIDE
+ROOM = 120  # pt, for a heading and the first rows of a long table
+WHOLE = 14  # rows of a table up to which it is not divided between pages
 
 
 def pdf(document: Document) -> bytes:
@@ -91,38 +94,51 @@ def _part(part: Part) -> list[Flowable]:
     head: list[Flowable] = [Text(escape(part.title), STYLES["h2"])]
     if part.about:
         head.append(Text(escape(part.about), STYLES["note"]))
-    blocks = [_block(block) for block in part.blocks]
-    if not blocks:
-        return head
-    return [KeepTogether([*head, *blocks[0]]), *[f for block in blocks[1:] for f in block]]
+    kept: list[list[Flowable]] = [head]
+    for block in part.blocks:
+        groups = _block(block)
+        if isinstance(block, Table) and len(block.rows) > WHOLE:
+            # its head begins where some of its rows have room, and the rest goes on
+            loose = kept.pop() if kept[-1] is head or _is_heading(kept[-1][-1]) else []
+            kept += [[CondPageBreak(ROOM)], *[[f] for f in loose], *groups]
+            continue
+        if kept[-1] is head or (_is_heading(kept[-1][-1])):
+            kept[-1] = [*kept[-1], *groups.pop(0)]
+        kept += groups
+    return [KeepTogether(group) if len(group) > 1 else group[0] for group in kept]
 
 
-def _block(block: Block) -> list[Flowable]:
+def _is_heading(flowable: Flowable) -> bool:
+    return isinstance(flowable, Text) and flowable.style is STYLES["h3"]
+
+
+def _block(block: Block) -> list[list[Flowable]]:
+    """Return what a block is made of, in groups that no page's end divides."""
     if isinstance(block, Paragraph):
-        return [Text(escape(block.text), STYLES[block.kind or "text"])]
+        return [[Text(escape(block.text), STYLES[block.kind or "text"])]]
     if isinstance(block, Heading):
-        return [Text(escape(block.text), STYLES["h3"])]
+        return [[Text(escape(block.text), STYLES["h3"])]]
     if isinstance(block, Bullets):
-        return [Text(escape(item), STYLES["bullet"], bulletText="•") for item in block.items]
+        return [[Text(escape(i), STYLES["bullet"], bulletText="•")] for i in block.items]
     if isinstance(block, Verdict):
-        return [
-            Text(badge_markup(block.badge), STYLES["verdict"]),
-            Text(escape(block.text), STYLES["lead"]),
-        ]
+        word = Text(badge_markup(block.badge), STYLES["verdict"])
+        return [[word, Text(escape(block.text), STYLES["lead"])]]
     if isinstance(block, Tiles):
-        return [tiles_table(block, WIDTH), Spacer(1, 8)]
-    if isinstance(block, Pairs):
-        return [pairs_table(block, WIDTH), Spacer(1, 6)]
+        return [[tiles_table(block, WIDTH), Spacer(1, 8)]]
+    if isinstance(block, Columns):
+        return [[columns_table(block, WIDTH), Spacer(1, 6)]]
     if isinstance(block, Table):
-        return [table(block, WIDTH), Spacer(1, 8)]
+        long = len(block.rows) > WHOLE
+        grid, space = table(block, WIDTH), Spacer(1, 8)
+        return [[grid], [space]] if long else [[grid, space]]
     return _pictures(block)
 
 
-def _pictures(block: Pictures) -> list[Flowable]:
-    """Return the drawings, two in a row, together with their caption."""
-    rows: list[Flowable] = [
-        DrawnRow(block.drawings[i : i + 2]) for i in range(0, len(block.drawings), 2)
+def _pictures(block: Pictures) -> list[list[Flowable]]:
+    """Return the drawings, two in a row; the caption stays with the last row."""
+    rows: list[list[Flowable]] = [
+        [DrawnRow(block.drawings[i : i + 2])] for i in range(0, len(block.drawings), 2)
     ]
     if block.caption:
-        rows.append(Text(escape(block.caption), STYLES["note"]))
-    return [KeepTogether(rows)]
+        rows[-1].append(Text(escape(block.caption), STYLES["note"]))
+    return rows

@@ -35,6 +35,7 @@ STYLES = {
     "bullet": _style("bullet", leftIndent=10, bulletIndent=1, spaceAfter=3),
     "cell": _style("cell", fontSize=8, leading=10, spaceAfter=0),
     "number": _style("number", fontSize=8, leading=10, spaceAfter=0, alignment=2),
+    "name": _style("name", fontSize=8, leading=10, spaceAfter=0, textColor=SOFT),
     "head": _style("head", fontName=BOLD, fontSize=7.5, leading=9.5, spaceAfter=0, textColor=SOFT),
     "head_number": _style("head_number", fontName=BOLD, fontSize=7.5, leading=9.5, spaceAfter=0,
                           textColor=SOFT, alignment=2),

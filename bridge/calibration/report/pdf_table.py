@@ -10,7 +10,7 @@ from reportlab.lib.colors import HexColor
 from reportlab.platypus import Flowable, Paragraph, TableStyle
 from reportlab.platypus import Table as Grid
 
-from bridge.calibration.report.blocks import Badge, Bar, Cell, Pairs, Strong, Table, Tiles
+from bridge.calibration.report.blocks import Badge, Bar, Cell, Columns, Pairs, Strong, Table, Tiles
 from bridge.calibration.report.pdf_style import STYLES, badge_markup
 
 LINE, RULE = HexColor("#e3e8ec"), HexColor("#9aa5b1")
@@ -68,17 +68,31 @@ def tiles_table(block: Tiles, width: float) -> Flowable:
     return Grid(cells, [width / columns] * columns, style=TableStyle(style))
 
 
-def pairs_table(block: Pairs, width: float) -> Flowable:
-    """Return names and what belongs to them."""
+def columns_table(block: Columns, width: float) -> Flowable:
+    """Return pairs side by side."""
+    each = width / len(block.columns)
+    cells = [
+        [Paragraph(escape(p.title), STYLES["h3"]), _pairs(p, each - 14)] if p.title else
+        [_pairs(p, each - 14)]
+        for p in block.columns
+    ]  # fmt: skip
+    style: list[Command] = [
+        ("VALIGN", (0, 0), (-1, -1), "TOP"), ("LEFTPADDING", (0, 0), (-1, -1), 0),
+        ("TOPPADDING", (0, 0), (-1, -1), 0), ("BOTTOMPADDING", (0, 0), (-1, -1), 2),
+    ]  # fmt: skip
+    return Grid([cells], [each] * len(cells), style=TableStyle(style))
+
+
+def _pairs(block: Pairs, width: float) -> Flowable:
     rows = [
-        [Paragraph(escape(k), STYLES["head"]), Paragraph(escape(v), STYLES["cell"])]
+        [Paragraph(escape(k), STYLES["name"]), Paragraph(escape(v), STYLES["cell"])]
         for k, v in block.pairs
     ]
     style = [
         ("VALIGN", (0, 0), (-1, -1), "TOP"), ("LEFTPADDING", (0, 0), (-1, -1), 0),
         ("TOPPADDING", (0, 0), (-1, -1), 1.5), ("BOTTOMPADDING", (0, 0), (-1, -1), 1.5),
     ]  # fmt: skip
-    return Grid(rows, [width * 0.24, width * 0.76], style=TableStyle(style))
+    return Grid(rows, [width * 0.34, width * 0.66], style=TableStyle(style))
 
 
 def _cell(cell: Cell, number: bool, strong: bool) -> Flowable:

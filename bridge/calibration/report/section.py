@@ -16,6 +16,7 @@ class Section(ABC, Generic[M]):
     key: ClassVar[str]
     title: ClassVar[str]
     about: ClassVar[str] = ""
+    folded: ClassVar[bool] = False  # True: the page shows it only when asked to
 
     @abstractmethod
     def blocks(self, material: M) -> list[Block]:
@@ -24,4 +25,4 @@ class Section(ABC, Generic[M]):
     def part(self, material: M) -> Part | None:
         """Return the section as a part of a document; None where there is nothing to tell."""
         blocks = tuple(self.blocks(material))
-        return Part(self.key, self.title, self.about, blocks) if blocks else None
+        return Part(self.key, self.title, self.about, blocks, self.folded) if blocks else None

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from bridge.calibration.report.blocks import Block, Bullets, Heading, Pairs
+from collections.abc import Sequence
+
+from bridge.calibration.report.blocks import Block, Bullets, Columns, Heading, Pairs
 from bridge.calibration.report.facts import SessionFacts
+from bridge.calibration.report.figures import load_words, mm, plain
 from bridge.calibration.report.material import Material
+from bridge.calibration.report.names import spoken
 from bridge.calibration.report.section import Section
-from bridge.report.words import number, told
 
 KINDS = {
     "position": "position of a target on the tool, three coordinates",
@@ -14,6 +17,9 @@ KINDS = {
     "distance": "distance from a fixed point to a target on the tool",
     "sphere": "the tool brought onto a fixed sphere, joint angles alone",
     "relative": "one target on the tool against another",
+    "point": "the tool's tip brought onto one fixed point, joint angles alone",
+    "touch": "the tool's tip brought onto one fixed place, joint angles alone",
+    "wrench": "forces and torques at the flange",
 }
 
 
@@ -30,15 +36,22 @@ class SessionSection(Section[Material]):
             ("readings", _readings_words(material)),
             ("loads", _loads_words(material)),
         ]
-        blocks: list[Block] = [
-            Pairs(tuple(_front(facts) + counts)),
-            Heading("Instrument"),
-            Pairs(tuple(_instrument(facts, len(c.stations)))),
-        ]
-        remarks = [*facts.remarks, *c.notes, *(material.plan.notes if material.plan else ())]
-        if remarks:
-            blocks += [Heading("Remarks"), Bullets(tuple(remarks))]
-        return blocks
+        notes = (*c.notes, *(material.plan.notes if material.plan else ()))
+        return facts_blocks(facts, counts, len(c.stations), notes)
+
+
+def facts_blocks(
+    facts: SessionFacts, counts: list[tuple[str, str]], places: int = 1, notes: Sequence[str] = ()
+) -> list[Block]:
+    """Return a session's facts beside its instrument's, and all remarks."""
+    blocks: list[Block] = [
+        Columns((
+            Pairs(tuple(_front(facts) + counts), "Session"),
+            Pairs(tuple(_instrument(facts, places)), "Instrument"),
+        ))
+    ]  # fmt: skip
+    remarks = tuple(spoken(text) for text in (*facts.remarks, *notes))
+    return [*blocks, Heading("Remarks"), Bullets(remarks)] if remarks else blocks
 
 
 def _front(facts: SessionFacts) -> list[tuple[str, str]]:
@@ -48,7 +61,7 @@ def _front(facts: SessionFacts) -> list[tuple[str, str]]:
     temperature = ""
     if facts.temperature:
         low, high = facts.temperature
-        temperature = f"{number(low)} °C at the start, {number(high)} °C at the end"
+        temperature = f"{plain(low)} °C at the start, {plain(high)} °C at the end"
     given = [
         ("customer", facts.customer), ("cell", facts.cell), ("arm", facts.arm),
         ("serial number", facts.serial), ("place", facts.place),
@@ -61,18 +74,20 @@ def _front(facts: SessionFacts) -> list[tuple[str, str]]:
 
 def _instrument(facts: SessionFacts, stations: int) -> list[tuple[str, str]]:
     tool = facts.instrument
-    error = ""
+    noise = error = ""
+    if tool.kind not in ("wrench", "touch"):
+        noise = f"{mm(tool.sigma)} (1 sigma of one coordinate)"
     if tool.error is not None:
-        error = f"± {told(tool.error, 'm')}"
+        error = f"± {mm(tool.error)}"
         if tool.error_per_metre:
-            error += f" and {told(tool.error_per_metre, 'm')} per metre of distance"
+            error += f" and {mm(tool.error_per_metre)} per metre of distance"
     given = [
         ("instrument", tool.name), ("serial number", tool.serial),
         ("its own calibration", tool.certificate),
         ("measures", KINDS.get(tool.kind, tool.kind)),
-        ("noise, declared", f"{told(tool.sigma, 'm')} (1 sigma of one coordinate)"),
+        ("noise, declared", noise),
         ("largest permissible error", error),
-        ("distance", f"{number(tool.distance)} m" if tool.distance else ""),
+        ("distance", f"{plain(tool.distance)} m" if tool.distance else ""),
         ("places", f"{stations}" if stations > 1 else ""),
     ]  # fmt: skip
     return [(name, text) for name, text in given if text]
@@ -99,5 +114,4 @@ def _loads_words(material: Material) -> str:
     plan = material.plan
     if plan is None:
         return str(len(set(material.calibration.readings.load.tolist())))
-    told_loads = [f"{p.name + ': ' if p.name else ''}{number(p.mass)} kg" for p in plan.loads]
-    return "; ".join(told_loads)
+    return "; ".join(load_words(p.mass, p.name) for p in plan.loads)

@@ -13,9 +13,11 @@ from bridge.calibration.report.blocks import (
     Tiles,
     Verdict,
 )
+from bridge.calibration.report.figures import mm
 from bridge.calibration.report.material import Material
+from bridge.calibration.report.names import sentence
 from bridge.calibration.report.section import Section
-from bridge.report.words import told
+from bridge.report.words import listed
 
 
 class Summary(Section[Material]):
@@ -31,17 +33,24 @@ class Summary(Section[Material]):
         if not after.mean < before.mean:
             badge = Badge("No improvement", BAD)
         tiles = [
-            Tile("mean error before", told(before.mean, "m"), f"at most {told(before.max, 'm')}"),
-            Tile("mean error after", told(after.mean, "m"), f"at most {told(after.max, 'm')}"),
+            Tile("mean error before", mm(before.mean), f"at most {mm(before.max)}"),
+            Tile("mean error after", mm(after.mean), f"at most {mm(after.max)}"),
             Tile("smaller by", _times(before.mean, after.mean), f"over {len(after.norm)} readings"),
-            Tile("expanded uncertainty (k = 2)", f"± {told(material.budget.expanded, 'm')}",
+            Tile("expanded uncertainty (k = 2)", f"± {mm(material.budget.expanded)}",
                  "of one coordinate of the tool"),
         ]  # fmt: skip
         text = (
             f"Errors are those of {material.judged_words}: the distance between where the tool "
             "was measured and where the model said it would be."
         )
-        return [Verdict(badge, c.verdict), Tiles(tuple(tiles)), Paragraph(text, "note")]
+        wild = [r for r in material.judged[1].rows if r in material.wild]
+        if wild and material.held_out:
+            rows = listed([str(int(r) + 1) for r in wild])
+            text += (
+                f" Among them {'is reading' if len(wild) == 1 else 'are readings'} {rows}, far "
+                "beyond all others: to be measured again. The uncertainty does not count it."
+            )
+        return [Verdict(badge, sentence(c.verdict)), Tiles(tuple(tiles)), Paragraph(text, "note")]
 
 
 def _times(before: float, after: float) -> str:

@@ -16,7 +16,7 @@ from core.model import Model, Poses
 from core.rotation import skew
 
 Array = NDArray[np.float64]
-NEWTON_ROUNDS = 40
+NEWTON_ROUNDS = 25
 CLOSED = 1e-10  # m
 MISSED = 1e-6  # m: farther off than this, no pose was found
 LONGEST = 0.3  # rad, of one joint in a step
@@ -48,19 +48,30 @@ class Closure(Observable):
 
         Newton with the smallest step in joint space; ``readings`` give load, place and target.
         """
-        q = q.copy()
+        q, open_rows = q.copy(), np.arange(len(q))
         for _ in range(NEWTON_ROUNDS):
-            poses = model.predict(q, readings.loads)
-            gap = self.gap(poses, readings, nuisance)
-            if np.abs(gap).max(initial=0.0) < CLOSED:
+            part, at = readings[open_rows], q[open_rows]
+            poses = model.predict(at, part.loads)
+            gap = self.gap(poses, part, nuisance)
+            left = np.abs(gap).max(axis=1) > CLOSED
+            if not left.any():
                 return q
-            whole = model.linear_form(q, readings.loads).jacobian
-            lever = np.einsum("nij,nj->ni", poses.rotation, nuisance.targets[readings.target])
-            moving = whole[:, :3] - skew(lever) @ whole[:, 3:]
-            J = self.directions(self.apart(poses, readings, nuisance)) @ moving
-            step = np.einsum("njk,nk->nj", np.linalg.pinv(J, rcond=1e-6), gap)
-            size = np.abs(step).max(axis=1, keepdims=True)
-            q += step * np.minimum(1.0, LONGEST / np.maximum(size, 1e-12))
+            step = self._step(model, poses, at, part, nuisance)
+            q[open_rows[left]] += step[left]
+            open_rows = open_rows[left]
         gap = self.gap(model.predict(q, readings.loads), readings, nuisance)
         q[np.abs(gap).max(axis=1) > MISSED] = np.nan
         return q
+
+    def _step(
+        self, model: Model, poses: Poses, q: Array, readings: Readings, nuisance: Nuisance
+    ) -> Array:
+        """Return the smallest steps (N, n) that close the gap to first order, cut to size."""
+        whole = model.linear_form(q, readings.loads).jacobian
+        lever = np.einsum("nij,nj->ni", poses.rotation, nuisance.targets[readings.target])
+        moving = whole[:, :3] - skew(lever) @ whole[:, 3:]
+        J = self.directions(self.apart(poses, readings, nuisance)) @ moving
+        gap = self.gap(poses, readings, nuisance)
+        step = np.einsum("njk,nk->nj", np.linalg.pinv(J, rcond=1e-6), gap)
+        size = np.abs(step).max(axis=1, keepdims=True)
+        return np.asarray(step * np.minimum(1.0, LONGEST / np.maximum(size, 1e-12)))

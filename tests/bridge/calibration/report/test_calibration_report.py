@@ -7,8 +7,8 @@ import pytest
 from calibration_report_cases import calibration, plan, session
 
 from bridge.calibration.report import write_report
+from bridge.calibration.report.figures import mm
 from bridge.calibration.report.sections import CALIBRATION
-from bridge.report.words import told
 
 
 @pytest.fixture(scope="module")
@@ -36,8 +36,8 @@ def test_the_figures_of_the_calibration_stand_in_both(written):
     html, words = page.read_text("utf-8"), text_of(paper)
     for errors in (calibration().held_out_before, calibration().held_out_after):
         for figure in (errors.mean, errors.max, errors.rms):
-            assert told(figure, "m") in html
-            assert told(figure, "m") in words
+            assert mm(figure) in html
+            assert mm(figure) in words
 
 
 def test_names_are_written_as_they_are_and_nothing_of_them_is_markup(written):

@@ -1,0 +1,1 @@
+"""Fleets: how they grow, and what the hierarchical fit is worth."""

@@ -1,0 +1,39 @@
+"""How far a session has come, and how long it will still take."""
+
+from __future__ import annotations
+
+from statistics import median
+
+from bridge.calibration.book import Book
+from bridge.calibration.words import duration
+from bridge.demo.terminal import bar
+
+FIRST = 60.0  # s a stop, before anyone knows
+PAUSE = 600.0  # s: a longer time between two readings was a pause
+WIDTH = 16
+
+
+def seconds_left(book: Book, minutes_per_load: float) -> float:
+    """Return s until the last stop, by the pace so far."""
+    paces = [s for s in book.seconds if s < PAUSE][-20:]
+    done = {t.stop for t in book.taken} | book.skipped
+    loads = {p.load for i, p in enumerate(book.stops) if i not in done}
+    changes = len(loads - {book.mounted})
+    return book.left * (median(paces) if paces else FIRST) + changes * 60.0 * minutes_per_load
+
+
+def header(book: Book, stop: int, minutes_per_load: float) -> str:
+    """Return the line above a stop."""
+    count, done = len(book.stops), len(book.stops) - book.left
+    pose = book.stops[stop]
+    drawn = bar(done / count, WIDTH) if done else ""
+    more = []
+    if pose.repeat:
+        first = next(i for i, p in enumerate(book.stops) if p.number == pose.number)
+        more.append(f"stop {first + 1} once more")
+    if pose.held_out:
+        more.append("to verify, not fitted")
+    return " · ".join(
+        [f"{drawn:<{WIDTH}} stop {stop + 1} of {count}", f"load {pose.load + 1}", *more,
+         f"{duration(seconds_left(book, minutes_per_load))} left"]
+    )  # fmt: skip

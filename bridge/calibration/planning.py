@@ -1,0 +1,125 @@
+"""From a cell to the plan of its session."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from bridge.calibration.instruments.settings import Base
+from bridge.calibration.order import Order
+from bridge.calibration.settings import BoxEntry, CalibrationSettings, JointRange
+from bridge.cell import Cell
+from core.calibration.capsules import Box
+from core.calibration.design import plan
+from core.calibration.observables import Observable, make_observable
+from core.calibration.parameters import DEFAULT, Parameters
+from core.calibration.plan import Payload, Plan
+from core.calibration.space import Place, Space
+from core.errors import CellError
+from core.metrology import Metrology
+
+REPEATABILITY = 5e-5  # m, 1 sigma of one coordinate, where the cell does not tell it
+NEEDS_PLACE = ("distance", "sphere")  # kinds that are planned around a fixed point
+
+
+def effects_of(cell: Cell) -> tuple[str, ...]:
+    """Return what is to be found."""
+    return tuple(cell.calibration.effects or DEFAULT)
+
+
+def observable_of(cell: Cell, instrument: Base, places: int = 1) -> Observable:
+    """Return how the instrument's readings depend on arm and instrument.
+
+    An instrument that was moved on the way, so that it had several ``places``, is registered at
+    none of them.
+    """
+    return make_observable(
+        instrument.measures, registered=cell.metrology.registered and places == 1
+    )
+
+
+def parameters_of(cell: Cell, observable: Observable) -> Parameters:
+    """Return what is to be found, without what such readings cannot show. Raises CellError."""
+    return Parameters.of(cell.model, effects_of(cell), observable=observable)
+
+
+def metrology_of(cell: Cell, instrument: Base, places: int = 1) -> Metrology:
+    """Return the instrument as the fit takes it."""
+    own = cell.metrology
+    sigma = instrument.sigma or own.sigma
+    return Metrology(own.registered and places == 1, sigma, own.repeatability)
+
+
+def loads_of(cell: Cell) -> tuple[Payload, ...]:
+    """Return the loads that people hang on; the cell's own payload where it names none."""
+    entries = cell.calibration.loads
+    if not entries:
+        own = cell.file.payload
+        return (Payload(own.mass, _three(own.cog), "as in the cell"),)
+    return tuple(Payload(e.mass, _three(e.cog), e.name) for e in entries)
+
+
+def planned(cell: Cell, order: Order, tell: Callable[[str, float], None]) -> Plan:
+    """Return the plan of a whole session. Raises InputError where there can be none."""
+    given, instrument = cell.calibration, order.instrument
+    observable = observable_of(cell, instrument)
+    return plan(
+        parameters_of(cell, observable),
+        observable,
+        loads_of(cell),
+        space_of(cell, instrument.measures),
+        poses=order.poses or given.poses,
+        held_out=given.held_out,
+        repeats=given.repeats,
+        seed=order.seed,
+        sigma=float(np.hypot(instrument.sigma or cell.metrology.sigma,
+                             cell.metrology.repeatability or REPEATABILITY)),
+        progress=tell,
+    )  # fmt: skip
+
+
+def space_of(cell: Cell, kind: str) -> Space:
+    """Return where the arm may be measured. Raises CellError."""
+    given = cell.calibration
+    if kind in NEEDS_PLACE and given.instrument_at is None:
+        raise CellError(
+            f"{cell.path}: calibration.instrument_at: found nothing, expected where the "
+            f"{'sphere' if kind == 'sphere' else 'fixed point'} is, m, in base, about"
+        )
+    places = [] if given.instrument_at is None else [Place(_three(given.instrument_at))]
+    lower, upper = _range(cell, given.joint_range)
+    return Space.of(
+        cell.model, lower=lower, upper=upper, floor=given.floor, places=places,
+        keep_out=[Box(_three(b.lower), _three(b.upper)) for b in _boxes(cell, given)],
+    )  # fmt: skip
+
+
+def _boxes(cell: Cell, given: CalibrationSettings) -> list[BoxEntry]:
+    for i, box in enumerate(given.keep_out):
+        if any(a >= b for a, b in zip(box.lower, box.upper, strict=True)):
+            raise CellError(
+                f"{cell.path}: calibration.keep_out entry {i + 1}: found lower {box.lower} and "
+                f"upper {box.upper}, expected lower below upper"
+            )
+    return list(given.keep_out)
+
+
+def _range(
+    cell: Cell, given: JointRange | None
+) -> tuple[list[float] | None, list[float] | None]:  # fmt: skip
+    if given is None:
+        return None, None
+    n = cell.arm.n
+    for name, values in (("lower", given.lower), ("upper", given.upper)):
+        if len(values) != n:
+            raise CellError(
+                f"{cell.path}: calibration.joint_range.{name}: found {len(values)} values, "
+                f"expected {n}"
+            )
+    return given.lower, given.upper
+
+
+def _three(values: list[float]) -> tuple[float, float, float]:
+    x, y, z = values
+    return x, y, z

@@ -1,0 +1,73 @@
+"""Figures as a certificate tells them: lengths in mm, angles in mrad, no more digits than known."""
+
+from __future__ import annotations
+
+import math
+
+from bridge.report.words import unit_of
+from core.calibration.result import Estimate
+
+
+def mm(length: float) -> str:
+    """Return a length (m) in mm, to the micrometre; finer below ten of them."""
+    if not math.isfinite(length):
+        return "unknown"
+    size = abs(length) * 1e3
+    decimals = 4 if 0 < size < 0.00995 else 3 if size < 10 else 2
+    return f"{fixed(length * 1e3, decimals)} mm"
+
+
+def fine(length: float) -> str:
+    """Return a length (m) in mm to a tenth of a micrometre, for what is added up."""
+    return f"{fixed(length * 1e3, 4)} mm" if math.isfinite(length) else "unknown"
+
+
+def load_words(mass: float, name: str = "") -> str:
+    """Return "8 kg" or "1 kg (gripper)"; a name that only says the mass is left out."""
+    weight = f"{plain(mass)} kg"
+    return f"{weight} ({name})" if name and name != weight else weight
+
+
+def mrad(angle: float) -> str:
+    """Return an angle (rad) in mrad."""
+    return f"{fixed(angle * 1e3, 3)} mrad" if math.isfinite(angle) else "unknown"
+
+
+def fixed(value: float, decimals: int) -> str:
+    """Return a number with so many decimals, with a true minus sign, never minus nothing."""
+    if not math.isfinite(value):
+        return "unknown"
+    text = f"{value:.{decimals}f}"
+    if not text.strip("-0."):
+        text = text.lstrip("-")
+    return text.replace("-", "−")
+
+
+def plain(value: float) -> str:
+    """Return a number as people say it: no zeros behind."""
+    return f"{value:.4g}".replace("-", "−")
+
+
+def decimals_of(spread: float) -> int:
+    """Return the decimals that show two digits of a spread."""
+    if not math.isfinite(spread) or spread <= 0:
+        return 3
+    return min(max(1 - math.floor(math.log10(spread)), 0), 9)
+
+
+def estimate_words(e: Estimate) -> tuple[str, str, str, str]:
+    """Return value, interval, 1 sigma and unit of an estimate, all to the digits of its sigma."""
+    unit, factor = unit_of(e.unit)
+    digits = decimals_of(e.std * factor)
+    low, high = (fixed(v * factor, digits) for v in e.interval)
+    return fixed(e.value * factor, digits), f"{low} to {high}", fixed(e.std * factor, digits), unit
+
+
+def degrees(q: object) -> str:
+    """Return joint angles (rad) in degrees, with one decimal."""
+    return ", ".join(fixed(math.degrees(float(v)), 1) for v in q)  # type: ignore[attr-defined]
+
+
+def counted(count: int, one: str, many: str = "") -> str:
+    """Return "1 pose" or "3 poses"."""
+    return f"{count} {one if count == 1 else many or one + 's'}"

@@ -1,0 +1,78 @@
+"""Before and after over the load."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.calibration.report.axes import Chart, logarithmic, named
+from bridge.calibration.report.blocks import Block, Pictures, Table
+from bridge.calibration.report.drawing import AFTER, BEFORE, Drawing
+from bridge.calibration.report.figures import load_words, mm, plain
+from bridge.calibration.report.material import Material
+from bridge.calibration.report.section import Section
+
+Index = NDArray[np.int64]
+
+
+class LoadsSection(Section[Material]):
+    """How the errors go with the load."""
+
+    key, title = "loads", "Over the load"
+    about = "Errors by what hung on the flange; wild readings are left out."
+
+    def blocks(self, material: Material) -> list[Block]:
+        """Return a picture and a table, one column and one row a load."""
+        before, _ = material.calm
+        load = material.calibration.readings.load[before.rows]
+        numbers = [int(k) for k in np.unique(load)]
+        return [
+            Pictures((_picture(material, load, numbers),),
+                     "One dot a reading, a line at the mean; powers of ten upwards."),
+            _table(material, load, numbers),
+        ]  # fmt: skip
+
+
+def _picture(material: Material, load: Index, numbers: list[int]) -> Drawing:
+    before, after = material.calm
+    labels = [f"{plain(_mass(material, k))} kg" for k in numbers]
+    chart = Chart(
+        "Error by load", named("load on the flange", labels),
+        logarithmic("error, mm", [*before.norm * 1e3, *after.norm * 1e3]), width=420,
+    )  # fmt: skip
+    for shift, errors, colour in ((-0.17, before, BEFORE), (0.17, after, AFTER)):
+        for place, k in enumerate(numbers):
+            norm = errors.norm[load == k] * 1e3
+            # spread sideways in a fixed pattern, so that dots do not hide each other
+            x = place + shift + 0.1 * (np.arange(len(norm)) * 0.618 % 1 - 0.5)
+            chart.points(list(x), list(norm), colour, radius=2.4, opacity=0.6)
+            mean = float(norm.mean())
+            chart.line(
+                [place + shift - 0.13, place + shift + 0.13], [mean, mean], colour, width=2.4
+            )
+    chart.legend((("before", BEFORE), ("after", AFTER)))
+    return chart.drawing
+
+
+def _mass(material: Material, number: int) -> float:
+    """Return the declared mass of a load, kg."""
+    calibration = material.calibration
+    given = calibration.readings.loads.payload_mass
+    if given is None:
+        return float(calibration.model.payload_mass)
+    return float(np.median(given[calibration.readings.load == number]))
+
+
+def _table(material: Material, load: Index, numbers: list[int]) -> Table:
+    before, after = material.calm
+    plan, rows = material.plan, []
+    for k in numbers:
+        old, new = before.norm[load == k], after.norm[load == k]
+        name = plan.loads[k].name if plan and k < len(plan.loads) else ""
+        rows.append([
+            load_words(_mass(material, k), name), str(len(old)),
+            mm(float(old.mean())), mm(float(old.max())), mm(float(new.mean())),
+            mm(float(new.max())),
+        ])  # fmt: skip
+    heads = ("load", "readings", "mean before", "maximum before", "mean after", "maximum after")
+    return Table(heads, rows, (2, 0.9, 1, 1.2, 1, 1.2), (1, 2, 3, 4, 5))

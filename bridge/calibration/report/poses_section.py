@@ -1,0 +1,82 @@
+"""The poses: what was planned, what was measured, and what more poses would buy."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bridge.calibration.report.axes import Chart, scale
+from bridge.calibration.report.blocks import Block, Paragraph, Pictures
+from bridge.calibration.report.drawing import AFTER, EDGE, INK, LIMIT, Circle, Drawing
+from bridge.calibration.report.figures import mm
+from bridge.calibration.report.material import Material
+from bridge.calibration.report.section import Section
+from bridge.report.arm_view import joint_origins
+from core.calibration.plan import Plan
+
+VIEWS = (("The poses, from above", 0, 1), ("The poses, from the side", 0, 2))
+AXES = ("x, m", "y, m", "z, m")
+
+
+class PosesSection(Section[Material]):
+    """Where the arm stood, and what that was expected to tell."""
+
+    key, title = "poses", "Poses"
+    about = "Chosen so that they tell the parameters best; those kept out of the fit judge it."
+
+    def blocks(self, material: Material) -> list[Block]:
+        """Return the arm in its poses, and the plan's expectation beside what was reached."""
+        drawings = [_view(material, *view) for view in VIEWS]
+        caption = "The arm in the poses of the fit (grey) and those kept out of it (green)."
+        blocks: list[Block] = [Pictures(tuple(drawings), caption)]
+        if material.plan is not None:
+            blocks += _planned(material, material.plan)
+        return blocks
+
+
+def _view(material: Material, title: str, i: int, j: int) -> Drawing:
+    readings = material.calibration.readings
+    _, first = np.unique(readings.pose, return_index=True)
+    shapes = [joint_origins(material.calibration.model, readings.q[k]) for k in first]
+    points = np.concatenate(shapes)
+    x, y = (scale(AXES[k], [*points[:, k]], tight=True) for k in (i, j))
+    chart = Chart(title, x, y, height=300, equal=True)
+    held = readings.held_out[first]
+    for shape, out in sorted(zip(shapes, held, strict=True), key=lambda pair: bool(pair[1])):
+        colour = LIMIT if out else EDGE
+        chart.line([*shape[:, i]], [*shape[:, j]], colour, width=0.8)
+        chart.drawing.add(Circle(*chart.at(shape[-1, i], shape[-1, j]), 2.4, colour))
+    chart.square(0.0, 0.0, INK)
+    return chart.drawing
+
+
+def _planned(material: Material, plan: Plan) -> list[Block]:
+    reached = material.predicted_std
+    minutes = plan.travel / 60
+    text = (
+        f"Before anyone moved, the plan expected the tool's place to be known to "
+        f"{mm(plan.expected.tcp_std)} (1 sigma, rms over the workspace; at worst "
+        f"{mm(plan.expected.tcp_std_worst)}); reached are {mm(reached)} at the poses that judge "
+        f"it. Travel between the poses takes about {minutes:.0f} min."
+    )
+    blocks: list[Block] = [Paragraph(text)]
+    if len(plan.bought) > 1:
+        blocks.append(Pictures((_bought(plan),), (
+            "What so many poses in the fit buy, as the plan expects it; the line is what was "
+            "planned."
+        )))  # fmt: skip
+    return blocks
+
+
+def _bought(plan: Plan) -> Drawing:
+    count = [float(k) for k, _ in plan.bought]
+    std = [v * 1e3 for _, v in plan.bought]
+    planned = len({p.number for p in plan.poses if not p.held_out})
+    known = [v for v in std if np.isfinite(v)]
+    most = min(max(known), 8 * min(known)) if known else 1.0
+    y = scale("1 sigma of the tool, mm", [most])
+    chart = Chart("What poses buy", scale("poses in the fit", [*count, planned]), y, width=420)
+    kept = [(a, b) for a, b in zip(count, std, strict=True) if b <= y.high]
+    chart.line([a for a, _ in kept], [b for _, b in kept], AFTER)
+    chart.points([a for a, _ in kept], [b for _, b in kept], AFTER, radius=3)
+    chart.line([planned, planned], [0.0, y.high], LIMIT, width=1.2, dashed=True)
+    return chart.drawing

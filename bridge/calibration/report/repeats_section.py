@@ -1,0 +1,85 @@
+"""Pose accuracy and repeatability in the terms of ISO 9283."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bridge.calibration.report.blocks import Block, Paragraph, Table
+from bridge.calibration.report.figures import counted, fixed, mm, mrad, plain
+from bridge.calibration.report.material import Material
+from bridge.calibration.report.section import Section
+from core.calibration.pose_accuracy import PoseAccuracy
+
+ASKED = 30  # visits that the standard asks for
+
+
+class RepeatsSection(Section[Material]):
+    """AP and RP of the poses that were visited more than once."""
+
+    key, title = "repeats", "Pose accuracy and repeatability"
+    about = "In the terms of ISO 9283: AP and RP of every pose that was visited more than once."
+
+    def blocks(self, material: Material) -> list[Block]:
+        """Return the table, and how far these visits are what the standard asks for."""
+        found = material.accuracies
+        if not found:
+            return [Paragraph(_none(material))]
+        worst = max(found, key=lambda p: p.repeatability)
+        before, after = (max(p.accuracy[k] for p in found) for k in (0, 1))
+        lead = (
+            f"The largest pose accuracy AP is {mm(before)} before and {mm(after)} after the "
+            f"calibration; the largest pose repeatability RP is {mm(worst.repeatability)} "
+            f"(pose {worst.pose + 1})."
+        )
+        return [Paragraph(lead), _table(found), Paragraph(_note(found), "note")]
+
+
+def _none(material: Material) -> str:
+    if material.calibration.readings.kind not in ("position", "pose"):
+        return (
+            "AP and RP speak of the tool's position; this instrument does not show it on its own, "
+            "so they are not stated."
+        )
+    return "No pose was visited twice from the same side, so that AP and RP are not stated."
+
+
+def _table(found: tuple[PoseAccuracy, ...]) -> Table:
+    turning = any(p.angles is not None for p in found)
+    rows = []
+    for p in found:
+        before, after = p.accuracy
+        row = [f"pose {p.pose + 1}", str(p.load + 1), str(p.visits), mm(before), mm(after)]
+        row += [_axes(p), mm(p.repeatability)]
+        if turning:
+            row.append("–" if p.angles is None else mrad(float(np.max(p.angles))))
+        rows.append(row)
+    heads = ["pose", "load", "visits", "AP before", "AP after", "AP after along x, y, z (mm)",
+             "RP"]  # fmt: skip
+    widths = [0.6, 0.6, 0.7, 1.1, 1.1, 2.2, 1.0]
+    if turning:
+        heads.append("RP of angles, largest")
+        widths.append(1.2)
+    return Table(tuple(heads), rows, tuple(widths), tuple(range(1, len(heads))))
+
+
+def _axes(p: PoseAccuracy) -> str:
+    return ",  ".join(fixed(float(v) * 1e3, 3) for v in p.after)
+
+
+def _note(found: tuple[PoseAccuracy, ...]) -> str:
+    visits = min(p.visits for p in found)
+    unsure = 100 / np.sqrt(2 * (visits - 1))
+    text = (
+        "AP is the distance of the mean of all visits from the commanded place; commanded is what "
+        "the model says (before: the model as the cell had it; after: the calibrated one). RP is "
+        "the mean distance of the visits from their own mean, plus three of its standard "
+        f"deviations. The standard asks for {ASKED} visits of five poses at rated load and speed; "
+        f"here {counted(len(found), 'pose was', 'poses were')} visited {visits} times or more, so "
+        f"that a standard deviation is itself known to about {plain(round(unsure))} %. RP includes "
+        "the instrument's noise."
+    )
+    if any(p.steered for p in found):
+        text += (
+            " Where the arm was brought back by hand, what the encoders showed of it was taken out."
+        )
+    return text

@@ -1,0 +1,27 @@
+"""The work on one session: what it tells of the arm's compliance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from bridge.cell import Cell
+from bridge.fleet.diagnosing import facts
+from core.compliance_fit import flexibilities
+from core.hierarchy_evidence import evidence, usual_flexibility
+from core.log import Log
+
+
+def work(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the session's equations for the flexibilities, and what the cell says of them."""
+    found = evidence(cell.model, log, cell.metrology)
+    return {
+        **facts(cell, log),
+        "nominal": flexibilities(cell.model).tolist(),
+        "usual": usual_flexibility(cell.model),
+        "evidence": {
+            "matrix": found.matrix.tolist(), "right": found.right.tolist(),
+            "squares": found.squares, "freedom": found.freedom, "least": found.least,
+            "poses": found.poses, "wild": found.wild,
+        },
+    }  # fmt: skip

@@ -1,0 +1,1 @@
+"""The report of a fleet: one self-contained HTML file."""

@@ -1,0 +1,123 @@
+"""Sections that both reports have: drifts, outliers, sessions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from bridge.fleet.drifting import Drift
+from bridge.fleet.outlying import Outlier
+from bridge.fleet.report.parameter_words import parameter_words
+from bridge.fleet.running import Done
+from bridge.fleet.task import DONE, Outcome
+from bridge.report.fragment import (
+    AFTER,
+    Cell,
+    Figure,
+    Raw,
+    badge,
+    figure_block,
+    html_of,
+    paragraph,
+    table,
+)
+from bridge.report.words import number, told, unit_of
+
+MOST = 40  # rows of a table: the Parquet files have all
+DRAWN = 6  # drifts in the picture
+COLOURS = (AFTER, "#d9822b", "#2f9e62", "#8e5bb5", "#c43d3d", "#5b6770")
+STATES = {"bad": "cannot be used", "crashed": "failed", "died": "took its workers along"}
+
+
+def drifts(found: Sequence[Drift]) -> str:
+    """Return the table of what drifts, and a picture of the surest."""
+    if not found:
+        return paragraph("Nothing drifts by more than sessions scatter anyway.")
+    rows: list[list[Cell]] = [
+        [
+            Raw(f"<b>{html_of(d.arm)}</b>"), parameter_words(d.quantity),
+            f"{told(d.slope, d.unit)} a {d.per}", f"± {told(d.std, d.unit)}",
+            f"{told(d.change, d.unit)} over {len(d.at)} sessions", _surely(d.p_value),
+        ]
+        for d in found[:MOST]
+    ]  # fmt: skip
+    heads = ("arm", "what", "changes by", "1 sigma", "in all", "by chance")
+    return table(heads, rows) + _rest(len(found)) + figure_block(_drawn(found[:DRAWN]))
+
+
+def _surely(p_value: float) -> str:
+    return "under 1 in 10⁶" if p_value < 1e-6 else f"1 in {number(1 / p_value, 2)}"
+
+
+def _drawn(found: Sequence[Drift]) -> Figure:
+    """Return the surest drifts, each in its own 1 sigma about its first session."""
+    traces: list[dict[str, Any]] = []
+    for i, drift in enumerate(found):
+        at, value = np.array(drift.at), np.array(drift.value)
+        first = value[0]
+        name, factor = unit_of(drift.unit)
+        traces.append({
+            "type": "scatter", "mode": "lines+markers",
+            "name": f"{drift.arm}: {parameter_words(drift.quantity)}",
+            "x": at + (0 if drift.per == "day" else 1),
+            "y": (value - first) / max(abs(first), 1e-300) * 100,
+            "customdata": value * factor, "text": list(drift.sessions),
+            "hovertemplate": f"%{{text}}: %{{customdata:.4g}} {name}<extra></extra>",
+            "line": {"color": COLOURS[i % len(COLOURS)], "width": 2}, "marker": {"size": 6},
+        })  # fmt: skip
+    per = {d.per for d in found}
+    title = "days since the first session" if per == {"day"} else "session of the arm"
+    return Figure(
+        traces,
+        {"xaxis": {"title": {"text": title}},
+         "yaxis": {"title": {"text": "change since the first session (%)"}},
+         "legend": {"orientation": "h", "y": -0.22, "x": 0, "yanchor": "top"},
+         "margin": {"l": 60, "r": 16, "t": 16, "b": 40}},
+        "The surest drifts. Point at a session for its value.", 420,
+    )  # fmt: skip
+
+
+def outliers(found: Sequence[Outlier]) -> str:
+    """Return the table of what stands out."""
+    if not found:
+        return paragraph("No arm and no session is far from the others.")
+    rows: list[list[Cell]] = [
+        [
+            Raw(f"<b>{html_of(o.arm)}</b>"), _short(o), parameter_words(o.what),
+            told(o.value, o.unit), told(o.usual, o.unit), f"{abs(o.deviations):.1f}",
+        ]
+        for o in found[:MOST]
+    ]  # fmt: skip
+    heads = ("arm", "session", "what", "found", "usual", "deviations away")
+    return table(heads, rows) + _rest(len(found))
+
+
+def _short(outlier: Outlier) -> str:
+    return outlier.session.removeprefix(f"{outlier.arm}/") or "all"
+
+
+def sessions(done: Done, heads: Sequence[str], cells: Callable[[Outcome], Sequence[Cell]]) -> str:
+    """Return the sessions that were skipped, with the reason, and a table of the others."""
+    bad = [o for o in done.outcomes if o.state != DONE]
+    good = [o for o in done.outcomes if o.state == DONE]
+    parts = []
+    rows: list[list[Cell]]
+    if bad:
+        parts.append(f"<h3>Skipped ({len(bad)})</h3>")
+        rows = [
+            [Raw(f"<b>{html_of(o.session)}</b>"), badge(STATES[o.state], "bad"), o.error]
+            for o in bad[:MOST]
+        ]
+        parts += [table(("session", "state", "why"), rows), _rest(len(bad))]
+        parts.append(f"<h3>Used ({len(good)})</h3>")
+    rows = [[Raw(f"<b>{html_of(o.session)}</b>"), *cells(o)] for o in good[:MOST]]
+    parts += [table(("session", *heads), rows), _rest(len(good))]
+    return "".join(parts)
+
+
+def _rest(count: int) -> str:
+    if count <= MOST:
+        return ""
+    return paragraph(f"{count - MOST} more are in results.parquet and sessions.parquet.", "note")

@@ -1,0 +1,95 @@
+"""Arms as chains of capsules: distances between segments, and from segments to boxes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+TINY = 1e-12
+FINEST = 0.02  # m, between points at which a segment is held against a box
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box in base axes into which nothing of the arm may come."""
+
+    lower: tuple[float, float, float]  # m
+    upper: tuple[float, float, float]  # m
+
+
+@dataclass(frozen=True)
+class Capsules:
+    """C capsules at each of N poses: segments of base, with a radius each."""
+
+    begin: Array  # (N, C, 3) m
+    end: Array  # (N, C, 3) m
+    radius: Array  # (C,) m
+
+
+def segment_distance(p: Array, q: Array, r: Array, s: Array) -> Array:
+    """Return the distance between segments p-q and r-s, all (..., 3).
+
+    Source: Ericson, Real-Time Collision Detection (2005), 5.1.9.
+    """
+    u, v, w = q - p, s - r, p - r
+    a, e = np.sum(u * u, axis=-1), np.sum(v * v, axis=-1)
+    b, c, f = np.sum(u * v, axis=-1), np.sum(u * w, axis=-1), np.sum(v * w, axis=-1)
+    denominator = a * e - b * b
+    along = np.where(denominator > TINY, (b * f - c * e) / np.maximum(denominator, TINY), 0.0)
+    along = np.clip(along, 0, 1)
+    across = np.where(e > TINY, (b * along + f) / np.maximum(e, TINY), 0.0)
+    clipped = np.clip(across, 0, 1)
+    again = np.where(a > TINY, (b * clipped - c) / np.maximum(a, TINY), 0.0)
+    along = np.where(clipped != across, np.clip(again, 0, 1), along)
+    gap = w + along[..., None] * u - clipped[..., None] * v
+    return np.asarray(np.linalg.norm(gap, axis=-1))
+
+
+def in_box(capsules: Capsules, box: Box) -> NDArray[np.bool_]:
+    """Return at which poses (N,) some capsule comes into the box."""
+    lower, upper = np.array(box.lower), np.array(box.upper)
+    hit = np.zeros(len(capsules.begin), dtype=bool)
+    for i, radius in enumerate(capsules.radius):
+        begin, end = capsules.begin[:, i], capsules.end[:, i]
+        longest = float(np.linalg.norm(end - begin, axis=1).max(initial=0.0))
+        count = int(np.ceil(longest / max(0.5 * float(radius), FINEST))) + 1
+        for share in np.linspace(0, 1, count):
+            point = begin + share * (end - begin)
+            away = point - np.clip(point, lower, upper)
+            hit |= np.sum(away**2, axis=1) < radius**2
+    return hit
+
+
+def below(capsules: Capsules, height: float, first: int) -> NDArray[np.bool_]:
+    """Return at which poses (N,) a capsule from number ``first`` on dips below a height of base."""
+    lowest = np.minimum(capsules.begin[:, first:, 2], capsules.end[:, first:, 2])
+    return np.asarray((lowest - capsules.radius[first:] < height).any(axis=1))
+
+
+def touching(capsules: Capsules, pairs: tuple[tuple[int, int], ...]) -> NDArray[np.bool_]:
+    """Return at which poses (N,) two capsules of some pair touch."""
+    hit = np.zeros(len(capsules.begin), dtype=bool)
+    for i, j in pairs:
+        apart = segment_distance(
+            capsules.begin[:, i], capsules.end[:, i], capsules.begin[:, j], capsules.end[:, j]
+        )
+        hit |= apart < capsules.radius[i] + capsules.radius[j]
+    return hit
+
+
+def hidden(capsules: Capsules, eye: Array, target: Array) -> NDArray[np.bool_]:
+    """Return at which poses (N,) a capsule stands between the eye (3,) and a target (N, 3).
+
+    A target nearer to a capsule than its radius sits on it: there the capsule is only as thick as
+    leaves the target outside.
+    """
+    hit = np.zeros(len(target), dtype=bool)
+    for i, radius in enumerate(capsules.radius):
+        begin, end = capsules.begin[:, i], capsules.end[:, i]
+        clear = segment_distance(target, target, begin, end)
+        apart = segment_distance(np.broadcast_to(eye, target.shape), target, begin, end)
+        hit |= apart < np.minimum(radius, 0.9 * clear)
+    return hit

@@ -1,0 +1,85 @@
+"""How much each parameter of a calibration moves the tool (GUM 5.1.3: sensitivity coefficients)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.calibration.parameters import Parameters
+from core.calibration.promise import effects_of
+from core.calibration.result import Calibration
+from core.errors import InputError
+
+Array = NDArray[np.float64]
+STEP = 1e-3  # usual sizes
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """One parameter's part in the uncertainty of one coordinate of the TCP."""
+
+    name: str
+    unit: str
+    std: float  # 1 sigma, in ``unit``
+    coefficient: float  # m per ``unit``, rms over poses and axes
+
+    @property
+    def contribution(self) -> float:
+        """Return what it would make alone, m."""
+        return self.coefficient * self.std
+
+
+@dataclass(frozen=True)
+class Sensitivities:
+    """All parameters, and what their correlations add or take away."""
+
+    each: tuple[Sensitivity, ...]
+    combined: float  # m, of one coordinate, all parameters with their correlations
+
+    @property
+    def correlation(self) -> float:
+        """Return what correlations add to the sum of squares, m2; negative where they take away."""
+        return self.combined**2 - sum(s.contribution**2 for s in self.each)
+
+
+def sensitivities(calibration: Calibration) -> Sensitivities | None:
+    """Return the parameters' sensitivities at the held-out poses, at all poses without any.
+
+    None where a parameter's name does not say which effect it belongs to.
+    """
+    shown, covariance = list(calibration.estimates), calibration.whole_covariance
+    if len(covariance) != len(shown):
+        shown, covariance = [e for e in shown if e.shown], calibration.covariance
+    J = _columns(calibration, [e.name for e in shown])
+    if J is None or len(covariance) != len(shown):
+        return None
+    each = tuple(
+        Sensitivity(e.name, e.unit, e.std, float(np.sqrt(np.mean(J[:, :, i] ** 2))))
+        for i, e in enumerate(shown)
+    )
+    variance = np.einsum("nip,pq,niq->n", J, covariance, J)
+    return Sensitivities(each, float(np.sqrt(max(np.mean(variance), 0.0) / 3)))
+
+
+def _columns(calibration: Calibration, names: list[str]) -> Array | None:
+    """Return d TCP / d parameter (M, 3, p), central differences around the calibrated model."""
+    try:
+        every = Parameters.every(calibration.model, effects_of(names))
+    except InputError:
+        return None
+    places = {name: i for i, name in enumerate(every.names)}
+    if not set(names) <= set(places):
+        return None
+    readings = calibration.readings
+    chosen = readings[readings.held_out] if readings.held_out.any() else readings
+    columns = []
+    for name in names:
+        step = np.zeros(len(every))
+        step[places[name]] = STEP * every.scales[places[name]]
+        ends = [
+            every.model(sign * step).predict(chosen.q, chosen.loads).position for sign in (1, -1)
+        ]
+        columns.append((ends[0] - ends[1]) / (2 * step[places[name]]))
+    return np.stack(columns, axis=2) if columns else None

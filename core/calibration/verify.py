@@ -1,0 +1,221 @@
+"""Does a calibration still hold? A few poses, measured again months later.
+
+What the readings leave over is held against what the calibration promised of them: its parameters'
+uncertainty, the noise of instrument and arm. Where that is broken, the simple things that may have
+moved since compete: the tool, one joint's zero, the load, the instrument, one bad reading.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+from scipy.stats import f as fisher
+
+from core.calibration.noise import presumed
+from core.calibration.observables import make_observable
+from core.calibration.observables.nuisance import Nuisance
+from core.calibration.observables.observable import Observable
+from core.calibration.parameters import Parameters
+from core.calibration.promise import Promise, promise_in
+from core.calibration.readings import Readings
+from core.calibration.result import Errors, Estimate
+from core.calibration.telling_moved import moved_words, verdict_words
+from core.errors import ExcitationError
+from core.metrology import Metrology
+from core.model import Model
+from core.registration import Registration
+
+Array = NDArray[np.float64]
+BROKEN = 1e-3  # chance below which a promise counts as broken
+BESIDE = 6.0  # of chi-square: suspects that explain as much are told beside the best one
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """One thing that may have moved."""
+
+    name: str  # tool_frame, joint_offset_3, payload, instrument, reading_4
+    estimates: tuple[Estimate, ...]  # how far it moved; none for a bad reading
+    chance: float  # of what is left, were it the only change
+    left: float  # chi-square that it leaves
+
+
+@dataclass(frozen=True)
+class Verification:
+    """Whether a calibration still holds."""
+
+    holds: bool
+    verdict: str  # one sentence
+    errors: Errors  # of each reading, the instrument's place fitted where nobody registered it
+    promised: Array  # (M,) m, 1 sigma (3D) that the calibration promised of each error
+    ratio: float  # rms of the errors over what was promised, the numbers fitted counted
+    chance: float  # of so large a ratio if the calibration holds
+    moved: Suspect | None  # what explains the change, where one thing does
+    suspects: tuple[Suspect, ...]  # others that explain it as well
+    stations: tuple[Registration, ...]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Task:
+    """Readings against a promise, whitened by all that was promised."""
+
+    left: Array  # (M,)
+    root: Array  # (M, M): root @ equations are independent, of variance one
+    F: Array  # (M, m) of the nuisances
+
+    def chi_square(self, columns: Array) -> tuple[float, int, Array, Array]:
+        """Return chi-square left, degrees of freedom, the columns' values and covariance."""
+        A = self.root @ np.hstack([self.F, columns])
+        b = self.root @ self.left
+        size = np.linalg.norm(A, axis=0)
+        size = np.where(size > 0, size, 1.0)
+        U, s, Vt = np.linalg.svd(A / size, full_matrices=False)
+        seen = s > 1e-9 * max(float(s.max(initial=0.0)), 1e-300)
+        inside = U[:, seen].T @ b
+        values = (Vt[seen].T @ (inside / s[seen])) / size
+        wide = (Vt[seen].T / s[seen]) @ (Vt[seen].T / s[seen]).T / np.outer(size, size)
+        rest = float(b @ b - inside @ inside)
+        m = self.F.shape[1]
+        return max(rest, 0.0), len(b) - int(seen.sum()), values[m:], wide[m:, m:]
+
+
+def verify(
+    model: Model,
+    readings: Readings,
+    calibration: Mapping[str, Any] | Promise,
+    metrology: Metrology | None = None,
+    *,
+    observable: Observable | None = None,
+) -> Verification:
+    """Return whether the calibration that made ``model`` still holds, and if not, what moved.
+
+    ``calibration`` is its promise (``promise.document_of``). Raises ExcitationError where there are
+    too few readings to say anything, InputError where the promise does not fit the model.
+    """
+    metrology = metrology or Metrology()
+    promise = calibration if isinstance(calibration, Promise) else promise_in(calibration)
+    how = observable or make_observable(readings.kind, registered=metrology.registered)
+    parameters = promise.parameters(model)
+    nuisance = how.start(model, readings)
+    left = how.residual(model, readings, nuisance)
+    if left.size <= how.layout(readings).size + 1:
+        raise ExcitationError(
+            f"verification: {len(readings)} reading(s) only tell where the instrument stands, "
+            "expected more poses"
+        )
+    task, spread = _task(model, how, readings, nuisance, promise, parameters, metrology)
+    rest, freedom, _, _ = task.chi_square(np.zeros((left.size, 0)))
+    ratio = float(np.sqrt(rest / freedom))
+    chance = float(fisher.sf(rest / freedom, freedom, promise.freedom))
+    holds = chance > BROKEN
+    suspects = () if holds else _suspects(model, how, readings, nuisance, task)
+    moved = suspects[0] if suspects and suspects[0].chance > BROKEN else None
+    errors = Errors(left[:, :3], np.arange(len(readings)))
+    return Verification(
+        holds, verdict_words(holds, errors, ratio, chance, moved_words(moved, suspects)),
+        errors, spread, ratio, chance, moved,
+        tuple(s for s in suspects[1:] if moved and s.left < moved.left + BESIDE),
+        nuisance.stations, _notes(promise, metrology, freedom),
+    )  # fmt: skip
+
+
+def _task(
+    model: Model, how: Observable, readings: Readings, nuisance: Nuisance, promise: Promise,
+    parameters: Parameters, metrology: Metrology,
+) -> tuple[_Task, Array]:  # fmt: skip
+    """Return the whitened problem, and what was promised of each error (N,)."""
+    at = np.zeros(len(parameters))
+    J, F = how.columns(parameters, at, readings, nuisance)
+    noise, _ = presumed(model, readings, how, nuisance, metrology)
+    sizes = [_instrument(promise, metrology)]
+    if len(noise.sizes) > 2:
+        told = promise.turn / how.sigmas[3]
+        sizes.append(told if np.isfinite(told) else noise.sizes[1])
+    sizes.append(promise.joint if np.isfinite(promise.joint) else noise.joint)
+    own = np.asarray(sum(s**2 * one for s, one in zip(sizes, noise.shapes, strict=True)))
+    N, k, _ = own.shape
+    V = J @ promise.covariance @ J.T
+    for i in range(N):
+        V[i * k : i * k + k, i * k : i * k + k] += own[i]
+    spread = np.sqrt(np.diag(V).reshape(N, k)[:, :3].sum(axis=1))
+    root = np.linalg.inv(np.linalg.cholesky(V))
+    return _Task(how.residual(model, readings, nuisance).ravel(), root, F), spread
+
+
+def _instrument(promise: Promise, metrology: Metrology) -> float:
+    """Return 1 sigma of today's instrument: what the session found where it is the same one."""
+    same = abs(promise.sigma - metrology.sigma) < 1e-3 * metrology.sigma
+    known = np.isfinite(promise.instrument) and (same or not np.isfinite(promise.sigma))
+    return promise.instrument if known else metrology.sigma
+
+
+def _suspects(
+    model: Model, how: Observable, readings: Readings, nuisance: Nuisance, task: _Task
+) -> tuple[Suspect, ...]:
+    """Return what may have moved, the most likely first: by what it leaves and what it costs."""
+    found = []
+    for name, effects in _stories(model, readings):
+        own = Parameters.every(model, effects)
+        J, _ = how.columns(own, np.zeros(len(own)), readings, nuisance)
+        found.append(_suspect(name, task, J, own.names, own.units))
+    if how.registered and how.frame:
+        free = make_observable(readings.kind)
+        F = free.nuisance_columns(model.predict(readings.q, readings.loads), readings, nuisance)
+        names = [f"instrument_{k}" for k in ("x", "y", "z", "rx", "ry", "rz")][: F.shape[1]]
+        found.append(_suspect("instrument", task, F, names, ("m",) * 3 + ("rad",) * 3))
+    N, k = len(readings), len(task.left) // len(readings)
+    for i in range(N):
+        columns = np.zeros((N * k, k))
+        columns[i * k : i * k + k] = np.eye(k)
+        found.append(_suspect(f"reading_{i + 1}", task, columns, (), ()))
+    costs = np.log(len(task.left))
+    return tuple(sorted((s for s, _ in found), key=lambda s: s.left + costs * _cost(s, k)))
+
+
+def _stories(model: Model, readings: Readings) -> list[tuple[str, tuple[str, ...]]]:
+    stories: list[tuple[str, tuple[str, ...]]] = [("tool_frame", ("tool_frame",))]
+    zeros = [f"joint_offset_{joint}" for joint in range(1, model.arm.n + 1)]
+    stories += [(name, (name,)) for name in zeros]
+    mass = readings.loads.payload_mass
+    if model.payload_mass > 0 if mass is None else bool((mass > 0).any()):
+        stories.append(("payload", ("payload",)))
+    return stories
+
+
+def _cost(suspect: Suspect, width: int) -> int:
+    return len(suspect.estimates) or width
+
+
+def _suspect(
+    name: str, task: _Task, columns: Array, names: tuple[str, ...] | list[str],
+    units: tuple[str, ...],
+) -> tuple[Suspect, int]:  # fmt: skip
+    left, freedom, values, covariance = task.chi_square(columns)
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    # a direction that nothing shows has neither value nor width
+    seen = (std > 0) | (np.abs(values) > 0)
+    estimates = tuple(
+        Estimate(n, float(v), float(s), u)
+        for n, v, s, u, told in zip(names, values, std, units, seen, strict=False)
+        if told
+    )
+    chance = float(chi2.sf(left, freedom)) if freedom > 0 else 0.0
+    return Suspect(name, estimates, chance, left), freedom
+
+
+def _notes(promise: Promise, metrology: Metrology, freedom: int) -> tuple[str, ...]:
+    notes = []
+    if not metrology.registered:
+        notes.append(
+            "the instrument's place was fitted to these poses: a turn of the whole arm, or another "
+            "zero of joint 1, is not seen"
+        )
+    if freedom < 9:
+        notes.append(f"only {freedom} numbers are left to judge by: measure more poses")
+    return tuple(notes)
