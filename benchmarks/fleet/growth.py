@@ -1,0 +1,159 @@
+"""How a fleet's cost grows with its sessions: a bare loop, local processes, a Dask cluster.
+
+All run in turns over the same chunks of sessions, so that what else the machine does meets all of
+them alike; ratios are of a chunk's times, told as the median with the quartiles.
+"""
+
+from __future__ import annotations
+
+import shutil
+import statistics
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+from threadpoolctl import threadpool_limits
+
+from benchmarks.fleet.simulating import write_fleet
+from bridge.fleet import fitting
+from bridge.fleet.cell_source import OneCell
+from bridge.fleet.dask_workers import DaskWorkers
+from bridge.fleet.journal import Journal
+from bridge.fleet.local_workers import LocalWorkers
+from bridge.fleet.running import run, tasks_of
+from bridge.fleet.session import find_sessions
+from bridge.fleet.task import DONE, Outcome, Task, perform
+from bridge.fleet.workers import Workers
+
+WORKERS = 2
+POSES = 10
+Way = Callable[[Sequence[Task]], None]
+
+
+class Kept(Workers):
+    """Workers that stay when a run over them ends: their start is measured by itself."""
+
+    def __init__(self, inner: Workers) -> None:
+        self.inner = inner
+
+    def start(self) -> None:
+        """Leave them."""
+
+    def stop(self) -> None:
+        """Leave them."""
+
+    def run(self, tasks: Any) -> Iterator[Outcome]:
+        """Do the tasks."""
+        return self.inner.run(tasks)
+
+    def words(self) -> str:
+        """Return who they are."""
+        return self.inner.words()
+
+
+def measure(folder: Path, sessions: int, chunk: int, seed: int, *, dask: bool) -> dict[str, Any]:
+    """Return times and ratios for so many sessions."""
+    cell, _ = write_fleet(folder, [[POSES]] * sessions, seed)
+    found = find_sessions([str(folder / "logs")])
+    tasks, _ = tasks_of(found.sessions, OneCell(cell), fitting.work, {})
+    chunks = [tasks[i : i + chunk] for i in range(0, len(tasks), chunk)]
+    with ExitStack() as stack:
+        ways, started = _ways(folder, stack, dask=dask)
+        for way in ways.values():
+            way(tasks[: 2 * WORKERS])  # kernels loaded, files in memory: each meets the same
+        times: dict[str, list[float]] = {name: [] for name in ways}
+        for i, part in enumerate(chunks):
+            names = list(ways)
+            for name in names[i % len(names) :] + names[: i % len(names)]:
+                begin = time.perf_counter()
+                ways[name](part)
+                times[name].append(time.perf_counter() - begin)
+    sizes = [len(c) for c in chunks]
+    return {
+        "sessions": sessions, "chunk": chunk, "poses": POSES, "started_s": started,
+        "per_session_ms": {
+            name: _spread([1e3 * t / n for t, n in zip(ts, sizes, strict=True)])
+            for name, ts in times.items()
+        },
+        "faster_than_loop": _ratios(times, "loop", {"processes", "dask"}),
+        "overhead": {
+            name: _spread([t / b - 1 for t, b in zip(times[name], times["loop"], strict=True)])
+            for name in times if name.startswith("one ")
+        },
+    }  # fmt: skip
+
+
+def _ways(folder: Path, stack: ExitStack, *, dask: bool) -> tuple[dict[str, Way], dict[str, float]]:
+    """Return what does a chunk, by name, and how long it took to start."""
+    started: dict[str, float] = {}
+    ways: dict[str, Way] = {"loop": _loop}
+    journal = folder / "journal"
+    for name, count in (("one process", 1), ("processes", WORKERS)):
+        begin = time.perf_counter()
+        workers = stack.enter_context(LocalWorkers(count))
+        ways[name] = _pool(Kept(workers), journal)
+        ways[name]([])
+        started[name] = time.perf_counter() - begin
+    if dask:
+        address = stack.enter_context(cluster(WORKERS))
+        ways["dask"] = _pool(Kept(stack.enter_context(DaskWorkers(address))), journal)
+        one = stack.enter_context(cluster(1))
+        ways["one dask worker"] = _pool(Kept(stack.enter_context(DaskWorkers(one))), journal)
+    return ways, started
+
+
+def _loop(tasks: Sequence[Task]) -> None:
+    """Do the tasks one after the other, here: the bare work, nothing kept."""
+    with threadpool_limits(1, "blas"):
+        for task in tasks:
+            assert perform(task).state == DONE
+
+
+def _pool(workers: Workers, journal: Path) -> Way:
+    def way(tasks: Sequence[Task]) -> None:
+        with Journal(journal, fresh=True) as book:
+            done = run(tasks, [], workers, book, lambda outcome: None)
+        assert all(o.state == DONE for o in done.outcomes)
+
+    return way
+
+
+@contextmanager
+def cluster(workers: int) -> Iterator[str]:
+    """Give the address of a Dask cluster on this machine."""
+    from distributed import LocalCluster
+
+    with LocalCluster(
+        n_workers=workers, threads_per_worker=1, host="127.0.0.1", protocol="tcp",
+        dashboard_address=None, silence_logs=50,
+    ) as made:  # fmt: skip
+        yield made.scheduler_address
+
+
+def whole(folder: Path, sessions: int, seed: int) -> float:
+    """Return the time (s) of a whole run on two processes, their start included."""
+    shutil.rmtree(folder, ignore_errors=True)
+    cell, _ = write_fleet(folder, [[POSES]] * sessions, seed)
+    begin = time.perf_counter()
+    found = find_sessions([str(folder / "logs")])
+    tasks, _ = tasks_of(found.sessions, OneCell(cell), fitting.work, {})
+    with Journal(folder / "journal", fresh=True) as book:
+        run(tasks, [], LocalWorkers(WORKERS), book, lambda outcome: None)
+    return time.perf_counter() - begin
+
+
+def _ratios(times: dict[str, list[float]], peer: str, names: set[str]) -> dict[str, Any]:
+    return {
+        name: _spread([b / t for t, b in zip(times[name], times[peer], strict=True)])
+        for name in times if name in names
+    }  # fmt: skip
+
+
+def _spread(values: Sequence[float]) -> dict[str, float]:
+    """Return the median and the quartiles."""
+    if len(values) < 2:
+        return {"median": values[0], "low": values[0], "high": values[0]}
+    low, middle, high = statistics.quantiles(values, n=4, method="inclusive")
+    return {"median": middle, "low": low, "high": high}
