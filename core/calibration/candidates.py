@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.foreseen import empty_readings, foreseen
+from core.calibration.foreseen import beside, empty_readings, foreseen
 from core.calibration.observables.fixed_point import fixed_at
 from core.calibration.observables.nuisance import Nuisance
 from core.calibration.observables.observable import Observable
@@ -21,7 +21,7 @@ from core.loads import Loads
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-STOPS = 700  # candidate poses
+STOPS = 900  # candidate poses
 DRAWN = 4000  # random poses looked at in one go
 TRIES = 40
 BALLS_APART = 0.2  # m, of two balls on the tool where nobody says it
@@ -126,16 +126,35 @@ def _look(
         sight.hindered["do not reach the fixed point"] = missed + len(q) - len(touching)
         q, station, target = touching.q, touching.station, touching.target
     good = np.ones(len(q), dtype=bool)
-    hindrances = space.hindrances(q)
-    if space.places and not observable.closes:
-        hindrances |= _unseen(space, q, station, np.minimum(target, len(space.targets) - 1))
-    for reason, hit in hindrances.items():
+    for reason, hit in _hindrances(observable, space, q, station, target).items():
         sight.hindered[reason] = sight.hindered.get(reason, 0) + int(hit.sum())
         good &= ~hit
     sight.looked += len(q)
     sight.q.append(q[good])
     sight.station.append(station[good])
     sight.target.append(target[good])
+
+
+def readable(observable: Observable, space: Space, readings: Readings) -> NDArray[np.bool_]:
+    """Return which readings (N,) can be taken: nothing in the way, nothing hit."""
+    hits = _hindrances(observable, space, readings.q, readings.station, readings.target)
+    return np.asarray(~np.any(list(hits.values()), axis=0))
+
+
+def _hindrances(
+    observable: Observable, space: Space, q: Array, station: Index, target: Index
+) -> dict[str, NDArray[np.bool_]]:
+    found = space.hindrances(q)
+    if space.places and not observable.closes:
+        found |= _unseen(space, q, station, np.minimum(target, len(space.targets) - 1))
+    return found
+
+
+def joined(found: Candidates, more: Readings) -> Candidates:
+    """Return the candidates with further readings, each at a pose of its own."""
+    stop = np.concatenate([found.stop, len(found.q) + np.arange(len(more))])
+    q = np.concatenate([found.q, more.q])
+    return replace(found, q=q, readings=beside(found.readings, more), stop=stop)
 
 
 def _unseen(space: Space, q: Array, station: Index, target: Index) -> dict[str, NDArray[np.bool_]]:

@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.candidates import Candidates, candidates_of
+from core.calibration.candidates import Candidates, candidates_of, joined
 from core.calibration.exchange import Choice, exchanged, grown, shrunk
 from core.calibration.information import Reference, blocks, expectation_of
 from core.calibration.itinerary import Stop, itinerary
 from core.calibration.observables.observable import Observable
 from core.calibration.parameters import Parameters
 from core.calibration.plan import Payload, Plan
+from core.calibration.refinement import Refined, Refiner
 from core.calibration.space import Space
 from core.calibration.travel import joint_speed, leg_times
 from core.errors import PlanError
@@ -22,6 +23,8 @@ from core.loads import Loads
 
 Array = NDArray[np.float64]
 REFERENCE = 200  # poses over which the predicted TCP is judged
+REFINED = 15  # rounds in which the chosen poses are moved
+BOUGHT_ROUNDS = 3
 BOUGHT = (0.5, 0.75, 1.0, 1.5, 2.0)  # of the poses asked for: what these would give
 Progress = Callable[[str, float], None]
 
@@ -67,21 +70,31 @@ def plan(
     _require_enough(parameters, observable, found, wish)
     tell("working out what each pose tells", 0.1)
     rows = blocks(parameters, observable, found.readings, found.nuisance, sigma)
-    reference = _reference(parameters, loads, space, seed)
-    cost = _cost(parameters, found, wish)
-    choice = Choice.of(rows, reference.weight(rows.shape[2]), cost)
-    chosen = _chosen(choice, wish, lambda share: tell("choosing poses", 0.2 + 0.5 * share))
+    reference = reference_of(parameters, loads, space, seed)
+    weight = reference.weight(rows.shape[2])
+    choice = Choice.of(rows, weight, _cost(parameters, found, wish))
+    chosen = _chosen(choice, wish, lambda share: tell("choosing poses", 0.2 + 0.3 * share))
+    refiner = Refiner(parameters, observable, space, found, weight, sigma)
+    random = np.random.default_rng(seed)
+    best = refiner.refined(
+        Refined(found.readings[np.array(chosen)], rows[chosen]), REFINED, random,
+        lambda share: tell("moving poses to where they tell more", 0.5 + 0.2 * share),
+    )  # fmt: skip
     tell("working out what more or fewer poses buy", 0.7)
-    bought = _bought(choice, chosen, wish)
+    bought = _bought(choice, chosen, wish, refiner)
+    bought[poses] = refiner.value(best.rows)
     tell("finding a short way", 0.95)
-    fit = [Stop(row) for row in chosen]
     checks = [Stop(row, held_out=True) for row in _held_out(found, chosen, wish)]
+    found = joined(found, best.readings)
+    fit = [Stop(len(rows) + i) for i in range(poses)]
     way = itinerary(found, fit + checks, space, repeats)
-    measured = chosen + [stop.row for stop in way.stops if stop.repeat]
-    expected = expectation_of(parameters, rows[measured], reference)
+    again = [stop.row - len(rows) for stop in way.stops if stop.repeat]
+    expected = expectation_of(parameters, np.concatenate([best.rows, best.rows[again]]), reference)
     tell("planned", 1.0)
     notes = (*found.notes, *way.notes, *_notes(parameters, loads, expected.std))
-    return Plan(tuple(loads), way.poses(found), expected, bought, way.travel, notes)
+    return Plan(
+        tuple(loads), way.poses(found), expected, tuple(sorted(bought.items())), way.travel, notes
+    )
 
 
 def _in_order(parameters: Parameters, loads: Sequence[Payload]) -> list[Payload]:
@@ -120,7 +133,7 @@ def _require_enough(
         )
 
 
-def _reference(
+def reference_of(
     parameters: Parameters, loads: Sequence[Payload], space: Space, seed: int
 ) -> Reference:
     """Return poses anywhere in the cell, seen by the instrument or not, under the loads in turn."""
@@ -162,20 +175,22 @@ def _chosen(choice: Choice, wish: Wish, told: Callable[[float], None]) -> list[i
     return exchanged(choice, grown(choice, [], wish.poses, -(-size // k)), told=told)
 
 
-def _bought(choice: Choice, chosen: list[int], wish: Wish) -> tuple[tuple[int, float], ...]:
+def _bought(choice: Choice, chosen: list[int], wish: Wish, refiner: Refiner) -> dict[int, float]:
     """Return what fewer and more poses would give, each number's poses chosen anew."""
     size, k = choice.rows.shape[2], choice.rows.shape[1]
     fewest = -(-size // k)
-    told = {}
+    told: dict[int, float] = {}
     for count in sorted({max(round(share * wish.poses), fewest) for share in BOUGHT}):
-        if count < len(chosen):
-            some = exchanged(choice, shrunk(choice, chosen, count), rounds=1)
-        elif count == len(chosen):
-            some = chosen
-        else:
-            some = exchanged(choice, grown(choice, chosen, count, 0), rounds=1)
-        told[len(some)] = choice.value(some)
-    return tuple(sorted(told.items()))
+        if count == len(chosen):
+            continue
+        fewer = count < len(chosen)
+        some = shrunk(choice, chosen, count) if fewer else grown(choice, chosen, count, 0)
+        some = exchanged(choice, some, rounds=1)
+        readings = refiner.found.readings[np.array(some)]
+        random = np.random.default_rng(wish.seed)
+        best = refiner.refined(Refined(readings, choice.rows[some]), BOUGHT_ROUNDS, random)
+        told[len(some)] = refiner.value(best.rows)
+    return told
 
 
 def _held_out(found: Candidates, chosen: list[int], wish: Wish) -> list[int]:

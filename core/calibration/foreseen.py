@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +46,20 @@ def foreseen(
     reached = np.flatnonzero(np.isfinite(q).all(axis=1))
     readings = replace(readings, q=q, value=np.zeros((len(q), observable.width)))[reached]
     return replace(readings, value=observable.predict(model, readings, nuisance))
+
+
+def beside(one: Readings, other: Readings) -> Readings:
+    """Return the readings of both, one after the other; both know the same of their loads."""
+    loads = Loads(**{f.name: _both(one.loads, other.loads, f.name) for f in fields(Loads)})
+    columns = {f.name: _both(one, other, f.name) for f in fields(Readings)[1:]}
+    return Readings(one.kind, **(columns | {"loads": loads}))
+
+
+def _both(one: Any, other: Any, name: str) -> Any:
+    first, second = getattr(one, name), getattr(other, name)
+    if first is None or isinstance(first, Loads):
+        return None
+    return np.concatenate([first, second])
 
 
 def somewhere(model: Model, observable: Observable, readings: Readings, seed: int = 0) -> Nuisance:
