@@ -40,8 +40,8 @@ class WorkspaceSection(Section[Material]):
                 title = f"{name}, {view}"
                 drawings.append(_view(title, axes, tip, errors.vector * factor, colour))
         caption = (
-            f"{_all(material)} Errors before are drawn {factors[0]:,.0f} times as long as they are, "
-            f"errors after {factors[1]:,.0f} times. Axes of the base; the square is the base."
+            f"{_all(material)} Errors before are drawn {factors[0]:,.0f} times as long as they are,"
+            f" errors after {factors[1]:,.0f} times. Axes of the base; the square is the base."
         )
         return [Pictures(tuple(drawings), caption), zones]
 
