@@ -9,7 +9,7 @@ import numpy as np
 
 from bridge.fleet.fitted import Fitted, FittedArm, FittedSession, FittedType
 from bridge.fleet.outcome_words import counted
-from bridge.fleet.report.parameter_words import parameter_words
+from bridge.fleet.report.parameter_words import parameter_words, type_words
 from bridge.fleet.report.shared_sections import MOST
 from bridge.fleet.task import Outcome
 from bridge.report.fragment import (
@@ -44,8 +44,8 @@ def answer(together: Fitted) -> str:
         shown = kind.scatter.shown
         spread = kind.scatter.between_arms[shown] / np.maximum(kind.scatter.mean[shown], 1e-12)
         parts.append(paragraph(
-            f"{kind.name}: {counted(len(kind.arms), 'arm')}, {counted(len(sessions), 'session')}. "
-            f"With the flexibilities of the cells the gap is {told(before, 'm')} a coordinate; "
+            f"{type_words(kind.name)}: {counted(len(kind.arms), 'arm')}, "
+            f"{counted(len(sessions), 'session')}. With the flexibilities of the cells the gap is {told(before, 'm')} a coordinate; "
             f"with those found {told(after, 'm')}; a session is foretold by the others, which did "
             f"not see it, to {told(held, 'm')}. The noise of one coordinate is "
             f"{told(kind.scatter.noise, 'm')}."
@@ -60,7 +60,7 @@ def types(together: Fitted) -> str:
     parts = []
     for kind in together.types:
         if len(together.types) > 1:
-            parts.append(f"<h3>{html_of(kind.name)}</h3>")
+            parts.append(f"<h3>{html_of(type_words(kind.name))}</h3>")
         parts.append(table(
             ("flexibility", "of the type", "arms scatter by", "sessions scatter by"),
             [_parameter(kind, j) for j in range(len(kind.parameters))],
@@ -91,7 +91,7 @@ def arms(together: Fitted) -> str:
     )]  # fmt: skip
     for kind in together.types:
         if len(together.types) > 1:
-            parts.append(f"<h3>{html_of(kind.name)}</h3>")
+            parts.append(f"<h3>{html_of(type_words(kind.name))}</h3>")
         parts.append(figure_block(_picture(kind)))
         heads = ("arm", "sessions", "poses", "own", "farthest from the type")
         parts.append(table(heads, [_arm(kind, arm) for arm in kind.arms[:MOST]]))

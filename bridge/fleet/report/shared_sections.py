@@ -71,7 +71,8 @@ def _drawn(found: Sequence[Drift]) -> Figure:
     title = "days since the first session" if per == {"day"} else "session of the arm"
     return Figure(
         traces,
-        {"xaxis": {"title": {"text": title}},
+        {"xaxis": {"title": {"text": title}} | ({} if per == {"day"} else {"dtick": 1}),
+         "showlegend": True,
          "yaxis": {"title": {"text": "change since the first session (%)"}},
          "legend": {"orientation": "h", "y": -0.22, "x": 0, "yanchor": "top"},
          "margin": {"l": 60, "r": 16, "t": 16, "b": 40}},
