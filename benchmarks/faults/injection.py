@@ -53,11 +53,21 @@ def _await(rig: Rig, row: Row, moment: float, before: dict[str, int]) -> float |
     while time.monotonic() < until:
         if row.sign == "none":
             return 0.0
-        seen = _left(rig, moment) if row.sign == "left" else _counted(rig, row, before)
+        seen = _seen(rig, row, moment, before)
         if seen is not None:
             return seen - moment
         rig.pass_time(POLL)
     return None
+
+
+def _seen(rig: Rig, row: Row, moment: float, before: dict[str, int]) -> float | None:
+    if row.sign == "left":
+        return _left(rig, moment)
+    if row.sign.startswith("event:"):
+        kind, _, key = row.sign.removeprefix("event:").partition(" ")
+        told = (e for e in rig.run.since(moment) if e["kind"] == kind and (not key or e.get(key)))
+        return next((float(event["time"]) for event in told), None)
+    return _counted(rig, row, before)
 
 
 def _left(rig: Rig, moment: float) -> float | None:

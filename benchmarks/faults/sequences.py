@@ -6,10 +6,12 @@ the daemon comes back to compensating once a person has healed and armed it agai
 
 from __future__ import annotations
 
+import contextlib
+import json
 import random
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from benchmarks.faults.links import LINKS
@@ -19,6 +21,7 @@ from benchmarks.faults.table import rows_of
 
 LONGEST = 4  # faults of a sequence
 LONGEST_WAIT = 0.25  # s between two of them
+KEPT = "sequences.json"
 SEVERE = 0.06  # share of faults that end the loop's process or the peer: they take seconds
 
 
@@ -35,6 +38,19 @@ class Tally:
     violations: dict[str, list[str]] = field(default_factory=dict)
     violated: int = 0
     stuck: int = 0
+
+    def add(self, other: Tally) -> None:
+        """Take another tally's links in; each link is in one of them only."""
+        for key in ("sequences", "faults", "frames", "writes"):
+            mine, theirs = getattr(self, key), getattr(other, key)
+            mine.update({name: mine.get(name, 0) + count for name, count in theirs.items()})
+        for key in ("largest_step", "largest_offset"):
+            mine, theirs = getattr(self, key), getattr(other, key)
+            mine.update({name: max(mine.get(name, 0.0), most) for name, most in theirs.items()})
+        for name, words in other.violations.items():
+            self.violations[name] = [*self.violations.get(name, []), *words]
+        self.violated += other.violated
+        self.stuck += other.stuck
 
     def words(self) -> str:
         """Return it in one line."""
@@ -83,7 +99,13 @@ def run_sequences(
             with Rig(link, folder / f"sequences-{name}") as rig:
                 done = _on_rig(rig, name, done, share, draw, tally, until, say)
                 _add(tally, name, rig)
+            (folder / KEPT).write_text(json.dumps(asdict(tally)), encoding="utf-8")
     return tally
+
+
+def read_tally(folder: Path) -> Tally:
+    """Return what a run has kept in its folder."""
+    return Tally(**json.loads((folder / KEPT).read_text(encoding="utf-8")))
 
 
 def _on_rig(
@@ -98,8 +120,9 @@ def _on_rig(
             rig.compensate()
             for row, wait in chosen:
                 assert row.inject is not None
-                row.inject(rig)
-                tally.faults[name] += 1
+                with contextlib.suppress(OSError):  # a peer that stands still does not obey
+                    row.inject(rig)
+                    tally.faults[name] += 1
                 rig.pass_time(wait)
             rig.recover()
         except Exception as error:

@@ -80,7 +80,7 @@ def test_a_fault_is_detected_and_answered_as_the_table_says(
     assert attempt(rigs, name, row).wrong == ()
 
 
-APART = [(name, row) for name in LINKS for row in rows_of(name, apart=True)]
+APART = [(name, row) for name in LINKS for row in rows_of(name, shared=False)]
 
 
 @pytest.mark.parametrize(
