@@ -61,6 +61,11 @@ class Foresight:
         self._sigma = float(np.hypot(np.hypot(sigma, arm), UNMODELLED))
         self._parameters: dict[bool, Parameters] = {}
 
+    @property
+    def compares(self) -> bool:
+        """Return whether two readings of one pose can be held against each other."""
+        return not make_observable(self._kind).closes
+
     def judge(self, before: Readings, new: Readings, typed: bool, joints: bool) -> Verdict:
         """Judge one new reading (a Readings of one row) by those before it.
 

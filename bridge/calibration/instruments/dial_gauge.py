@@ -13,6 +13,7 @@ class DialGauge(Instrument[DialGaugeSettings]):
     """A person reads the dial and types what stands there; ``zero`` is added."""
 
     manual = True
+    waits = True
 
     @property
     def name(self) -> str:

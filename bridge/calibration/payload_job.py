@@ -1,0 +1,85 @@
+"""`--payload-only`: what hangs on the flange, from the force sensor in a few orientations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.calibration.facts import session_facts
+from bridge.calibration.foresight import Foresight
+from bridge.calibration.instruments.flange_sensor import FlangeSensor
+from bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
+from bridge.calibration.job import Job, bare_plan
+from bridge.calibration.words import figure
+from core.calibration.payload_plan import plan_payload
+from core.calibration.payload_session import calibrate_payload
+from core.calibration.plan import Payload, Plan, PlannedPose
+from core.errors import CellError
+
+Array = NDArray[np.float64]
+
+
+class PayloadJob(Job):
+    """Mass, centre of gravity and the sensor's bias; the wrist turns where the arm stands."""
+
+    from_here = True
+    suffix = "loaded"
+
+    def plan(self, begin: Array | None, tell: Callable[[str, float], None]) -> Plan:
+        """Return orientations of the flange around where the arm stands."""
+        if self.cell.link is None:
+            raise CellError(
+                f"{self.cell.path}: link: found nothing, expected a controller that tells "
+                "ft_raw_wrench"
+            )
+        assert begin is not None
+        own = self.cell.file.payload
+        load = Payload(own.mass, (own.cog[0], own.cog[1], own.cog[2]), "what is to be weighed")
+        found = plan_payload(self.cell.model, begin, poses=self.order.poses, seed=self.order.seed)
+        free = np.zeros(len(begin))
+        poses = [PlannedPose(i, q, 0, free) for i, q in enumerate(found.poses)]
+        names = zip(found.names, found.units, found.std, strict=True)
+        self._expected = ", ".join(f"{n} ±{figure(s)} {u}" for n, u, s in list(names)[:4])
+        return bare_plan((load,), poses)
+
+    def tell_plan(self, plan: Plan) -> None:
+        """Say how many orientations there are, and how well they will tell the load."""
+        self.talk.say(f"plan: {len(plan.poses)} orientations; expected {self._expected}")
+
+    def instrument(self, around: Surroundings) -> AnyInstrument:
+        """Return the flange's own sensor."""
+        return FlangeSensor.here(around)
+
+    def foresight(self) -> Foresight | None:
+        """Return nobody: ten unknowns of a few orientations are judged at the end."""
+        return None
+
+    def finish(self) -> None:
+        """Tell mass, centre of gravity and bias, and write them into a new cell after a yes."""
+        talk, taken = self.talk, self.book.taken
+        q = np.array([t.q for t in taken])
+        wrench = np.array([t.raw_wrench for t in taken])
+        found = calibrate_payload(self.cell.model, q, wrench)
+        talk.say()
+        talk.say(found.verdict, "bold")
+        for e in found.estimates:
+            low, high = e.interval
+            talk.say(
+                f"  {e.name:<14} {figure(e.value)} {e.unit}  "
+                f"(95 %: {figure(low)} to {figure(high)})"
+            )
+        for note in found.notes:
+            talk.say(f"  note: {note}")
+        from bridge.calibration.report import write_payload
+
+        facts = session_facts(
+            self.cell, self.order, self.book, ("the force sensor of the flange", "wrench")
+        )
+        for file in write_payload(found, facts, self.folder, self.cell.model):
+            talk.say(f"{file}: written")
+        payload = {"mass": found.mass, "cog": [float(v) for v in found.cog]}
+        self.hand_over(
+            found.applied(self.cell.model), "the cell with this load", {"payload": payload}
+        )
