@@ -77,8 +77,9 @@ def _fitted_lines(together: Fitted) -> list[str]:
         )
         lines.append(
             f"{type_words(kind.name)}: {counted(len(kind.arms), 'arm')}, "
-            f"{int(shown.sum())} of {len(shown)} flexibilities shown, scatter between arms {_percent(spread)}; gap "
-            f"{told(before, 'm')} with the cells, {told(after, 'm')} as the other sessions foretell"
+            f"{int(shown.sum())} of {len(shown)} flexibilities shown, scatter between arms "
+            f"{_percent(spread)}; gap {told(before, 'm')} with the cells, {told(after, 'm')} as "
+            "the other sessions foretell"
         )
     return lines + _unlike(together)
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from bridge.fleet.diagnosed import Diagnosed, Onset, Recurrence
 from bridge.fleet.outcome_words import counted
+from bridge.fleet.report.shared_sections import unbroken
 from bridge.fleet.running import Done
 from bridge.fleet.task import DONE, Outcome
 from bridge.report.fragment import (
@@ -33,7 +34,7 @@ from bridge.report.words import (
 
 KINDS = {"no_gap": "good", "explained": "good", "partly_explained": "doubtful",
          "unexplained": "bad"}  # fmt: skip
-SESSION_HEADS = ("arm", "verdict", "samples", "gap", "unexplained", "causes")
+SESSION_HEADS = ("verdict", "samples", "gap", "unexplained", "causes")
 JOINTS = 4  # named of an effect's joints
 DRAWN = 14  # effects in the picture
 
@@ -79,7 +80,7 @@ def recurring(together: Diagnosed) -> str:
     if not together.recurrences:
         return paragraph("No effect is accused in any session.")
     rows = [_row(r) for r in together.recurrences]
-    heads = ("effect", "sessions", "arms", "always in", "joints", "takes off the gap")
+    heads = ("effect", "sessions", "arms", "always in", "joints (sessions)", "takes off the gap")
     return figure_block(_picture(together.recurrences[:DRAWN])) + table(heads, rows)
 
 
@@ -140,7 +141,7 @@ def session_cells(outcome: Outcome) -> list[Cell]:
     causes = {(r["effect"], tuple(r["joints"])) for r in result["rows"] if r["accused"]}
     words = [f"{effect_words(e)}{', ' + joints_words(j) if j else ''}" for e, j in sorted(causes)]
     return [
-        outcome.arm, badge(VERDICTS[result["verdict"]], KINDS[result["verdict"]]),
-        str(channel["samples"]), told(channel["gap_rms"], channel["unit"]),
-        told(channel["remaining_rms"], channel["unit"]), "; ".join(words) or "–",
+        badge(VERDICTS[result["verdict"]], KINDS[result["verdict"]]),
+        str(channel["samples"]), unbroken(told(channel["gap_rms"], channel["unit"])),
+        unbroken(told(channel["remaining_rms"], channel["unit"])), "; ".join(words) or "–",
     ]  # fmt: skip

@@ -10,7 +10,7 @@ import numpy as np
 from bridge.fleet.fitted import Fitted, FittedArm, FittedSession, FittedType
 from bridge.fleet.outcome_words import counted
 from bridge.fleet.report.parameter_words import parameter_words, type_words
-from bridge.fleet.report.shared_sections import MOST
+from bridge.fleet.report.shared_sections import MOST, unbroken
 from bridge.fleet.task import Outcome
 from bridge.report.fragment import (
     AFTER,
@@ -28,7 +28,7 @@ from bridge.report.fragment import (
 )
 from bridge.report.words import number, percent, told
 
-SESSION_HEADS = ("arm", "poses", "gap with the cell", "with the fit", "foretold by the others")
+SESSION_HEADS = ("poses", "gap with the cell", "with the fit", "foretold by the others")
 MICRO = 1e6
 
 
@@ -45,10 +45,10 @@ def answer(together: Fitted) -> str:
         spread = kind.scatter.between_arms[shown] / np.maximum(kind.scatter.mean[shown], 1e-12)
         parts.append(paragraph(
             f"{type_words(kind.name)}: {counted(len(kind.arms), 'arm')}, "
-            f"{counted(len(sessions), 'session')}. With the flexibilities of the cells the gap is {told(before, 'm')} a coordinate; "
-            f"with those found {told(after, 'm')}; a session is foretold by the others, which did "
-            f"not see it, to {told(held, 'm')}. The noise of one coordinate is "
-            f"{told(kind.scatter.noise, 'm')}."
+            f"{counted(len(sessions), 'session')}. With the flexibilities of the cells the gap is "
+            f"{told(before, 'm')} a coordinate; with those found {told(after, 'm')}; a session is "
+            f"foretold by the others, which did not see it, to {told(held, 'm')}. The noise of one "
+            f"coordinate is {told(kind.scatter.noise, 'm')}."
             + (f" Arms of the type scatter by {percent(float(np.median(spread)))}." if len(spread)
                else " No session shows any flexibility."), "lead",
         ))  # fmt: skip
@@ -166,6 +166,6 @@ def session_cells(together: Fitted) -> Callable[[Outcome], Sequence[Cell]]:
         one = fits[outcome.session]
         gaps = (one.gap_before, one.gap_after, one.gap_held_out)
         poses = str(outcome.result["evidence"]["poses"])
-        return [outcome.arm, poses, *(told(gap, "m") for gap in gaps)]
+        return [poses, *(unbroken(told(gap, "m")) for gap in gaps)]
 
     return cells
