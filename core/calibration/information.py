@@ -66,7 +66,8 @@ def blocks(
 ) -> Array:
     """Return the equations of each reading (N, k, p+m), in units of noise and usual sizes."""
     J, F = observable.columns(parameters, parameters.begin, readings, nuisance)
-    whole = np.hstack([J * parameters.prior, F]).reshape(len(readings), observable.equations, -1)
+    whole = np.hstack([J * parameters.prior, F])
+    whole = whole.reshape(len(readings), observable.equations, whole.shape[1])
     return np.asarray(whole / (sigma * observable.sigmas)[None, :, None])
 
 
