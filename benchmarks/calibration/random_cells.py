@@ -37,10 +37,17 @@ def random_cell(seed: int) -> RandomCell:
     tool[:3, :3] = rotation_matrix(random.normal(0, 0.2, 3))
     tool[:3, 3] = [*random.normal(0, 0.04, 2), random.uniform(0.08, 0.25)]
     model = Model(arm, tool)
-    heavy = float(random.uniform(0.4, 0.9) * arm.payload)
-    cog = (float(random.normal(0, 0.03)), float(random.normal(0, 0.03)), 0.07)
-    loads = (Payload(0.0), Payload(heavy, cog, "plate"))
-    return RandomCell(f"{arm.name}-{seed}", model, loads, _room(model, random))
+    return RandomCell(f"{arm.name}-{seed}", model, _loads(arm, random), _room(model, random))
+
+
+def _loads(arm: Arm, random: np.random.Generator) -> tuple[Payload, ...]:
+    """Return one to three weights that happen to be there, and no load at all."""
+    loads = [Payload(0.0)]
+    for _ in range(int(random.integers(1, 4))):
+        mass = float(random.uniform(0.1, 0.9) * arm.payload)
+        cog = tuple(float(c) for c in (*random.normal(0, 0.03, 2), random.uniform(0.03, 0.12)))
+        loads.append(Payload(mass, (cog[0], cog[1], cog[2])))
+    return tuple(loads)
 
 
 def _room(model: Model, random: np.random.Generator) -> Space:
@@ -54,7 +61,7 @@ def _room(model: Model, random: np.random.Generator) -> Space:
     box = Box((at[0] - size, at[1] - size, -1.0), (at[0] + size, at[1] + size, 0.2 * long))
     return Space.of(
         model, floor=0.0, keep_out=(box,), places=(Place(place, nearest=0.3),),
-        looks=(0.3, 0.0, 1.0), acceptance=np.radians(random.uniform(50, 90)),
+        looks=(0.3, 0.0, 1.0), acceptance=np.radians(random.uniform(30, 80)),
     )  # fmt: skip
 
 
@@ -66,7 +73,7 @@ def _drawn(random: np.random.Generator) -> Arm:
     weight = 20 * scale**2
     seven = random.random() < 0.4
     if seven:
-        rows = [(0, -H, small[0] * 2), (0, H, 0), (0, H, upper), (0, -H, 0), (0, -H, fore),
+        rows = [(0.0, -H, small[0] * 2), (0, H, 0), (0, H, upper), (0, -H, 0), (0, -H, fore),
                 (0, H, 0), (0, 0, small[1])]  # fmt: skip
         share = [0.2, 0.25, 0.15, 0.15, 0.1, 0.1, 0.05]
     else:
