@@ -28,7 +28,7 @@ def tell(event):
     print(json.dumps(event, default=str), file=sys.stderr, flush=True)
 sys.exit(run_cell(Path(sys.argv[1]), arm=True, log=tell))
 """
-PAGE_LIMIT = 20.0  # s
+PAGE_LIMIT = 90.0  # s
 END_LIMIT = 6.0  # s for every process of a run to be gone
 
 

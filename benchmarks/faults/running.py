@@ -7,6 +7,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
+from benchmarks.faults.punctual import go_first
 from bridge.cell import load_cell
 from bridge.daemon import Daemon, settings_of
 from bridge.summary import RunSummary
@@ -64,6 +65,7 @@ class Running(Told):
         self._thread.start()
 
     def _run(self) -> None:
+        go_first()
         try:
             self.summary = self.daemon.run()
         except Exception as error:
