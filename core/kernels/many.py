@@ -21,7 +21,11 @@ def _part(rows: Rows, first: int, last: int) -> Rows:
 
 def _singly(chain: Chain, rows: Rows) -> bool:
     """Return whether blocks cannot (links that bend), or would take longer (not compiled)."""
-    return len(rows.q) <= FEW or bool(chain.flexibility.any()) or bool(getattr(config, "DISABLE_JIT", 0))
+    return (
+        len(rows.q) <= FEW
+        or bool(chain.flexibility.any())
+        or bool(getattr(config, "DISABLE_JIT", 0))
+    )
 
 
 def predict(chain: Chain, rows: Rows, position: Array, rotation: Array) -> int:
