@@ -153,3 +153,9 @@ def test_names_of_no_effect_have_no_sensitivities():
     c = session(estimates=strange, covariance=np.eye(1))
     assert sensitivities(c) is None
     assert budget(c, Stated()).parameters is None
+
+
+def test_closures_are_no_check_of_the_tools_place():
+    found = budget(session(scatter=2e-5, kind="sphere"), Stated())
+    assert found.looked_at == 0
+    assert not found.doubtful
