@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -221,3 +222,25 @@ def test_gains_are_what_adding_a_candidate_brings() -> None:
     for row in (4, 17, 29):
         assert np.exp(gains[row]) == pytest.approx(choice.value([0, 1, 2, 3, row]))
     assert np.isinf(gains[:4]).all()
+
+
+def test_two_places_and_two_balls_are_visited_one_place_after_the_other(
+    parameters: Parameters, model: Model
+) -> None:
+    places = [Place((2.0, 0.5, 0.6), 0.3), Place((-1.5, 1.5, 0.8), 0.3)]
+    space = small_space(model, places=places, targets=[(0, 0, 0), (0.1, 0.05, 0)])
+    planned = plan(parameters, POSITION, LOADS, space, poses=16, held_out=2, repeats=2)
+    stations = [pose.station for pose in planned.poses]
+    assert stations == sorted(stations) and set(stations) == {0, 1}
+    assert {pose.target for pose in planned.poses} == {0, 1}
+    turns = sum(a.load != b.load for a, b in pairwise(planned.poses))
+    assert turns <= 3  # a load is not hung anew for the second place
+
+
+def test_a_load_that_tells_nothing_is_named(parameters: Parameters, space: Space) -> None:
+    loads = [Payload(0.0), Payload(0.01), Payload(4.0, (0.0, 0.02, 0.06))]
+    planned = plan(parameters, POSITION, loads, space, poses=9, held_out=3, repeats=0)
+    hung = {planned.loads[pose.load].mass for pose in planned.poses}
+    idle = [note for note in planned.notes if "need not be hung" in note]
+    assert ("0.01 kg" in str(idle)) == (0.01 not in hung)
+    assert 4.0 in hung
