@@ -7,7 +7,6 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.facts import session_facts
 from bridge.calibration.foresight import Foresight
 from bridge.calibration.instruments.flange_sensor import FlangeSensor
 from bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
@@ -72,6 +71,7 @@ class PayloadJob(Job):
             )
         for note in found.notes:
             talk.say(f"  note: {note}")
+        from bridge.calibration.facts import session_facts
         from bridge.calibration.report import write_payload
 
         facts = session_facts(

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bridge.calibration.facts import session_facts
 from bridge.calibration.foresight import Foresight
 from bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
 from bridge.calibration.instruments.settings import SphereSettings
@@ -68,6 +67,7 @@ class ToolJob(Job):
             )
         for note in found.notes:
             talk.say(f"  note: {note}")
+        from bridge.calibration.facts import session_facts
         from bridge.calibration.report import write_tool
 
         facts = session_facts(self.cell, self.order, self.book, ("tip on a fixed point", "touch"))

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.facts import session_facts
 from bridge.calibration.job import Job, bare_plan
 from bridge.calibration.log_of import write_log
 from bridge.calibration.pace import seconds_left
@@ -95,6 +94,7 @@ class VerifyJob(Job):
         talk.say()
         self._tell(found)
         write_log(readings, metrology.registered, folder / "readings.csv")
+        from bridge.calibration.facts import session_facts
         from bridge.calibration.report import write_verification
 
         facts = session_facts(self.cell, order, self.book)

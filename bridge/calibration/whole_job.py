@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.facts import session_facts
 from bridge.calibration.fitting import fitted, tell_calibration
 from bridge.calibration.job import Job, write_document
 from bridge.calibration.log_of import write_log
@@ -67,7 +66,8 @@ class WholeJob(Job):
         write_log(found.readings, metrology.registered, folder / "readings.csv")
         promise = document_of(found, sigma=metrology.sigma)
         write_document(folder / "promise.json", promise)
-        from bridge.calibration.report import write_report  # pictures take their time
+        from bridge.calibration.facts import session_facts  # pictures take their time
+        from bridge.calibration.report import write_report
 
         facts = session_facts(self.cell, order, self.book)
         for file in write_report(found, self.book.plan, facts, folder):
