@@ -21,7 +21,7 @@ from bridge.daemon import Daemon, settings_of
 from bridge.daemon_settings import DaemonSettings
 from bridge.recording.settings import RecordingSettings
 from bridge.settings import SetpointSettings
-from bridge.shared_page import PageReader
+from bridge.shared_page import PageReader, Phase
 from bridge.supervisor import State
 from core.calibration.plan import PlannedPose
 from core.errors import GapbridgeError, LinkError, RunError
@@ -34,6 +34,7 @@ STEADY = 1.0  # N: the force may drift by this over the time of settling, beside
 KEPT = 20.0  # s of cycles that are kept
 STEP = 1e-5  # rad: a joint that has come this far has moved, in that direction
 PATIENCE = 30.0  # s for a connection, on top of the link's own
+STARTING = 180.0  # s that the loop's process may take to start
 FOREVER = 1e9  # s
 SLOWEST = 4.0  # a move may take this many times as long as planned
 
@@ -142,8 +143,12 @@ class LinkedJoints(JointSource):
 
     def _start(self, settings: DaemonSettings, write: bool) -> None:
         self._run = run = _Run(settings, write)
-        until = time.monotonic() + settings.link.connect_timeout + PATIENCE
+        begun = time.monotonic()
+        limit = settings.link.connect_timeout + PATIENCE
+        until = begun + limit
         while not len(self._rows(1.0)):
+            if run.daemon.phase == Phase.STARTING and time.monotonic() < begun + STARTING:
+                until = time.monotonic() + limit  # imports, on a busy machine
             if time.monotonic() > until:
                 raise LinkError("the arm tells nothing, expected its joints")
             time.sleep(0.02)

@@ -98,7 +98,7 @@ class Talk:
         if not self.console.is_terminal:
             yield lambda text: None
             return
-        with Status(text, console=self.console) as shown:
+        with Status(text, console=self.console, refresh_per_second=4) as shown:
             yield lambda text: shown.update(text)
 
     def _heard(self, question: str, look: Callable[[], T | None]) -> str | T:
