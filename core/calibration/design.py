@@ -27,6 +27,7 @@ REFERENCE = 200  # poses over which the predicted TCP is judged
 REFINED = 15  # rounds in which the chosen poses are moved
 BOUGHT_ROUNDS = 3
 BOUGHT = (0.5, 0.75, 1.0, 1.5, 2.0)  # of the poses asked for: what these would give
+SIGHT = "nobody said where the instrument stands: whether it sees the target was not looked at"
 Progress = Callable[[str, float], None]
 
 
@@ -113,7 +114,8 @@ def _planned(
     expected = expectation_of(parameters, measured, reference)
     tell("planned", 1.0)
     hung = set(found.readings.load[len(rows) :])
-    notes = (*found.notes, *way.notes, *_notes(parameters, loads, hung, expected.std))
+    unseen = () if space.places or observable.unknown else (SIGHT,)
+    notes = (*found.notes, *unseen, *way.notes, *_notes(parameters, loads, hung, expected.std))
     return Plan(
         tuple(loads), way.poses(found), expected, tuple(sorted(bought.items())), way.travel, notes
     )
