@@ -27,7 +27,7 @@ JOINT = re.compile(r"J\d ([+-][\d.]+)°")
 PROMPT = re.compile(r"(?:\r\n|^)([^\r\n]*?) > $")
 COLOURS = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 FRAME = Registration(rotation_matrix(np.array([0.1, -0.2, 0.7])), np.array([2.5, -0.8, 0.3]))
-PATIENCE = 90.0  # s, on a busy machine
+PATIENCE = 240.0  # s, on a busy machine
 
 
 @dataclass
