@@ -38,8 +38,8 @@ from core.loads import Loads
 
 Array = NDArray[np.float64]
 SIGMA = 3e-5
-DRAWS = 25  # random choices of each number of poses
-TIMES = (1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0, 4.0)  # of the planned number
+DRAWS = 15  # random choices of each number of poses
+TIMES = (1.0, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0)  # of the planned number
 SHOWN = 3.0  # a parameter counts as told where the weak prior is this many times as wide
 
 
@@ -54,7 +54,7 @@ class Row:
     planned_worst: float
     random: dict[str, float]  # times as many poses: median rms of random choices
     random_worst: dict[str, float]
-    equal: float  # times as many random poses give the plan's rms; inf: more than 4
+    equal: float  # times as many random poses give the plan's rms; inf: more than 3
     equal_worst: float  # the same for the worst place
     told: int  # parameters that the plan shows
     scatter: list[float]  # scatter / expected of each of them
@@ -118,7 +118,7 @@ def chosen_at_random(
 ) -> tuple[list[float], list[float]]:
     """Return medians of rms and worst deviation of random choices, for each of TIMES."""
     loads = sorted(cell.loads, key=lambda load: load.mass)
-    found = candidates_of(parameters, observable, loads, cell.space, seed + 1000)
+    found = candidates_of(parameters, observable, loads, cell.space, seed + 1000, 500)
     rows = blocks(parameters, observable, found.readings, found.nuisance, SIGMA)
     random = np.random.default_rng(seed)
     rms, worst = [], []
@@ -190,10 +190,22 @@ def summary_of(rows: list[Row]) -> dict[str, float]:
     }
 
 
+def written(given: argparse.Namespace, rows: list[Row]) -> None:
+    """Write the figures so far."""
+    document = {
+        "given": {k: v for k, v in vars(given).items() if k != "json"},
+        "summary": summary_of(rows),
+        "rows": [asdict(row) for row in rows],
+    }
+    given.json.parent.mkdir(parents=True, exist_ok=True)
+    given.json.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+
+
 def main() -> int:
     """Print the table, write the figures."""
     reader = argparse.ArgumentParser(prog="python -m benchmarks.calibration.design")
     reader.add_argument("--cells", type=int, default=20)
+    reader.add_argument("--first", type=int, default=0, help="seed of the first cell")
     reader.add_argument("--kind", default="position", help="of the readings")
     reader.add_argument("--poses", type=int, default=30)
     reader.add_argument("--sessions", type=int, default=1000)
@@ -202,21 +214,14 @@ def main() -> int:
     console, rows = Console(width=170), []
     observable = make_observable(given.kind)
     with threadpool_limits(1):
-        for seed in range(given.cells):
+        for seed in range(given.first, given.first + given.cells):
             cell = random_cell(seed)
             rows.append(row_of(cell, observable, given.poses, given.sessions, seed))
             console.print(f"{cell.name}: {rows[-1].equal:.2f}x, {rows[-1].equal_worst:.2f}x")
+            written(given, rows)
     console.print(table_of(rows))
-    found = summary_of(rows)
-    for name, value in found.items():
+    for name, value in summary_of(rows).items():
         console.print(f"{name}: {value:.4g}")
-    given.json.parent.mkdir(parents=True, exist_ok=True)
-    document = {
-        "given": {k: v for k, v in vars(given).items() if k != "json"},
-        "summary": found,
-        "rows": [asdict(row) for row in rows],
-    }
-    given.json.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     return 0
 
 
