@@ -11,7 +11,8 @@ from bridge.supervisor import Cause, State
 POLL = 0.001  # s
 AFTERWARDS = 0.25  # s for which the end state must stay
 RESTING, AT_REST = (State.OBSERVING, State.COMPENSATING, State.FAULT), 3.0  # s: stays for good
-END_LIMIT = 25.0  # s
+END_LIMIT = 90.0  # s: a new process takes its time on a busy machine
+PATIENCE = 10.0  # s on top of what is allowed, to tell what is late from what never comes
 BUSY = (Cause.OVERRUN.value, Cause.RESYNC.value)
 
 
@@ -49,7 +50,7 @@ def _disturbed(rig: Rig, row: Row, moment: float) -> bool:
 
 def _await(rig: Rig, row: Row, moment: float, before: dict[str, int]) -> float | None:
     """Return how long after ``moment`` the fault was detected, s."""
-    until = time.monotonic() + row.within(rig.link) + 2.0
+    until = time.monotonic() + row.within(rig.link) + PATIENCE
     while time.monotonic() < until:
         if row.sign == "none":
             return 0.0

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import psutil
 
+from benchmarks.faults.punctual import go_first
 from benchmarks.faults.running import Event, Told
 from bridge.cell import load_cell
 from bridge.shared_page import Page
@@ -51,6 +52,7 @@ class ProcessRun(Told):
             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, cwd=self._cell.parent,
             start_new_session=True,
         )  # fmt: skip
+        go_first(self.pid)
         threading.Thread(target=self._listen, daemon=True).start()
         self._page = self._join(time.monotonic() + PAGE_LIMIT)
 

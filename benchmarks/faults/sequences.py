@@ -22,7 +22,8 @@ from benchmarks.faults.table import rows_of
 LONGEST = 4  # faults of a sequence
 LONGEST_WAIT = 0.25  # s between two of them
 KEPT = "sequences.json"
-SEVERE = 0.06  # share of faults that end the loop's process or the peer: they take seconds
+TOGETHER = 40  # sequences on one rig
+SEVERE = 0.04  # share of faults that end the loop's process or the peer: they take seconds
 
 
 @dataclass
@@ -113,18 +114,12 @@ def _on_rig(
     until: float, say: Callable[[str], None],
 ) -> int:  # fmt: skip
     """Run sequences until all are done or the rig is beyond recovery; returns how many are."""
-    while done < share and time.monotonic() < until:
+    last = min(share, done + TOGETHER)
+    while done < last and time.monotonic() < until:
         chosen = draw_sequence(draw, name)
         before, begun = rig.found.violated, time.monotonic()
         try:
-            rig.compensate()
-            for row, wait in chosen:
-                assert row.inject is not None
-                with contextlib.suppress(OSError):  # a peer that stands still does not obey
-                    row.inject(rig)
-                    tally.faults[name] += 1
-                rig.pass_time(wait)
-            rig.recover()
+            tally.faults[name] += make_sequence(rig, chosen)
         except Exception as error:
             tally.stuck += 1
             say(f"{name}: {[row.key for row, _ in chosen]}: {type(error).__name__}: {error}")
@@ -142,14 +137,30 @@ def _on_rig(
     return done
 
 
-def draw_sequence(draw: random.Random, link: str) -> list[tuple[Row, float]]:
-    """Return rows and how long to wait after each, s."""
+def make_sequence(rig: Rig, chosen: Sequence[tuple[Row, float]]) -> int:
+    """Make faults in a row while the daemon compensates, and recover; returns how many."""
+    rig.compensate()
+    made = 0
+    for row, wait in chosen:
+        assert row.inject is not None
+        with contextlib.suppress(OSError):  # a peer that stands still does not obey
+            row.inject(rig)
+            made += 1
+        rig.pass_time(wait)
+    rig.recover()
+    return made
+
+
+def draw_sequence(
+    draw: random.Random, link: str, severe: float = SEVERE
+) -> list[tuple[Row, float]]:
+    """Return rows and how long to wait after each, s; ``severe``: share that restarts processes."""
     rows = [row for row in rows_of(link) if row.inject is not None]
     quick = [row for row in rows if not row.slow]
-    severe = [row for row in rows if row.slow]
+    slow = [row for row in rows if row.slow]
     return [
         (
-            draw.choice(severe if severe and draw.random() < SEVERE else quick),
+            draw.choice(slow if slow and draw.random() < severe else quick),
             draw.uniform(0.0, LONGEST_WAIT),
         )
         for _ in range(draw.randint(1, LONGEST))
