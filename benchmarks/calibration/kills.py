@@ -42,6 +42,8 @@ calibration:
   repeats: 2
   folder: sessions
 """
+MOST_KEPT = 4  # readings before a kill
+LONGEST_WAIT = 0.3  # s
 AXIAL = (3e-6, 8e-6, 7e-6, 1e-5, 1.2e-5, 2e-5)  # rad/Nm
 
 
@@ -65,7 +67,8 @@ def run(kills: int, seed: int, say: bool = True) -> Tally:
         template = _planned(folder)
         session = _fresh(folder, template, tally.sessions)
         while tally.kills < kills:
-            ended = _killed_once(folder, session, float(rng.uniform(0.0, 1.2)), tally)
+            when = int(rng.integers(0, MOST_KEPT)), float(rng.uniform(0.0, LONGEST_WAIT))
+            ended = _killed_once(folder, session, when, tally)
             if say:
                 print(f"\r{tally}", end="", flush=True)
             if ended:
@@ -113,8 +116,11 @@ def _env() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
 
 
-def _killed_once(folder: Path, session: Path, wait: float, tally: Tally) -> bool:
-    """Start the session, kill it ``wait`` s after it measures; returns whether it had ended."""
+def _killed_once(folder: Path, session: Path, when: tuple[int, float], tally: Tally) -> bool:
+    """Start the session and kill it; returns whether all stops were measured by then.
+
+    ``when``: after how many readings, and how long after the last of them, s.
+    """
     before = [e for e in read_entries(session / FILE) if e["kind"] == "reading"]
     process = subprocess.Popen(
         _command(folder, session), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
@@ -124,23 +130,32 @@ def _killed_once(folder: Path, session: Path, wait: float, tally: Tally) -> bool
     assert process.stdout is not None
     process.stdin.write(b"\n\n")  # the loads hang
     process.stdin.flush()
-    told, begun = b"", False
+    told, kept, begun = b"", 0, False
+    count = min(when[0], _stops(session) - len(before))
     for line in process.stdout:
         told += line
-        if line.startswith(b"instrument:"):
-            begun = True
+        begun |= line.startswith(b"instrument:")
+        kept += line.startswith(b"  kept")
+        if begun and kept >= count:
             break
     if not begun:
         tally.refused += 1
         raise RuntimeError(f"the session did not go on: {told.decode()[-600:]}")
-    time.sleep(wait)
+    time.sleep(when[1])
     os.killpg(process.pid, signal.SIGKILL)
     told += process.stdout.read()
     process.wait()
     process.stdin.close()
     process.stdout.close()
     _count(session, before, told, tally)
-    return told.count(b"Write the calibrated cell") > 0 or b"fitted poses" in told
+    done = sum(e["kind"] == "reading" for e in read_entries(session / FILE))
+    return done >= _stops(session)
+
+
+def _stops(session: Path) -> int:
+    """Return how many stops a session's plan has."""
+    entry = next(e for e in read_entries(session / FILE) if e["kind"] == "plan")
+    return len(entry["plan"]["poses"])
 
 
 def _count(session: Path, before: list[dict[str, object]], told: bytes, tally: Tally) -> None:

@@ -17,6 +17,7 @@ from core.errors import RunError
 
 Array = NDArray[np.float64]
 FAR = np.radians(3.0)  # an arm farther from the pose than this is asked about
+THERE = 2e-3  # rad: an arm this near need not be driven
 HEAVY = 0.05  # kg, and share: the controller's payload may differ from the plan's by as much
 PULL = 12.0  # N at a tool that nothing touches
 CHECKED = 60  # points of a way that are looked at
@@ -71,7 +72,7 @@ class Bringing:
 
         None where the instrument has it seated by hand afterwards.
         """
-        if self._driven and self._way_is_clear(pose):
+        if self._driven and not self._there(pose) and self._way_is_clear(pose):
             try:
                 with self.talk.waiting("driving"):
                     self.joints.drive(pose)
@@ -87,6 +88,10 @@ class Bringing:
         stand = self._rested(pose)
         self._look_at_load(pose, stand)
         return stand
+
+    def _there(self, pose: PlannedPose) -> bool:
+        now = self.joints.now()
+        return now is not None and bool(np.abs(now - pose.q).max() < THERE)
 
     def _way_is_clear(self, pose: PlannedPose) -> bool:
         """Return whether the straight way in joint space is free of what the cell names."""

@@ -189,6 +189,10 @@ class Conversation:
     def mark_moved(self, what: str, since: int | None = None) -> None:
         """Begin a new place of the instrument, or of the target, from a reading on."""
         book = self.book
+        here = (book.station, book.target)
+        if all((t.station, t.target - book.stops[t.stop].target) != here for t in book.taken):
+            self.talk.say("  nothing has been measured from where it stands: it is that place")
+            return
         station = book.station + (what == "moved")
         target = book.target + (what == "slipped")
         book.add("moved", station=station, target=target, since=since)

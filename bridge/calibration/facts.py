@@ -57,8 +57,8 @@ def session_facts(
 def _remarks(book: Book) -> list[str]:
     """Return what happened on the way, in words."""
     found = list(book.notes)
-    if book.station:
-        found.append(f"the instrument stood at {book.station + 1} places")
+    if book.places > 1:
+        found.append(f"the instrument stood at {book.places} places")
     if book.target:
         found.append(f"the target had {book.target + 1} places on the tool")
     if book.skipped:

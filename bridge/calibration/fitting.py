@@ -23,13 +23,13 @@ DIAGNOSED = ("position", "pose")  # kinds whose remainder the diagnosis can judg
 def fitted(cell: Cell, order: Order, talk: Talk, book: Book) -> Calibration:
     """Return the fit of a session's readings. Raises InputError where they are too few."""
     assert book.plan is not None
-    kind, places = order.instrument.measures, book.station + 1
+    kind, places = order.instrument.measures, book.places
     observable = observable_of(cell, order.instrument, places)
     metrology = metrology_of(cell, order.instrument, places)
     with talk.waiting("fitting") as tell:
         parameters = Parameters.of(cell.model, effects_of(cell), observable=observable)
         return calibrate(
-            cell.model, book.readings(kind), parameters, metrology, observable=observable,
+            cell.model, book.all_readings(kind), parameters, metrology, observable=observable,
             expected=book.plan.expected, diagnose=kind in DIAGNOSED,
             progress=lambda text: tell(f"fitting: {text}"),
         )  # fmt: skip

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from bridge.calibration.planning import effects_of, loads_of, metrology_of
 from bridge.calibration.talk import Talk
 from bridge.cell import Cell, save_cell
 from bridge.output_file import require_writable, write_text
-from core.calibration.plan import Expectation, Plan, PlannedPose
+from core.calibration.plan import Expectation, Payload, Plan, PlannedPose
 from core.model import Model
 
 Array = NDArray[np.float64]
@@ -59,7 +59,7 @@ class Job(ABC):
         metrology = metrology_of(self.cell, self.order.instrument)
         return Foresight(
             self.cell.model, metrology, self.order.instrument.measures, metrology.sigma,
-            effects_of(self.cell), loads_of(self.cell),
+            effects_of(self.cell), loads_of(self.cell), self.order.instrument.options,
         )  # fmt: skip
 
     @abstractmethod
@@ -87,9 +87,14 @@ class Job(ABC):
         return target
 
 
-def bare_plan(loads: tuple[Any, ...], poses: list[PlannedPose], bought: Any = ()) -> Plan:
-    """Return a plan of a short session, of which no parameters are expected."""
-    return Plan(loads, tuple(poses), NO_EXPECTATION, tuple(bought), 0.0)
+def bare_plan(
+    loads: tuple[Payload, ...],
+    poses: list[PlannedPose],
+    bought: Sequence[tuple[int, float]] = (),
+    expected: Expectation = NO_EXPECTATION,
+) -> Plan:
+    """Return a plan of a short session, of which no parameters of the arm are expected."""
+    return Plan(loads, tuple(poses), expected, tuple(bought), 0.0)
 
 
 def write_document(path: Path, document: dict[str, Any]) -> None:

@@ -7,14 +7,18 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from bridge.calibration.book import Book
 from bridge.calibration.foresight import Foresight
 from bridge.calibration.instruments.flange_sensor import FlangeSensor
 from bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
 from bridge.calibration.job import Job, bare_plan
+from bridge.calibration.order import Order
+from bridge.calibration.talk import Talk
 from bridge.calibration.words import figure
+from bridge.cell import Cell
 from core.calibration.payload_plan import plan_payload
 from core.calibration.payload_session import calibrate_payload
-from core.calibration.plan import Payload, Plan, PlannedPose
+from core.calibration.plan import Expectation, Payload, Plan, PlannedPose
 from core.errors import CellError
 
 Array = NDArray[np.float64]
@@ -26,26 +30,32 @@ class PayloadJob(Job):
     from_here = True
     suffix = "loaded"
 
+    def __init__(self, cell: Cell, order: Order, talk: Talk, book: Book) -> None:
+        if cell.link is None or cell.calibration.joints not in (None, "link"):
+            raise CellError(
+                f"{cell.path}: link: found nothing to read ft_raw_wrench from, expected a "
+                "controller, and calibration.joints: link"
+            )
+        super().__init__(cell, order, talk, book)
+
     def plan(self, begin: Array | None, tell: Callable[[str, float], None]) -> Plan:
         """Return orientations of the flange around where the arm stands."""
-        if self.cell.link is None:
-            raise CellError(
-                f"{self.cell.path}: link: found nothing, expected a controller that tells "
-                "ft_raw_wrench"
-            )
         assert begin is not None
         own = self.cell.file.payload
         load = Payload(own.mass, (own.cog[0], own.cog[1], own.cog[2]), "what is to be weighed")
         found = plan_payload(self.cell.model, begin, poses=self.order.poses, seed=self.order.seed)
         free = np.zeros(len(begin))
         poses = [PlannedPose(i, q, 0, free) for i, q in enumerate(found.poses)]
-        names = zip(found.names, found.units, found.std, strict=True)
-        self._expected = ", ".join(f"{n} ±{figure(s)} {u}" for n, u, s in list(names)[:4])
-        return bare_plan((load,), poses)
+        expected = Expectation(
+            found.names, found.units, found.std, np.full(len(found.std), np.nan), np.nan, np.nan
+        )
+        return bare_plan((load,), poses, expected=expected)
 
     def tell_plan(self, plan: Plan) -> None:
         """Say how many orientations there are, and how well they will tell the load."""
-        self.talk.say(f"plan: {len(plan.poses)} orientations; expected {self._expected}")
+        rows = zip(plan.expected.names, plan.expected.units, plan.expected.std, strict=True)
+        told = ", ".join(f"{n} ±{figure(s)} {u}" for n, u, s in list(rows)[:4])
+        self.talk.say(f"plan: {len(plan.poses)} orientations; expected {told}")
 
     def instrument(self, around: Surroundings) -> AnyInstrument:
         """Return the flange's own sensor."""

@@ -49,7 +49,12 @@ def run_session(cell: Cell, order: Order) -> None:
         talk.note = lambda text: book.add("note", text=text)
         try:
             _lead(cell, order, talk, book)
-        except Word:  # quit
+        except Word as word:
+            if word.word == "undo" and book.taken:  # at the last question
+                book.add("undo", stop=book.taken[-1].stop)
+                talk.say(
+                    f"took back the last reading; stop {(book.next or 0) + 1} is to be measured"
+                )
             talk.say(_how_to_go_on(cell, order, book))
         except InputEnded:
             talk.say()
@@ -80,18 +85,23 @@ def _lead(cell: Cell, order: Order, talk: Talk, book: Book) -> None:
     )
     with ExitStack() as stack:
         joints = make_joints(cell, order, around.ask, folder)
+        instrument = None
+        if not order.plan_only and (book.plan is None or book.next is not None):
+            instrument = job.instrument(around)  # before the plan: what is missing is told at once
+            with talk.waiting("reaching the instrument"):
+                stack.enter_context(instrument)
         if job.from_here and (book.plan is None or book.next is not None):
             _open(talk, stack, joints)
         if book.plan is None:
             _make_plan(job, joints)
+        else:
+            _tell_old_plan(job)
         if order.plan_only:
             talk.say(f"every stop with its joints: {folder / 'poses.csv'}")
             talk.say(f"go on with: {_command(cell, order, book)}")
             return
         if book.next is not None:
-            instrument = job.instrument(around)
-            with talk.waiting("reaching the instrument"):
-                stack.enter_context(instrument)
+            assert instrument is not None
             if not job.from_here:
                 _open(talk, stack, joints)
             _measure(job, joints, instrument)
@@ -117,6 +127,14 @@ def _make_plan(job: Job, joints: JointSource) -> None:
     book.keep_plan(plan)
     write_poses(plan, job.folder / "poses.csv")
     job.tell_plan(plan)
+
+
+def _tell_old_plan(job: Job) -> None:
+    """Tell the plan of an earlier call where it is asked for, and that it stays."""
+    if job.order.poses is not None:
+        job.talk.warn("this session has its plan: --poses counts for a new one")
+    if job.order.plan_only and job.book.plan is not None:
+        job.tell_plan(job.book.plan)
 
 
 def _tell_resumed(talk: Talk, book: Book, folder: Path) -> None:

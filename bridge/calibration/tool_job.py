@@ -8,16 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bridge.calibration.book import Book
 from bridge.calibration.foresight import Foresight
 from bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
 from bridge.calibration.instruments.settings import SphereSettings
 from bridge.calibration.instruments.sphere import TipOnPoint
 from bridge.calibration.job import Job, bare_plan
+from bridge.calibration.order import Order
 from bridge.calibration.planning import loads_of
+from bridge.calibration.talk import Talk
 from bridge.calibration.words import millimetres
+from bridge.cell import Cell
 from core.calibration.plan import Plan, PlannedPose
 from core.calibration.tool_plan import plan_tool
 from core.calibration.tool_session import calibrate_tool
+from core.errors import CellError
 
 Array = NDArray[np.float64]
 POSES = 6
@@ -28,6 +33,14 @@ class ToolJob(Job):
 
     from_here = True
     suffix = "tool"
+
+    def __init__(self, cell: Cell, order: Order, talk: Talk, book: Book) -> None:
+        if cell.calibration.joints == "planned":
+            raise CellError(
+                f"{cell.path}: calibration.joints: found 'planned', expected 'link' or 'typed': "
+                "the tip is brought onto the point by hand"
+            )
+        super().__init__(cell, order, talk, book)
 
     def plan(self, begin: Array | None, tell: Callable[[str, float], None]) -> Plan:
         """Return orientations about where the tip is now."""

@@ -83,9 +83,9 @@ class VerifyJob(Job):
     def finish(self) -> None:
         """Say whether the calibration holds, and report it."""
         talk, order, folder = self.talk, self.order, self.folder
-        places = self.book.station + 1
+        places = self.book.places
         metrology = metrology_of(self.cell, order.instrument, places)
-        readings = self.book.readings(order.instrument.measures)
+        readings = self.book.all_readings(order.instrument.measures)
         with talk.waiting("comparing"):
             found = verify(
                 self.cell.model, readings, self._promise(), metrology,

@@ -62,7 +62,7 @@ class WholeJob(Job):
         talk.say()
         found = fitted(self.cell, order, talk, self.book)
         tell_calibration(talk, found)
-        metrology = metrology_of(self.cell, order.instrument, self.book.station + 1)
+        metrology = metrology_of(self.cell, order.instrument, self.book.places)
         write_log(found.readings, metrology.registered, folder / "readings.csv")
         promise = document_of(found, sigma=metrology.sigma)
         write_document(folder / "promise.json", promise)
