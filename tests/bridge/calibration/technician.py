@@ -8,8 +8,7 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -24,7 +23,6 @@ from drivers.simulated.settings import BENCH_PORT, SCRIPT_PORT
 
 Array = NDArray[np.float64]
 JOINT = re.compile(r"J\d ([+-][\d.]+)°")
-PROMPT = re.compile(r"(?:\r\n|^)([^\r\n]*?) > $")
 COLOURS = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 FRAME = Registration(rotation_matrix(np.array([0.1, -0.2, 0.7])), np.array([2.5, -0.8, 0.3]))
 PATIENCE = 240.0  # s, on a busy machine
@@ -36,8 +34,6 @@ class Hands:
 
     host: str
     frame: Registration = FRAME  # where the tracker stands
-    samples: int = 10
-    sockets: list[socket.socket] = field(default_factory=list)
 
     def bench(self, line: str) -> str:
         with socket.create_connection((self.host, BENCH_PORT), timeout=10) as link:
@@ -115,6 +111,14 @@ class Terminal:
             if line.endswith(" > "):
                 return line[:-3].strip()
 
+    def watch(self) -> None:
+        """Take what is shown meanwhile."""
+        assert self._child is not None
+        try:
+            self.shown += COLOURS.sub("", self._child.read_nonblocking(4096, timeout=PATIENCE))
+        except pexpect.EOF:
+            raise AssertionError(f"it ended: {self.shown[-1500:]}") from None
+
     def type(self, line: str) -> None:
         assert self._child is not None
         self._child.send(line + "\r")
@@ -138,6 +142,3 @@ def last_pose(shown: str) -> Array:
     """Return the joints (n,), rad, that were told last."""
     line = next(part for part in reversed(shown.splitlines()) if "J1 " in part)
     return np.radians([float(v) for v in JOINT.findall(line)])
-
-
-Answer = Callable[[str], str | None]
