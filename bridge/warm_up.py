@@ -10,6 +10,7 @@ import numpy as np
 
 from core.arm import builtin_arm
 from core.compensation import correct
+from core.kernels.factor import factor_blocks
 from core.limits import Limiter, Limits
 from core.model import Model
 from drivers.ur_rtde.nominal import Nominal
@@ -20,8 +21,11 @@ def warm_up() -> None:
     n = 6
     model = Model(builtin_arm("ur10e")).with_compliance([1e-6] * n, [1e-6] * n)
     q = np.array([[0.0, -1.5, 1.8, -1.87, -1.57, 0.0]])
-    model.predict(q)
-    model.linear_form(q)
+    for rows in (q, np.repeat(q, 4, axis=0)):  # one by one, and in blocks
+        model.predict(rows)
+        model.linear_form(rows)
+    gap, factor = np.zeros((1, 3)), np.zeros((2 * n + 1, 2 * n + 1))
+    factor_blocks(model.chain(), model.rows(q), gap, gap, 0, 0, 1, factor)
     corrected = correct(model, q)
     Nominal(model)
     limits = Limits(np.full(n, -7.0), np.full(n, 7.0), np.full(n, 3.0))

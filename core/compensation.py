@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from core import kernel
 from core.kernel import JIT, Rows
+from core.kernels import single
 from core.least_offset import LARGEST_OFFSET as LARGEST_OFFSET
 from core.least_offset import smallest_offset
 from core.loads import Loads
@@ -26,6 +27,7 @@ Array = NDArray[np.float64]
 TOLERANCE = 1e-9  # m, and rad times the tool's lever: where the pose counts as reached
 MAX_STEPS = 12
 NOTHING = Loads()
+SCRATCH = 42  # numbers that the compiled correction needs besides
 LEVER = 0.5  # m: weighs a rotation against a shift
 
 
@@ -132,56 +134,6 @@ def _rigid_pose(rigid, row, shape, q, pose):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
-def _solve(chain, row, shape, pose, nominal, offset, q):  # type: ignore[no-untyped-def]
-    """Write the best joint angles q (n,); returns the distance (m) left and the steps taken."""
-    n = nominal.shape[0]
-    best, steps = np.inf, 0
-    q[:] = nominal
-    for _ in range(MAX_STEPS):
-        steps += 1
-        for i in range(n):
-            row.q[0, i] = nominal[i] + offset[i]
-        distance = next_offset(
-            chain, row, 0, shape, pose[:3], pose[3:].reshape((3, 3)), LEVER, offset
-        )
-        if distance < 0:
-            break
-        if distance < best:
-            q[:], best = row.q[0], distance
-        if distance < TOLERANCE:
-            break
-    return best, steps
-
-
-@njit(**JIT)
-def _correct(block, rigid_block, n, nominal, found):  # type: ignore[no-untyped-def]
-    """Write the corrected setpoint q (n,) and the motion (6,); returns distance, steps.
-
-    The blocks hold all that is kept: chain, row, shape; the first one the last offset besides, the
-    second one the wanted pose. For rows of which nothing but the joint angles changes from step to
-    step.
-    """
-    c, r = sizes_of(n)
-    row_end, shape_end = c + r, block.shape[0] - n
-    offset, wanted = block[shape_end:], rigid_block[rigid_block.shape[0] - 12 :]
-    rigid, rigid_row = chain_of(rigid_block, n), row_of(rigid_block[c:row_end], n)
-    rigid_shape = shape_of(rigid_block[row_end:], n)
-    q, moved = found[:n], found[n:]
-    _rigid_pose(rigid, rigid_row, rigid_shape, nominal, wanted)
-    best, steps = _solve(
-        chain_of(block, n), row_of(block[c:row_end], n), shape_of(block[row_end:], n), wanted,
-        nominal, offset, q,
-    )  # fmt: skip
-    for i in range(n):
-        # where nothing was found, nothing (nor a joint angle that is no number) may go on
-        offset[i] = q[i] - nominal[i] if best < np.inf else 0.0
-    pose = np.empty(12)
-    _rigid_pose(rigid, rigid_row, rigid_shape, q, pose)
-    _moved(wanted, pose, offset, moved)
-    return best, steps
-
-
-@njit(**JIT)
 def _want(rigid_block, row_block, shape_block, q, pose):  # type: ignore[no-untyped-def]
     """``_rigid_pose`` of packed records."""
     n = q.shape[0]
@@ -210,8 +162,7 @@ def _parts(block: Array, n: int) -> tuple[Array, Array, Array, Array]:
 class Compensator:
     """Live compensation of one setpoint after the other, with buffers kept between them.
 
-    ``correct`` costs some ten microseconds, one Newton step another ten. Not to be shared between
-    threads.
+    ``correct`` costs a few microseconds. Not to be shared between threads.
     """
 
     def __init__(self, model: Model) -> None:
@@ -222,14 +173,18 @@ class Compensator:
         )
         shape, row = pack(kernel.new_shape(n)), pack(plain)
         # one block for all that is kept: each array handed to compiled code is unwrapped anew
-        self._block = np.concatenate([pack(model.chain()), row, shape, np.zeros(n)])
+        chain = model.chain()
+        self._block = np.concatenate([pack(chain), row, shape, np.zeros(n + SCRATCH)])
         rigid = pack(model.without_terms().chain())
-        self._rigid_block = np.concatenate([rigid, row, shape, np.zeros(12)])
-        self._chain, self._row, self._shape, self._offset = _parts(self._block, n)
-        self._rigid, self._rigid_row, self._rigid_shape, self._wanted = _parts(self._rigid_block, n)
+        self._rigid_block = np.concatenate([rigid, row, shape, np.zeros(24)])
+        self._chain, self._row, self._shape, rest = _parts(self._block, n)
+        self._offset = rest[:n]
+        self._rigid, self._rigid_row, self._rigid_shape, rest = _parts(self._rigid_block, n)
+        self._wanted = rest[:12]
         self._view = view_row(self._row, n)
         self._loaded: Loads | None = None
         self._conditions = model.conditions()
+        self._stiff_links = not chain.flexibility.any()
         self._nominal, self._pose = np.zeros(n), np.zeros(12)
 
     def correct(self, nominal_q: Array, loads: Loads | None = None) -> Correction:
@@ -245,15 +200,17 @@ class Compensator:
         if loads is not None or self._loaded is not NOTHING:
             loads = loads or NOTHING
             self._load(loads)
-        if self._conditions:
+        if self._stiff_links and not self._conditions:
+            best, steps = single.correct(
+                self._block, self._rigid_block, nominal, found, LEVER, TOLERANCE, MAX_STEPS
+            )
+        else:
             rigid = self._rigid
             _want(rigid, self._rigid_row, self._rigid_shape, nominal, self._wanted)
             best, steps = self._solve_conditioned(nominal, loads or NOTHING, q)
             self._offset[:] = q - nominal if best < np.inf else 0.0
             _want(rigid, self._rigid_row, self._rigid_shape, q, self._pose)
             _moved(self._wanted, self._pose, self._offset, moved)
-        else:
-            best, steps = _correct(self._block, self._rigid_block, n, nominal, found)
         return Correction(q, moved, np.float64(best), np.int64(steps))
 
     def forget(self) -> None:
@@ -262,7 +219,7 @@ class Compensator:
         self._shape[:] = 0.0
 
     def _solve_conditioned(self, nominal: Array, loads: Loads, q: Array) -> tuple[float, int]:
-        """Solve where effects in the model look at the joint angles anew in each step."""
+        """Solve where links bend, or effects look at the joint angles anew in each step."""
         best, steps, row, offset = np.inf, 0, self._view, self._offset
         q[:] = nominal
         for steps in range(1, MAX_STEPS + 1):  # noqa: B007

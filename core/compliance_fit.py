@@ -120,10 +120,10 @@ def fit_nuisances(model: Model, data: Data) -> Fit:
     for _ in range(NUISANCE_ROUNDS):
         gap, poses = residual(model, data, frame)
         weights, scale = _robust_weights(gap)
-        per_cell = _per_cell(weights, scale, gap.shape[1])
+        per_cell = per_cell_of(weights, scale, gap.shape[1])
         columns = nuisance_columns(model, poses, gap.shape[1]) * per_cell[..., None]
         step = np.linalg.lstsq(columns.reshape(-1, 9), (gap * per_cell).ravel(), rcond=RANK)[0]
-        model, frame = _moved(model, frame, step)
+        model, frame = moved(model, frame, step)
         if np.abs(step).max() < SETTLED:
             break
     return Fit(model, frame, weights)
@@ -154,24 +154,37 @@ def fit_flexibilities(
 def _round(now: Fit, data: Data, kept: Mask, prior: tuple[Array, float], nonnegative: bool) -> Fit:
     """Take one step of Gauss and Newton."""
     model, n = now.model, now.model.arm.n
-    flexibility = now.flexibility
     gap, poses = residual(model, data, now.frame)
     weights, scale = _robust_weights(gap)
     width = gap.shape[1]
-    per_cell = _per_cell(weights, scale, width)
+    per_cell = per_cell_of(weights, scale, width)
     form = model.linear_form(data.q, data.loads).regressor[:, :width]
     A = (form * per_cell[..., None]).reshape(-1, 2 * n)
     b = (gap * per_cell).ravel()
-    linear = _projected(A, b + A @ flexibility, np.zeros((len(b), 0)))
     F = np.zeros((len(b), 0))
     if data.nuisances:
         F = (nuisance_columns(model, poses, width) * per_cell[..., None]).reshape(len(b), -1)
-        linear = _projected(A, b + A @ flexibility, orthonormal(F))
+    return stepped(now, (F, A, b), weights, kept, prior, nonnegative=nonnegative)
+
+
+def stepped(
+    now: Fit, problem: tuple[Array, Array, Array], weights: Array, kept: Mask,
+    prior: tuple[Array, float], *, nonnegative: bool,
+) -> Fit:  # fmt: skip
+    """Return the fit after one step of Gauss and Newton.
+
+    ``problem``: columns of the nuisances (M, 0 or 9), of the flexibilities (M, 2n), and the gap
+    (M,), all weighed; or their R factor's, which says the same in fewer rows.
+    """
+    F, A, b = problem
+    model, frame, flexibility = now.model, now.frame, now.flexibility
+    base = orthonormal(F) if F.shape[1] else F
+    linear = _projected(A, b + A @ flexibility, base)
     found = solve(linear, kept, flexibility, prior, nonnegative)
-    frame = now.frame
-    if data.nuisances:
+    if F.shape[1]:
         left = b - A @ (found - flexibility)
-        model, frame = _moved(model, frame, np.linalg.lstsq(F, left, rcond=RANK)[0])
+        model, frame = moved(model, frame, np.linalg.lstsq(F, left, rcond=RANK)[0])
+    n = model.arm.n
     return Fit(model.with_compliance(found[:n], found[n:]), frame, weights, linear)
 
 
@@ -210,28 +223,39 @@ def solve(
     return found
 
 
-def _moved(model: Model, frame: Registration, step: NDArray[Any]) -> tuple[Model, Registration]:
+def moved(model: Model, frame: Registration, step: NDArray[Any]) -> tuple[Model, Registration]:
     """Return model and frame after a step of the nuisances: frame (6,), tool point (3,)."""
     tool = model.tool_in_flange.copy()
     tool[:3, 3] += step[6:]
     return replace(model, tool_in_flange=tool), frame.moved(step[:6])
 
 
-def _per_cell(weights: Array, scale: Array, width: int) -> Array:
+def per_cell_of(weights: Array, scale: Array, width: int) -> Array:
+    """Return the factor (N, width) that makes every cell's noise 1 and weighs its row."""
     return np.asarray(np.sqrt(weights)[:, None] / np.repeat(scale, 3)[:width])
 
 
 def _robust_weights(gap: Array) -> tuple[Array, Array]:
     """Return weights (N,) (Tukey's biweight on wild rows) and the noise scale of each unit."""
 
-    def spread(part: Array) -> float:
-        middle = np.median(np.abs(part))
-        return max(float(1.4826 * middle), 1e-12)
+    def middle(part: Array) -> float:
+        return float(np.median(np.abs(part)))
 
-    scale = np.array([spread(gap[:, :3]), spread(gap[:, 3:]) if gap.shape[1] > 3 else 1.0])
+    scale = noise_scale(middle(gap[:, :3]), middle(gap[:, 3:]) if gap.shape[1] > 3 else None)
+    return weights_at(gap, scale), scale
+
+
+def noise_scale(middle: float, turned: float | None) -> Array:
+    """Return the noise (2,), m and rad, from the medians of a gap's absolute values."""
+    spread = [max(1.4826 * value, 1e-12) for value in (middle, turned or 0.0)]
+    return np.array([spread[0], 1.0 if turned is None else spread[1]])
+
+
+def weights_at(gap: Array, scale: Array) -> Array:
+    """Return the weights (N,) of gaps (N, 3 or 6) where the noise is ``scale`` (2,)."""
     distance = np.linalg.norm(gap / np.repeat(scale, 3)[: gap.shape[1]], axis=1)
     limit = WILD * np.sqrt(gap.shape[1])
     weights = np.clip(1 - (distance / limit) ** 2, 0, 1) ** 2
     # below two deviations nothing is weighed down: clean data keep their full information
     weights = np.where(distance < 2 * np.sqrt(gap.shape[1]), 1.0, weights)
-    return np.maximum(weights, 1e-12), scale
+    return np.asarray(np.maximum(weights, 1e-12))

@@ -98,7 +98,7 @@ def _folded(fit: Fit, data: Data, metrology: Metrology) -> Evidence:
     gap, poses = residual(fit.model, data, fit.frame)
     width, count = gap.shape[1], 2 * fit.model.arm.n
     units = _units(gap)
-    calm = _calm(gap * units, count + data.nuisances)
+    calm = _calm(gap * units, count + data.nuisances, metrology.sigma)
     if not calm.any():
         raise ExcitationError("found wild readings alone, expected measured poses")
     unit = units * np.ones((int(calm.sum()), 1))
@@ -126,11 +126,14 @@ def _folded(fit: Fit, data: Data, metrology: Metrology) -> Evidence:
     )  # fmt: skip
 
 
-def _calm(gap: Array, spent: int) -> NDArray[np.bool_]:
-    """Return the rows (N,) that are no wild readings; ``spent`` numbers were fitted to them."""
+def _calm(gap: Array, spent: int, least: float) -> NDArray[np.bool_]:
+    """Return the rows (N,) that are no wild readings.
+
+    ``spent`` numbers were fitted to them; ``least`` (m) is the noise that there is in any case.
+    """
     # of few poses the fit takes up much of the noise: what is left understates it
     share = max(1 - spent / gap.size, 0.1)
-    scale = max(1.4826 * float(np.median(np.abs(gap))), 1e-12) / np.sqrt(share)
+    scale = max(1.4826 * float(np.median(np.abs(gap))) / np.sqrt(share), least)
     limit = WILD * scale * np.sqrt(gap.shape[1])
     return np.asarray(np.linalg.norm(gap, axis=1) < limit)
 

@@ -108,10 +108,10 @@ def identify_compliance(
     are missing, ExcitationError where nothing in the log makes the joints bend.
     """
     metrology = metrology or Metrology()
-    data, used = _data(log, metrology)
+    data, used = data_of(log, metrology)
     usual = 1e-2 / typical_moment(model.arm)
     prior_std = usual if prior_std is None else prior_std
-    _require_excitation(model, data, metrology, min(prior_std, usual))
+    require_excitation(model, data, metrology, min(prior_std, usual))
     centre = flexibilities(model)
     scale = prior_std if np.isfinite(prior_std) else usual
     task = _Task((centre, prior_std), scale, nonnegative)
@@ -125,7 +125,8 @@ def identify_compliance(
     return _result(model, data, used, (before, fit), shown, held_out)
 
 
-def _data(log: Log, metrology: Metrology) -> tuple[Data, NDArray[np.int64]]:
+def data_of(log: Log, metrology: Metrology) -> tuple[Data, NDArray[np.int64]]:
+    """Return the rows of a log that have measured poses, and which ones they are."""
     q = log.require("actual_q", "target_q")
     measured = log.get("measured_position")
     if measured is None:
@@ -141,7 +142,8 @@ def _data(log: Log, metrology: Metrology) -> tuple[Data, NDArray[np.int64]]:
     return Data(q[used], loads, measured[used], matrix, metrology.registered), used
 
 
-def _require_excitation(model: Model, data: Data, metrology: Metrology, usual: float) -> None:
+def require_excitation(model: Model, data: Data, metrology: Metrology, usual: float) -> None:
+    """Raise ExcitationError where nothing in the data makes a joint bend by ``usual`` (rad/Nm)."""
     n = model.arm.n
     unknown = 2 + data.nuisances
     if 3 * len(data.q) < unknown:
@@ -222,20 +224,21 @@ def _result(
         shown.told, after.frame,
         after.model.tool_in_flange[:3, 3] - model.tool_in_flange[:3, 3], len(data.q),
         _rms(gaps[0], data.nuisances), _rms(gaps[1], data.nuisances + int(kept.sum())),
-        *held_out, used[~calm], tuple(_notes(after, kept, calm, data)),
+        *held_out, used[~calm], tuple(notes_of(after, kept, int((~calm).sum()), data.nuisances)),
     )  # fmt: skip
 
 
-def _notes(fit: Fit, kept: Mask, calm: Mask, data: Data) -> list[str]:
+def notes_of(fit: Fit, kept: Mask, wild: int, nuisances: int) -> list[str]:
+    """Return in words what a fit was like: wild readings, bounds reached, what was not shown."""
     notes = []
-    if not calm.all():
-        notes.append(f"{int((~calm).sum())} wild reading(s) weighed down")
+    if wild:
+        notes.append(f"{wild} wild reading(s) weighed down")
     at_zero = np.flatnonzero((fit.flexibility <= 0) & kept)
     if len(at_zero):
         names = ", ".join(base_parameters.name(i, len(kept)) for i in at_zero)
         notes.append(f"at their bound of zero: {names}")
     if not kept.any():
         notes.append("these data show no flexibility at all: the model is left as it was")
-    if data.nuisances:
+    if nuisances:
         notes.append("frame and tool point were estimated along and are not written to the cell")
     return notes

@@ -138,7 +138,7 @@ def read_log(path: Path | str, n: int) -> Log:
         names, table = _read_csv(path)
     if not len(table):
         raise LogError(f"{path}: found no data rows, expected at least one")
-    columns = _group(path, [name for name in names if is_known(name)], table, n)
+    columns = table_columns(path, [name for name in names if is_known(name)], table, n)
     if not columns:
         raise LogError(f"{path}: columns: found none that the contract names{nearest(names)}")
     unknown = tuple(name for name in names if not is_known(name))
@@ -226,7 +226,11 @@ def _read_parquet(path: Path) -> tuple[list[str], Array]:
     return names, np.column_stack(table) if wanted else np.empty((rows, 0))
 
 
-def _group(path: Path, names: Sequence[str], table: Array, n: int) -> dict[str, Array]:
+def table_columns(path: Path, names: Sequence[str], table: Array, n: int) -> dict[str, Array]:
+    """Return columns (N,) or (N, k) of a table (N, names), grouped by contract name.
+
+    Raises LogError where a vector has a gap in its indices, or not its length.
+    """
     found: dict[str, dict[int, int]] = {}
     columns: dict[str, Array] = {}
     for position, name in enumerate(names):

@@ -63,7 +63,12 @@ def parts_of(name: str) -> tuple[str, int, str]:
 
 def arm_with(kind: ArmKind, values: Mapping[str, float]) -> RealArm:
     """Return the real arm with these values beyond its drawing."""
-    rows, axial, radial = list(kind.rows), np.zeros(kind.n), np.zeros(kind.n)
+    return with_values(real_arm(kind), values)
+
+
+def with_values(real: RealArm, values: Mapping[str, float]) -> RealArm:
+    """Return an arm with these values beyond what it has."""
+    rows, axial, radial = list(real.rows), real.axial.copy(), real.radial.copy()
     shift, twist = np.zeros(3), np.zeros(3)
     for name, value in values.items():
         effect, joint, key = parts_of(name)
@@ -77,9 +82,10 @@ def arm_with(kind: ArmKind, values: Mapping[str, float]) -> RealArm:
             (twist if key.startswith("r") else shift)["xyz".index(key[-1])] += value
         else:
             (axial if effect == "axial_compliance" else radial)[i] += value
-    return real_arm(
-        kind, rows=tuple(rows), axial=axial, radial=radial,
-        tool_position=np.array([0.0, 0.0, kind.tool]) + shift, tool_rotation=turn(twist[None])[0],
+    return replace(
+        real, rows=tuple(rows), axial=axial, radial=radial,
+        tool_position=real.tool_position + shift,
+        tool_rotation=turn(twist[None])[0] @ real.tool_rotation,
     )  # fmt: skip
 
 

@@ -11,7 +11,8 @@ from bridge.supervisor import Cause, State
 POLL = 0.001  # s
 AFTERWARDS = 0.25  # s for which the end state must stay
 RESTING, AT_REST = (State.OBSERVING, State.COMPENSATING, State.FAULT), 3.0  # s: stays for good
-END_LIMIT = 25.0  # s
+END_LIMIT = 90.0  # s: a new process takes its time on a busy machine
+PATIENCE = 10.0  # s on top of what is allowed, to tell what is late from what never comes
 BUSY = (Cause.OVERRUN.value, Cause.RESYNC.value)
 
 
@@ -49,15 +50,25 @@ def _disturbed(rig: Rig, row: Row, moment: float) -> bool:
 
 def _await(rig: Rig, row: Row, moment: float, before: dict[str, int]) -> float | None:
     """Return how long after ``moment`` the fault was detected, s."""
-    until = time.monotonic() + row.within(rig.link) + 2.0
+    until = time.monotonic() + row.within(rig.link) + PATIENCE
     while time.monotonic() < until:
         if row.sign == "none":
             return 0.0
-        seen = _left(rig, moment) if row.sign == "left" else _counted(rig, row, before)
+        seen = _seen(rig, row, moment, before)
         if seen is not None:
             return seen - moment
         rig.pass_time(POLL)
     return None
+
+
+def _seen(rig: Rig, row: Row, moment: float, before: dict[str, int]) -> float | None:
+    if row.sign == "left":
+        return _left(rig, moment)
+    if row.sign.startswith("event:"):
+        kind, _, key = row.sign.removeprefix("event:").partition(" ")
+        told = (e for e in rig.run.since(moment) if e["kind"] == kind and (not key or e.get(key)))
+        return next((float(event["time"]) for event in told), None)
+    return _counted(rig, row, before)
 
 
 def _left(rig: Rig, moment: float) -> float | None:

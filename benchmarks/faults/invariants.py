@@ -103,6 +103,11 @@ class Checker:
         self._ended_at = -math.inf  # s
         self._unused = 0.0  # states that no write has followed yet
 
+    @property
+    def last_offset(self) -> Numbers:
+        """Return the offset (6,) that the last write carried; what is over has none."""
+        return self._stream.offset
+
     def take(self, seen: Sequence[Fresh | Write]) -> None:
         """Check what the tap has seen next."""
         for item in seen:

@@ -21,6 +21,7 @@ from benchmarks.faults.wire.socketcand import PiperDecoder
 from bridge.cell import load_cell
 from drivers.simulated.kinematics import frame_of
 from drivers.simulated.plant_arm import plant_arm
+from drivers.simulated.settings import START_Q
 from drivers.ur_rtde.driver import OFFSET_SCRIPT
 
 CONFIG = Path(__file__).parents[2] / "config"
@@ -66,6 +67,7 @@ class Link(ABC):
     """One kind of link. ``rate`` is in Hz; ``hold`` (s) is after what silence the offset goes."""
 
     name: str
+    start_q: tuple[float, ...] = START_Q
     usual_rate: float
     moves_arm: bool
     base: str
@@ -231,6 +233,7 @@ class CanPiper(Link):
 
     name, usual_rate, moves_arm, base, main = "can piper", 200.0, True, PIPER, "can"
     port = 29536
+    start_q = (0.0, 1.5, -1.2, 0.0, 0.6, 0.0)
     grain, grain_rotation = 2e-5, 6e-5  # 0.001 degrees of each joint
 
     def section(self, host: str) -> str:

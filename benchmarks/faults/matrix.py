@@ -17,6 +17,7 @@ from benchmarks.faults.row import Result, Row
 from benchmarks.faults.table import rows_of
 
 Say = Callable[[str], None]
+KEPT = "results.jsonl"
 ATTEMPTS = 6  # of one fault on a machine that misses deadlines by itself
 
 
@@ -36,15 +37,23 @@ def run_matrix(
         for result in _on_one_rig(link, rows * repeat, folder / name, until, say):
             found.append(result)
             _keep(folder, result)
-        for row in rows_of(name, apart=True) * repeat:
+        for i, row in enumerate(rows_of(name, shared=False) * repeat):
             if (keys and row.key not in keys) or time.monotonic() > until:
                 continue
-            assert row.apart is not None
-            result = row.apart(row, link, folder / f"{name}-{row.key.replace(' ', '-')}")
+            result = run_alone(row, link, folder / f"{name}-{i}")
             found.append(result)
             say(line(result))
             _keep(folder, result)
     return found
+
+
+def run_alone(row: Row, link: Link, folder: Path) -> Result:
+    """Make a fault that has a rig, or even a daemon, of its own."""
+    if row.apart is not None:
+        return row.apart(row, link, folder)
+    assert row.own is not None
+    with row.own(link, folder) as rig:
+        return _patiently(rig, row)
 
 
 def _on_one_rig(
@@ -88,8 +97,15 @@ def _failed(rig: Rig, row: Row, error: Exception) -> Result:
 
 def _keep(folder: Path, result: Result) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "results.jsonl").open("a", encoding="utf-8") as file:
+    with (folder / KEPT).open("a", encoding="utf-8") as file:
         file.write(json.dumps(asdict(result)) + "\n")
+
+
+def read_results(folder: Path) -> list[Result]:
+    """Return what a run has kept in its folder."""
+    lines = (folder / KEPT).read_text(encoding="utf-8").splitlines()
+    kept = [json.loads(text) for text in lines]
+    return [Result(**{**given, "wrong": tuple(given["wrong"])}) for given in kept]
 
 
 def line(result: Result) -> str:

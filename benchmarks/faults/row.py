@@ -38,6 +38,7 @@ class Result:
         return None if self.detected is None else self.detected / self.cycle
 
 
+Own = Callable[[Link, Path], Rig]
 Apart = Callable[["Row", Link, Path], Result]
 
 
@@ -46,10 +47,12 @@ class Row:
     """A fault.
 
     fault: as facts and documents name it. how: how it is made. links: where it can happen.
-    sign: how it is detected: ``left`` (compensating ends), or the name of a counter of the loop.
+    sign: how it is detected: ``left`` (compensating ends), names of counters of the loop, or
+    ``event:KIND`` (KIND may be followed by a key that the event must have).
     within: longest time to that, s, by link. end: states it may end in, once it is over, without a
     person; ``lasting``: s from the detection to the healing. ``inject`` makes it on a running rig;
-    ``apart`` runs a fault that needs a daemon of its own.
+    ``own`` makes the rig of a fault that needs settings of its own; ``apart`` runs one that ends
+    the daemon itself, or keeps it from starting.
     """
 
     key: str
@@ -61,9 +64,15 @@ class Row:
     within: Limit = lambda link: link.hold + 0.1
     end: tuple[str, ...] = ("observing",)
     lasting: float = 0.0
+    own: Own | None = None
     apart: Apart | None = None
     slow: bool = False
     after: Inject | None = field(default=None)  # undoes what healing the rig does not
+
+    @property
+    def shares(self) -> bool:
+        """Return whether it is made on a rig that runs already."""
+        return self.own is None and self.apart is None
 
 
 def cycles(count: float, least: float = 0.06) -> Limit:

@@ -7,6 +7,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
+from benchmarks.faults.punctual import go_first
 from bridge.cell import load_cell
 from bridge.daemon import Daemon, settings_of
 from bridge.summary import RunSummary
@@ -17,7 +18,36 @@ WRITES = tuple(state.name for state in State if state.writes)
 Event = dict[str, Any]
 
 
-class Running:
+class Told:
+    """What a run has told: its events, with both clocks' times."""
+
+    events: list[Event]
+
+    def since(self, moment: float) -> list[Event]:
+        """Return the events that happened after ``moment`` (s, wall clock)."""
+        return [event for event in list(self.events) if event["time"] >= moment]
+
+    def writing_spans(self) -> list[tuple[float, float]]:
+        """Return from when until when the loop was in a state that writes, s monotonic."""
+        spans, begun = [], None
+        for event in list(self.events):
+            if event["kind"] == "transition":
+                if event["to"] in WRITES:
+                    begun = event["monotonic"] if begun is None else begun
+                    continue
+            elif event["kind"] not in ("failure", "fault"):
+                continue
+            if begun is not None:
+                spans.append((begun, event["monotonic"]))
+                begun = None
+        return spans if begun is None else [*spans, (begun, math.inf)]
+
+    def last_words(self) -> str:
+        """Return the last events in short."""
+        return "; ".join(f"{e.get('kind')} {words_of(e)}" for e in self.events[-4:])
+
+
+class Running(Told):
     """One run of the daemon; every event is kept, with its wall clock's time."""
 
     def __init__(self, cell: Path, observe: bool = False, **changed: Any) -> None:
@@ -35,6 +65,7 @@ class Running:
         self._thread.start()
 
     def _run(self) -> None:
+        go_first()
         try:
             self.summary = self.daemon.run()
         except Exception as error:
@@ -56,29 +87,6 @@ class Running:
             return self.page.state
         except (IndexError, ValueError):
             return -1
-
-    def writing_spans(self) -> list[tuple[float, float]]:
-        """Return from when until when the loop was in a state that writes, s monotonic."""
-        spans, begun = [], None
-        for event in list(self.events):
-            if event["kind"] == "transition":
-                if event["to"] in WRITES:
-                    begun = event["monotonic"] if begun is None else begun
-                    continue
-            elif event["kind"] not in ("failure", "fault"):
-                continue
-            if begun is not None:
-                spans.append((begun, event["monotonic"]))
-                begun = None
-        return spans if begun is None else [*spans, (begun, math.inf)]
-
-    def last_words(self) -> str:
-        """Return the last events in short."""
-        return "; ".join(f"{e.get('kind')} {words_of(e)}" for e in self.events[-4:])
-
-    def since(self, moment: float) -> list[Event]:
-        """Return the events that happened after ``moment`` (s, wall clock)."""
-        return [event for event in list(self.events) if event["time"] >= moment]
 
     def stop(self) -> None:
         """End it and wait."""

@@ -6,10 +6,12 @@ the daemon comes back to compensating once a person has healed and armed it agai
 
 from __future__ import annotations
 
+import contextlib
+import json
 import random
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from benchmarks.faults.links import LINKS
@@ -19,7 +21,9 @@ from benchmarks.faults.table import rows_of
 
 LONGEST = 4  # faults of a sequence
 LONGEST_WAIT = 0.25  # s between two of them
-SEVERE = 0.06  # share of faults that end the loop's process or the peer: they take seconds
+KEPT = "sequences.json"
+TOGETHER = 40  # sequences on one rig
+SEVERE = 0.04  # share of faults that end the loop's process or the peer: they take seconds
 
 
 @dataclass
@@ -35,6 +39,19 @@ class Tally:
     violations: dict[str, list[str]] = field(default_factory=dict)
     violated: int = 0
     stuck: int = 0
+
+    def add(self, other: Tally) -> None:
+        """Take another tally's links in; each link is in one of them only."""
+        for key in ("sequences", "faults", "frames", "writes"):
+            mine, theirs = getattr(self, key), getattr(other, key)
+            mine.update({name: mine.get(name, 0) + count for name, count in theirs.items()})
+        for key in ("largest_step", "largest_offset"):
+            mine, theirs = getattr(self, key), getattr(other, key)
+            mine.update({name: max(mine.get(name, 0.0), most) for name, most in theirs.items()})
+        for name, words in other.violations.items():
+            self.violations[name] = [*self.violations.get(name, []), *words]
+        self.violated += other.violated
+        self.stuck += other.stuck
 
     def words(self) -> str:
         """Return it in one line."""
@@ -83,7 +100,13 @@ def run_sequences(
             with Rig(link, folder / f"sequences-{name}") as rig:
                 done = _on_rig(rig, name, done, share, draw, tally, until, say)
                 _add(tally, name, rig)
+            (folder / KEPT).write_text(json.dumps(asdict(tally)), encoding="utf-8")
     return tally
+
+
+def read_tally(folder: Path) -> Tally:
+    """Return what a run has kept in its folder."""
+    return Tally(**json.loads((folder / KEPT).read_text(encoding="utf-8")))
 
 
 def _on_rig(
@@ -91,17 +114,12 @@ def _on_rig(
     until: float, say: Callable[[str], None],
 ) -> int:  # fmt: skip
     """Run sequences until all are done or the rig is beyond recovery; returns how many are."""
-    while done < share and time.monotonic() < until:
+    last = min(share, done + TOGETHER)
+    while done < last and time.monotonic() < until:
         chosen = draw_sequence(draw, name)
         before, begun = rig.found.violated, time.monotonic()
         try:
-            rig.compensate()
-            for row, wait in chosen:
-                assert row.inject is not None
-                row.inject(rig)
-                tally.faults[name] += 1
-                rig.pass_time(wait)
-            rig.recover()
+            tally.faults[name] += make_sequence(rig, chosen)
         except Exception as error:
             tally.stuck += 1
             say(f"{name}: {[row.key for row, _ in chosen]}: {type(error).__name__}: {error}")
@@ -119,14 +137,30 @@ def _on_rig(
     return done
 
 
-def draw_sequence(draw: random.Random, link: str) -> list[tuple[Row, float]]:
-    """Return rows and how long to wait after each, s."""
+def make_sequence(rig: Rig, chosen: Sequence[tuple[Row, float]]) -> int:
+    """Make faults in a row while the daemon compensates, and recover; returns how many."""
+    rig.compensate()
+    made = 0
+    for row, wait in chosen:
+        assert row.inject is not None
+        with contextlib.suppress(OSError):  # a peer that stands still does not obey
+            row.inject(rig)
+            made += 1
+        rig.pass_time(wait)
+    rig.recover()
+    return made
+
+
+def draw_sequence(
+    draw: random.Random, link: str, severe: float = SEVERE
+) -> list[tuple[Row, float]]:
+    """Return rows and how long to wait after each, s; ``severe``: share that restarts processes."""
     rows = [row for row in rows_of(link) if row.inject is not None]
     quick = [row for row in rows if not row.slow]
-    severe = [row for row in rows if row.slow]
+    slow = [row for row in rows if row.slow]
     return [
         (
-            draw.choice(severe if severe and draw.random() < SEVERE else quick),
+            draw.choice(slow if slow and draw.random() < severe else quick),
             draw.uniform(0.0, LONGEST_WAIT),
         )
         for _ in range(draw.randint(1, LONGEST))

@@ -117,6 +117,16 @@ class Book:
         done = {t.stop for t in self.taken} | self.skipped
         return sum(i not in done for i in range(len(self.stops)))
 
+    @property
+    def places(self) -> int:
+        """Return how many places the instrument has had; 1 means that it was never moved."""
+        return max((t.station for t in self.taken), default=0) + 1
+
+    def all_readings(self, kind: str) -> Readings:
+        """Return all readings, the instrument's places numbered without holes."""
+        found = self.readings(kind)
+        return replace(found, station=np.unique(found.station, return_inverse=True)[1])
+
     def readings(self, kind: str, taken: list[Taken] | None = None) -> Readings:
         """Return readings (default: all that stand) as the calibration takes them."""
         assert self.plan is not None

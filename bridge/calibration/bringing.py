@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.calibration.book import Book
-from bridge.calibration.instruments.instrument import ReadingError
+from bridge.calibration.instruments.instrument import AnyInstrument, ReadingError
 from bridge.calibration.stand import JointSource, PlannedJoints, Stand
 from bridge.calibration.talk import Talk
 from bridge.calibration.words import degrees, load_text
@@ -17,6 +17,7 @@ from core.errors import RunError
 
 Array = NDArray[np.float64]
 FAR = np.radians(3.0)  # an arm farther from the pose than this is asked about
+THERE = 2e-3  # rad: an arm this near need not be driven
 HEAVY = 0.05  # kg, and share: the controller's payload may differ from the plan's by as much
 PULL = 12.0  # N at a tool that nothing touches
 CHECKED = 60  # points of a way that are looked at
@@ -30,12 +31,12 @@ class Bringing:
 
     def __init__(
         self, talk: Talk, book: Book, joints: JointSource, clear: Callable[[Array], Array],
-        speed: float, minutes_per_load: float, paced: bool,
+        speed: float, minutes_per_load: float, instrument: AnyInstrument,
     ) -> None:  # fmt: skip
         self.talk, self.book, self.joints = talk, book, joints
         self.minutes_per_load = minutes_per_load
         self._clear, self._speed = clear, speed
-        self._paced = paced  # whether the instrument itself waits for the person
+        self._instrument = instrument
         self._asked: int | None = None  # load for which driving was asked about
         self._driven = False
         self._warned: set[int] = set()
@@ -66,9 +67,12 @@ class Bringing:
         self.talk.ask("  Enter when it hangs there")
         self.book.add("mounted", load=load)
 
-    def bring(self, pose: PlannedPose) -> Stand:
-        """Return where the arm rests, once it does so at the pose."""
-        if self._driven and self._way_is_clear(pose):
+    def bring(self, pose: PlannedPose) -> Stand | None:
+        """Return where the arm rests, once it does so at the pose.
+
+        None where the instrument has it seated by hand afterwards.
+        """
+        if self._driven and not self._there(pose) and self._way_is_clear(pose):
             try:
                 with self.talk.waiting("driving"):
                     self.joints.drive(pose)
@@ -79,9 +83,15 @@ class Bringing:
                 self._asked = None
         if not self._driven:
             self.talk.say(f"  {degrees(pose.q)}")
+        if self._instrument.seats:
+            return None
         stand = self._rested(pose)
         self._look_at_load(pose, stand)
         return stand
+
+    def _there(self, pose: PlannedPose) -> bool:
+        now = self.joints.now()
+        return now is not None and bool(np.abs(now - pose.q).max() < THERE)
 
     def _way_is_clear(self, pose: PlannedPose) -> bool:
         """Return whether the straight way in joint space is free of what the cell names."""
@@ -99,7 +109,7 @@ class Bringing:
         while True:
             try:
                 if not self.joints.watches:
-                    if isinstance(self.joints, PlannedJoints) and not self._paced:
+                    if isinstance(self.joints, PlannedJoints) and not self._instrument.waits:
                         self.talk.ask("  Enter when it stands there")
                     return self.joints.stand(pose)
                 found = self.joints.arrived(pose)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from bridge.calibration.instruments.instrument import AnyInstrument, ReadingError, Where
 from bridge.calibration.stand import JointSource, Stand
 from core.calibration.plan import PlannedPose
+from core.errors import LinkError
 from core.rotation import rotation_matrix, rotation_vector
 
 Array = NDArray[np.float64]
@@ -28,12 +29,20 @@ class Captured:
 
 
 def capture(
-    instrument: AnyInstrument, joints: JointSource, pose: PlannedPose, stand: Stand, where: Where
-) -> Captured:
-    """Read the instrument. Raises ReadingError where it fails or the arm moved meanwhile."""
+    instrument: AnyInstrument, joints: JointSource, pose: PlannedPose, stand: Stand | None,
+    where: Where,
+) -> Captured:  # fmt: skip
+    """Read the instrument. Raises ReadingError where it fails or the arm moved meanwhile.
+
+    ``stand`` None: the arm stands where it does once the instrument has been read.
+    """
     found = instrument.read(where)
-    if not joints.still(stand):
+    if stand is None:
+        stand = joints.stand(pose)
+    elif not joints.still(stand):
         raise ReadingError("the arm moved while it was measured")
+    if instrument.needs_wrench and stand.raw_wrench is None:
+        raise LinkError("the controller tells no ft_raw_wrench, expected a force sensor's reading")
     values = found.values
     if not np.isfinite(values).all():
         raise ReadingError("found a reading that is not finite")

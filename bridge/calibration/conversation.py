@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bridge.calibration.book import Book
 from bridge.calibration.bringing import Bringing
 from bridge.calibration.capture import Captured, capture
-from bridge.calibration.foresight import Foresight, Verdict
+from bridge.calibration.foresight import NOTHING, Foresight, Verdict
 from bridge.calibration.instruments.instrument import AnyInstrument, ReadingError, Where
 from bridge.calibration.looking_back import look_back
 from bridge.calibration.pace import header
@@ -30,7 +30,7 @@ class Conversation:
 
     def __init__(
         self, talk: Talk, book: Book, bringing: Bringing, instrument: AnyInstrument,
-        foresight: Foresight, sigma: float, samples: int,
+        foresight: Foresight | None, sigma: float, samples: int,
     ) -> None:  # fmt: skip
         self.talk, self.book, self.bringing = talk, book, bringing
         self.instrument, self.foresight = instrument, foresight
@@ -54,7 +54,6 @@ class Conversation:
         before: Array | None = None  # what was rejected last
         while True:
             taken, captured = self.measure(stop, stand)
-            stand = captured.stand
             verdict = self.judge(taken, captured)
             if not verdict.doubted:
                 self._keep(taken, verdict)
@@ -71,13 +70,18 @@ class Conversation:
             before = taken.value
             stand = self.bringing.bring(pose)
 
-    def measure(self, stop: int, stand: Stand, again: bool = False) -> tuple[Taken, Captured]:
+    def measure(
+        self, stop: int, stand: Stand | None, again: bool = False
+    ) -> tuple[Taken, Captured]:
         """Read the instrument until it gives a reading."""
         pose = self.book.stops[stop]
         while True:
             try:
-                with self.talk.waiting(f"reading {self.instrument.name}"):
+                if self.instrument.manual or self.instrument.seats:
                     found = self._captured(stop, stand)
+                else:
+                    with self.talk.waiting(f"reading {self.instrument.name}"):
+                        found = self._captured(stop, stand)
                 break
             except ReadingError as error:
                 self.talk.warn(str(error))
@@ -95,7 +99,7 @@ class Conversation:
             temperature=at.temperature, wrench=at.wrench, raw_wrench=at.raw_wrench, again=again,
         ), found  # fmt: skip
 
-    def _captured(self, stop: int, stand: Stand) -> Captured:
+    def _captured(self, stop: int, stand: Stand | None) -> Captured:
         where = Where(stop + 1, self._samples, frozenset(self.book.used))
         return capture(
             self.instrument, self.bringing.joints, self.book.stops[stop], stand, where
@@ -103,6 +107,8 @@ class Conversation:
 
     def judge(self, taken: Taken, captured: Captured) -> Verdict:
         """Return whether a reading can be believed, by the readings so far and its own scatter."""
+        if self.foresight is None:
+            return NOTHING
         good = [t for t in self.book.taken if not t.doubted]
         kind = self.instrument.kind
         verdict = self.foresight.judge(
@@ -183,6 +189,10 @@ class Conversation:
     def mark_moved(self, what: str, since: int | None = None) -> None:
         """Begin a new place of the instrument, or of the target, from a reading on."""
         book = self.book
+        here = (book.station, book.target)
+        if all((t.station, t.target - book.stops[t.stop].target) != here for t in book.taken):
+            self.talk.say("  nothing has been measured from where it stands: it is that place")
+            return
         station = book.station + (what == "moved")
         target = book.target + (what == "slipped")
         book.add("moved", station=station, target=target, since=since)

@@ -23,9 +23,15 @@ NAMES = {
 }
 
 
-def session_facts(cell: Cell, order: Order, book: Book) -> SessionFacts:
-    """Return who, where, when and with what."""
+def session_facts(
+    cell: Cell, order: Order, book: Book, what: tuple[str, str] | None = None
+) -> SessionFacts:
+    """Return who, where, when and with what.
+
+    ``what`` is name and kind of what measured, where it is not the ordered instrument.
+    """
     given, instrument = cell.calibration, order.instrument
+    name, kind = what or (NAMES[instrument.kind], instrument.measures)
     times = [t.time for t in book.taken] or [float(book.begun["time"])]
     distances = [np.linalg.norm(t.value[:3]) for t in book.taken if len(t.value) >= 3]
     return SessionFacts(
@@ -35,7 +41,7 @@ def session_facts(cell: Cell, order: Order, book: Book) -> SessionFacts:
         operator=given.operator,
         environment=given.environment,
         instrument=InstrumentFacts(
-            name=NAMES[instrument.kind], kind=instrument.measures, serial=instrument.serial,
+            name=name, kind=kind, serial="" if what else instrument.serial,
             sigma=instrument.sigma or cell.metrology.sigma,
             distance=float(np.median(distances)) if distances else 0.0,
         ),
@@ -51,8 +57,8 @@ def session_facts(cell: Cell, order: Order, book: Book) -> SessionFacts:
 def _remarks(book: Book) -> list[str]:
     """Return what happened on the way, in words."""
     found = list(book.notes)
-    if book.station:
-        found.append(f"the instrument stood at {book.station + 1} places")
+    if book.places > 1:
+        found.append(f"the instrument stood at {book.places} places")
     if book.target:
         found.append(f"the target had {book.target + 1} places on the tool")
     if book.skipped:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from core.calibration.observables.nuisance import Nuisance
 from core.calibration.observables.observable import Observable
@@ -79,7 +79,7 @@ class FittedSoFar:
         """Return how far a reading is off, how far it may be (m), and whether it is too far."""
         left = self.gap(new)
         distance = float(left @ np.linalg.solve(self.spread, left))
-        limit = float(chi2.isf(RARE, len(left)))
+        limit = float(chdtri(len(left), RARE))
         off = float(np.linalg.norm(left[:3]))
         allowed = float(np.sqrt(limit * np.linalg.eigvalsh(self.spread[:3, :3])[-1]))
         return off, allowed, distance > limit

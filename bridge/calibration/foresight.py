@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,13 +54,18 @@ class Foresight:
 
     def __init__(
         self, model: Model, metrology: Metrology, kind: str, sigma: float,
-        effects: tuple[str, ...], loads: tuple[Payload, ...],
+        effects: tuple[str, ...], loads: tuple[Payload, ...], options: dict[str, Any] | None = None,
     ) -> None:  # fmt: skip
         self._model, self._metrology, self._kind, self._loads = model, metrology, kind, loads
-        self._effects = effects
+        self._effects, self._options = effects, options or {}
         arm = metrology.repeatability or REPEATABILITY
         self._sigma = float(np.hypot(np.hypot(sigma, arm), UNMODELLED))
         self._parameters: dict[bool, Parameters] = {}
+
+    @property
+    def compares(self) -> bool:
+        """Return whether two readings of one pose can be held against each other."""
+        return not make_observable(self._kind, **self._options).closes
 
     def judge(self, before: Readings, new: Readings, typed: bool, joints: bool) -> Verdict:
         """Judge one new reading (a Readings of one row) by those before it.
@@ -100,7 +106,7 @@ class Foresight:
     def _fitted(self, before: Readings, new: Readings) -> FittedSoFar | None:
         registered = self._metrology.registered and int(new.station[0]) == 0
         before, new = here(before), here(new)
-        observable = make_observable(self._kind, registered=registered)
+        observable = make_observable(self._kind, registered=registered, **self._options)
         layout = observable.layout(before if len(before) else new)
         few = len(before) * observable.equations <= layout.size
         if observable.closes or (few and layout.size):

@@ -6,8 +6,8 @@ pose, through the one limiter, without corrections; once it rests there the daem
 
 from __future__ import annotations
 
-import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,32 +16,29 @@ from numpy.typing import NDArray
 from bridge.calibration.instruments.instrument import ReadingError
 from bridge.calibration.move import write_move
 from bridge.calibration.stand import JointSource, Stand
+from bridge.calibration.watched_run import WatchedRun
 from bridge.cell import Cell, load_cell
-from bridge.daemon import Daemon, settings_of
+from bridge.daemon import settings_of
 from bridge.daemon_settings import DaemonSettings
 from bridge.recording.settings import RecordingSettings
 from bridge.settings import SetpointSettings
-from bridge.shared_page import PageReader
+from bridge.shared_page import Phase
 from bridge.supervisor import State
 from core.calibration.plan import PlannedPose
-from core.errors import GapbridgeError, LinkError, RunError
+from core.errors import LinkError, RunError
 
 Array = NDArray[np.float64]
 STILL = 0.003  # rad/s: slower than this, the arm stands
 NEAR = 0.05  # rad: an arm that rests this near to the pose has arrived
 MOVED = 2e-4  # rad: farther than this from where it stood, it has moved
 STEADY = 1.0  # N: the force may drift by this over the time of settling, beside its noise
-KEPT = 20.0  # s of cycles that are kept
-STEP = 1e-5  # rad: a joint that has come this far has moved, in that direction
 PATIENCE = 30.0  # s for a connection, on top of the link's own
-FOREVER = 1e9  # s
+STARTING = 180.0  # s that the loop's process may take to start
 SLOWEST = 4.0  # a move may take this many times as long as planned
 
 
 def uncorrected(path: Path) -> Cell:
     """Return a cell whose model has no effects: poses of a session are written as planned."""
-    from dataclasses import replace
-
     cell = load_cell(path)
     return replace(cell, model=cell.model.without_terms())
 
@@ -61,7 +58,7 @@ class LinkedJoints(JointSource):
                 "model_source": "bridge.calibration.linked_joints:uncorrected",
             }
         )  # fmt: skip
-        self._run: _Run | None = None
+        self._run: WatchedRun | None = None
 
     def open(self) -> None:
         """Watch the arm. Raises LinkError where it cannot be reached."""
@@ -141,15 +138,19 @@ class LinkedJoints(JointSource):
     # -- the watched arm --------------------------------------------------------------------------
 
     def _start(self, settings: DaemonSettings, write: bool) -> None:
-        self._run = run = _Run(settings, write)
-        until = time.monotonic() + settings.link.connect_timeout + PATIENCE
+        self._run = run = WatchedRun(settings, write)
+        begun = time.monotonic()
+        limit = settings.link.connect_timeout + PATIENCE
+        until = begun + limit
         while not len(self._rows(1.0)):
+            if run.daemon.phase == Phase.STARTING and time.monotonic() < begun + STARTING:
+                until = time.monotonic() + limit  # imports, on a busy machine
             if time.monotonic() > until:
                 raise LinkError("the arm tells nothing, expected its joints")
             time.sleep(0.02)
         run.ready = True
 
-    def _require(self) -> _Run:
+    def _require(self) -> WatchedRun:
         if self._run is None:
             raise LinkError("the link to the arm is closed")
         self._run.check()
@@ -203,71 +204,3 @@ class LinkedJoints(JointSource):
             payload=None if payload is None else float(payload[0]),
             approach=run.approach.copy(),
         )
-
-
-class _Run:
-    """One run of the daemon in a thread of its own."""
-
-    def __init__(self, settings: DaemonSettings, write: bool) -> None:
-        self.daemon = Daemon(settings, may_write=write, say=self._say)
-        self.slices = self.daemon.page.slices
-        self.rows = np.empty((0, self.daemon.page.width))
-        self.approach = np.zeros(self.daemon.page.n)
-        self.ready = False
-        self._turned_at: Array | None = None
-        self._reader: PageReader | None = self.daemon.page.reader()
-        self._said: list[str] = []
-        self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._main, args=(write,), daemon=True)
-        self._thread.start()
-
-    def _say(self, text: str) -> None:
-        self._said.append(text)
-
-    def _main(self, write: bool) -> None:
-        try:
-            self.daemon.run(arm=write, duration=FOREVER, by="--arm")
-        except BaseException as error:
-            self._error = error
-
-    def words(self) -> str:
-        """Return what the daemon said last."""
-        return self._said[-1] if self._said else ""
-
-    def check(self) -> None:
-        """Raise what ended the run."""
-        if self._thread.is_alive():
-            return
-        if isinstance(self._error, GapbridgeError):
-            raise self._error
-        raise LinkError(f"the link to the arm ended: {self._error or self.words() or 'no reason'}")
-
-    def take(self) -> None:
-        """Take the cycles over that came since the last call."""
-        if self._reader is None:
-            return
-        try:
-            new = self._reader.drain()
-        except (IndexError, ValueError):  # the page was closed meanwhile
-            return
-        if not len(new):
-            return
-        at = self.slices["timestamp"].start
-        self._follow_motion(new[:, self.slices["actual_q"]])
-        rows = np.vstack([self.rows, new])
-        self.rows = rows[rows[:, at] >= rows[-1, at] - KEPT]
-
-    def _follow_motion(self, q: Array) -> None:
-        before = q[0].copy() if self._turned_at is None else self._turned_at
-        for row in q:
-            way = row - before
-            moved = np.abs(way) > STEP
-            self.approach[moved] = np.sign(way[moved])
-            before[moved] = row[moved]
-        self._turned_at = before
-
-    def end(self) -> None:
-        """End the run."""
-        self._reader = None
-        self.daemon.stop()
-        self._thread.join(20.0)

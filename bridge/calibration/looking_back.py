@@ -37,8 +37,8 @@ def look_back(talking: Conversation) -> None:
     """Measure an earlier pose again, further ones where it has changed, and say what moved."""
     talk, book = talking.talk, talking.book
     earlier = _earlier(talking)
-    if not earlier:
-        talk.say("  no earlier pose with this load and this place of the instrument")
+    if talking.foresight is None or not talking.foresight.compares or not earlier:
+        talk.say("  no earlier pose to go back to with this load, place and instrument")
         return
     limit = max(NOISES * float(np.hypot(talking.sigma, REPEATABILITY)), LEAST)
     first = len(book.taken)
@@ -76,6 +76,7 @@ def _once_more(talking: Conversation, before: Taken) -> Again:
     now, _ = talking.measure(before.stop, talking.bringing.bring(pose), again=True)
     book.add("reading", **now.entry())
     kind = talking.instrument.kind
+    assert talking.foresight is not None
     shift = talking.foresight.shift(
         book.readings(kind, [before]), book.readings(kind, [now]),
         book.readings(kind, [t for t in book.taken[:-1] if not t.doubted]),
@@ -110,6 +111,7 @@ def _stories(talking: Conversation, seen: list[Again]) -> dict[str, float]:
     """Return what each story leaves over, m rms: a rigid motion, or a shift in the tool's axes."""
     if len(seen) < POSES or len(seen[0].shift) < 3:
         return {}
+    assert talking.foresight is not None
     poses = talking.foresight.poses(talking.book.readings(
         talking.instrument.kind, [a.now for a in seen]
     ))  # fmt: skip

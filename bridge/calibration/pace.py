@@ -6,11 +6,10 @@ from statistics import median
 
 from bridge.calibration.book import Book
 from bridge.calibration.words import duration
-from bridge.demo.terminal import bar
 
 FIRST = 60.0  # s a stop, before anyone knows
 PAUSE = 600.0  # s: a longer time between two readings was a pause
-WIDTH = 16
+WIDTH = 16  # characters of the whole bar
 
 
 def seconds_left(book: Book, minutes_per_load: float) -> float:
@@ -26,7 +25,7 @@ def header(book: Book, stop: int, minutes_per_load: float) -> str:
     """Return the line above a stop."""
     count, done = len(book.stops), len(book.stops) - book.left
     pose = book.stops[stop]
-    drawn = bar(done / count, WIDTH) if done else ""
+    drawn = "█" * round(done / count * WIDTH)
     more = []
     if pose.repeat:
         first = next(i for i, p in enumerate(book.stops) if p.number == pose.number)
@@ -34,6 +33,6 @@ def header(book: Book, stop: int, minutes_per_load: float) -> str:
     if pose.held_out:
         more.append("to verify, not fitted")
     return " · ".join(
-        [f"{drawn:<{WIDTH}} stop {stop + 1} of {count}", f"load {pose.load + 1}", *more,
+        [f"{drawn:░<{WIDTH}} stop {stop + 1} of {count}", f"load {pose.load + 1}", *more,
          f"{duration(seconds_left(book, minutes_per_load))} left"]
     )  # fmt: skip

@@ -35,8 +35,9 @@ def observable_of(cell: Cell, instrument: Base, places: int = 1) -> Observable:
     none of them.
     """
     return make_observable(
-        instrument.measures, registered=cell.metrology.registered and places == 1
-    )
+        instrument.measures, registered=cell.metrology.registered and places == 1,
+        **instrument.options,
+    )  # fmt: skip
 
 
 def parameters_of(cell: Cell, observable: Observable) -> Parameters:

@@ -14,24 +14,29 @@ from numpy.typing import NDArray
 from bridge.calibration.book import Book
 from bridge.calibration.bringing import Bringing
 from bridge.calibration.conversation import Conversation
-from bridge.calibration.finish import finish
 from bridge.calibration.folders import begun_entry, check_begun, session_folder
-from bridge.calibration.foresight import Foresight
-from bridge.calibration.instruments import make_instrument
 from bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
+from bridge.calibration.job import Job
+from bridge.calibration.jobs import make_job
+from bridge.calibration.joint_sources import make_joints
 from bridge.calibration.journal import Journal
 from bridge.calibration.order import Order
-from bridge.calibration.pace import seconds_left
 from bridge.calibration.plan_document import write_poses
-from bridge.calibration.planning import effects_of, loads_of, metrology_of, planned, space_of
-from bridge.calibration.stand import JointSource, PlannedJoints, TypedJoints
+from bridge.calibration.planning import metrology_of, space_of
+from bridge.calibration.stand import JointSource, PlannedJoints
 from bridge.calibration.talk import InputEnded, Talk, Word
-from bridge.calibration.words import duration, load_text, millimetres, parameter
+from bridge.calibration.words import load_text
 from bridge.cell import Cell
-from core.calibration.plan import Plan
+from core.calibration.plan import PlannedPose
 from core.errors import CellError, LinkError
 
 Array = NDArray[np.float64]
+TITLES = {
+    "whole": "Calibration of",
+    "verify": "Verification of",
+    "payload": "Load and force sensor of",
+    "tool": "Tool of",
+}
 
 
 def run_session(cell: Cell, order: Order) -> None:
@@ -44,7 +49,12 @@ def run_session(cell: Cell, order: Order) -> None:
         talk.note = lambda text: book.add("note", text=text)
         try:
             _lead(cell, order, talk, book)
-        except Word:  # quit
+        except Word as word:
+            if word.word == "undo" and book.taken:  # at the last question
+                book.add("undo", stop=book.taken[-1].stop)
+                talk.say(
+                    f"took back the last reading; stop {(book.next or 0) + 1} is to be measured"
+                )
             talk.say(_how_to_go_on(cell, order, book))
         except InputEnded:
             talk.say()
@@ -60,61 +70,71 @@ def run_session(cell: Cell, order: Order) -> None:
 
 def _lead(cell: Cell, order: Order, talk: Talk, book: Book) -> None:
     folder = book.journal.path.parent
-    talk.say(f"Calibration of {cell.path}: {cell.arm.name}", "bold")
+    talk.say(f"{TITLES[order.kind]} {cell.path}: {cell.arm.name}", "bold")
+    job = make_job(cell, order, talk, book)
     if book.begun:
         check_begun(book.begun, cell, order, folder)
         _tell_resumed(talk, book, folder)
     else:
         book.add("begun", **begun_entry(cell, order))
         talk.say(f"new session in {folder}")
-    if book.plan is None:
-        _make_plan(cell, order, talk, book)
-    assert book.plan is not None
-    if order.plan_only:
-        talk.say(f"every stop with its joints: {folder / 'poses.csv'}")
-        talk.say(f"go on with: {_command(cell, order, book)}")
-        return
-    if book.next is not None:
-        _measure(cell, order, talk, book)
-    finish(cell, order, talk, book)
-
-
-def _make_plan(cell: Cell, order: Order, talk: Talk, book: Book) -> None:
-    with talk.waiting("planning") as tell:
-        plan = planned(cell, order, lambda text, share: tell(f"planning: {text} ({share:.0%})"))
-    book.keep_plan(plan)
-    write_poses(plan, book.journal.path.parent / "poses.csv")
-    _tell_plan(talk, plan, book, cell.calibration.minutes_per_load)
-
-
-def _tell_plan(talk: Talk, plan: Plan, book: Book, minutes: float) -> None:
-    fitted = sum(not p.held_out and not p.repeat for p in plan.poses)
-    held = sum(p.held_out for p in plan.poses)
-    again = sum(p.repeat > 0 for p in plan.poses)
-    talk.say(
-        f"plan: {fitted} poses to fit, {held} to verify, {again} once more for the repeatability: "
-        f"{len(plan.poses)} stops, {duration(seconds_left(book, minutes) + plan.travel)}"
+    around = Surroundings(
+        ask=lambda question: talk.ask(f"  {question}"),
+        link_host=str(getattr(cell.link, "host", "") or ""),
+        since=float(book.begun["time"]),
     )
-    for i, load in enumerate(plan.loads):
-        talk.say(f"  load {i + 1}: {load_text(load)}")
-    expected = plan.expected
-    talk.say(
-        f"expected: the predicted TCP known to {millimetres(expected.tcp_std)} (1 sigma over the "
-        f"workspace and loads; {millimetres(expected.tcp_std_worst)} at worst)"
-    )
-    told = ", ".join(f"{n}: {millimetres(s)}" for n, s in plan.bought)
-    talk.say(f"  what n poses buy: {told}")
-    weak = [
-        f"{n} ±{parameter(s, u)}"
-        for n, u, s, p in zip(
-            expected.names, expected.units, expected.std, expected.prior, strict=True
+    with ExitStack() as stack:
+        joints = make_joints(cell, order, around.ask, folder)
+        instrument = None
+        if not order.plan_only and (book.plan is None or book.next is not None):
+            instrument = job.instrument(around)  # before the plan: what is missing is told at once
+            with talk.waiting("reaching the instrument"):
+                stack.enter_context(instrument)
+        if job.from_here and (book.plan is None or book.next is not None):
+            _open(talk, stack, joints)
+        if book.plan is None:
+            _make_plan(job, joints)
+        else:
+            _tell_old_plan(job)
+        if order.plan_only:
+            talk.say(f"every stop with its joints: {folder / 'poses.csv'}")
+            talk.say(f"go on with: {_command(cell, order, book)}")
+            return
+        if book.next is not None:
+            assert instrument is not None
+            if not job.from_here:
+                _open(talk, stack, joints)
+            _measure(job, joints, instrument)
+    job.finish()
+
+
+def _open(talk: Talk, stack: ExitStack, joints: JointSource) -> None:
+    with talk.waiting("reaching the arm"):
+        stack.enter_context(joints)
+
+
+def _make_plan(job: Job, joints: JointSource) -> None:
+    talk, book = job.talk, job.book
+    begin = None
+    if job.from_here:
+        n = job.cell.arm.n
+        here = joints.now()
+        begin = (
+            joints.stand(PlannedPose(0, np.zeros(n), 0, np.zeros(n))).q if here is None else here
         )
-        if not np.isfinite(s) or s > p
-    ]
-    if weak:
-        talk.say(f"  these poses hardly tell: {', '.join(weak)}")
-    for note in plan.notes:
-        talk.say(f"  note: {note}")
+    with talk.waiting("planning") as tell:
+        plan = job.plan(begin, lambda text, share: tell(f"planning: {text} ({share:.0%})"))
+    book.keep_plan(plan)
+    write_poses(plan, job.folder / "poses.csv")
+    job.tell_plan(plan)
+
+
+def _tell_old_plan(job: Job) -> None:
+    """Tell the plan of an earlier call where it is asked for, and that it stays."""
+    if job.order.poses is not None:
+        job.talk.warn("this session has its plan: --poses counts for a new one")
+    if job.order.plan_only and job.book.plan is not None:
+        job.tell_plan(job.book.plan)
 
 
 def _tell_resumed(talk: Talk, book: Book, folder: Path) -> None:
@@ -129,65 +149,25 @@ def _tell_resumed(talk: Talk, book: Book, folder: Path) -> None:
         talk.say(f"  on the flange: {load_text(book.plan.loads[book.mounted])}")
 
 
-def _measure(cell: Cell, order: Order, talk: Talk, book: Book) -> None:
-    given, assumed = cell.calibration, order.instrument
-    metrology = metrology_of(cell, assumed)
-    with ExitStack() as stack:
-        around = Surroundings(
-            ask=lambda question: talk.ask(f"  {question}"),
-            link_host=str(getattr(cell.link, "host", "") or ""),
-            since=float(book.begun["time"]),
-        )
-        with talk.waiting("reaching the instrument"):
-            instrument = stack.enter_context(make_instrument(assumed, around))
-        joints = _joints(cell, order, around, book.journal.path.parent)
-        with talk.waiting("reaching the arm"):
-            stack.enter_context(joints)
-        talk.say(f"instrument: {instrument.name}; joints: {_told(joints, order)}")
-        talk.say("at every question: Enter goes on, `undo`, `back`, `skip`, `quit`, `?`")
-        bringing = Bringing(
-            talk, book, joints, _clear(cell, assumed.measures), given.speed,
-            given.minutes_per_load, _waits(instrument),
-        )  # fmt: skip
-        foresight = Foresight(
-            cell.model, metrology, assumed.measures, metrology.sigma, effects_of(cell),
-            loads_of(cell),
-        )  # fmt: skip
-        Conversation(
-            talk, book, bringing, instrument, foresight, metrology.sigma, given.samples
-        ).lead()
-
-
-def _waits(instrument: AnyInstrument) -> bool:
-    """Return whether reading the instrument waits for the person, or for what is exported."""
-    return instrument.manual or instrument.settings.kind in ("file", "folder", "sphere")
-
-
-def _clear(cell: Cell, kind: str) -> Callable[[Array], Array]:
-    space = space_of(cell, kind)
-    return lambda q: np.asarray(space.clear(q), dtype=float)
-
-
-def _joints(cell: Cell, order: Order, around: Surroundings, folder: Path) -> JointSource:
-    """Return how joints are known. Raises CellError where the cell does not fit the order."""
-    given = cell.calibration
-    source = given.joints or ("link" if cell.link is not None else "typed")
-    if source != "link":
-        if order.move:
-            raise CellError(
-                f"{cell.path}: calibration.joints: found {source!r} with --move, expected 'link'"
-            )
-        return TypedJoints(around.ask) if source == "typed" else PlannedJoints()
-    if cell.link is None:
-        raise CellError(f"{cell.path}: link: found nothing, expected the robot's address")
-    if order.move and not cell.link.moves_arm:
+def _measure(job: Job, joints: JointSource, instrument: AnyInstrument) -> None:
+    talk, given, order = job.talk, job.cell.calibration, job.order
+    if instrument.seats and order.move:
         raise CellError(
-            f"{cell.path}: link.driver: found {cell.link.driver!r}, which cannot move the arm; "
-            "expected another for --move, or jog it"
+            f"{job.cell.path}: calibration.instrument.kind: found {order.instrument.kind!r} with "
+            "--move, expected another: the tool is brought onto something by hand"
         )
-    from bridge.calibration.linked_joints import LinkedJoints
+    talk.say(f"instrument: {instrument.name}; joints: {_told(joints, order)}")
+    talk.say("at every question: Enter goes on, `undo`, `back`, `skip`, `quit`, `?`")
+    bringing = Bringing(
+        talk, job.book, joints, _clear(job), given.speed, given.minutes_per_load, instrument,
+    )  # fmt: skip
+    sigma = metrology_of(job.cell, order.instrument).sigma
+    Conversation(talk, job.book, bringing, instrument, job.foresight(), sigma, given.samples).lead()
 
-    return LinkedJoints(cell, given.settle, given.speed, folder, order.move)
+
+def _clear(job: Job) -> Callable[[Array], Array]:
+    space = space_of(job.cell, "position")
+    return lambda q: np.asarray(space.clear(q), dtype=float)
 
 
 def _told(joints: JointSource, order: Order) -> str:

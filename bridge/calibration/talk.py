@@ -81,14 +81,16 @@ class Talk:
 
     def choose(self, question: str, answers: dict[str, str]) -> str:
         """Return the key of one of the answers; Enter is the first."""
-        for key, text in answers.items():
-            self.say(f"    {key or 'Enter':<6} {text}")
+        first = next(iter(answers))
+        shown = {"Enter" if key == first else key: text for key, text in answers.items()}
+        for key, text in shown.items():
+            self.say(f"    {key:<8} {text}")
         while True:
             answer = self.ask(question).lower()
-            found = [k for k in answers if k == answer or (answer and k.startswith(answer))]
-            if found:
-                return found[0]
-            self.say(f"found {answer!r}, expected {_either([k or 'Enter' for k in answers])}")
+            found = [k for k in answers if answer and k.startswith(answer)]
+            if found or not answer:
+                return found[0] if found else first
+            self.say(f"found {answer!r}, expected {_either(list(shown))}")
 
     @contextmanager
     def waiting(self, text: str) -> Iterator[Callable[[str], None]]:
@@ -96,7 +98,7 @@ class Talk:
         if not self.console.is_terminal:
             yield lambda text: None
             return
-        with Status(text, console=self.console) as shown:
+        with Status(text, console=self.console, refresh_per_second=4) as shown:
             yield lambda text: shown.update(text)
 
     def _heard(self, question: str, look: Callable[[], T | None]) -> str | T:

@@ -37,21 +37,31 @@ _Dumper.add_representer(
 )
 
 
-def save_cell(cell: Cell, path: Path | str, model: Model | None = None) -> None:
+def save_cell(
+    cell: Cell,
+    path: Path | str,
+    model: Model | None = None,
+    sections: dict[str, Any] | None = None,
+) -> None:
     """Write the cell, with the effects of ``model`` instead of its own, to ``path`` in one step.
+
+    ``sections`` are whole top-level keys that take the place of the cell's own (``payload``).
 
     Keys, order and comments of the user's file stay; relative paths are written so that they hold
     from the new file's folder. Reading the new file gives the same model, number for number.
     """
     path = Path(path)
     model = model or cell.model
-    text = cell_text(cell.document, path, model)
+    text = cell_text(cell.document, path, model, sections)
     write_text(path, text)
 
 
-def cell_text(document: Document, path: Path, model: Model) -> str:
-    """Return the text of the cell file at ``path`` for ``model``."""
-    changes: dict[str, Any] = {"compliance": compliance_entry(model.terms, model.arm.n)}
+def cell_text(
+    document: Document, path: Path, model: Model, sections: dict[str, Any] | None = None
+) -> str:
+    """Return the text of the cell file at ``path`` for ``model``; see save_cell."""
+    changes: dict[str, Any] = {**(sections or {})}
+    changes["compliance"] = compliance_entry(model.terms, model.arm.n)
     entries = effect_entries(model.terms, model.arm)
     if entries or "effects" in document.data:
         changes["effects"] = entries

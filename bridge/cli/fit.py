@@ -9,12 +9,14 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from bridge.cell import save_cell
+from bridge.cell import Cell, save_cell
+from bridge.cli.large_log import LargeLog, is_large
 from bridge.cli.options import cell_option, log_argument, open_cell, open_log
-from bridge.cli.progress import progress
+from bridge.cli.progress import progress, status
 from bridge.output_file import require_writable
 from core.errors import ExcitationError
 from core.identification import Identification, identify_compliance
+from core.streamed_identification import identify_streamed
 
 
 @click.command()
@@ -31,22 +33,33 @@ def fit(log: Path, cell: Path, out: Path) -> None:
     the same cell with the flexibilities found; what the log does not show stays as it is in the
     cell, and is told. Where the metrology is not registered, its frame and the tool point are
     estimated along, before as well as after, and not written. Declines, with the reason, where
-    nothing in the log excites the compliance.
+    nothing in the log excites the compliance. A log of more than 20,000 rows is read in pieces,
+    so that memory does not grow with it; so is a recording of the daemon (.mcap).
 
     Example: gapbridge fit log.csv --cell cell.yaml --out calibrated.yaml
     """
     given = open_cell(cell)
-    rows = open_log(log, given)
     require_writable(out, log, cell)
     try:
-        with progress("fitting"):
-            found = identify_compliance(given.model, rows, given.metrology)
+        found = _identified(log, given)
     except ExcitationError as error:
         raise ExcitationError(f"{log}: {error}") from None
     # frame and tool point that were estimated along stay out of the cell
     save_cell(given, out, given.model.with_compliance(found.axial, found.radial))
     tell(found)
     click.echo(f"{out}: written")
+
+
+def _identified(path: Path, cell: Cell) -> Identification:
+    """Return what the log shows; one of many rows passes by in pieces."""
+    if is_large(path):
+        with status("fitting") as tell_step:
+            return identify_streamed(
+                cell.model, LargeLog(path, cell), cell.metrology, progress=tell_step
+            )
+    rows = open_log(path, cell)
+    with progress("fitting"):
+        return identify_compliance(cell.model, rows, cell.metrology)
 
 
 def tell(found: Identification) -> None:

@@ -38,6 +38,12 @@ def open_log(path: Path, cell: Cell) -> Log:
     millimetres.
     """
     log = read_log(path, cell.arm.n)
+    check_log(log, cell)
+    return log
+
+
+def check_log(log: Log, cell: Cell) -> None:
+    """Raise LogError where a log's numbers cannot be meant for a cell's arm."""
     for name in ("actual_q", "target_q"):
         if np.isinf(log.columns.get(name, np.zeros(0))).any():
             log.require(name)  # names the cell
@@ -46,7 +52,6 @@ def open_log(path: Path, cell: Cell) -> Log:
     if mass is not None and (mass > HEAVIEST * rated).any():
         row = int(np.argmax(mass > HEAVIEST * rated))
         raise LogError(
-            f"{path}: row {row + log.first_row}, column payload: found {mass[row]:g} kg, out of "
+            f"{log.path}: row {log.line(row)}, column payload: found {mass[row]:g} kg, out of "
             f"range: expected 0 to {rated:g} kg, what {cell.arm.name} is rated for"
         )
-    return log

@@ -28,8 +28,8 @@ class Outlier:
 def far_from_median(values: Sequence[float], *, ratios: bool) -> list[tuple[int, float, float]]:
     """Return (index, usual value, deviations) of values far from the median.
 
-    ``ratios``: values are positive and told by their ratio to the median. The deviation is the
-    median one; where more than half agree exactly, nothing is far.
+    ``ratios``: values are positive, told by their ratio to the median, and only those above it are
+    far. The deviation is the median one; where more than half agree exactly, nothing is far.
     """
     given = np.array(values, dtype=float)
     if len(given) < FEWEST:

@@ -12,7 +12,7 @@ from typing import Any
 
 from bridge.fleet.cell_source import CellSource
 from bridge.fleet.journal import Journal
-from bridge.fleet.session import Session
+from bridge.fleet.session import Session, natural
 from bridge.fleet.task import BAD, Outcome, Task, Work, outcome
 from bridge.fleet.workers import Workers
 from core.errors import InputError
@@ -73,7 +73,7 @@ def run(
                 journal.add(found)
                 outcomes[found.session] = found
                 tell(found)
-    ordered = sorted(outcomes.values(), key=lambda o: o.session)
+    ordered = sorted(outcomes.values(), key=lambda o: natural(o.session))
     return Done(tuple(ordered), resumed, time.perf_counter() - begin, workers.words())
 
 

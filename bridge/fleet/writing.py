@@ -12,6 +12,7 @@ from bridge.fleet.diagnosed import Diagnosed, diagnosed
 from bridge.fleet.fitted import Fitted, fitted, rows, session_figures
 from bridge.fleet.outcome_words import counted
 from bridge.fleet.report.page import write_diagnosed_report, write_fitted_report
+from bridge.fleet.report.parameter_words import type_words
 from bridge.fleet.running import Done
 from bridge.fleet.session import Found
 from bridge.report.words import effect_words, joints_words, told
@@ -75,9 +76,10 @@ def _fitted_lines(together: Fitted) -> list[str]:
             for name in ("gap_before", "gap_held_out")
         )
         lines.append(
-            f"{kind.name}: {counted(len(kind.arms), 'arm')}, {int(shown.sum())} of {len(shown)} "
-            f"flexibilities shown, scatter between arms {_percent(spread)}; gap "
-            f"{told(before, 'm')} with the cells, {told(after, 'm')} as the other sessions foretell"
+            f"{type_words(kind.name)}: {counted(len(kind.arms), 'arm')}, "
+            f"{int(shown.sum())} of {len(shown)} flexibilities shown, scatter between arms "
+            f"{_percent(spread)}; gap {told(before, 'm')} with the cells, {told(after, 'm')} as "
+            "the other sessions foretell"
         )
     return lines + _unlike(together)
 

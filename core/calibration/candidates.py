@@ -24,6 +24,7 @@ Index = NDArray[np.int64]
 STOPS = 900  # candidate poses
 DRAWN = 4000  # random poses looked at in one go
 TRIES = 40
+HOPELESS = 6  # tries without any pose after which none is expected
 BALLS_APART = 0.2  # m, of two balls on the tool where nobody says it
 
 
@@ -66,8 +67,12 @@ def candidates_of(
     loads: Sequence[Payload],
     space: Space,
     seed: int,
+    stops: int = STOPS,
 ) -> Candidates:
-    """Return candidates; raises PlanError where no pose is reachable and seen."""
+    """Return candidates at up to ``stops`` poses.
+
+    Raises PlanError where no pose is reachable and seen.
+    """
     if observable.unknown and not space.places:
         raise PlanError(
             f"places: found none, expected where in base the fixed point of the {observable.kind} "
@@ -76,16 +81,16 @@ def candidates_of(
     nuisance = _nuisance(observable, space)
     random = np.random.default_rng(seed)
     sight = _Sight([], [], [], 0, {})
-    for _ in range(TRIES):
+    for tried in range(TRIES):
         _look(parameters, observable, space, nuisance, random, sight)
-        if sight.count >= STOPS:
+        if sight.count >= stops or (tried >= HOPELESS and not sight.count):
             break
     if not sight.count:
         raise PlanError(f"no pose can be reached and seen: {sight.why}")
-    q, station = np.concatenate(sight.q)[:STOPS], np.concatenate(sight.station)[:STOPS]
-    target = np.concatenate(sight.target)[:STOPS]
+    q, station = np.concatenate(sight.q)[:stops], np.concatenate(sight.station)[:stops]
+    target = np.concatenate(sight.target)[:stops]
     readings, stop = _under_loads(parameters, observable, loads, (q, station, target), random)
-    notes = () if sight.count >= STOPS else (f"few poses to choose from: {sight.why}",)
+    notes = () if sight.count >= stops else (f"few poses to choose from: {sight.why}",)
     readings = replace(readings, value=observable.predict(parameters.nominal, readings, nuisance))
     return Candidates(q, readings, stop, nuisance, sight.why, notes)
 

@@ -38,7 +38,10 @@ def segment_distance(p: Array, q: Array, r: Array, s: Array) -> Array:
     a, e = np.sum(u * u, axis=-1), np.sum(v * v, axis=-1)
     b, c, f = np.sum(u * v, axis=-1), np.sum(u * w, axis=-1), np.sum(v * w, axis=-1)
     denominator = a * e - b * b
-    along = np.where(denominator > TINY, (b * f - c * e) / np.maximum(denominator, TINY), 0.0)
+    # parallel, or one of them a point: from where the other's beginning stands before the first
+    plumb = np.where(a > TINY, -c / np.maximum(a, TINY), 0.0)
+    skewed = denominator > TINY * np.maximum(a * e, TINY)
+    along = np.where(skewed, (b * f - c * e) / np.where(skewed, denominator, 1.0), plumb)
     along = np.clip(along, 0, 1)
     across = np.where(e > TINY, (b * along + f) / np.maximum(e, TINY), 0.0)
     clipped = np.clip(across, 0, 1)

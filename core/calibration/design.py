@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
-from core.calibration.candidates import Candidates, candidates_of, joined
+from core.calibration.candidates import STOPS, Candidates, candidates_of, joined
 from core.calibration.exchange import Choice, exchanged, grown, shrunk
 from core.calibration.information import Reference, blocks, expectation_of
 from core.calibration.itinerary import Stop, itinerary
@@ -26,6 +27,7 @@ REFERENCE = 200  # poses over which the predicted TCP is judged
 REFINED = 15  # rounds in which the chosen poses are moved
 BOUGHT_ROUNDS = 3
 BOUGHT = (0.5, 0.75, 1.0, 1.5, 2.0)  # of the poses asked for: what these would give
+SIGHT = "nobody said where the instrument stands: whether it sees the target was not looked at"
 Progress = Callable[[str, float], None]
 
 
@@ -39,6 +41,7 @@ class Wish:
     seed: int = 0
     sigma: float = 3e-5  # m, 1 sigma of one coordinate: instrument and arm together
     travel_weight: float = 0.1  # a usual leg more at every pose is worth this share of the std
+    stops: int = STOPS  # candidates
 
 
 def plan(
@@ -53,45 +56,66 @@ def plan(
     seed: int = 0,
     sigma: float = 3e-5,
     travel_weight: float = 0.1,
+    stops: int = STOPS,
     progress: Progress | None = None,
 ) -> Plan:
     """Return the poses, loads and approaches that tell most, in the order of travel.
 
     Chosen so that the TCP predicted by the calibrated model is known best over the whole reachable
-    space and under all ``loads``. ``sigma`` (m) is 1 sigma of one coordinate of a reading.
+    space and under all ``loads``. ``sigma`` (m) is 1 sigma of one coordinate of a reading;
+    ``travel_weight`` the share of the TCP's deviation that a usual leg more at every pose is worth;
+    ``stops`` how many candidate poses are looked at.
     Raises PlanError where no pose is reachable and seen, or where the poses cannot be enough.
     """
-    wish = Wish(poses, held_out, repeats, seed, sigma, travel_weight)
-    tell = progress or (lambda text, share: None)
+    wish = Wish(poses, held_out, repeats, seed, sigma, travel_weight, stops)
+    with threadpool_limits(1, "blas"):  # matrices of this size gain nothing from threads
+        return _planned(parameters, observable, loads, space, wish, progress or _silent)
+
+
+def _silent(text: str, share: float) -> None:
+    """Tell nobody."""
+
+
+def _planned(
+    parameters: Parameters,
+    observable: Observable,
+    loads: Sequence[Payload],
+    space: Space,
+    wish: Wish,
+    tell: Progress,
+) -> Plan:
     loads = _in_order(parameters, loads)
     tell("looking for poses", 0.0)
     space = replace(space, hung=(*space.hung, *(_far_end(load) for load in loads)))
-    found = candidates_of(parameters, observable, loads, space, seed)
+    found = candidates_of(parameters, observable, loads, space, wish.seed, wish.stops)
     _require_enough(parameters, observable, found, wish)
     tell("working out what each pose tells", 0.1)
-    rows = blocks(parameters, observable, found.readings, found.nuisance, sigma)
-    reference = reference_of(parameters, loads, space, seed)
+    rows = blocks(parameters, observable, found.readings, found.nuisance, wish.sigma)
+    reference = reference_of(parameters, loads, space, wish.seed)
     weight = reference.weight(rows.shape[2])
     choice = Choice.of(rows, weight, _cost(parameters, found, wish))
     chosen = _chosen(choice, wish, lambda share: tell("choosing poses", 0.2 + 0.3 * share))
-    refiner = Refiner(parameters, observable, space, found, weight, sigma)
-    random = np.random.default_rng(seed)
+    refiner = Refiner(parameters, observable, space, found, weight, wish.sigma)
     best = refiner.refined(
-        Refined(found.readings[np.array(chosen)], rows[chosen]), REFINED, random,
+        Refined(found.readings[np.array(chosen)], rows[chosen]), REFINED,
+        np.random.default_rng(wish.seed),
         lambda share: tell("moving poses to where they tell more", 0.5 + 0.2 * share),
     )  # fmt: skip
     tell("working out what more or fewer poses buy", 0.7)
     bought = _bought(choice, chosen, wish, refiner)
-    bought[poses] = refiner.value(best.rows)
+    bought[wish.poses] = refiner.value(best.rows)
     tell("finding a short way", 0.95)
     checks = [Stop(row, held_out=True) for row in _held_out(found, chosen, wish)]
     found = joined(found, best.readings)
-    fit = [Stop(len(rows) + i) for i in range(poses)]
-    way = itinerary(found, fit + checks, space, repeats)
+    fit = [Stop(len(rows) + i) for i in range(wish.poses)]
+    way = itinerary(found, fit + checks, space, wish.repeats)
     again = [stop.row - len(rows) for stop in way.stops if stop.repeat]
-    expected = expectation_of(parameters, np.concatenate([best.rows, best.rows[again]]), reference)
+    measured = np.concatenate([best.rows, best.rows[again]])
+    expected = expectation_of(parameters, measured, reference)
     tell("planned", 1.0)
-    notes = (*found.notes, *way.notes, *_notes(parameters, loads, expected.std))
+    hung = set(found.readings.load[len(rows) :])
+    unseen = () if space.places or observable.unknown else (SIGHT,)
+    notes = (*found.notes, *unseen, *way.notes, *_notes(parameters, loads, hung, expected.std))
     return Plan(
         tuple(loads), way.poses(found), expected, tuple(sorted(bought.items())), way.travel, notes
     )
@@ -194,13 +218,13 @@ def _bought(choice: Choice, chosen: list[int], wish: Wish, refiner: Refiner) -> 
 
 
 def _held_out(found: Candidates, chosen: list[int], wish: Wish) -> list[int]:
-    """Return candidates at poses that are not fitted, drawn at random, the loads in turn."""
+    """Return candidates at poses that are not fitted, drawn at random, the fitted loads in turn."""
     random = np.random.default_rng(wish.seed + 2)
     used = set(found.stop[chosen])
-    count = int(found.readings.load.max()) + 1
+    loads = np.unique(found.readings.load[chosen])
     picked: list[int] = []
     for row in random.permutation(len(found.readings)):
-        wanted = len(picked) % count
+        wanted = loads[len(picked) % len(loads)]
         if len(picked) == wish.held_out:
             break
         if found.stop[row] not in used and found.readings.load[row] == wanted:
@@ -209,11 +233,16 @@ def _held_out(found: Candidates, chosen: list[int], wish: Wish) -> list[int]:
     return picked
 
 
-def _notes(parameters: Parameters, loads: Sequence[Payload], std: Array) -> list[str]:
+def _notes(
+    parameters: Parameters, loads: Sequence[Payload], hung: set[int], std: Array
+) -> list[str]:
     notes = []
     vague = [n for n, s in zip(parameters.names, std, strict=True) if not np.isfinite(s)]
     if vague:
         notes.append(f"not shown by these poses: {', '.join(vague)}")
+    idle = [f"{load.mass:g} kg" for i, load in enumerate(loads) if i not in hung]
+    if idle:
+        notes.append(f"loads that tell nothing more and need not be hung: {', '.join(idle)}")
     soft = [e for e in ("axial_compliance", "radial_compliance") if parameters.joints(e)]
     if soft and len(loads) == 1:
         notes.append(

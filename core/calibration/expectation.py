@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,5 +33,7 @@ def expectation(
     not looked at. Where everything is known no better than its weak prior, std is inf.
     """
     fitted = readings[np.flatnonzero(~readings.held_out)]
+    begin = parameters.model(parameters.begin)
+    fitted = replace(fitted, value=observable.predict(begin, fitted, nuisance))
     rows = blocks(parameters, observable, fitted, nuisance, sigma)
     return expectation_of(parameters, rows, Reference.of(parameters, *reference))

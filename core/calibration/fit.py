@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from core.calibration.lacking import lacking
 from core.calibration.noise import Noise
 from core.calibration.observables import make_observable
 from core.calibration.observables.nuisance import Nuisance
@@ -65,7 +66,8 @@ def calibrate(
     shown = np.array([e.shown for e in estimates], dtype=bool)
     errors = _errors(model, found, how, readings, rest.nuisance)
     odds = _stages_at_odds(problem, rest)
-    complete = remainder.calm and (told is None or told.verdict == "no_gap")
+    lacks = lacking(problem, rest)
+    complete = remainder.calm and not lacks and (told is None or told.verdict == "no_gap")
     notes = notes_of(problem, rest, remainder, odds, estimates)
     return Calibration(
         model=found, nominal=model, readings=readings, estimates=estimates,
@@ -78,9 +80,10 @@ def calibrate(
         stations=rest.nuisance.stations,
         tcp_std=tcp_deviation(parameters, rest, readings[readings.held_out]),
         diagnosis=told, complete=complete,
-        verdict=verdict_of(errors, remainder, told, rest, complete), notes=notes,
+        verdict=verdict_of(errors, remainder, told, rest, complete, lacks), notes=notes,
         instrument_noise=rest.noise.instrument, turn_noise=_turn_noise(how, rest.noise),
-        joint_noise=rest.noise.joint, freedom=rest.freedom, whole_covariance=rest.covariance,
+        joint_noise=rest.noise.joint, freedom=rest.freedom,
+        whole_covariance=rest.covariance, lacking=tuple(lack.name for lack in lacks),
     )  # fmt: skip
 
 

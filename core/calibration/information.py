@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.observables.nuisance import Nuisance
+from core.calibration.observables.nuisance import Layout, Nuisance
 from core.calibration.observables.observable import Observable
 from core.calibration.parameters import Parameters
 from core.calibration.plan import Expectation
@@ -63,10 +63,12 @@ def blocks(
     readings: Readings,
     nuisance: Nuisance,
     sigma: float,
+    layout: Layout | None = None,
 ) -> Array:
     """Return the equations of each reading (N, k, p+m), in units of noise and usual sizes."""
-    J, F = observable.columns(parameters, parameters.begin, readings, nuisance)
-    whole = np.hstack([J * parameters.prior, F]).reshape(len(readings), observable.equations, -1)
+    J, F = observable.columns(parameters, parameters.begin, readings, nuisance, layout)
+    whole = np.hstack([J * parameters.prior, F])
+    whole = whole.reshape(len(readings), observable.equations, whole.shape[1])
     return np.asarray(whole / (sigma * observable.sigmas)[None, :, None])
 
 

@@ -62,7 +62,7 @@ def itinerary(found: Candidates, stops: Sequence[Stop], space: Space, repeats: i
     readings = found.readings
     speed = joint_speed(space.model.arm.limits.velocity)
     blocks = _blocks(found, stops)
-    share = [len(part) for part in np.array_split(np.arange(repeats), max(len(blocks), 1))]
+    share = _shares([sum(not stop.held_out for stop in block) for block in blocks], repeats)
     at, travel = None, 0.0
     way: list[Stop] = []
     hit: list[tuple[int, int]] = []
@@ -72,7 +72,7 @@ def itinerary(found: Candidates, stops: Sequence[Stop], space: Space, repeats: i
         first = np.zeros(len(q)) if at is None else leg_times(at[None], q, speed)[0]
         order = shortest_way(np.where(blocked, ROUNDABOUT * legs + 1.0, legs), first)
         own = [block[i] for i in order]
-        fitted = [i for i in order if not block[i].held_out] or order
+        fitted = [i for i in order if not block[i].held_out]
         order += [fitted[i] for i in _spread(len(fitted), again)]
         for step, (a, b) in enumerate(pairwise(order)):
             travel += float(legs[a, b])
@@ -87,6 +87,15 @@ def itinerary(found: Candidates, stops: Sequence[Stop], space: Space, repeats: i
         more = f" and {len(hit) - 8} more" if len(hit) > 8 else ""
         notes = (f"no straight way in joint space, go round: stops {told}{more}",)
     return Itinerary(tuple(way), travel, notes)
+
+
+def _shares(fitted: list[int], repeats: int) -> list[int]:
+    """Return how many fitted stops of each block are visited again, the blocks in turn."""
+    share = [0] * len(fitted)
+    for _ in range(min(repeats, sum(fitted))):
+        block = min((b for b in range(len(share)) if share[b] < fitted[b]), key=lambda b: share[b])
+        share[block] += 1
+    return share
 
 
 def _spread(count: int, again: int) -> list[int]:

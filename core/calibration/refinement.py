@@ -70,7 +70,9 @@ class Refiner:
         return float(np.sqrt(np.sum(self.weight * inverse(gathered(rows)))))
 
     def _rows(self, readings: Readings) -> Array:
-        return blocks(self.parameters, self.observable, readings, self.found.nuisance, self.sigma)
+        layout = self.observable.layout(self.found.readings)
+        given = readings, self.found.nuisance, self.sigma, layout
+        return blocks(self.parameters, self.observable, *given)
 
     def _round(self, now: Refined, random: np.random.Generator) -> Refined:
         """Return the poses after each was offered some steps, the best taken."""

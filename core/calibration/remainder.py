@@ -123,9 +123,8 @@ def diagnosed(
         columns["measured_rotation"] = rotation_vector(rotation)
     log = Log("the session's readings", columns, part.q.shape[1])
     progress("diagnosing what is left")
-    instrument = Metrology(metrology.registered, rest.noise.instrument, metrology.repeatability)
     try:
-        return diagnose(found, log, instrument, progress=progress)
+        return diagnose(found, log, metrology, progress=progress)
     except InputError:
         return None
 

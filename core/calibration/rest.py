@@ -14,14 +14,13 @@ from core.calibration.observables.observable import Observable
 from core.calibration.parameters import Parameters
 from core.calibration.readings import Readings
 from core.calibration.robust import scaled_length, weights_of
-from core.calibration.staging import OF_LOADS, Stages, staged_step, stages_of
+from core.calibration.staging import Stages, staged_step, stages_of
 from core.calibration.system import Bounds, Mask, System, posterior, solve
 from core.errors import ExcitationError, InputError
 from core.metrology import Metrology
 
 Array = NDArray[np.float64]
-GEOMETRY_HELD = 10.0  # usual sizes within which a parameter is weakly held at its beginning
-BENDING_HELD = 3.0
+HELD = 10.0  # usual sizes within which a parameter is weakly held at its beginning
 NOISES = 2
 LOOKS = 4  # derivatives taken anew at most
 STEPS = 12  # steps with the same derivatives at most
@@ -69,9 +68,7 @@ class Rest:
 
 def bounds_of(parameters: Parameters) -> Bounds:
     """Return the parameters' bounds, and how firmly each is held at its beginning."""
-    effects = [parameters.terms[t].effect for t, _ in parameters.place]
-    times = [BENDING_HELD if effect in OF_LOADS else GEOMETRY_HELD for effect in effects]
-    held = parameters.scales * np.array(times)
+    held = HELD * parameters.scales
     return Bounds(parameters.lower, parameters.upper, held, parameters.begin)
 
 

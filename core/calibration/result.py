@@ -91,4 +91,5 @@ class Calibration:
     turn_noise: float = float("nan")  # rad, 1 sigma of a measured rotation; nan: none were
     joint_noise: float = float("nan")  # rad, 1 sigma of one joint's repeatability
     freedom: float = float("inf")  # degrees of freedom that the fit left
+    lacking: tuple[str, ...] = ()  # effects to ask for next: the remainder speaks of them
     whole_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # of all estimates

@@ -52,7 +52,7 @@ def sensitivities(calibration: Calibration) -> Sensitivities | None:
     shown, covariance = list(calibration.estimates), calibration.whole_covariance
     if len(covariance) != len(shown):
         shown, covariance = [e for e in shown if e.shown], calibration.covariance
-    J = _columns(calibration, [e.name for e in shown])
+    J = _columns(calibration, [e.name for e in shown]) if shown else None
     if J is None or len(covariance) != len(shown):
         return None
     each = tuple(

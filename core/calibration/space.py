@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from core.calibration.capsules import Box, Capsules, below, hidden, in_box, touching
 from core.errors import PlanError
@@ -74,8 +74,8 @@ class Space:
         keep_out: Sequence[Box] = (),
         floor: float | None = None,
         places: Sequence[Place] = (),
-        targets: Sequence[Sequence[float]] | Array = ((0.0, 0.0, 0.0),),
-        looks: Sequence[Sequence[float]] | Array | None = None,
+        targets: ArrayLike = ((0.0, 0.0, 0.0),),
+        looks: ArrayLike | None = None,
         acceptance: float = np.pi,
         link_radius: float | None = None,
         tool_radius: float | None = None,

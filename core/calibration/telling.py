@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from core.calibration.lacking import Lack
 from core.calibration.parameters import Parameters
 from core.calibration.remainder import Remainder
 from core.calibration.rest import Problem, Rest
@@ -72,7 +73,7 @@ def notes_of(
 
 def verdict_of(
     errors: tuple[Errors, ...], remainder: Remainder, diagnosis: Diagnosis | None, rest: Rest,
-    complete: bool,
+    complete: bool, lacks: tuple[Lack, ...],
 ) -> str:  # fmt: skip
     """Return the calibration in one sentence."""
     held = len(errors[2].rows) > 0
@@ -84,6 +85,9 @@ def verdict_of(
     )
     if complete:
         return f"{text}; nothing is left that a further effect could explain"
+    if lacks:
+        names = ", ".join(f"{lack.name} ({100 * lack.share:.0f} %)" for lack in lacks)
+        return f"{text}; not complete: to be added, with the share of what is left: {names}"
     left = [] if diagnosis is None else sorted(
         {cause.effect for c in diagnosis.channels for cause in c.causes}
     )  # fmt: skip

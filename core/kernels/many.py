@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import config
 from numpy.typing import NDArray
 
 from core import kernel
@@ -11,15 +12,25 @@ from core.kernels.predict import linear_blocks, predict_blocks
 from core.kernels.threads import in_ranges
 
 Array = NDArray[np.float64]
+FEW = 2  # rows that are not worth a block
 
 
 def _part(rows: Rows, first: int, last: int) -> Rows:
     return Rows(*(part[first:last] for part in rows))
 
 
+def _singly(chain: Chain, rows: Rows) -> bool:
+    """Return whether blocks cannot (links that bend), or would take longer (not compiled)."""
+    return (
+        len(rows.q) <= FEW
+        or bool(chain.flexibility.any())
+        or bool(getattr(config, "DISABLE_JIT", 0))
+    )
+
+
 def predict(chain: Chain, rows: Rows, position: Array, rotation: Array) -> int:
     """Write the TCP pose of every row; returns the first row without equilibrium, or -1."""
-    if chain.flexibility.any():
+    if _singly(chain, rows):
         return int(kernel.predict_rows(chain, rows, position, rotation))
 
     def work(first: int, last: int) -> int:
@@ -42,6 +53,6 @@ def linear_form(chain: Chain, rows: Rows, A: Array, jacobian: Array, moment: Arr
         stopped = int(linear_blocks(chain, rows, first, last, A, jacobian, moment))
         return -1 if stopped < 0 else singly(stopped, last)
 
-    if chain.flexibility.any():
+    if _singly(chain, rows):
         return singly(0, len(rows.q))
     return next((bad for bad in in_ranges(work, len(rows.q)) if bad >= 0), -1)

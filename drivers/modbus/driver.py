@@ -28,6 +28,7 @@ from drivers.ur_rtde.nominal import Nominal
 Vector = NDArray[np.float64]
 SLOW_EVERY = 0.2  # s between two readings of conditions that lie apart
 BEYOND = 0.1  # rad outside the arm's joint limits: the register map is wrong
+LONGEST_ANSWER, LEAST_ANSWER = 4.0, 0.03  # cycles, s: an older answer is not fresh
 MARGIN = 2.0  # times the arm's own velocity limits: what no joint can pass
 MODES = {"not_ready": (5, 1), "protective_stop": (7, 3), "emergency_stop": (3, 7), "fault": (7, 9)}
 """Trouble -> RTDE robot_mode and safety_mode."""
@@ -57,6 +58,8 @@ class ModbusDriver(Driver):
         self._q: Vector | None = None  # of the last sample that was believed
         self._first: tuple[Vector, float] = (np.zeros(0), 0.0)  # what the first must agree with
         self._fastest = np.minimum(profile.fastest, MARGIN * model.arm.limits.velocity)
+        self._longest_answer = max(LONGEST_ANSWER / self.rate, LEAST_ANSWER)  # s
+        self._given = 0.0  # s, monotonic: when the last setpoint was given
         self._connected = False
 
     # -- reading ----------------------------------------------------------------------------------
@@ -118,9 +121,13 @@ class ModbusDriver(Driver):
             time.sleep(min(self.profile.period / 4.0, 0.01))
 
     def _attempt(self) -> Sample | None:
-        """Return a sample, or None where the controller kept silent once."""
+        """Return a sample, or None where the controller kept silent once.
+
+        An answer that was long under way, or lay here while this process stood still, is none.
+        """
+        asked = time.monotonic()
         try:
-            return self._decoder.decode(self._read_blocks())
+            sample = self._decoder.decode(self._read_blocks())
         except StaleStateError:
             self.transport.open()  # raises LinkError where nobody is there any more
             return None
@@ -128,6 +135,7 @@ class ModbusDriver(Driver):
             if not self.transport.is_open:
                 self.transport.open()
             raise
+        return None if time.monotonic() - asked > self._longest_answer else sample
 
     def _read_blocks(self) -> dict[Block, Sequence[int]]:
         """Return the registers of one cycle: one block, where the profile's map allows it."""
@@ -138,6 +146,8 @@ class ModbusDriver(Driver):
         found = dict(self._slow)
         first, *others = self.map.fast
         words = self._writer.pending()
+        if now - self._given > self._longest_answer:
+            words = None  # of a state that is old by now
         if words is not None and first.table == "holding":
             found[first] = self.transport.exchange(first, *words)
         else:
@@ -256,6 +266,7 @@ class ModbusDriver(Driver):
         if self._sample is None:
             raise WriteError(f"{self.transport.name}: found no state, expected read_state() first")
         try:
+            self._given = time.monotonic()
             self._writer.write(setpoint, self._sample)
         except WriteError:
             raise

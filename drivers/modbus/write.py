@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import IneffectiveWriteError, StaleStateError, WriteError
+from core.errors import ForeignCommandError, IneffectiveWriteError, StaleStateError, WriteError
 from core.model import Model
 from core.setpoint import Setpoint
 from core.state import RobotState
@@ -93,6 +93,7 @@ class MailboxWriter:
         self._sequence = self._heartbeat = 0
         self._counts: list[int] = [0] * 6
         self._awaited = 0  # a sequence number that has not come back yet
+        self._sent = 0  # numbers since arming, as far as an echo can lie back
         self._since = 0.0
         self._pending: list[int] | None = None
 
@@ -117,7 +118,7 @@ class MailboxWriter:
             if time.monotonic() > until:
                 raise WriteError(self._silence(echo))
             time.sleep(ANNOUNCE)
-        self._awaited, self._armed = 0, True
+        self._awaited, self._sent, self._armed = 0, 0, True
 
     def write(self, setpoint: Setpoint, sample: Sample) -> None:
         """Send one offset. Raises WriteError where the program does not take them."""
@@ -131,6 +132,7 @@ class MailboxWriter:
         if counts != self._counts:
             self._counts = counts
             self._sequence = encode.next_number(self._sequence)
+            self._sent = min(self._sent + 1, encode.SEQUENCES // 4)
             if not self._awaited:
                 self._awaited, self._since = self._sequence, time.monotonic()
         words = self._words()
@@ -162,6 +164,11 @@ class MailboxWriter:
         if echo[1] != encode.RUNNING:
             self._armed = False
             raise WriteError(self._silence(echo))
+        if (self._sequence - echo[0]) % (encode.SEQUENCES - 1) > self._sent:
+            raise ForeignCommandError(
+                f"{self._transport.name}: found number {echo[0]} in the mailbox's echo, which was "
+                "not sent from here: somebody else writes the mailbox"
+            )
         if late:  # it was sent again in every cycle since
             raise IneffectiveWriteError(self._silence(echo))
 

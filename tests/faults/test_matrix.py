@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from rigs import Rigs, calm_link
 
 from benchmarks.faults.injection import make_fault
 from benchmarks.faults.links import LINKS
-from benchmarks.faults.rig import Rig
+from benchmarks.faults.matrix import run_alone
 from benchmarks.faults.row import Result, Row
 from benchmarks.faults.table import ROWS, rows_of
 
@@ -22,36 +22,6 @@ pytestmark = [
     ),
 ]
 BUSY = 1.5  # processes that want to run, per core
-CALM = 125.0  # Hz of the UR links: what a busy machine still keeps up with
-
-
-class Rigs:
-    """The rig of the link at hand; one that a fault has left beyond recovery is replaced."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._rig: Rig | None = None
-        self._name = ""
-
-    def of(self, name: str) -> Rig:
-        if self._rig is None or self._name != name or not self._rig.run.alive:
-            self.close()
-            link = LINKS[name](CALM if name.startswith("ur_") else None)
-            self._rig, self._name = Rig(link, self._folder / name), name
-            self._rig.__enter__()
-        return self._rig
-
-    def close(self) -> None:
-        rig, self._rig = self._rig, None
-        if rig is not None:
-            rig.__exit__(None, None, None)
-
-
-@pytest.fixture(scope="module")
-def rigs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rigs]:
-    found = Rigs(tmp_path_factory.mktemp("faults"))
-    yield found
-    found.close()
 
 
 def attempt(rigs: Rigs, name: str, row: Row) -> Result:
@@ -80,7 +50,7 @@ def test_a_fault_is_detected_and_answered_as_the_table_says(
     assert attempt(rigs, name, row).wrong == ()
 
 
-APART = [(name, row) for name in LINKS for row in rows_of(name, apart=True)]
+APART = [(name, row) for name in LINKS for row in rows_of(name, shared=False)]
 
 
 @pytest.mark.parametrize(
@@ -89,9 +59,7 @@ APART = [(name, row) for name in LINKS for row in rows_of(name, apart=True)]
 def test_a_fault_that_needs_a_daemon_of_its_own_is_answered_as_the_table_says(
     tmp_path: Path, name: str, row: Row
 ) -> None:
-    assert row.apart is not None
-    link = LINKS[name](CALM if name.startswith("ur_") else None)
-    assert row.apart(row, link, tmp_path).wrong == ()
+    assert run_alone(row, calm_link(name), tmp_path).wrong == ()
 
 
 def test_every_row_has_a_name_of_its_own_and_links_that_exist() -> None:

@@ -77,7 +77,7 @@ _MODBUS: tuple[tuple[str, Ruin], ...] = (
 ROWS = (
     *(Row(f"{name}, once", f"{name}", "proxy ruins one answer", _ruin(ruin, 1), MODBUS, DROPS,
           SOON, GOES_ON) for name, ruin in _MODBUS),
-    *(Row(f"{name}, for long", f"{name}, 3 in a row", "proxy ruins 30 answers", _ruin(ruin, 30),
+    *(Row(f"{name}, for long", f"{name}, 3 in a row", "proxy ruins 15 answers", _ruin(ruin, 15),
           MODBUS, within=LATER, end=("observing", "fault")) for name, ruin in _MODBUS[:4]),
     Row("broken text, once", "short or corrupt message", "one message is no frame",
         _ruin(_no_socketcand, 1), CAN, "none", SOON, GOES_ON),

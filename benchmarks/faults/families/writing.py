@@ -87,17 +87,18 @@ STAYS = ("observing", "fault")
 
 ROWS = (
     Row("writes are lost", "write not effective", "proxy loses all data packages of the client",
-        _lose_packets, ("ur_servoj", "ur_offset"), within=seconds(0.6), lasting=0.2, end=STAYS),
+        _lose_packets, ("ur_servoj", "ur_offset"), within=seconds(0.6), lasting=0.2, end=STAYS,
+        slow=True),
     Row("requests are lost", "write not effective", "proxy loses all writing requests",
-        _lose_requests, ("modbus",), within=seconds(0.9), lasting=0.2, end=STAYS),
+        _lose_requests, ("modbus",), within=seconds(0.9), lasting=0.2, end=STAYS, slow=True),
     Row("no echo", "register that does not echo", "the robot's program is stopped", _stop_program,
-        ("modbus", "ur_offset"), within=seconds(0.8), end=STAYS),
+        ("modbus", "ur_offset"), within=seconds(0.8), end=STAYS, slow=True),
     Row("another program", "second commander", "another script is uploaded", _another_program,
-        ("ur_servoj", "ur_offset"), within=seconds(0.6), end=STAYS),
+        ("ur_servoj", "ur_offset"), within=seconds(0.6), end=STAYS, slow=True),
     Row("another commander", "second commander", "10 foreign frames 0x155", _another_on_the_bus,
         ("can",), within=seconds(0.4), lasting=0.3, end=STAYS),
     Row("another master", "second commander", "another client writes the mailbox 10 times",
         _another_in_the_mailbox, ("modbus",), within=seconds(0.6), lasting=0.3, end=STAYS),
     Row("half a setpoint", "partial multi-frame write", "connection cut behind frame 0x155",
-        _half_a_setpoint, ("can",), within=seconds(0.3), end=STAYS),
+        _half_a_setpoint, ("can",), within=seconds(0.3), end=STAYS, slow=True),
 )  # fmt: skip

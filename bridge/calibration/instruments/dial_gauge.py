@@ -13,6 +13,7 @@ class DialGauge(Instrument[DialGaugeSettings]):
     """A person reads the dial and types what stands there; ``zero`` is added."""
 
     manual = True
+    waits = True
 
     @property
     def name(self) -> str:
@@ -23,10 +24,11 @@ class DialGauge(Instrument[DialGaugeSettings]):
         """Return one sample (1, 1), m. Raises ReadingError."""
         given = self.settings
         (dial,) = numbers(self.around.ask(f"dial, {given.unit}"), 1, given.unit)
-        distance = (dial + given.zero) * METRES[given.unit]
-        if not 0.0 < distance < FARTHEST:
+        distance = (dial + (given.zero or 0.0)) * METRES[given.unit]
+        low = 0.0 if given.zero is not None else -FARTHEST
+        if not low < distance < FARTHEST:
             raise ReadingError(
-                f"found a distance of {distance:g} m, expected more than 0 and less than "
-                f"{FARTHEST:g}: are unit and zero right?"
+                f"found a distance of {distance:g} m, expected more than {low:g} and less "
+                f"than {FARTHEST:g}: are unit and zero right?"
             )
         return Samples(np.array([[distance]]))

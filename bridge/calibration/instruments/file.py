@@ -18,6 +18,8 @@ LOOK = 0.1  # s between two looks at the file
 class File(Instrument[FileSettings]):
     """Takes the next row that has not been had, or, with a column ``stop``, the stop's last one."""
 
+    waits = True
+
     @property
     def name(self) -> str:
         """Return the file."""

@@ -23,6 +23,8 @@ class WatchedFolder(Instrument[FolderSettings]):
     A file with several rows is several samples of one point.
     """
 
+    waits = True
+
     @property
     def name(self) -> str:
         """Return the folder."""

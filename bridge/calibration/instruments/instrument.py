@@ -58,6 +58,9 @@ class Instrument(ABC, Generic[S]):
     """One instrument, for one thread. The constructor opens nothing."""
 
     manual = False  # a person reads it: mistakes of typing happen
+    waits = False  # for the person, or for what is exported: nobody need say when to read
+    needs_wrench = False  # the controller must tell the raw reading of a flange sensor
+    seats = False  # the tool is brought onto something by hand: the joints are read afterwards
 
     def __init__(self, settings: S, around: Surroundings) -> None:
         self.settings, self.around = settings, around

@@ -6,7 +6,7 @@ Small pydantic models without any instrument behind them, so that a cell is read
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -32,6 +32,11 @@ class Base(BaseModel):
     def measures(self) -> str:
         """Return the kind of its readings, a key of the calibration's observables."""
         return "position"
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Return what else the calibration must know of this kind of reading."""
+        return {}
 
     def located(self, folder: Path) -> Base:
         """Return the settings with relative paths, which are seen from ``folder``, made whole."""
@@ -113,7 +118,14 @@ class DialGaugeSettings(Base):
 
     kind: Literal["dial_gauge"]
     unit: LengthUnit = Field(description="of lengths: m, mm, um or in")
-    zero: float = Field(default=0.0, description="distance at which it reads nothing, in its unit")
+    zero: float | None = Field(
+        default=None, description="distance at which it reads 0, in its unit; default: found along"
+    )
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Return whether its zero is unknown."""
+        return {"zeroed": self.zero is None}
 
     @property
     def measures(self) -> str:
@@ -137,6 +149,14 @@ class SphereSettings(Base):
     """A fixed sphere that the tool's probe touches: joint angles alone are the reading."""
 
     kind: Literal["sphere"]
+    radius: Positive | None = Field(
+        default=None, description="m, of sphere and probe together; default: found along"
+    )
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Return the radius."""
+        return {"radius": self.radius}
 
     @property
     def measures(self) -> str:

@@ -11,6 +11,10 @@ from bridge.calibration.instruments.settings import SphereSettings
 class Sphere(Instrument[SphereSettings]):
     """A person brings the probe onto the sphere and says so."""
 
+    waits = True
+    seats = True
+    question = "probe seated on the sphere? Enter"
+
     @property
     def name(self) -> str:
         """Return what is done."""
@@ -18,5 +22,21 @@ class Sphere(Instrument[SphereSettings]):
 
     def read(self, where: Where) -> Samples:
         """Return one sample without any number (1, 0), once the probe sits on the sphere."""
-        self.around.ask("probe seated on the sphere? Enter")
+        self.around.ask(self.question)
         return Samples(np.zeros((1, 0)))
+
+
+class TipOnPoint(Sphere):
+    """A person brings the tool's tip onto one fixed point and says so."""
+
+    question = "tip on the point? Enter"
+
+    @property
+    def kind(self) -> str:
+        """Return ``point``."""
+        return "point"
+
+    @property
+    def name(self) -> str:
+        """Return what is done."""
+        return "tip on a fixed point"

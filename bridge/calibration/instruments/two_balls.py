@@ -15,6 +15,7 @@ class TwoBalls(Instrument[TwoBallsSettings]):
     """A person measures both balls at each pose; the instrument may stand anywhere."""
 
     manual = True
+    waits = True
 
     @property
     def name(self) -> str:

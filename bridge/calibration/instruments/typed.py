@@ -11,6 +11,7 @@ class Typed(Instrument[TypedSettings]):
     """A person reads a display and types; several lines pasted at once count one by one."""
 
     manual = True
+    waits = True
 
     @property
     def name(self) -> str:

@@ -1,6 +1,18 @@
 """Reports of calibration sessions, for customers: one HTML file and a PDF."""
 
 from bridge.calibration.report.facts import InstrumentFacts, SessionFacts
-from bridge.calibration.report.report import write_report
+from bridge.calibration.report.report import (
+    write_payload,
+    write_report,
+    write_tool,
+    write_verification,
+)
 
-__all__ = ["InstrumentFacts", "SessionFacts", "write_report"]
+__all__ = [
+    "InstrumentFacts",
+    "SessionFacts",
+    "write_payload",
+    "write_report",
+    "write_tool",
+    "write_verification",
+]

@@ -79,6 +79,12 @@ def logarithmic(title: str, values: Sequence[float]) -> Scale:
     return Scale(title, low, high, kept, log=True)
 
 
+def visible(values: Sequence[float]) -> list[float]:
+    """Return values for a scale in powers of ten, the least ones not to stretch it."""
+    least = sorted(values)[len(values) // 4] / 20 if values else 0.0
+    return [max(v, least) for v in values]
+
+
 def named(title: str, labels: Sequence[str]) -> Scale:
     """Return a scale of named places 0, 1, 2, ..."""
     count = len(labels)

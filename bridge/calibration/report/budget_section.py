@@ -14,7 +14,7 @@ from bridge.calibration.report.blocks import (
     Strong,
     Table,
 )
-from bridge.calibration.report.figures import fine, mm, plain
+from bridge.calibration.report.figures import fine, mm
 from bridge.calibration.report.material import Material
 from bridge.calibration.report.names import parameter_words
 from bridge.calibration.report.section import Section
@@ -137,8 +137,10 @@ def _behind(given: Sensitivities) -> list[Block]:
 
 def _parameter(s: Sensitivity) -> list[Cell]:
     unit, factor = unit_of(s.unit)
-    coefficient = plain(float(f"{s.coefficient * 1e3 / factor:.3g}"))
+    coefficient = s.coefficient * 1e3 / factor
+    small = coefficient < 1e-3
+    per = f"{number(coefficient * (1e3 if small else 1.0))} {'µm' if small else 'mm'} per {unit}"
     return [
-        parameter_words(s.name), told(s.std, s.unit), f"{coefficient} mm per {unit}",
+        parameter_words(s.name), told(s.std, s.unit), per,
         fine(s.contribution),
     ]  # fmt: skip

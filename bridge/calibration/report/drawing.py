@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 INK, SOFT, GRID, EDGE = "#1c2730", "#5b6770", "#e3e8ec", "#9aa5b1"
-BEFORE, AFTER, LIMIT = "#d9822b", "#1f77b4", "#2f9e62"
+BEFORE, AFTER, LIMIT, BAD_DOT = "#d9822b", "#1f77b4", "#2f9e62", "#c43d3d"
 
 Point = tuple[float, float]
 

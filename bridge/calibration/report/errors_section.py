@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from bridge.calibration.report.axes import Chart, logarithmic, named, scale
-from bridge.calibration.report.blocks import Block, Pictures, Table
+from bridge.calibration.report.axes import Chart, logarithmic, named, scale, visible
+from bridge.calibration.report.blocks import Block, Paragraph, Pictures, Table
 from bridge.calibration.report.drawing import AFTER, BEFORE, Drawing
 from bridge.calibration.report.figures import fixed, mm
 from bridge.calibration.report.material import Material
@@ -19,14 +19,15 @@ class ErrorsSection(Section[Material]):
     """How large the errors were and are."""
 
     key, title = "errors", "Before and after"
-    about = "Distance between where the tool was measured and where the model puts it."
 
     def blocks(self, material: Material) -> list[Block]:
         """Return the table of figures, the distribution and the axes."""
         pictures = [_distribution(material)]
         if len(material.axes) > 1:
             pictures.append(_axes(material))
+        words = material.error_words
         return [
+            Paragraph(f"{words[:1].upper()}{words[1:]}.", "note"),
             _table(material),
             Pictures(tuple(pictures), _caption(material)),
         ]
@@ -65,7 +66,7 @@ def _row(name: str, errors: Errors) -> list[str]:
 def _distribution(material: Material) -> Drawing:
     before, after = (np.sort(e.norm) * 1e3 for e in material.judged)
     chart = Chart(
-        "Distribution of the error", logarithmic("error, mm", [*before, *after]),
+        "Distribution of the error", logarithmic("error, mm", visible([*before, *after])),
         scale("share of the readings, %", [0, 100]),
     )  # fmt: skip
     for values, colour in ((before, BEFORE), (after, AFTER)):

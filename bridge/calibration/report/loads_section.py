@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.report.axes import Chart, logarithmic, named
+from bridge.calibration.report.axes import Chart, logarithmic, named, visible
 from bridge.calibration.report.blocks import Block, Pictures, Table
 from bridge.calibration.report.drawing import AFTER, BEFORE, Drawing
 from bridge.calibration.report.figures import load_words, mm, plain
@@ -38,7 +38,7 @@ def _picture(material: Material, load: Index, numbers: list[int]) -> Drawing:
     labels = [f"{plain(_mass(material, k))} kg" for k in numbers]
     chart = Chart(
         "Error by load", named("load on the flange", labels),
-        logarithmic("error, mm", [*before.norm * 1e3, *after.norm * 1e3]), width=420,
+        logarithmic("error, mm", visible([*before.norm * 1e3, *after.norm * 1e3])), width=420,
     )  # fmt: skip
     for shift, errors, colour in ((-0.17, before, BEFORE), (0.17, after, AFTER)):
         for place, k in enumerate(numbers):

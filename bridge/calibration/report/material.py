@@ -11,10 +11,18 @@ from numpy.typing import NDArray
 from bridge.calibration.report.facts import SessionFacts
 from core.calibration.budget import Budget, Stated, budget, wild_readings
 from core.calibration.plan import Plan
-from core.calibration.pose_accuracy import PoseAccuracy, pose_accuracies
+from core.calibration.pose_accuracy import KINDS, PoseAccuracy, pose_accuracies
 from core.calibration.result import Calibration, Errors
 
 Array = NDArray[np.float64]
+
+ERRORS = {
+    "position": "the distance between where the tool was measured and where the model puts it",
+    "distance": "the difference between the distance that was measured and the model's",
+    "sphere": "how far from the sphere the model puts the tool while it touched it",
+    "point": "how far from the fixed point the model puts the tip while it was there",
+    "relative": "the difference between one ball's place seen from the other, and the model's",
+}
 
 
 @dataclass(frozen=True)
@@ -96,6 +104,16 @@ class Material:
         """Return where the calibrated model puts the TCP of every reading (N, 3), m, in base."""
         readings = self.calibration.readings
         return self.calibration.model.predict(readings.q, readings.loads).position
+
+    @property
+    def shows_places(self) -> bool:
+        """Return whether the readings show where the tool is, all three coordinates."""
+        return self.calibration.readings.kind in KINDS
+
+    @property
+    def error_words(self) -> str:
+        """Return what an error is, for this kind of reading."""
+        return ERRORS.get(self.calibration.readings.kind, ERRORS["position"])
 
     @property
     def axes(self) -> tuple[str, ...]:

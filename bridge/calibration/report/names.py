@@ -17,6 +17,10 @@ PATTERNS = {
     "backlash": "play of joint {joint}",
     "base_compliance": "yielding of the foundation about {part}",
     "transmission_error": "gear error of joint {joint} ({part})",
+    "stiffness_nonlinearity": "stiffening of joint {joint} ({part})",
+    "gravity_direction": "tilt of the base about {part}",
+    "thermal_drift": "growth of link {joint} with warmth",
+    "payload": "mass of the load beyond the declared one",
     "tool_tcp": "tool centre {part}",
     "payload_mass": "mass of the load",
     "payload_cog": "centre of gravity {part}",
@@ -38,7 +42,7 @@ def effect_of(name: str) -> str:
 def parameter_words(name: str) -> str:
     """Return a parameter's public name in words; the name itself where there are none."""
     effect = effect_of(name)
-    if name == effect and effect in CATALOGUE:
+    if name == effect and effect in CATALOGUE and "{" in PATTERNS.get(effect, "{"):
         return effect_words(effect)
     match = re.fullmatch(r"(?:_(\d+))?(?:_(.+))?", name.removeprefix(effect))
     if not effect or match is None:
@@ -49,7 +53,7 @@ def parameter_words(name: str) -> str:
     if pattern is None:
         where = f", joint {joint}" if joint else ""
         return f"{effect_words(effect)}{where}{', ' + part if part else ''}"
-    return pattern.format(joint=joint, part=part).strip()
+    return pattern.format(joint=joint, part=part).replace(" ()", "").strip()
 
 
 def spoken(text: str) -> str:

@@ -40,7 +40,7 @@ STYLES = {
     "head_number": _style("head_number", fontName=BOLD, fontSize=7.5, leading=9.5, spaceAfter=0,
                           textColor=SOFT, alignment=2),
     "tile_label": _style("tile_label", fontSize=7.5, leading=9.5, spaceAfter=1, textColor=SOFT),
-    "tile_value": _style("tile_value", fontName=BOLD, fontSize=12.5, leading=15.5, spaceAfter=1),
+    "tile_value": _style("tile_value", fontName=BOLD, fontSize=12, leading=15, spaceAfter=1),
 }  # fmt: skip
 
 

@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from bridge.calibration.report.blocks import Document
 from bridge.calibration.report.facts import SessionFacts
 from bridge.calibration.report.html import html
 from bridge.calibration.report.material import Material
+from bridge.calibration.report.payload_sections import PAYLOAD, PayloadMaterial
+from bridge.calibration.report.section import Section
 from bridge.calibration.report.sections import CALIBRATION
+from bridge.calibration.report.tool_sections import TOOL, ToolMaterial
+from bridge.calibration.report.verification_sections import VERIFICATION, VerificationMaterial
 from bridge.output_file import replacing_bytes, write_text
+from core.calibration.payload_session import PayloadCalibration
 from core.calibration.plan import Plan
+from core.calibration.readings import Readings
 from core.calibration.result import Calibration
+from core.calibration.tool_session import ToolCalibration
+from core.calibration.verify import Verification
+from core.model import Model
+
+M = TypeVar("M")
 
 
 def write_report(
@@ -22,14 +35,55 @@ def write_report(
     Raises RunError where a file cannot be written.
     """
     material = Material(calibration, plan, session)
-    parts = [section.part(material) for section in CALIBRATION]
-    document = Document(
-        f"Calibration of {session.cell}",
+    return _written(_document("Calibration", session, CALIBRATION, material), out, "calibration")
+
+
+def write_verification(
+    verification: Verification, session: SessionFacts, out: Path, readings: Readings | None = None
+) -> tuple[Path, Path]:
+    """Write ``verification.html`` and ``verification.pdf`` into folder ``out``; return their paths.
+
+    ``readings`` are those that were verified: they tell the poses. Raises RunError where a file
+    cannot be written.
+    """
+    material = VerificationMaterial(verification, session, readings)
+    document = _document("Verification", session, VERIFICATION, material)
+    return _written(document, out, "verification")
+
+
+def write_payload(
+    found: PayloadCalibration, session: SessionFacts, out: Path, nominal: Model | None = None
+) -> tuple[Path, Path]:
+    """Write ``payload.html`` and ``payload.pdf`` into folder ``out``; return their paths.
+
+    ``nominal`` is the model as the cell had it. Raises RunError where a file cannot be written.
+    """
+    material = PayloadMaterial(found, session, nominal)
+    return _written(_document("Load and force sensor", session, PAYLOAD, material), out, "payload")
+
+
+def write_tool(
+    found: ToolCalibration, session: SessionFacts, out: Path, nominal: Model | None = None
+) -> tuple[Path, Path]:
+    """Write ``tool.html`` and ``tool.pdf`` into folder ``out``; return their paths.
+
+    ``nominal`` is the model as the cell had it. Raises RunError where a file cannot be written.
+    """
+    material = ToolMaterial(found, session, nominal)
+    return _written(_document("Tool", session, TOOL, material), out, "tool")
+
+
+def _document(
+    what: str, session: SessionFacts, sections: Sequence[Section[M]], material: M
+) -> Document:
+    parts = [section.part(material) for section in sections]
+    title = f"{what} of {session.cell}"
+    return Document(
+        title,
         f"Arm {session.arm}, {session.started:%d %B %Y} · Gapbridge",
         tuple(part for part in parts if part is not None),
-        f"Gapbridge · calibration of {session.cell} · {session.started:%Y-%m-%d}",
+        f"Gapbridge · {title[:1].lower()}{title[1:]} · {session.started:%Y-%m-%d}",
     )
-    return _written(document, out, "calibration")
 
 
 def _written(document: Document, out: Path, name: str) -> tuple[Path, Path]:

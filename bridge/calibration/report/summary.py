@@ -39,10 +39,12 @@ class Summary(Section[Material]):
             Tile("expanded uncertainty (k = 2)", f"± {mm(material.budget.expanded)}",
                  "of one coordinate of the tool"),
         ]  # fmt: skip
-        text = (
-            f"Errors are those of {material.judged_words}: the distance between where the tool "
-            "was measured and where the model said it would be."
-        )
+        text = f"Errors are those of {material.judged_words}: {material.error_words}."
+        if not material.shows_places:
+            text += (
+                " Such readings show a part of where the tool is: how well its place is known "
+                "stands in the uncertainty, not in these errors."
+            )
         wild = [r for r in material.judged[1].rows if r in material.wild]
         if wild and material.held_out:
             rows = listed([str(int(r) + 1) for r in wild])

@@ -10,10 +10,12 @@ from bridge.calibration.report.drawing import Circle, Drawing, Line, Rectangle, 
 def svg(drawing: Drawing) -> str:
     """Return the drawing as one SVG element, as wide as its place but not wider than drawn."""
     width, height = _number(drawing.width), _number(drawing.height)
+    # as wide as its place allows, up to half as wide again as it was drawn
+    most = _number(1.45 * drawing.width)
     shapes = "".join(_shape(shape) for shape in drawing.shapes)
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
-        f'width="{width}" height="{height}" role="img" '
+        f'width="{width}" height="{height}" style="max-width:min(100%,{most}px)" role="img" '
         f'aria-label="{escape(drawing.title)}">{shapes}</svg>'
     )
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.calibration.report.axes import Chart, scale
-from bridge.calibration.report.blocks import Block, Pictures, Table
+from bridge.calibration.report.blocks import Block, Paragraph, Pictures, Table
 from bridge.calibration.report.drawing import AFTER, BEFORE, EDGE, INK, Circle, Drawing
 from bridge.calibration.report.figures import mm
 from bridge.calibration.report.material import Material
@@ -22,15 +22,15 @@ class WorkspaceSection(Section[Material]):
     """Where in the workspace the errors are."""
 
     key, title = "workspace", "Over the workspace"
-    about = "Each line begins where the tool was meant to be and shows which way it was off."
 
     def blocks(self, material: Material) -> list[Block]:
         """Return the errors as arrows, from two sides, and a table of zones."""
         before, after = material.calm
         tip = material.tip[before.rows]
         zones = _zones(tip, before, after)
-        if before.vector.shape[1] != 3:
+        if not material.shows_places:
             return [zones]
+        about = "Each line begins where the tool was meant to be and shows which way it was off."
         size = float(np.ptp(tip, axis=0).max())
         drawings, factors = [], []
         for name, errors, colour in (("Before", before, BEFORE), ("After", after, AFTER)):
@@ -40,10 +40,10 @@ class WorkspaceSection(Section[Material]):
                 title = f"{name}, {view}"
                 drawings.append(_view(title, axes, tip, errors.vector * factor, colour))
         caption = (
-            f"{_all(material)} Errors before are drawn {factors[0]:,.0f} times as long as they are, "
-            f"errors after {factors[1]:,.0f} times. Axes of the base; the square is the base."
+            f"{_all(material)} Errors before are drawn {factors[0]:,.0f} times as long as they are,"
+            f" errors after {factors[1]:,.0f} times. Axes of the base; the square is the base."
         )
-        return [Pictures(tuple(drawings), caption), zones]
+        return [Paragraph(about, "note"), Pictures(tuple(drawings), caption), zones]
 
 
 def _all(material: Material) -> str:

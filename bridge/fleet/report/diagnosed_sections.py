@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 
 from bridge.fleet.diagnosed import Diagnosed, Onset, Recurrence
 from bridge.fleet.outcome_words import counted
+from bridge.fleet.report.shared_sections import unbroken
 from bridge.fleet.running import Done
+from bridge.fleet.session import natural
 from bridge.fleet.task import DONE, Outcome
 from bridge.report.fragment import (
     AFTER,
@@ -33,8 +36,9 @@ from bridge.report.words import (
 
 KINDS = {"no_gap": "good", "explained": "good", "partly_explained": "doubtful",
          "unexplained": "bad"}  # fmt: skip
-SESSION_HEADS = ("arm", "verdict", "samples", "gap", "unexplained", "causes")
+SESSION_HEADS = ("verdict", "samples", "gap", "unexplained", "causes")
 JOINTS = 4  # named of an effect's joints
+NAMED = 4  # drifting arms in the answer
 DRAWN = 14  # effects in the picture
 
 
@@ -46,7 +50,12 @@ def answer(together: Diagnosed, done: Done) -> str:
         for verdict, count in together.verdicts
     )
     parts = [f'<p class="verdict">{words}</p>']
-    sentences = [_recurs(together), _drifting(together), _skipped(done, usable)]
+    sentences = [
+        _recurs(together),
+        _drifting(together),
+        _standing_out(together),
+        _skipped(done, usable),
+    ]
     parts.append(paragraph(" ".join(s for s in sentences if s), "lead"))
     return "".join(parts)
 
@@ -63,10 +72,20 @@ def _recurs(together: Diagnosed) -> str:
 
 
 def _drifting(together: Diagnosed) -> str:
-    arms = {d.arm for d in together.drifts} | {o.arm for o in together.onsets}
+    arms = sorted({d.arm for d in together.drifts} | {o.arm for o in together.onsets}, key=natural)
     if not arms:
         return "No arm drifts by more than its sessions scatter."
-    return f"{counted(len(arms), 'arm')} {'drifts' if len(arms) == 1 else 'drift'}."
+    who = listed(arms) if len(arms) <= NAMED else counted(len(arms), "arm")
+    return f"{who} {'drifts' if len(arms) == 1 else 'drift'}."
+
+
+def _standing_out(together: Diagnosed) -> str:
+    if not together.outliers:
+        return ""
+    first = together.outliers[0]
+    more = f" and {len(together.outliers) - 1} more" if len(together.outliers) > 1 else ""
+    verb = "stand" if more else "stands"
+    return f"{first.session or first.arm}{more} {verb} out."
 
 
 def _skipped(done: Done, usable: int) -> str:
@@ -79,7 +98,7 @@ def recurring(together: Diagnosed) -> str:
     if not together.recurrences:
         return paragraph("No effect is accused in any session.")
     rows = [_row(r) for r in together.recurrences]
-    heads = ("effect", "sessions", "arms", "always in", "joints", "takes off the gap")
+    heads = ("effect", "sessions", "arms", "always in", "joints (sessions)", "takes off the gap")
     return figure_block(_picture(together.recurrences[:DRAWN])) + table(heads, rows)
 
 
@@ -100,8 +119,7 @@ def _row(one: Recurrence) -> list[Cell]:
 def _picture(found: Sequence[Recurrence]) -> Figure:
     shown = list(reversed(found))
     # an effect that two channels show stands once for each
-    names = [f"{effect_words(r.effect)} " + ("" if r.channel == "position" else f"({r.channel})")
-             for r in shown]  # fmt: skip
+    names = [_label(r) for r in shown]
     traces = [
         {"type": "bar", "orientation": "h", "name": title, "y": names, "x": values,
          "marker": {"color": colour}, "hovertemplate": "%{y}: %{x:.0f} %<extra></extra>"}
@@ -118,6 +136,12 @@ def _picture(found: Sequence[Recurrence]) -> Figure:
         "Share of the sessions, and of the arms, in which the effect is accused, of those whose "
         "logs could show it.", 110 + 44 * len(shown),
     )  # fmt: skip
+
+
+def _label(one: Recurrence) -> str:
+    """Return an effect's name in lines that a phone has room for."""
+    words = effect_words(one.effect) + ("" if one.channel == "position" else f" ({one.channel})")
+    return "<br>".join(textwrap.wrap(words, 20))
 
 
 def onsets(found: Sequence[Onset]) -> str:
@@ -140,7 +164,7 @@ def session_cells(outcome: Outcome) -> list[Cell]:
     causes = {(r["effect"], tuple(r["joints"])) for r in result["rows"] if r["accused"]}
     words = [f"{effect_words(e)}{', ' + joints_words(j) if j else ''}" for e, j in sorted(causes)]
     return [
-        outcome.arm, badge(VERDICTS[result["verdict"]], KINDS[result["verdict"]]),
-        str(channel["samples"]), told(channel["gap_rms"], channel["unit"]),
-        told(channel["remaining_rms"], channel["unit"]), "; ".join(words) or "–",
+        badge(VERDICTS[result["verdict"]], KINDS[result["verdict"]]),
+        str(channel["samples"]), unbroken(told(channel["gap_rms"], channel["unit"])),
+        unbroken(told(channel["remaining_rms"], channel["unit"])), "; ".join(words) or "–",
     ]  # fmt: skip

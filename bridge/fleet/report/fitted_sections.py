@@ -9,8 +9,8 @@ import numpy as np
 
 from bridge.fleet.fitted import Fitted, FittedArm, FittedSession, FittedType
 from bridge.fleet.outcome_words import counted
-from bridge.fleet.report.parameter_words import parameter_words
-from bridge.fleet.report.shared_sections import MOST
+from bridge.fleet.report.parameter_words import parameter_words, type_words
+from bridge.fleet.report.shared_sections import MOST, unbroken
 from bridge.fleet.task import Outcome
 from bridge.report.fragment import (
     AFTER,
@@ -28,7 +28,7 @@ from bridge.report.fragment import (
 )
 from bridge.report.words import number, percent, told
 
-SESSION_HEADS = ("arm", "poses", "gap with the cell", "with the fit", "foretold by the others")
+SESSION_HEADS = ("poses", "gap with the cell", "with the fit", "foretold by the others")
 MICRO = 1e6
 
 
@@ -44,11 +44,11 @@ def answer(together: Fitted) -> str:
         shown = kind.scatter.shown
         spread = kind.scatter.between_arms[shown] / np.maximum(kind.scatter.mean[shown], 1e-12)
         parts.append(paragraph(
-            f"{kind.name}: {counted(len(kind.arms), 'arm')}, {counted(len(sessions), 'session')}. "
-            f"With the flexibilities of the cells the gap is {told(before, 'm')} a coordinate; "
-            f"with those found {told(after, 'm')}; a session is foretold by the others, which did "
-            f"not see it, to {told(held, 'm')}. The noise of one coordinate is "
-            f"{told(kind.scatter.noise, 'm')}."
+            f"{type_words(kind.name)}: {counted(len(kind.arms), 'arm')}, "
+            f"{counted(len(sessions), 'session')}. With the flexibilities of the cells the gap is "
+            f"{told(before, 'm')} a coordinate; with those found {told(after, 'm')}; a session is "
+            f"foretold by the others, which did not see it, to {told(held, 'm')}. The noise of one "
+            f"coordinate is {told(kind.scatter.noise, 'm')}."
             + (f" Arms of the type scatter by {percent(float(np.median(spread)))}." if len(spread)
                else " No session shows any flexibility."), "lead",
         ))  # fmt: skip
@@ -60,7 +60,7 @@ def types(together: Fitted) -> str:
     parts = []
     for kind in together.types:
         if len(together.types) > 1:
-            parts.append(f"<h3>{html_of(kind.name)}</h3>")
+            parts.append(f"<h3>{html_of(type_words(kind.name))}</h3>")
         parts.append(table(
             ("flexibility", "of the type", "arms scatter by", "sessions scatter by"),
             [_parameter(kind, j) for j in range(len(kind.parameters))],
@@ -91,7 +91,7 @@ def arms(together: Fitted) -> str:
     )]  # fmt: skip
     for kind in together.types:
         if len(together.types) > 1:
-            parts.append(f"<h3>{html_of(kind.name)}</h3>")
+            parts.append(f"<h3>{html_of(type_words(kind.name))}</h3>")
         parts.append(figure_block(_picture(kind)))
         heads = ("arm", "sessions", "poses", "own", "farthest from the type")
         parts.append(table(heads, [_arm(kind, arm) for arm in kind.arms[:MOST]]))
@@ -166,6 +166,6 @@ def session_cells(together: Fitted) -> Callable[[Outcome], Sequence[Cell]]:
         one = fits[outcome.session]
         gaps = (one.gap_before, one.gap_after, one.gap_held_out)
         poses = str(outcome.result["evidence"]["poses"])
-        return [outcome.arm, poses, *(told(gap, "m") for gap in gaps)]
+        return [poses, *(unbroken(told(gap, "m")) for gap in gaps)]
 
     return cells

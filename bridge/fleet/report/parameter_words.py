@@ -27,3 +27,8 @@ def parameter_words(name: str) -> str:
     if joint:
         rest = f"joint {joint[1]}{joint[2]}"
     return f"{EFFECTS[effect]}{': ' + rest if rest else ''}"
+
+
+def type_words(name: str) -> str:
+    """Return an arm type's name; DH rows have none but a number."""
+    return f"Arms of DH rows ({name[3:]})" if name.startswith("dh ") else name

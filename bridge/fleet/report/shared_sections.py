@@ -71,7 +71,8 @@ def _drawn(found: Sequence[Drift]) -> Figure:
     title = "days since the first session" if per == {"day"} else "session of the arm"
     return Figure(
         traces,
-        {"xaxis": {"title": {"text": title}},
+        {"xaxis": {"title": {"text": title}} | ({} if per == {"day"} else {"dtick": 1}),
+         "showlegend": True,
          "yaxis": {"title": {"text": "change since the first session (%)"}},
          "legend": {"orientation": "h", "y": -0.22, "x": 0, "yanchor": "top"},
          "margin": {"l": 60, "r": 16, "t": 16, "b": 40}},
@@ -85,8 +86,9 @@ def outliers(found: Sequence[Outlier]) -> str:
         return paragraph("No arm and no session is far from the others.")
     rows: list[list[Cell]] = [
         [
-            Raw(f"<b>{html_of(o.arm)}</b>"), _short(o), parameter_words(o.what),
-            told(o.value, o.unit), told(o.usual, o.unit), f"{abs(o.deviations):.1f}",
+            Raw(f"<b>{unbroken(o.arm).html}</b>"), unbroken(_short(o)), parameter_words(o.what),
+            unbroken(told(o.value, o.unit)), unbroken(told(o.usual, o.unit)),
+            f"{abs(o.deviations):.1f}",
         ]
         for o in found[:MOST]
     ]  # fmt: skip
@@ -106,15 +108,22 @@ def sessions(done: Done, heads: Sequence[str], cells: Callable[[Outcome], Sequen
     rows: list[list[Cell]]
     if bad:
         parts.append(f"<h3>Skipped ({len(bad)})</h3>")
-        rows = [
-            [Raw(f"<b>{html_of(o.session)}</b>"), badge(STATES[o.state], "bad"), o.error]
-            for o in bad[:MOST]
-        ]
-        parts += [table(("session", "state", "why"), rows), _rest(len(bad))]
+        rows = [[*_whose(o), badge(STATES[o.state], "bad"), o.error] for o in bad[:MOST]]
+        parts += [table(("arm", "session", "state", "why"), rows), _rest(len(bad))]
         parts.append(f"<h3>Used ({len(good)})</h3>")
-    rows = [[Raw(f"<b>{html_of(o.session)}</b>"), *cells(o)] for o in good[:MOST]]
-    parts += [table(("session", *heads), rows), _rest(len(good))]
+    rows = [[*_whose(o), *cells(o)] for o in good[:MOST]]
+    parts += [table(("arm", "session", *heads), rows), _rest(len(good))]
     return "".join(parts)
+
+
+def _whose(outcome: Outcome) -> tuple[Cell, Cell]:
+    name = outcome.session.removeprefix(f"{outcome.arm}/")
+    return Raw(f"<b>{unbroken(outcome.arm).html}</b>"), unbroken(name)
+
+
+def unbroken(text: str) -> Raw:
+    """Return a text that stays on one line."""
+    return Raw(f'<span style="white-space:nowrap">{html_of(text)}</span>')
 
 
 def _rest(count: int) -> str:

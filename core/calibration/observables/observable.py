@@ -83,9 +83,17 @@ class Observable(ABC):
         return self.gap(model.predict(readings.q, readings.loads), readings, nuisance)
 
     def columns(
-        self, parameters: Parameters, values: Array, readings: Readings, nuisance: Nuisance
+        self,
+        parameters: Parameters,
+        values: Array,
+        readings: Readings,
+        nuisance: Nuisance,
+        layout: Layout | None = None,
     ) -> tuple[Array, Array]:
-        """Return J (N*k, p) and F (N*k, m): residual(new) = residual - J step - F nuisance step."""
+        """Return J (N*k, p) and F (N*k, m): residual(new) = residual - J step - F nuisance step.
+
+        ``layout`` of all readings, where these are a part of them.
+        """
         poses = parameters.model(values).predict(readings.q, readings.loads)
         J = np.empty((len(readings) * self.equations, len(values)))
         for i in range(len(values)):
@@ -97,11 +105,13 @@ class Observable(ABC):
             ]
             one, other = (self.gap(end, readings, nuisance) for end in ends)
             J[:, i] = (other - one).ravel() / (2 * step[i])
-        return J, self.nuisance_columns(poses, readings, nuisance)
+        return J, self.nuisance_columns(poses, readings, nuisance, layout)
 
-    def nuisance_columns(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
+    def nuisance_columns(
+        self, poses: Poses, readings: Readings, nuisance: Nuisance, layout: Layout | None = None
+    ) -> Array:
         """Return F (N*k, m) for TCP poses of the readings."""
-        layout = self.layout(readings)
+        layout = layout or self.layout(readings)
         F = np.empty((len(readings) * self.equations, layout.size))
         for i in range(layout.size):
             step = np.zeros(layout.size)

@@ -48,7 +48,7 @@ class CanCase(Case):
         self.settings = CanSettings(
             profile=profile, interface=interface, channel=channel, port=number, rate=rate,
             state_timeout=self.state_timeout, foreign_quiet=0.2, gear=gears,
-            send_timeout=0.05,  # both ends of the pty are in this busy process
+            send_timeout=0.25,  # both ends of the pty are in this busy process
         )  # fmt: skip
         super().__init__()
         self.settings = self.settings.model_copy(update={"host": self.host})

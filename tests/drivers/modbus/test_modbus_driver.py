@@ -41,7 +41,7 @@ def test_the_robot_takes_offsets_out_when_the_heartbeat_stops(ur: ModbusCase) ->
         stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), 0.6)
         assert max(map(abs, program_of(ur).applied)) > 1e-4
         driver.transport.close()  # as if the process had died: nothing is released
-        wait_for(lambda: not any(program_of(ur).applied), 2.0, "the watchdog")
+        wait_for(lambda: not any(program_of(ur).applied), 10.0, "the watchdog")
 
 
 def test_a_robot_without_its_program_is_not_armed(ur: ModbusCase) -> None:

@@ -107,6 +107,19 @@ def test_a_late_answer_is_never_taken_for_the_next_ones(case: ModbusCase, proxy:
         assert np.abs(next_state(driver).actual_q - goal).max() <= case.resolution
 
 
+def test_an_answer_that_was_long_under_way_is_not_fresh(case: ModbusCase, proxy: EvilProxy) -> None:
+    settings = case.settings.model_copy(
+        update={"port": proxy.port, "timeout": 0.4, "state_timeout": 0.3}
+    )
+    with ModbusDriver(settings, case.model) as driver:
+        next_state(driver)
+        proxy.wait = 4.0 / driver.rate + 0.05  # as if this process had stood still meanwhile
+        with pytest.raises(StaleStateError, match="no new sample for"):
+            driver.read_state()
+        proxy.wait = 0.0
+        assert np.isfinite(next_state(driver).actual_q).all()
+
+
 def test_an_offset_whose_answer_is_lost_once_is_sent_once_more(
     case: ModbusCase, proxy: EvilProxy
 ) -> None:

@@ -5,10 +5,12 @@ import re
 import pypdfium2
 import pytest
 from calibration_report_cases import calibration, plan, session
+from other_kinds import calibration_of
 
-from bridge.calibration.report import write_report
+from bridge.calibration.report import InstrumentFacts, write_report
 from bridge.calibration.report.figures import mm
 from bridge.calibration.report.sections import CALIBRATION
+from core.calibration.observables import OBSERVABLES
 
 
 @pytest.fixture(scope="module")
@@ -52,3 +54,19 @@ def test_nothing_is_loaded_from_outside(written):
     html = written[0].read_text("utf-8")
     assert "<script" not in html
     assert not re.findall(r"""(?:src|href)=["']?https?:|url\(""", html)
+
+
+@pytest.mark.parametrize("kind", list(OBSERVABLES))
+def test_every_kind_of_reading_has_its_report(kind, tmp_path):
+    c = calibration_of(kind)
+    facts = session(instrument=InstrumentFacts("an instrument", kind=kind), temperature=None)
+    page, paper = write_report(c, None, facts, tmp_path)
+    html, words = page.read_text("utf-8"), text_of(paper)
+    assert mm(c.held_out_after.mean) in html
+    assert "expanded uncertainty" in words
+    assert "nan" not in re.sub(r"<[^>]*>", " ", html).split()
+    assert "unknown" not in words
+    shows_places = kind in ("position", "pose")
+    assert ("AP before" in words) == shows_places
+    # no public name of a parameter is left untranslated
+    assert not re.findall(r"joint_offset|axial_compliance|tool_frame", words)

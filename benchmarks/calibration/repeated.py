@@ -16,6 +16,7 @@ from core.calibration.readings import Readings
 
 Array = NDArray[np.float64]
 ROUNDS = 6
+SETTLED = 1e-3  # usual sizes: the next step would be of second order in this
 
 
 @dataclass(frozen=True)
@@ -62,16 +63,19 @@ def repeated_sessions(
     solver = np.linalg.pinv(np.vstack([np.hstack([J, F]) * weight, prior]), rcond=1e-14)
     layout = observable.layout(readings)
     found = np.empty((sessions, len(parameters)))
+    real = parameters.model(truth).predict(readings.q, readings.loads)
     for s in range(sessions):
         measured = replace(readings, value=exact + random.normal(0, 1, exact.shape) * noise_of)
-        values, place = truth.copy(), nuisance
-        for _ in range(ROUNDS):
-            gap = observable.residual(parameters.model(values), measured, place)
+        values, place, poses = truth, nuisance, real
+        for number in range(ROUNDS):
+            if number:
+                poses = parameters.model(values).predict(readings.q, readings.loads)
+            gap = observable.gap(poses, measured, place)
             held = -values / parameters.prior
             step = solver @ np.concatenate([gap.ravel() * weight[:, 0], held])
             values = values + step[: len(values)]
             place = place.moved(step[len(values) :], layout)
-            if np.abs(step[: len(values)] / parameters.scales).max() < 1e-6:
+            if np.abs(step[: len(values)] / parameters.scales).max() < SETTLED:
                 break
         found[s] = values
     return Scatter(found, truth)

@@ -1,0 +1,131 @@
+"""A daemon in a process of its own, which may be ended and killed; its events come as lines."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import psutil
+
+from benchmarks.faults.punctual import go_first
+from benchmarks.faults.running import Event, Told
+from bridge.cell import load_cell
+from bridge.shared_page import Page
+from bridge.supervisor import State
+
+CODE = """
+import ctypes, json, signal, sys
+from pathlib import Path
+from bridge.cli import main
+from bridge.daemon_run import run_cell
+def tell(event):
+    print(json.dumps(event, default=str), file=sys.stderr, flush=True)
+sys.exit(run_cell(Path(sys.argv[1]), arm=True, log=tell))
+"""
+PAGE_LIMIT = 90.0  # s
+END_LIMIT = 6.0  # s for every process of a run to be gone
+
+
+class ProcessRun(Told):
+    """``gapbridge run CELL --arm`` as the command runs it."""
+
+    def __init__(self, cell: Path) -> None:
+        self._cell, self._n = cell, load_cell(cell).arm.n
+        self.events: list[Event] = []
+        self.error: BaseException | None = None
+        self.said = ""
+        self._page: Page | None = None
+        self._process: subprocess.Popen[str] | None = None
+
+    def start(self) -> None:
+        """Start it and read along."""
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", CODE, str(self._cell)], env=environment, text=True,
+            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, cwd=self._cell.parent,
+            start_new_session=True,
+        )  # fmt: skip
+        go_first(self.pid)
+        threading.Thread(target=self._listen, daemon=True).start()
+        self._page = self._join(time.monotonic() + PAGE_LIMIT)
+
+    def _listen(self) -> None:
+        assert self._process is not None and self._process.stderr is not None
+        for line in self._process.stderr:
+            try:
+                self.events.append(json.loads(line))
+            except ValueError:
+                self.said += line
+
+    def _join(self, until: float) -> Page:
+        """Return the page of the daemon, which has it open under a name that tells it."""
+        folder = Path(f"/proc/{self.pid}/fd")
+        while time.monotonic() < until:
+            with contextlib.suppress(OSError):
+                for name in os.listdir(folder):
+                    if os.readlink(folder / name).startswith("/memfd:gapbridge"):
+                        fd = os.open(folder / name, os.O_RDONLY)
+                        with contextlib.suppress(OSError, ValueError):
+                            return Page(self._n, fd, writable=False)
+            if not self.alive:
+                break
+            time.sleep(0.02)
+        raise TimeoutError(f"the daemon did not start: {self.said[-300:]}")
+
+    @property
+    def pid(self) -> int:
+        """Return the daemon's process id."""
+        assert self._process is not None
+        return self._process.pid
+
+    @property
+    def alive(self) -> bool:
+        """Return whether the daemon itself runs."""
+        return self._process is not None and self._process.poll() is None
+
+    @property
+    def exit_code(self) -> int | None:
+        """Return how it ended."""
+        return None if self._process is None else self._process.poll()
+
+    @property
+    def state(self) -> State:
+        """Return the loop's state at this moment."""
+        return State(max(self.state_word(), 0))
+
+    def state_word(self) -> int:
+        """Return the supervisor's state from the shared page, -1 where there is none yet."""
+        return -1 if self._page is None else self._page.state
+
+    def processes(self) -> dict[str, psutil.Process]:
+        """Return the processes of the run by the module that they run, ``daemon`` itself too."""
+        found = {"daemon": psutil.Process(self.pid)}
+        for child in found["daemon"].children(recursive=True):
+            with contextlib.suppress(psutil.Error):
+                words = child.cmdline()
+                name = words[words.index("-m") + 1] if "-m" in words else "other"
+                found[name.removeprefix("bridge.").removesuffix(".main")] = child
+        return found
+
+    def send(self, number: signal.Signals) -> dict[str, psutil.Process]:
+        """Send the daemon a signal; returns the processes that its run had."""
+        found = self.processes()
+        os.kill(self.pid, number)
+        return found
+
+    def stop(self) -> None:
+        """End it, by force where it does not end by itself."""
+        if not self.alive:
+            return
+        found = self.send(signal.SIGTERM)
+        _, left = psutil.wait_procs(found.values(), END_LIMIT)
+        for process in left:
+            with contextlib.suppress(psutil.Error):
+                process.kill()

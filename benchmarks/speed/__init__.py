@@ -1,0 +1,1 @@
+"""Speed beside peers, interleaved in one run: `python -m benchmarks.speed`."""

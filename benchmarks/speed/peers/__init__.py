@@ -1,0 +1,1 @@
+"""The same work done by others: plain numpy, Pinocchio, C++, CasADi."""

@@ -1,0 +1,91 @@
+"""A whole calibration: from an unknown arm to a cell that compensates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.calibration.fitting import fitted, tell_calibration
+from bridge.calibration.job import Job, write_document
+from bridge.calibration.log_of import write_log
+from bridge.calibration.pace import seconds_left
+from bridge.calibration.planning import metrology_of, planned
+from bridge.calibration.words import duration, load_text, millimetres, parameter
+from core.calibration.plan import Plan
+from core.calibration.promise import document_of
+
+Array = NDArray[np.float64]
+
+
+def promise_beside(cell: Path) -> Path:
+    """Return where a calibrated cell's promise is kept."""
+    return cell.with_name(f"{cell.stem}.promise.json")
+
+
+class WholeJob(Job):
+    """Plan, measure, fit, verify, report, and a new cell."""
+
+    def plan(self, begin: Array | None, tell: Callable[[str, float], None]) -> Plan:
+        """Return the poses that tell most."""
+        return planned(self.cell, self.order, tell)
+
+    def tell_plan(self, plan: Plan) -> None:
+        """Say how many stops there are, and what n poses buy."""
+        talk, minutes = self.talk, self.cell.calibration.minutes_per_load
+        fit = sum(not p.held_out and not p.repeat for p in plan.poses)
+        held = sum(p.held_out for p in plan.poses)
+        again = sum(p.repeat > 0 for p in plan.poses)
+        talk.say(
+            f"plan: {fit} poses to fit, {held} to verify, {again} once more for the repeatability: "
+            f"{len(plan.poses)} stops, {duration(seconds_left(self.book, minutes) + plan.travel)}"
+        )
+        for i, load in enumerate(plan.loads):
+            talk.say(f"  load {i + 1}: {load_text(load)}")
+        talk.say(
+            f"expected: the predicted TCP known to {millimetres(plan.expected.tcp_std)} (1 sigma "
+            f"over workspace and loads; {millimetres(plan.expected.tcp_std_worst)} at worst)"
+        )
+        told = ", ".join(f"{n}: {millimetres(s)}" for n, s in plan.bought)
+        talk.say(f"  what n poses buy: {told}")
+        weak = _hardly_told(plan)
+        if weak:
+            talk.say(f"  these poses hardly tell: {', '.join(weak)}")
+        for note in plan.notes:
+            talk.say(f"  note: {note}")
+
+    def finish(self) -> None:
+        """Fit, tell, report, and write the new cell once a person says yes."""
+        talk, folder, order = self.talk, self.folder, self.order
+        talk.say()
+        found = fitted(self.cell, order, talk, self.book)
+        tell_calibration(talk, found)
+        metrology = metrology_of(self.cell, order.instrument, self.book.places)
+        write_log(found.readings, metrology.registered, folder / "readings.csv")
+        promise = document_of(found, sigma=metrology.sigma)
+        write_document(folder / "promise.json", promise)
+        from bridge.calibration.facts import session_facts  # pictures take their time
+        from bridge.calibration.report import write_report
+
+        facts = session_facts(self.cell, order, self.book)
+        for file in write_report(found, self.book.plan, facts, folder):
+            talk.say(f"{file}: written")
+        if not found.complete:
+            talk.warn("something is left that these effects do not explain: see the report")
+        target = self.hand_over(found.model, "the calibrated cell")
+        if target is not None:
+            write_document(promise_beside(target), promise)
+            talk.say(f"  months later: gapbridge calibrate {target} --verify")
+
+
+def _hardly_told(plan: Plan) -> list[str]:
+    """Return the parameters whose expected spread is no less than their usual size."""
+    expected = plan.expected
+    rows = zip(expected.names, expected.units, expected.std, expected.prior, strict=True)
+    return [
+        f"{name} (±{parameter(std, unit)})"
+        for name, unit, std, prior in rows
+        if not np.isfinite(std) or std > prior
+    ]

@@ -1,0 +1,49 @@
+"""Logs that a command takes in pieces: recordings, and files of more rows than LARGE."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from bridge.cell import Cell
+from bridge.cli.options import check_log
+from core.errors import LogError
+from core.log import Log
+from core.log_pieces import PARQUET, RECORDING, LogPieces
+from core.recording.reading import files_of
+
+LARGE = 20_000  # rows from which a log is read in pieces
+BYTES = 8_000_000  # of a text file that holds about as many
+
+
+@dataclass(frozen=True)
+class LargeLog:
+    """The pieces of a log, each checked for a cell's arm."""
+
+    path: Path
+    cell: Cell
+
+    def __iter__(self) -> Iterator[Log]:
+        """Yield the pieces. Raises LogError, as ``open_log`` does."""
+        files = files_of(self.path) if not self.path.is_file() else [self.path]
+        for file in files:
+            for piece in LogPieces(file, self.cell.arm.n):
+                check_log(piece, self.cell)
+                yield piece
+
+
+def is_large(path: Path) -> bool:
+    """Return whether a log is to be read in pieces. Raises LogError where it cannot be read."""
+    if path.suffix.lower() == RECORDING:
+        return True
+    if not path.is_file():
+        return False
+    if path.suffix.lower() not in PARQUET:
+        return path.stat().st_size > BYTES
+    import pyarrow
+
+    try:
+        return LogPieces(path, 0).count() > LARGE
+    except (pyarrow.ArrowException, OSError) as error:
+        raise LogError(f"{path}: found no readable Parquet file ({error})") from None

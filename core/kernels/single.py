@@ -1,0 +1,191 @@
+"""The correction of one setpoint in one call, over blocks (core.kernels.one_row)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from core.kernel import JIT
+from core.kernels.layout import FAST, U
+from core.kernels.one_row import (
+    AXIS,
+    FLANGE,
+    ORIGIN,
+    RECORD,
+    TCP,
+    TCP_ROTATION,
+    equilibrium,
+    place,
+)
+from core.least_offset import LARGEST_OFFSET, REGULAR, smallest_offset
+from core.packed import sizes_of
+
+
+@njit(**FAST)
+def next_offset(b, n, w, wanted, k0, lever):  # type: ignore[no-untyped-def]
+    """Write the next joint offset (after the workspace), as ``compensation.next_offset`` does.
+
+    The wanted pose stands in the block ``wanted`` from ``k0`` on, twelve numbers.
+    """
+    if equilibrium(b, n, w) < 0:
+        return -1.0
+    f, J = w + RECORD * n, w + RECORD * n + FLANGE
+    at = J + 6 * n
+    px, py, pz = b[U(f + TCP)], b[U(f + TCP + 1)], b[U(f + TCP + 2)]
+    e0, e1, e2 = wanted[U(k0)] - px, wanted[U(k0 + 1)] - py, wanted[U(k0 + 2)] - pz
+    e3 = e4 = e5 = 0.0
+    for c in range(3):
+        r = f + TCP_ROTATION + c
+        r0, r1, r2 = b[U(r)], b[U(r + 3)], b[U(r + 6)]
+        v0, v1, v2 = wanted[U(k0 + 3 + c)], wanted[U(k0 + 6 + c)], wanted[U(k0 + 9 + c)]
+        e3 += r1 * v2 - r2 * v1
+        e4 += r2 * v0 - r0 * v2
+        e5 += r0 * v1 - r1 * v0
+    half = 0.5 * lever
+    e3, e4, e5 = half * e3, half * e4, half * e5
+    distance = np.sqrt(e0 * e0 + e1 * e1 + e2 * e2 + e3 * e3 + e4 * e4 + e5 * e5)
+    if not np.isfinite(distance):
+        return -1.0
+    for i in range(n):
+        j, c = w + RECORD * i, J + 6 * i
+        zx, zy, zz = b[U(j + AXIS)], b[U(j + AXIS + 1)], b[U(j + AXIS + 2)]
+        x = px - b[U(j + ORIGIN)]
+        y = py - b[U(j + ORIGIN + 1)]
+        z = pz - b[U(j + ORIGIN + 2)]
+        b[U(c)], b[U(c + 1)], b[U(c + 2)] = zy * z - zz * y, zz * x - zx * z, zx * y - zy * x
+        b[U(c + 3)], b[U(c + 4)], b[U(c + 5)] = lever * zx, lever * zy, lever * zz
+        # the whole offset is solved for anew, not a step on top
+        o = b[U(at + i)]
+        e0, e1, e2 = e0 + b[U(c)] * o, e1 + b[U(c + 1)] * o, e2 + b[U(c + 2)] * o
+        e3, e4, e5 = e3 + b[U(c + 3)] * o, e4 + b[U(c + 4)] * o, e5 + b[U(c + 5)] * o
+    if n > 6 or not _shortest(b, n, J, e0, e1, e2, e3, e4, e5):
+        _damped(b, n, J, e0, e1, e2, e3, e4, e5)
+    return distance
+
+
+@njit(**FAST)
+def _shortest(b, n, J, e0, e1, e2, e3, e4, e5):  # type: ignore[no-untyped-def]
+    """Write the offset by Cholesky; returns False where it is near singular, or too long."""
+    at = J + 6 * n
+    G, y = at + n, at + n + 36
+    least, most = np.inf, 0.0
+    for i in range(n):
+        c = J + 6 * i
+        b[U(y + i)] = b[U(c)] * e0 + b[U(c + 1)] * e1 + b[U(c + 2)] * e2 + (
+            b[U(c + 3)] * e3 + b[U(c + 4)] * e4 + b[U(c + 5)] * e5
+        )  # fmt: skip
+        for j in range(i + 1):
+            d = J + 6 * j
+            total = b[U(c)] * b[U(d)] + b[U(c + 1)] * b[U(d + 1)] + b[U(c + 2)] * b[U(d + 2)] + (
+                b[U(c + 3)] * b[U(d + 3)] + b[U(c + 4)] * b[U(d + 4)] + b[U(c + 5)] * b[U(d + 5)]
+            )  # fmt: skip
+            for k in range(j):
+                total -= b[U(G + 6 * i + k)] * b[U(G + 6 * j + k)]
+            if i > j:
+                b[U(G + 6 * i + j)] = total * b[U(G + 6 * j + j)]
+                continue
+            least, most = min(least, total), max(most, total)
+            if not least > REGULAR * most:
+                return False
+            b[U(G + 6 * i + i)] = 1.0 / np.sqrt(total)
+    for i in range(n):
+        total = b[U(y + i)]
+        for k in range(i):
+            total -= b[U(G + 6 * i + k)] * b[U(y + k)]
+        b[U(y + i)] = total * b[U(G + 6 * i + i)]
+    square = 0.0
+    for i in range(n - 1, -1, -1):
+        total = b[U(y + i)]
+        for k in range(i + 1, n):
+            total -= b[U(G + 6 * k + i)] * b[U(y + k)]
+        total *= b[U(G + 6 * i + i)]
+        b[U(y + i)] = total
+        square += total * total
+    if not square <= LARGEST_OFFSET * LARGEST_OFFSET:
+        return False
+    for i in range(n):
+        b[U(at + i)] = b[U(y + i)]
+    return True
+
+
+@njit(**JIT)
+def _damped(b, n, J, e0, e1, e2, e3, e4, e5):  # type: ignore[no-untyped-def]
+    """Write the offset by core.least_offset: singular poses, more than six joints."""
+    whole, wanted, found = np.empty((6, n)), np.array([e0, e1, e2, e3, e4, e5]), np.empty(n)
+    for i in range(n):
+        for k in range(6):
+            whole[k, i] = b[J + 6 * i + k]
+    smallest_offset(whole, wanted, found)
+    for i in range(n):
+        b[J + 6 * n + i] = found[i]
+
+
+@njit(**FAST)
+def rigid_pose(b, n, w, q, first, pose):  # type: ignore[no-untyped-def]
+    """Place the block's arm unbent at the angles that begin at q[first]; the pose to b[pose]."""
+    row = sizes_of(n)[0]
+    for i in range(n):
+        b[U(row + i)] = q[U(first + i)]
+    place(b, n, w, False, 0.0, 0.0, 0.0)
+    f = w + RECORD * n + TCP
+    for k in range(12):
+        b[U(pose + k)] = b[U(f + k)]
+
+
+@njit(**JIT)
+def correct(b, r, nominal, found, lever, tolerance, most):  # type: ignore[no-untyped-def]
+    """Write the corrected setpoint and the rigid motion it makes (n + 6,) into ``found``.
+
+    ``b``: chain, row, workspace, offset (n,), scratch (42,); kept from call to call. ``r``: chain,
+    row and workspace of the rigid arm, then the wanted pose and the reached one (12 each). Returns
+    the distance (m) that is left, and the steps taken.
+    """
+    n = nominal.shape[0]
+    c, size = sizes_of(n)
+    w, row = c + size, c
+    at = w + (RECORD + 6) * n + FLANGE
+    wanted = at
+    rigid_pose(r, n, w, nominal, 0, wanted)
+    best, steps = np.inf, 0
+    for i in range(n):
+        found[i] = nominal[i]
+    for _ in range(most):
+        steps += 1
+        for i in range(n):
+            b[U(row + i)] = nominal[i] + b[U(at + i)]
+        distance = next_offset(b, n, w, r, wanted, lever)
+        if distance < 0:
+            break
+        if distance < best:
+            best = distance
+            for i in range(n):
+                found[i] = b[U(row + i)]
+        if distance < tolerance:
+            break
+    moves = False
+    for i in range(n):
+        # where nothing was found, nothing (nor a joint angle that is no number) may go on
+        b[U(at + i)] = found[i] - nominal[i] if best < np.inf else 0.0
+        moves = moves or b[U(at + i)] != 0.0
+    rigid_pose(r, n, w, found, 0, wanted + 12)
+    _motion(r, wanted, found, n, moves)
+    return best, steps
+
+
+@njit(**FAST)
+def _motion(r, wanted, found, n, moves):  # type: ignore[no-untyped-def]
+    """Write the motion (6,) from the wanted pose to the reached one behind it; nothing for none."""
+    x = y = z = trace = 0.0
+    u, v = wanted + 15, wanted + 3  # reached and wanted rotation
+    for k in range(3):
+        found[U(n + k)] = r[U(wanted + 12 + k)] - r[U(wanted + k)] if moves else 0.0
+        x += r[U(u + 6 + k)] * r[U(v + 3 + k)] - r[U(u + 3 + k)] * r[U(v + 6 + k)]
+        y += r[U(u + k)] * r[U(v + 6 + k)] - r[U(u + 6 + k)] * r[U(v + k)]
+        z += r[U(u + 3 + k)] * r[U(v + k)] - r[U(u + k)] * r[U(v + 3 + k)]
+        trace += r[U(u + k)] * r[U(v + k)] + r[U(u + 3 + k)] * r[U(v + 3 + k)]
+        trace += r[U(u + 6 + k)] * r[U(v + 6 + k)]
+    twice_sine = np.sqrt(x * x + y * y + z * z)
+    scale = np.arctan2(twice_sine, trace - 1.0) / twice_sine if twice_sine > 1e-12 else 0.5
+    if not moves:
+        scale = 0.0
+    found[U(n + 3)], found[U(n + 4)], found[U(n + 5)] = scale * x, scale * y, scale * z

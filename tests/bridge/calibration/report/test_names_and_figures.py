@@ -1,0 +1,60 @@
+"""Names of parameters in words, and figures as a certificate tells them."""
+
+import math
+
+import pytest
+
+from bridge.calibration.report.figures import decimals_of, estimate_words, fixed, load_words, mm
+from bridge.calibration.report.names import parameter_words, sentence, spoken
+from core.arm import builtin_arm
+from core.calibration.parameters import Parameters
+from core.calibration.result import Estimate
+from core.effects import CATALOGUE
+from core.model import Model
+
+
+def test_every_parameter_that_a_session_can_find_has_words_of_its_own():
+    effects = [e for e, effect in CATALOGUE.items() if "position" in effect.channels]
+    names = Parameters.every(Model(builtin_arm("ur10e")), effects).names
+    words = [parameter_words(name) for name in names]
+    assert len(set(words)) == len(names)
+    assert not [w for w in words if "_" in w or w.endswith((":", "("))]
+
+
+def test_a_few_names_as_they_are_told():
+    assert parameter_words("joint_offset_3") == "zero of joint 3"
+    assert parameter_words("link_geometry_2_alpha") == "twist alpha of link 2"
+    assert parameter_words("tool_frame_rx") == "tool turn about x"
+    assert parameter_words("payload") == "mass of the load beyond the declared one"
+    assert parameter_words("made_up") == "made_up"
+
+
+def test_names_inside_texts_are_told_in_words_and_common_words_stay():
+    text = "joint_offset_1 and link_geometry_3_d: backlash and payload stay"
+    assert spoken(text) == "zero of joint 1 and offset d of link 3: backlash and payload stay"
+    assert sentence("the error falls") == "The error falls."
+    assert sentence("Done!") == "Done!"
+
+
+@pytest.mark.parametrize(("length", "text"), [
+    (0.0, "0.000 mm"), (5.4e-6, "0.0054 mm"), (41.3e-6, "0.041 mm"), (1.5894e-3, "1.589 mm"),
+    (0.0314159, "31.42 mm"), (-2e-5, "−0.020 mm"), (math.nan, "unknown"),
+])  # fmt: skip
+def test_lengths_are_told_to_the_micrometre(length, text):
+    assert mm(length) == text
+
+
+def test_a_value_has_the_digits_of_its_deviation():
+    e = Estimate("joint_offset_2", 7.99412e-4, 1.26e-5, "rad")
+    assert estimate_words(e) == ("0.799", "0.775 to 0.824", "0.013", "mrad")
+    assert decimals_of(0.0) == decimals_of(math.inf) == 3
+
+
+def test_nothing_is_never_minus_nothing():
+    assert fixed(-1e-9, 3) == "0.000"
+    assert fixed(-0.0126, 2) == "−0.01"
+
+
+def test_a_loads_name_that_only_says_its_mass_is_left_out():
+    assert load_words(8.0, "8 kg") == "8 kg"
+    assert load_words(1.25, "gripper") == "1.25 kg (gripper)"

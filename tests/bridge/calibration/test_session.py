@@ -1,0 +1,234 @@
+"""Whole sessions through the command: mistakes, breaks and their mending, refusals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from played import (
+    AXIAL,
+    FRAME,
+    KNOCKED,
+    Played,
+    plan_in,
+    play,
+    positions,
+    script,
+    truth,
+    typed,
+    write_cell,
+)
+
+from bridge.calibration.journal import FILE, read_entries
+from bridge.cell import load_cell
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Played]:
+    """Return the folder of a session without mistakes, and how it went."""
+    folder = tmp_path_factory.mktemp("clean")
+    cell = write_cell(folder)
+    assert play(cell, "--plan-only", "--session", folder / "s").code == 0
+    plan = plan_in(folder / "s")
+    lines = script(plan, [typed(v) for v in positions(plan)])
+    return folder, play(
+        cell, "--session", folder / "s", "--apply", folder / "new.yaml", lines=[*lines, "yes"]
+    )
+
+
+def remaining(cell: Path, plan_folder: Path) -> np.ndarray:
+    """Return how far a cell's prediction is off at the session's poses (N,), m, rigidly fitted."""
+    from core.registration import register
+
+    plan = plan_in(plan_folder)
+    q = np.array([p.q for p in plan.poses])
+    mass = np.array([plan.loads[p.load].mass for p in plan.poses])
+    cog = np.array([plan.loads[p.load].cog for p in plan.poses])
+    from core.loads import Loads
+
+    loads = Loads(payload_mass=mass, payload_cog=cog)
+    there = truth().predict(q, loads).position
+    said = load_cell(cell).model.predict(q, loads).position
+    return np.linalg.norm(register(there, said).in_base(there) - said, axis=1)
+
+
+def test_a_session_ends_with_a_cell_that_knows_the_arm(clean: tuple[Path, Played]) -> None:
+    folder, played = clean
+    assert played.code == 0, played.err
+    assert remaining(folder / "cell.yaml", folder / "s").max() > 5e-4
+    assert remaining(folder / "new.yaml", folder / "s").max() < 1.2e-4
+    axial = load_cell(folder / "new.yaml").model.compliance()[0]
+    assert axial[1] == pytest.approx(AXIAL[1], rel=0.15)
+    for name in ("calibration.html", "calibration.pdf", "readings.csv", "promise.json"):
+        assert (folder / "s" / name).stat().st_size > 500
+    assert (folder / "new.promise.json").exists()
+    assert "\ncompliance:" not in (folder / "cell.yaml").read_text()
+
+
+def test_nothing_is_applied_without_a_yes(clean: tuple[Path, Played], tmp_path: Path) -> None:
+    folder, _ = clean
+    played = play(
+        folder / "cell.yaml", "--session", folder / "s", "--apply", tmp_path / "no.yaml",
+        lines=["perhaps", "no"],
+    )  # fmt: skip
+    assert played.code == 0
+    assert "nothing is applied" in played.out
+    assert not (tmp_path / "no.yaml").exists()
+
+
+def test_mistakes_on_the_way_leave_the_same_calibration(
+    clean: tuple[Path, Played], tmp_path: Path
+) -> None:
+    """A reading in mm, a typo, a wrong key, an undo, a knocked tracker, breaks in between."""
+    cell = write_cell(tmp_path)
+    play(cell, "--plan-only", "--session", tmp_path / "s")
+    plan = plan_in(tmp_path / "s")
+    good, after = positions(plan), positions(plan, 1, KNOCKED)
+    wrong = good[6] + np.array([0.0, 0.09, 0.0])
+    first = ["", *(typed(v) for v in good[:5]), "1 2", typed(good[5], 1e3), "take",
+             typed(wrong), "", "undo", typed(good[5]), "note it rains"]  # fmt: skip
+    played = play(cell, "--session", tmp_path / "s", lines=first)
+    assert played.code == 0
+    assert "millimetres taken for metres" in played.out
+    assert "y alone is off" in played.out
+    assert "found 2 numbers" in played.out
+    assert "go on with: gapbridge calibrate" in played.out
+    assert len(_kept(tmp_path)) == 6
+    load = [p.load for p in plan.poses]
+    last = load.index(1) - 1  # the tracker is knocked before the last stop with the first load
+    second = [*(typed(v) for v in good[6:last]), typed(after[last]), "back"]
+    second += [typed(after[k]) for k in (last - 1, last - 2, last - 3)]
+    second += ["", *script_after(load, after, last), "yes"]
+    played = play(cell, "--session", tmp_path / "s", "--apply", tmp_path / "new.yaml", lines=second)
+    assert played.code == 0, played.err + played.out[-2000:]
+    assert "the instrument has moved" in played.out
+    assert "going on with the session" in played.out
+    assert remaining(tmp_path / "new.yaml", tmp_path / "s").max() < 1.2e-4
+    _same_within_intervals(clean[0] / "s", tmp_path / "s")
+
+
+def script_after(load: list[int], values: np.ndarray, first: int) -> list[str]:
+    """Return the lines from a stop on, the second load hung on the way."""
+    lines = []
+    for k in range(first, len(load)):
+        if k and load[k] != load[k - 1]:
+            lines.append("")
+        lines.append(typed(values[k]))
+    return lines
+
+
+def _kept(folder: Path) -> list[dict[str, object]]:
+    entries = read_entries(folder / "s" / FILE)
+    kept = [e for e in entries if e["kind"] == "reading"]
+    return kept[: len(kept) - sum(e["kind"] == "undo" for e in entries)]
+
+
+def _same_within_intervals(one: Path, other: Path) -> None:
+    import json
+
+    from core.calibration.promise import promise_in
+
+    a, b = (promise_in(json.loads((p / "promise.json").read_text())) for p in (one, other))
+    assert a.names == b.names
+    spread = np.sqrt(np.diag(a.covariance) + np.diag(b.covariance))
+    assert (np.abs(a.values - b.values) < 3.5 * spread).all()
+
+
+def test_an_ended_input_and_quit_end_in_order_and_tell_how_to_go_on(tmp_path: Path) -> None:
+    cell = write_cell(tmp_path)
+    play(cell, "--plan-only", "--session", tmp_path / "s")
+    value = typed(positions(plan_in(tmp_path / "s"))[0])
+    played = play(cell, "--session", tmp_path / "s", lines=["", "?", value, "quit"])
+    assert played.code == 0
+    assert "take the last reading back" in played.out
+    assert "1 of 19 stops are measured and kept; go on with: gapbridge calibrate" in played.out
+    played = play(cell, "--session", tmp_path / "s", lines=["skip"])
+    assert "stop 2 is left out" in played.out
+    assert "the input ended" in played.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "changed", "words"),
+    [
+        (["--instrument", "typd"], {}, "--instrument: found 'typd', expected one of typed"),
+        (["--instrument", "typed,unit=km"], {}, "--instrument typed: unit"),
+        (["--move"], {}, "calibration.joints: found 'planned' with --move, expected 'link'"),
+        (["--verify"], {}, "expected the promise that `gapbridge calibrate` writes"),
+        (["--payload-only"], {}, "link: found nothing"),
+        (["--verify", "--tool-only"], {}, "more than one of"),
+        ([], {"joints": "link"}, "link: found nothing, expected the robot's address"),
+        ([], {"instrument": "{kind: sphere}"}, "calibration.instrument_at: found nothing"),
+        ([], {"instrument": "{kind: file, unit: mm, file: none/x.csv}"}, "no such file"),
+        (["--apply", "none/new.yaml"], {}, "found no folder none"),
+        (["--poses", "6"], {"held_out": 0}, "poses"),
+    ],
+)
+def test_unusable_input_is_refused_in_one_line(
+    tmp_path: Path, arguments: list[str], changed: dict[str, object], words: str
+) -> None:
+    cell = write_cell(tmp_path, **{"poses": 12, **changed})
+    played = play(cell, "--session", tmp_path / "s", *arguments)
+    assert played.code == 2, played
+    assert words in played.err
+    assert played.err.count("\n") == 1
+    assert "Traceback" not in played.err
+
+
+def test_a_session_goes_on_only_with_the_cell_it_was_begun_for(
+    clean: tuple[Path, Played], tmp_path: Path
+) -> None:
+    session = clean[0] / "s"
+    cell = write_cell(tmp_path)
+    text = cell.read_text()
+    cell.write_text(text + "payload: {mass: 3.0}\n")
+    played = play(cell, "--session", session)
+    assert played.code == 2
+    assert "payload: found it changed since the session" in played.err
+    cell.write_text(text)
+    played = play(cell, "--session", session, "--instrument", "dial_gauge,unit=mm")
+    assert played.code == 2
+    assert "found readings of kind position, expected distance" in played.err
+
+
+def test_months_later_the_calibration_holds_and_a_bent_tool_is_seen(
+    clean: tuple[Path, Played], tmp_path: Path
+) -> None:
+    cell = clean[0] / "new.yaml"
+    for bend, words in ((0.0, "holds"), (0.004, "tool")):
+        session = tmp_path / f"v{bend:g}"
+        assert play(cell, "--verify", "--plan-only", "--session", session).code == 0
+        plan = plan_in(session)
+        value = _verified(plan, bend)
+        lines = script(plan, [typed(v) for v in value])
+        lines = [part for line in lines for part in ([line, "keep"] if bend and line else [line])]
+        played = play(cell, "--verify", "--session", session, lines=lines)
+        assert played.code == 0, played.err + played.out[-1500:]
+        assert (session / "verification.html").exists()
+        assert words in played.out.lower()
+        holds = next(e for e in read_entries(session / FILE) if e["kind"] == "ended")["holds"]
+        assert holds is (bend == 0.0)
+
+
+def _verified(plan: object, bend: float) -> np.ndarray:
+    """Return readings of the hidden arm whose tool was bent sideways by ``bend`` m."""
+    from dataclasses import replace
+
+    import played as source
+
+    from core.calibration.plan import Plan
+    from core.loads import Loads
+
+    assert isinstance(plan, Plan)
+    model = source.truth()
+    tool = model.tool_in_flange.copy()
+    tool[0, 3] += bend
+    model = replace(model, tool_in_flange=tool)
+    q = np.array([p.q for p in plan.poses])
+    loads = Loads(
+        payload_mass=np.array([plan.loads[p.load].mass for p in plan.poses]),
+        payload_cog=np.array([plan.loads[p.load].cog for p in plan.poses]),
+    )
+    found = model.predict(q, loads).position
+    found = found + np.random.default_rng(7).normal(0, 3e-5, found.shape)
+    return found @ FRAME.rotation.T + FRAME.position

@@ -1,0 +1,172 @@
+"""The real command in a terminal, against a simulated controller and its tracker."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+from technician import FRAME, Hands, Terminal, last_pose
+
+from benchmarks.calibration.kills import run as run_kills
+from bridge.calibration.journal import FILE, read_entries
+from bridge.cell import load_cell
+from bridge.demo.served_cell import ServedCell
+from core.registration import Registration
+from core.rotation import rotation_matrix
+
+_hosts = itertools.count(2)
+LOADS = ((1.5, (0.0, 0.0, 0.05)), (9.5, (0.0, 0.0, 0.09)))
+CELL = """\
+robot: {{model: ur10e}}
+tool: {{tcp: {{xyz: [0.0, 0.0, 0.18], rpy: [0.0, 0.0, 0.0]}}}}
+payload: {{mass: 1.5, cog: [0.0, 0.0, 0.05]}}
+metrology: {{registered: false, sigma: 2.0e-5}}
+link: {{driver: ur_rtde, host: {host}}}
+calibration:
+  instrument: {instrument}
+  loads: [{{mass: 1.5, cog: [0, 0, 0.05]}}, {{mass: 9.5, cog: [0, 0, 0.09]}}]
+  effects: [axial_compliance]
+  poses: {poses}
+  held_out: 3
+  repeats: 2
+  floor: 0.1
+  joint_range: {{lower: [-1.2, -2.4, 0.4, -2.8, -2.4, -1.5], upper: [1.2, -0.6, 2.3, -0.6, -0.8, 1.5]}}
+  settle: 0.2
+  speed: 1.5
+  folder: sessions
+simulation: {{seed: 3}}
+"""  # noqa: E501
+
+
+def write_cell(folder: Path, instrument: str, poses: int) -> tuple[Path, str]:
+    pid = os.getpid()
+    host = f"127.{1 + (pid >> 8) % 250}.{pid % 256}.{next(_hosts) + 150}"
+    path = folder / "cell.yaml"
+    path.write_text(CELL.format(host=host, instrument=instrument, poses=poses), encoding="utf-8")
+    return path, host
+
+
+@dataclass
+class Person:
+    """Answers the questions; makes the mistakes of ``mistakes`` (number of the reading: which)."""
+
+    hands: Hands
+    mistakes: dict[int, str] = field(default_factory=dict)
+    read: int = 0
+
+    def answer(self, terminal: Terminal, question: str) -> str | None:
+        """Return what is typed; None: nothing, the arm is jogged instead."""
+        if "hangs there" in question:
+            second = terminal.shown.rfind("load 2 of 2") > terminal.shown.rfind("load 1 of 2")
+            self.hands.hang(*LOADS[second])
+            return ""
+        if "rests there" in question:
+            self.hands.jog(last_pose(terminal.shown))
+            return None
+        if question.startswith("x y z"):
+            return self._reading()
+        if question.startswith("what now"):
+            told = terminal.shown[terminal.shown.rfind("a good reading is within") :]
+            if "it is no slip" in told:
+                return "back"
+            if "millimetres taken" in told:
+                return "take"
+            return "" if "alone is off" in told else "back"
+        if question.startswith("which"):
+            return ""
+        assert "[yes/no]" in question, question
+        return "yes"
+
+    def _reading(self) -> str | None:
+        self.read += 1
+        mistake = self.mistakes.pop(self.read, "")
+        if mistake == "power cut":
+            return None
+        if mistake == "knock":
+            turn = rotation_matrix(np.array([0.1, -0.2, 0.702]))
+            self.hands.frame = Registration(turn, FRAME.position + np.array([2e-3, 1e-3, -1.5e-3]))
+        value = self.hands.look() * (1e3 if mistake == "mm" else 1.0)
+        if mistake == "typo":
+            value[1] += 0.09
+        return " ".join(f"{v:.6f}" for v in value)
+
+    def lead(self, terminal: Terminal) -> bool:
+        """Answer until the command ends; returns False where the power was cut before."""
+        for _ in range(200):
+            question = terminal.question()
+            if question is None:
+                return True
+            before = self.read
+            typed = self.answer(terminal, question)
+            if typed is not None:
+                terminal.type(typed)
+            elif self.read != before:
+                terminal.signal(signal.SIGKILL)
+                return False
+        raise AssertionError(f"200 questions, and no end: {terminal.shown[-2000:]}")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_a_person_with_mistakes_and_a_power_cut_ends_with_a_valid_cell(tmp_path: Path) -> None:
+    cell, host = write_cell(tmp_path, "{kind: typed, unit: m}", 12)
+    new, session = tmp_path / "new.yaml", tmp_path / "s"
+    person = Person(Hands(host), {4: "mm", 5: "typo", 8: "knock", 14: "power cut"})
+    with ServedCell(cell, 3):
+        with Terminal(cell, "--session", session) as terminal:
+            assert not person.lead(terminal), terminal.shown[-2000:]
+            first = terminal.shown
+        kept = sum(e["kind"] == "reading" for e in read_entries(session / FILE))
+        assert kept == first.count("  kept  ")
+        with Terminal(cell, "--session", session, "--apply", new) as terminal:
+            assert person.lead(terminal), terminal.shown[-2000:]
+            assert terminal.code == 0, terminal.shown[-2000:]
+    assert "millimetres taken for metres" in first
+    assert "alone is off" in first
+    assert "the instrument has moved" in first
+    assert "going on with the session" in terminal.shown
+    axial = load_cell(new).model.compliance()[0]
+    true = load_cell(cell)
+    from bridge.cell.simulation import server_settings
+
+    hidden = server_settings(true, host, 3).plant.axial
+    assert axial[1] == pytest.approx(hidden[1], abs=2e-6)
+    assert axial[2] == pytest.approx(hidden[2], abs=2e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_arm_is_driven_after_a_yes_and_ctrl_c_tells_how_to_go_on(tmp_path: Path) -> None:
+    cell, host = write_cell(tmp_path, "{kind: simulated_tracker}", 8)
+    hands = Hands(host)
+    with ServedCell(cell, 3):
+        before = hands.bench("truth")
+        with Terminal(cell, "--session", tmp_path / "s", "--move") as terminal:
+            assert "hangs there" in str(terminal.question())
+            terminal.type("")
+            assert "Drive it?" in str(terminal.question())
+            assert hands.bench("truth").split('"true_tcp"')[0] == before.split('"true_tcp"')[0]
+            terminal.type("yes")
+            while terminal.shown.count("  kept  ") < 1:
+                terminal.watch()
+            terminal.signal(signal.SIGINT)
+            shown = terminal.rest()
+            assert terminal.code == 1
+    assert "interrupted" in shown
+    assert "go on with: gapbridge calibrate" in shown
+    kept = [e for e in read_entries(tmp_path / "s" / FILE) if e["kind"] == "reading"]
+    assert kept
+    assert all(e["samples"] == 10 for e in kept)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_no_reading_is_lost_by_kill_9_and_the_session_always_goes_on() -> None:
+    tally = run_kills(kills=5, seed=1, say=False)
+    assert tally.acknowledged > 0
+    assert (tally.lost, tally.refused) == (0, 0)

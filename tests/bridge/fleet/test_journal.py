@@ -1,0 +1,104 @@
+"""The journal: what was done stays done, whatever happened to the run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import pytest
+
+from bridge.fleet.cell_source import OneCell
+from bridge.fleet.journal import Journal
+from bridge.fleet.running import run, tasks_of
+from bridge.fleet.session import find_sessions
+from bridge.fleet.task import BAD, DIED, DONE, Outcome, Task, perform
+from bridge.fleet.workers import Workers
+from core.errors import RunError
+from tests.bridge.fleet.fleet_in import tasks_in
+from tests.bridge.fleet.jobs import count_rows
+
+
+def outcome(key: str, state: str = DONE) -> Outcome:
+    return Outcome(key, "arm", f"arm/{key}", "log.csv", "cell.yaml", state, 0.1)
+
+
+def test_what_was_added_is_known_to_the_next_run(tmp_path: Path) -> None:
+    path = tmp_path / "j.jsonl"
+    with Journal(path) as journal:
+        journal.add(outcome("a"))
+    with Journal(path) as journal:
+        assert journal.known("a") == outcome("a")
+        assert journal.known("b") is None
+
+
+def test_a_line_that_was_cut_off_is_taken_away_and_the_rest_kept(tmp_path: Path) -> None:
+    path = tmp_path / "j.jsonl"
+    with Journal(path) as journal:
+        journal.add(outcome("a"))
+        journal.add(outcome("b"))
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-7])
+    with Journal(path) as journal:
+        assert journal.known("a") is not None
+        assert journal.known("b") is None
+        journal.add(outcome("b"))
+    assert path.read_bytes() == whole
+
+
+def test_two_runs_do_not_write_one_journal(tmp_path: Path) -> None:
+    path = tmp_path / "j.jsonl"
+    with Journal(path), pytest.raises(RunError, match="another run writes it"):
+        Journal(path)
+
+
+def test_fresh_forgets(tmp_path: Path) -> None:
+    path = tmp_path / "j.jsonl"
+    with Journal(path) as journal:
+        journal.add(outcome("a"))
+    with Journal(path, fresh=True) as journal:
+        assert journal.known("a") is None
+
+
+class Here(Workers):
+    """This process does the tasks, and notes them."""
+
+    def __init__(self) -> None:
+        self.given: list[str] = []
+
+    def start(self) -> None: ...
+
+    def stop(self) -> None: ...
+
+    def words(self) -> str:
+        return "this process"
+
+    def run(self, tasks: Iterable[Task]) -> Iterator[Outcome]:
+        for task in tasks:
+            self.given.append(task.session)
+            yield perform(task)
+
+
+def resumed(tasks: list[Task], path: Path) -> list[str]:
+    """Run, and return the sessions that were really done."""
+    workers = Here()
+    with Journal(path) as journal:
+        run(tasks, [], workers, journal, lambda outcome: None)
+    return workers.given
+
+
+def test_a_run_goes_on_where_it_was_broken_off_and_redoes_what_has_changed(tmp_path: Path) -> None:
+    names = ["a/s1", "a/s2", "b/s1"]
+    tasks = tasks_in(tmp_path, names, count_rows)
+    path = tmp_path / "j.jsonl"
+    with Journal(path) as journal:
+        # as if broken off: one done, one bad, one whose workers died
+        for task, state in zip(tasks, (DONE, BAD, DIED), strict=True):
+            journal.add(Outcome(task.key, task.arm, task.session, "", "", state, 0.1))
+    assert resumed(tasks, path) == ["b/s1"]
+    log = tasks[0].log
+    log.write_text(log.read_text() + log.read_text().splitlines()[-1] + "\n")
+    sessions = find_sessions([str(tmp_path / "logs")]).sessions
+    again, _ = tasks_of(sessions, OneCell(tmp_path / "cell.yaml"), count_rows, {})
+    assert resumed(again, path) == ["a/s1"]
+    other, _ = tasks_of(sessions, OneCell(tmp_path / "cell.yaml"), count_rows, {"withhold": ["x"]})
+    assert {t.key for t in other}.isdisjoint({t.key for t in again})

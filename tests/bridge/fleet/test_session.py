@@ -1,0 +1,122 @@
+"""Which logs there are, whose they are, and which cell they belong to."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from bridge.fleet.cell_source import CellBeside, CellTable, OneCell, cell_source
+from bridge.fleet.session import Found, find_sessions
+from core.errors import InputError
+
+
+def files_in(folder: Path, *names: str) -> Path:
+    for name in names:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    return folder
+
+
+def arms_of(found: Found) -> dict[str, str]:
+    return {s.name: s.arm for s in found.sessions}
+
+
+def test_the_first_folder_says_the_arm_and_names_sort_by_their_numbers(tmp_path: Path) -> None:
+    files_in(tmp_path, "b/s10.csv", "b/s9.parquet", "a/2026/s1.CSV", "a/notes.txt")
+    found = find_sessions([str(tmp_path)])
+    assert list(arms_of(found).items()) == [("a/2026/s1", "a"), ("b/s9", "b"), ("b/s10", "b")]
+    assert found.arms == 2
+    assert "folder" in found.rule
+
+
+def test_of_logs_in_one_folder_the_name_says_the_arm(tmp_path: Path) -> None:
+    files_in(tmp_path, "ur7_monday.csv", "ur7_friday.csv", "ur8.csv")
+    assert set(arms_of(find_sessions([str(tmp_path)])).values()) == {"ur7", "ur8"}
+
+
+def test_a_glob_and_the_files_it_stands_for_come_to_the_same(tmp_path: Path) -> None:
+    files_in(tmp_path, "a/s1.csv", "b/s1.csv", "b/skip.txt")
+    glob = find_sessions([str(tmp_path / "*" / "*")])
+    listed = find_sessions([str(tmp_path / "a" / "s1.csv"), str(tmp_path / "b" / "s1.csv")])
+    assert arms_of(glob) == arms_of(listed) == {"a/s1": "a", "b/s1": "b"}
+
+
+def test_a_pattern_finds_the_arm(tmp_path: Path) -> None:
+    files_in(tmp_path, "hall1/line-a.csv", "hall2/line-a.csv")
+    found = find_sessions([str(tmp_path)], r"(hall\d)/")
+    assert set(arms_of(found).values()) == {"hall1", "hall2"}
+    with pytest.raises(InputError, match="--arm: 'x9' does not fit"):
+        find_sessions([str(tmp_path)], "x9")
+    with pytest.raises(InputError, match="no regular expression"):
+        find_sessions([str(tmp_path)], "(")
+
+
+def test_results_are_no_logs(tmp_path: Path) -> None:
+    files_in(tmp_path, "a/s.csv", "out/results.parquet")
+    assert list(arms_of(find_sessions([str(tmp_path)], without=tmp_path / "out"))) == ["a/s"]
+
+
+@pytest.mark.parametrize(
+    ("where", "told"),
+    [("nowhere", "not found"), ("*.csv", "no log that fits"), (".", "no log in this folder")],
+)
+def test_no_logs_are_told(
+    where: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=told):
+        find_sessions([where])
+
+
+def test_two_logs_of_one_name_are_refused(tmp_path: Path) -> None:
+    files_in(tmp_path, "a/s.csv", "a/s.parquet")
+    with pytest.raises(InputError, match=re.escape("expected one log of a name")):
+        find_sessions([str(tmp_path)])
+
+
+def test_a_cell_beside_the_log_wins_over_those_above(tmp_path: Path) -> None:
+    files_in(tmp_path / "logs", "a/s1.csv", "a/s2.csv", "b/s1.csv", "a/s1.yaml", "a/cell.yaml")
+    files_in(tmp_path, "cell.yaml")
+    found = find_sessions([str(tmp_path / "logs")])
+    cells = cell_source("beside", found.folder)
+    assert isinstance(cells, CellBeside)
+    first, second, third = found.sessions
+    assert cells.cell_of(first).name == "s1.yaml"
+    assert cells.cell_of(second) == tmp_path / "logs" / "a" / "cell.yaml"
+    with pytest.raises(InputError, match="found no cell beside it"):  # none above the fleet's
+        cells.cell_of(third)
+
+
+def test_a_table_maps_arms_to_cells_seen_from_its_folder(tmp_path: Path) -> None:
+    files_in(tmp_path, "logs/a/s.csv", "logs/b/s.csv")
+    table = tmp_path / "cells" / "arms.csv"
+    table.parent.mkdir()
+    table.write_text("arm,cell,note\na,x.yaml,\n")
+    cells = cell_source(str(table), tmp_path)
+    assert isinstance(cells, CellTable)
+    a, b = find_sessions([str(tmp_path / "logs")]).sessions
+    assert cells.cell_of(a) == tmp_path / "cells" / "x.yaml"
+    with pytest.raises(InputError, match="no row for arm 'b'"):
+        cells.cell_of(b)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("arm;cell\n", "header: found arm;cell, expected columns arm and cell"),
+        ("arm,cell\na,x\na,y\n", "row 3: found arm 'a' twice"),
+        ("arm,cell\na,\n", "row 2: found no cell"),
+    ],
+)
+def test_a_table_that_cannot_be_used_is_told(text: str, told: str, tmp_path: Path) -> None:
+    table = tmp_path / "arms.csv"
+    table.write_text(text)
+    with pytest.raises(InputError, match=re.escape(told)):
+        cell_source(str(table), tmp_path)
+
+
+def test_any_other_word_is_one_cell_for_all(tmp_path: Path) -> None:
+    assert cell_source("cell.yaml", tmp_path) == OneCell(Path("cell.yaml"))

@@ -1,0 +1,77 @@
+"""The table of faults in short: every family and every link, on any machine.
+
+Patient about time, which a busy machine takes; strict about what went over the wire. The whole
+table is test_matrix.py.
+"""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+from rigs import Rigs, calm_link
+
+from benchmarks.faults.injection import make_fault
+from benchmarks.faults.links import LINKS
+from benchmarks.faults.matrix import run_alone
+from benchmarks.faults.row import Result, Row
+from benchmarks.faults.sequences import draw_sequence, make_sequence
+from benchmarks.faults.table import FAMILIES, ROWS
+
+KEYS = {
+    "can": ("stale link", "one leap", "another commander", "flood"),
+    "modbus": ("late sample", "reset", "wrong function, once", "another master", "bad reload"),
+    "ur_offset": ("frozen clock", "NaN for long", "no echo", "emergency stop"),
+    "ur_servoj": ("one NaN", "text messages", "empty packet", "protective stop", "loop is killed"),
+}
+ALONE = (("can", "SIGTERM"), ("modbus", "bad model output"))
+ROW = {row.key: row for row in ROWS}
+TRIES = 3
+
+
+def judge(result: Result, is_last: bool) -> bool:
+    """Return whether a result stands; one of a machine that was late does not count for much."""
+    assert not result.violated, result.wrong
+    wrong = [words for words in result.wrong if not words.startswith("detected after")]
+    if wrong and not (result.disturbed and is_last):
+        assert not is_last, wrong
+        return False
+    return True
+
+
+def make(rigs: Rigs, name: str, row: Row) -> None:
+    for i in range(TRIES):
+        if judge(make_fault(rigs.of(name), row), i == TRIES - 1):
+            return
+
+
+CASES = [(name, key) for name, keys in KEYS.items() for key in keys]
+
+
+@pytest.mark.parametrize(("name", "key"), CASES, ids=[f"{n}-{k}" for n, k in CASES])
+def test_a_fault_is_detected_and_answered(rigs: Rigs, name: str, key: str) -> None:
+    make(rigs, name, ROW[key])
+    if key == KEYS[name][-1]:
+        rig = rigs.of(name)
+        before = rig.found.violated
+        chosen = draw_sequence(random.Random(7), name, severe=0.0)
+        make_sequence(rig, chosen)
+        assert rig.found.violated == before, rig.found.violations[before:]
+
+
+@pytest.mark.parametrize(("name", "key"), ALONE, ids=[f"{n}-{k}" for n, k in ALONE])
+def test_a_fault_with_a_rig_of_its_own_is_answered(tmp_path: Path, name: str, key: str) -> None:
+    for i in range(TRIES):
+        result = run_alone(ROW[key], calm_link(name), tmp_path / str(i))
+        if judge(result, i == TRIES - 1):
+            return
+
+
+def test_every_family_and_every_link_is_among_them() -> None:
+    keys = {key for _, key in (*CASES, *ALONE)}
+    for family in FAMILIES:
+        assert keys & {row.key for row in family.ROWS}, family.__name__
+    assert set(KEYS) == set(LINKS)
+    for name, key in (*CASES, *ALONE):
+        assert name in ROW[key].links, (name, key)
