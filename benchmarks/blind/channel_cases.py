@@ -64,6 +64,9 @@ class ChannelCase:
         return float(np.sqrt(np.mean(sigma**2)))
 
 
+DRAWS = 600  # a delay and a lag are hardly told apart in most slow motions
+
+
 def draw_channel_case(channel: str, what: str, rng: Generator) -> ChannelCase:
     """Return a case: ``what`` is none, effects joined by +, pair, or a name outside."""
     effects: tuple[str, ...] = ()
@@ -76,7 +79,7 @@ def draw_channel_case(channel: str, what: str, rng: Generator) -> ChannelCase:
             if effect not in EFFECTS[channel]:
                 known = ", ".join((*EFFECTS[channel], *OUTSIDE[channel]))
                 raise ValueError(f"kind: found {effect!r} in {channel}, expected one of {known}")
-    for _ in range(60):
+    for _ in range(DRAWS):
         cell = _draw_cell(channel, rng)
         try:
             values = draw_values(
@@ -86,7 +89,7 @@ def draw_channel_case(channel: str, what: str, rng: Generator) -> ChannelCase:
             continue
         error, columns = _error(cell, strange, rng) if strange else (None, ())
         return ChannelCase(channel, cell, values, error, strange, columns)
-    raise RuntimeError(f"no clear draw of {channel}:{what} in 60")
+    raise RuntimeError(f"no clear draw of {channel}:{what} in {DRAWS}")
 
 
 def _draw_cell(channel: str, rng: Generator) -> wrench.WrenchCell | moving.MovingCell:
