@@ -75,6 +75,7 @@ def _front(facts: SessionFacts) -> list[tuple[str, str]]:
 def _instrument(facts: SessionFacts, stations: int) -> list[tuple[str, str]]:
     tool = facts.instrument
     noise = error = ""
+    far = tool.distance > 0 and tool.kind in ("position", "pose", "distance")
     if tool.kind not in ("wrench", "touch"):
         noise = f"{mm(tool.sigma)} (1 sigma of one coordinate)"
     if tool.error is not None:
@@ -87,7 +88,7 @@ def _instrument(facts: SessionFacts, stations: int) -> list[tuple[str, str]]:
         ("measures", KINDS.get(tool.kind, tool.kind)),
         ("noise, declared", noise),
         ("largest permissible error", error),
-        ("distance", f"{plain(tool.distance)} m" if tool.distance else ""),
+        ("distance", f"{plain(tool.distance)} m" if far else ""),
         ("places", f"{stations}" if stations > 1 else ""),
     ]  # fmt: skip
     return [(name, text) for name, text in given if text]
