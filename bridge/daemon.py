@@ -227,10 +227,9 @@ class Daemon:
                         self.manager.stopping()
                     loop.ask_to_stop()
                 if loop.hangs or (stop_by is not None and time.monotonic() > stop_by):
-                    self._fault(
-                        "hang", f"the loop stood still for {self.page.silence:.2f} s and was ended"
-                    )
-                    loop.kill()
+                    words = f"the loop stood still for {self.page.silence:.2f} s and was ended"
+                    loop.kill()  # told when it is over: nothing is written after that
+                    self._fault("hang", words)
             self._take()
             self._after(loop)
             if first_cycle is not None and time.monotonic() - first_cycle > HEALTHY:
