@@ -8,7 +8,7 @@ from bridge.calibration.report.blocks import Block, Bullets, Columns, Heading, P
 from bridge.calibration.report.facts import SessionFacts
 from bridge.calibration.report.figures import load_words, mm, plain
 from bridge.calibration.report.material import Material
-from bridge.calibration.report.names import spoken
+from bridge.calibration.report.names import sentence
 from bridge.calibration.report.section import Section
 
 KINDS = {
@@ -50,7 +50,7 @@ def facts_blocks(
             Pairs(tuple(_instrument(facts, places)), "Instrument"),
         ))
     ]  # fmt: skip
-    remarks = tuple(spoken(text) for text in (*facts.remarks, *notes))
+    remarks = tuple(sentence(text) for text in (*facts.remarks, *notes))
     return [*blocks, Heading("Remarks"), Bullets(remarks)] if remarks else blocks
 
 
