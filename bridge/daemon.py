@@ -282,8 +282,8 @@ class Daemon:
         words = str(self._failure.get("detail", "")) or f"the loop's process {loop.describe_end()}"
         if self._stopping.is_set() and not self._failure:
             return
-        if code == Exit.INPUT:
-            raise InputError(words)
+        if code == Exit.INPUT and not self._seen:
+            raise InputError(words)  # later, it is a file that somebody is at: tried again
         if not self._seen:
             raise LinkError(words)
         self._fault("loop", words)

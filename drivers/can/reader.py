@@ -71,21 +71,27 @@ class FrameReader:
         Raises LinkError where the bus has gone.
         """
         frame = self._receive(timeout)
-        return None if frame is None else self._fresh(self._take(frame, time.monotonic()))
+        if frame is None:
+            return None
+        return self._fresh(self._take(frame, time.monotonic()), self._empty)
 
     def newest(self) -> Sample | None:
         """Take everything that has piled up; returns the newest complete sample of it."""
         newest, until = None, time.monotonic() + BACKLOG_TIME
+        empty = self._empty  # before all that is read now
         while (frame := self._receive(0.0)) is not None:
             now = time.monotonic()
             newest = self._take(frame, now) or newest
             if now > until:
                 break
-        return self._fresh(newest)
+        return self._fresh(newest, empty)
 
-    def _fresh(self, sample: Sample | None) -> Sample | None:
-        """Return a sample unless it may have lain here for long, this process being late."""
-        late = sample is not None and sample.received - self._empty > self._longest
+    def _fresh(self, sample: Sample | None, empty: float) -> Sample | None:
+        """Return a sample unless it may have lain here for long, this process being late.
+
+        ``empty`` (s, monotonic): when nothing was waiting, the last time before it came.
+        """
+        late = sample is not None and sample.received - empty > self._longest
         return None if late else sample
 
     def listen(self, seconds: float) -> Sample | None:
