@@ -5,13 +5,14 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: help demo test check coverage faults clean
+.PHONY: help demo test check coverage bench faults clean
 
 help:
 	@echo "make demo      the whole job on a simulated cell; results in out/demo"
 	@echo "make test      all tests"
 	@echo "make check     format, lint, types, import contracts, all tests"
 	@echo "make coverage  all tests, and which lines of core and drivers they reach"
+	@echo "make bench     speed beside peers, in one run; figures in out/speed.json"
 	@echo "make faults    every fault on the real wire, and random ones; fills docs/reliability.md"
 	@echo "make clean     remove .venv and everything that was made"
 
@@ -35,6 +36,9 @@ KERNEL_TESTS := $(addprefix tests/core/test_,kinematics.py statics.py equilibriu
 coverage: .venv/.test
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest --cov --cov-report= $(KERNEL_TESTS)
 	$(BIN)/python -m pytest --cov --cov-append --cov-report=term-missing:skip-covered
+
+bench: .venv/.test
+	$(BIN)/python -m benchmarks.speed --out out/speed.json
 
 # REPEAT: times that each fault is made. SEQUENCES: random ones. MINUTES: no fault is begun after.
 REPEAT ?= 5

@@ -227,10 +227,9 @@ class Daemon:
                         self.manager.stopping()
                     loop.ask_to_stop()
                 if loop.hangs or (stop_by is not None and time.monotonic() > stop_by):
-                    self._fault(
-                        "hang", f"the loop stood still for {self.page.silence:.2f} s and was ended"
-                    )
-                    loop.kill()
+                    words = f"the loop stood still for {self.page.silence:.2f} s and was ended"
+                    loop.kill()  # told when it is over: nothing is written after that
+                    self._fault("hang", words)
             self._take()
             self._after(loop)
             if first_cycle is not None and time.monotonic() - first_cycle > HEALTHY:
@@ -283,8 +282,8 @@ class Daemon:
         words = str(self._failure.get("detail", "")) or f"the loop's process {loop.describe_end()}"
         if self._stopping.is_set() and not self._failure:
             return
-        if code == Exit.INPUT:
-            raise InputError(words)
+        if code == Exit.INPUT and not self._seen:
+            raise InputError(words)  # later, it is a file that somebody is at: tried again
         if not self._seen:
             raise LinkError(words)
         self._fault("loop", words)

@@ -142,6 +142,7 @@ class Writing:
             if stream.finite:
                 self._driver.write_setpoint(setpoint)
                 self._failed = 0
+                self._judge_sending(expiry)
                 return setpoint
             self.unsent = _copied(setpoint)
             self._end(Count.BAD_OUTPUT, Cause.BAD_OUTPUT, "the model's correction is no number")
@@ -149,6 +150,14 @@ class Writing:
             self.unsent = _copied(setpoint)
             self._fail(error)
         return None
+
+    def _judge_sending(self, expiry: float) -> None:
+        """End the motion where the system stopped this process between judging and sending."""
+        late = time.monotonic() - expiry
+        if late > 0.0:
+            words = f"a setpoint left {1e3 * late:.0f} ms after its state was too old"
+            self._page.count(Count.OVERRUN)
+            self._supervisor.take(Cause.OVERRUN, words)
 
     def _fail(self, error: WriteError) -> None:
         """Act on a setpoint that could not be delivered."""

@@ -143,11 +143,16 @@ def _data(
     right = np.stack([s.right for s in sessions])
     M = np.swapaxes(R, 1, 2) @ R / noise[:, None, None]
     k = np.einsum("sij,si->sj", R, right) / noise[:, None]
-    order = np.zeros(len(arm))
-    for number in np.unique(arm):
-        at = np.flatnonzero(arm == number)
-        order[at] = np.arange(len(at)) - (len(at) - 1) / 2
-    return Information(M, k, arm, int(arm.max()) + 1, order)
+    return Information(M, k, arm, int(arm.max()) + 1, _order(arm))
+
+
+def _order(arm: NDArray[np.int64]) -> Array:
+    """Return the number (S,) of each session within its arm, counted from the arm's middle."""
+    count = np.bincount(arm)
+    sorted_ = np.argsort(arm, kind="stable")
+    order = np.empty(len(arm))
+    order[sorted_] = np.arange(len(arm)) - np.repeat(np.cumsum(count) - count, count)
+    return order - (count[arm] - 1) / 2
 
 
 def _averaged(believed: Sequence[Type]) -> Type:

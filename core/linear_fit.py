@@ -9,12 +9,14 @@ bounds there is core.identification.
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import InputError
+from core.kernel import Rows
 from core.kernels.factor import factor_blocks, normal_blocks
 from core.kernels.layout import LANES
 from core.kernels.threads import in_ranges
@@ -76,19 +78,41 @@ def fit_linear(
     return LinearFit(found, condition, int(shown.sum()), True, "" if factored else note)
 
 
+def _views(model: Model, q: Array, loads: Loads) -> Callable[[slice], Rows]:
+    """Return what gives a part of the rows: views, where no effect changes them row by row."""
+    if model.conditions():
+        return lambda part: model.rows(q[part], loads[part])
+    chunk, n = min(CHUNK, len(q)), model.arm.n
+    plain = model.rows(np.zeros((chunk, n)))
+
+    def view(column: Array | None, same: Array, part: slice) -> Array:
+        if column is None:
+            return same[: part.stop - part.start]
+        return np.ascontiguousarray(column[part], dtype=float)
+
+    return lambda part: Rows(
+        view(q, plain.q, part),
+        view(None, plain.growth, part),
+        view(loads.payload_mass, plain.payload_mass, part),
+        view(loads.payload_cog, plain.payload_cog, part),
+        view(loads.wrench, plain.wrench, part),
+    )
+
+
 def _summed(model: Model, q: Array, loads: Loads, gap: Array, *, normal: bool) -> Array:
     """Return the normal matrix (lower tiles) or the R factor of [regressor | gap]."""
     chain, columns = model.chain(), 2 * model.arm.n + 1
     size = -(-columns // 4) * 4 if normal else columns
     total, lock = np.zeros((size, size)), threading.Lock()
     ones = np.ones((min(CHUNK, len(q)), gap.shape[1]))
+    given = _views(model, q, loads)
 
     def work(first: int, last: int) -> None:
         own = np.zeros((size, size))
         for at in range(first, last, CHUNK):
             part = slice(at, min(at + CHUNK, last))
             count = part.stop - at
-            rows, right = model.rows(q[part], loads[part]), np.ascontiguousarray(gap[part])
+            rows, right = given(part), np.ascontiguousarray(gap[part])
             if normal:
                 bad = normal_blocks(chain, rows, right, 0, count, own)
             else:

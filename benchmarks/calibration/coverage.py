@@ -43,6 +43,7 @@ LAYOUTS = {
 }
 
 
+KEPT = 20  # sessions after which the figures so far are written
 COLUMNS = ("sessions", "parameters", "readings", "z_rms", "seconds")
 
 
@@ -148,17 +149,22 @@ def _share(held: list[bool]) -> float:
 def main(sessions: int, seed: int, out: Path | None) -> None:
     """Count how often 95 % intervals hold the truth."""
     console, known = Console(), settings()
-    outcomes = [
-        run(known[i % len(known)], seed + i)
-        for i in track(range(sessions), "sessions", console=console)
-    ]
+    outcomes: list[Outcome] = []
+    for i in track(range(sessions), "sessions", console=console):
+        outcomes.append(run(known[i % len(known)], seed + i))
+        if out is not None and len(outcomes) % KEPT == 0:
+            _write(out, outcomes)
     told = summary(outcomes)
     table = Table("", "sessions", "parameters held", "predictions held", "rms z", "s a fit")
     for name, row in told.items():
         table.add_row(name, *(_cell(row.get(k), k) for k in COLUMNS))
     console.print(table)
     if out is not None:
-        out.write_text(json.dumps(told, indent=1), encoding="utf-8")
+        _write(out, outcomes)
+
+
+def _write(out: Path, outcomes: list[Outcome]) -> None:
+    out.write_text(json.dumps(summary(outcomes), indent=1), encoding="utf-8")
 
 
 def _cell(value: float | None, key: str) -> str:

@@ -143,17 +143,19 @@ def _floor(bench: Bench, real: RealArm, readings: Readings) -> float:
 @click.command()
 @click.option("--seeds", default=2, show_default=True, help="Sessions of each arm and effect.")
 @click.option("--seed", default=0, show_default=True, help="First seed.")
+@click.option("--effects", default=",".join(("none", *POSITION_EFFECTS)), help="By commas.")
 @click.option("--json", "out", type=click.Path(path_type=Path), default=None, help="Write figures.")
-def main(seeds: int, seed: int, out: Path | None) -> None:
+def main(seeds: int, seed: int, effects: str, out: Path | None) -> None:
     """Calibrate every arm with every effect, and check it on poses that the fit never saw."""
     console = Console()
-    jobs = [(a, e, seed + s) for a in ARMS for e in ("none", *POSITION_EFFECTS)
+    chosen = effects.split(",")
+    jobs = [(a, e, seed + s) for a in ARMS for e in chosen
             for s in range(seeds)]  # fmt: skip
     done = [run(*job) for job in track(jobs, "arms", console=console)]
     table = Table(
         "", "sessions", "before, mm", "after, mm", "floor, mm", "median", "mean", "largest"
     )
-    for name in (*ARMS, "none", *POSITION_EFFECTS, "all"):
+    for name in (*ARMS, *chosen, "all"):
         own = [o for o in done if name in (o.arm, o.effect, "all")]
         table.add_row(name, str(len(own)), *_cells(own))
     console.print(table)

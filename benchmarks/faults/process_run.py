@@ -80,6 +80,12 @@ class ProcessRun(Told):
         raise TimeoutError(f"the daemon did not start: {self.said[-300:]}")
 
     @property
+    def page(self) -> Page:
+        """Return the run's shared page."""
+        assert self._page is not None
+        return self._page
+
+    @property
     def pid(self) -> int:
         """Return the daemon's process id."""
         assert self._process is not None

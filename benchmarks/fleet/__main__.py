@@ -24,6 +24,7 @@ def main() -> None:
     parser.add_argument("--fleets", type=int, default=12, help="of the shrinkage")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--no-dask", action="store_true")
+    parser.add_argument("--no-whole", action="store_true", help="leave out the runs with a start")
     parser.add_argument("--json", type=Path, default=None, help="file for the figures")
     given = parser.parse_args()
     asked = given.what or ["growth", "shrinkage"]
@@ -36,7 +37,7 @@ def main() -> None:
             )
             found["whole_s"] = {
                 str(n): growth.whole(folder / "whole", n, given.seed)
-                for n in SIZES if n <= given.sessions
+                for n in SIZES if n <= given.sessions and not given.no_whole
             }  # fmt: skip
         if "shrinkage" in asked:
             found["shrinkage"] = shrinkage.measure(folder / "type", given.fleets, POSES, given.seed)

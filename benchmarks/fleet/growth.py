@@ -61,7 +61,7 @@ def measure(folder: Path, sessions: int, chunk: int, seed: int, *, dask: bool) -
     tasks, _ = tasks_of(found.sessions, OneCell(cell), fitting.work, {})
     chunks = [tasks[i : i + chunk] for i in range(0, len(tasks), chunk)]
     with ExitStack() as stack:
-        ways, started = _ways(folder, stack, dask=dask)
+        ways, started, below = _ways(folder, stack, dask=dask)
         for way in ways.values():
             way(tasks[: 2 * WORKERS])  # kernels loaded, files in memory: each meets the same
         times: dict[str, list[float]] = {name: [] for name in ways}
@@ -69,10 +69,10 @@ def measure(folder: Path, sessions: int, chunk: int, seed: int, *, dask: bool) -
         for i, part in enumerate(chunks):
             names = list(ways)
             for name in names[i % len(names) :] + names[: i % len(names)]:
-                begin, before = time.perf_counter(), _processor_time()
+                begin, before = time.perf_counter(), _processor_time(below[name])
                 ways[name](part)
                 times[name].append(time.perf_counter() - begin)
-                spent[name].append(_processor_time() - before)
+                spent[name].append(_processor_time(below[name]) - before)
     sizes = [len(c) for c in chunks]
     return {
         "sessions": sessions, "chunk": chunk, "poses": POSES, "started_s": started,
@@ -93,23 +93,28 @@ def measure(folder: Path, sessions: int, chunk: int, seed: int, *, dask: bool) -
     }  # fmt: skip
 
 
-def _ways(folder: Path, stack: ExitStack, *, dask: bool) -> tuple[dict[str, Way], dict[str, float]]:
-    """Return what does a chunk, by name, and how long it took to start."""
+def _ways(
+    folder: Path, stack: ExitStack, *, dask: bool
+) -> tuple[dict[str, Way], dict[str, float], dict[str, set[int]]]:
+    """Return what does a chunk, by name, how long it took to start, and its processes."""
     started: dict[str, float] = {}
     ways: dict[str, Way] = {"loop": _loop}
+    below: dict[str, set[int]] = {"loop": set()}
     journal = folder / "journal"
-    for name, count in (("one process", 1), ("processes", WORKERS)):
-        begin = time.perf_counter()
-        workers = stack.enter_context(LocalWorkers(count))
-        ways[name] = _pool(Kept(workers), journal)
+
+    def add(name: str, workers: Workers, begin: float, before: set[int]) -> None:
+        ways[name] = _pool(Kept(stack.enter_context(workers)), journal)
         ways[name]([])
         started[name] = time.perf_counter() - begin
+        below[name] = _children() - before
+
+    for name, count in (("one process", 1), ("processes", WORKERS)):
+        add(name, LocalWorkers(count), time.perf_counter(), _children())
     if dask:
-        address = stack.enter_context(cluster(WORKERS))
-        ways["dask"] = _pool(Kept(stack.enter_context(DaskWorkers(address))), journal)
-        one = stack.enter_context(cluster(1))
-        ways["one dask worker"] = _pool(Kept(stack.enter_context(DaskWorkers(one))), journal)
-    return ways, started
+        for name, count in (("one dask worker", 1), ("dask", WORKERS)):
+            begin, before = time.perf_counter(), _children()
+            add(name, DaskWorkers(stack.enter_context(cluster(count))), begin, before)
+    return ways, started, below
 
 
 def _loop(tasks: Sequence[Task]) -> None:
@@ -152,14 +157,18 @@ def whole(folder: Path, sessions: int, seed: int) -> float:
     return time.perf_counter() - begin
 
 
-def _processor_time() -> float:
-    """Return the processor time (s) of this process and all those below it.
+def _children() -> set[int]:
+    return {p.pid for p in psutil.Process().children(recursive=True)}
 
-    On a machine that others use this says what a way costs where the clock on the wall cannot.
+
+def _processor_time(processes: set[int]) -> float:
+    """Return the processor time (s) of this thread and of a way's processes.
+
+    On a machine that others use this says what a way costs where the clock on the wall cannot. A
+    Dask cluster's scheduler and client run in other threads of this process and are left out.
     """
-    own = psutil.Process()
-    every = [own, *own.children(recursive=True)]
-    return sum(sum(p.cpu_times()[:2]) for p in every)
+    below = (psutil.Process(pid).cpu_times() for pid in processes)
+    return time.thread_time() + sum(t.user + t.system for t in below)
 
 
 def _ratios(

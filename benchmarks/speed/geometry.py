@@ -57,8 +57,8 @@ def linear(count: int, rounds: int) -> dict[str, Any]:
     )  # fmt: skip
 
 
-def whole(count: int) -> dict[str, Any]:
-    """Return the row of the whole geometry with flexibilities: one run of each side, in turns."""
+def whole(count: int, turns: int = 1) -> dict[str, Any]:
+    """Return the row of the whole geometry with flexibilities: ``turns`` of each side."""
     model = task.rigid()
     observable = make_observable("position", registered=True)
     parameters = Parameters.of(model, observable=observable, pulls=True)
@@ -71,7 +71,7 @@ def whole(count: int) -> dict[str, Any]:
     readings = replace(empty_readings("position", q, loads), value=value)
     nuisance = observable.start(model, readings)
     rounds: list[tuple[float, float]] = []
-    for _ in range(2):
+    for _ in range(turns):
         begin = time.thread_time()
         ours = _newton(parameters, observable, readings, nuisance)
         middle = time.thread_time()
@@ -82,7 +82,7 @@ def whole(count: int) -> dict[str, Any]:
              for v in (ours, theirs)]  # fmt: skip
     off = np.abs((ours - theirs) / parameters.scales).max()
     sides = {
-        name: {"rounds": 2, "cpu_s": {"median": float(np.median([r[k] for r in rounds]))},
+        name: {"rounds": turns, "cpu_s": {"median": float(np.median([r[k] for r in rounds]))},
                "wall_s": {"median": float("nan")}}
         for k, name in enumerate((OURS, PEER))
     }  # fmt: skip
@@ -128,5 +128,5 @@ def _numerical(
         return 1e3 * (predicted(model) - value).ravel()
 
     begin = parameters.begin / parameters.scales
-    found = least_squares(residual, begin, method="lm", xtol=1e-10, ftol=1e-14)
+    found = least_squares(residual, begin, method="lm", xtol=1e-9, ftol=1e-11)
     return parameters.scales * found.x, calls

@@ -46,8 +46,7 @@ def regressor(count: int, rounds: int) -> dict[str, Any]:
     figures = interleaved(sides, rounds)
     _agree(A, other, pin, rows)
     pairs = [(side.name, OURS) for side in sides[2:]]
-    found = compared(f"regressor for {count} rows", "within 4 times of C++", figures, pairs)
-    return found
+    return compared(f"regressor for {count} rows", "within 4 times of C++", figures, pairs)
 
 
 def _agree(A: np.ndarray, other: np.ndarray, pin: PinocchioTask, rows: Any) -> None:

@@ -60,9 +60,7 @@ class Bringing:
         assert self.book.plan is not None
         what = self.book.plan.loads[load]
         self.talk.say()
-        self.talk.say(
-            f"load {load + 1} of {len(self.book.plan.loads)} · {load_text(what)}", "bold cyan"
-        )
+        self.talk.say(f"load {load + 1} · {load_text(what)}", "bold cyan")
         self.talk.say("  hang it on the flange, and tell the controller its mass and centre")
         self.talk.ask("  Enter when it hangs there")
         self.book.add("mounted", load=load)

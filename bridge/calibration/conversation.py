@@ -61,9 +61,10 @@ class Conversation:
             taken_again = before is not None and np.linalg.norm((taken.value - before)[:3]) < SAME
             chosen = self._doubt(verdict, bool(taken_again))
             if chosen:
-                put_right = verdict.instead if chosen == "take" else None
-                value = taken.value if put_right is None else put_right
-                self._keep(replace(taken, value=value, doubted=chosen == "keep"), verdict)
+                if chosen == "take" and verdict.instead is not None:
+                    taken = replace(taken, value=verdict.instead)
+                    verdict = self.judge(taken, captured)
+                self._keep(replace(taken, doubted=chosen == "keep"), verdict)
                 return
             self.book.add("rejected", stop=stop, value=taken.value, source=taken.source,
                           off=verdict.off, reasons=verdict.reasons)  # fmt: skip

@@ -20,14 +20,19 @@ LEAST_TOLD = 2e-6  # m: a repeatability below this is none that was seen
 DIAGNOSED = ("position", "pose")  # kinds whose remainder the diagnosis can judge
 
 
-def fitted(cell: Cell, order: Order, talk: Talk, book: Book) -> Calibration:
-    """Return the fit of a session's readings. Raises InputError where they are too few."""
+def fitted(
+    cell: Cell, order: Order, talk: Talk, book: Book, more: tuple[str, ...] = ()
+) -> Calibration:
+    """Return the fit of a session's readings, with ``more`` effects than the cell names.
+
+    Raises InputError where the readings are too few.
+    """
     assert book.plan is not None
     kind, places = order.instrument.measures, book.places
     observable = observable_of(cell, order.instrument, places)
     metrology = metrology_of(cell, order.instrument, places)
     with talk.waiting("fitting") as tell:
-        parameters = Parameters.of(cell.model, effects_of(cell), observable=observable)
+        parameters = Parameters.of(cell.model, (*effects_of(cell), *more), observable=observable)
         return calibrate(
             cell.model, book.all_readings(kind), parameters, metrology, observable=observable,
             expected=book.plan.expected, diagnose=kind in DIAGNOSED,

@@ -42,8 +42,10 @@ class WholeJob(Job):
             f"plan: {fit} poses to fit, {held} to verify, {again} once more for the repeatability: "
             f"{len(plan.poses)} stops, {duration(seconds_left(self.book, minutes) + plan.travel)}"
         )
+        used = {p.load for p in plan.poses}
         for i, load in enumerate(plan.loads):
-            talk.say(f"  load {i + 1}: {load_text(load)}")
+            needless = "" if i in used else " (not needed: it would tell nothing more)"
+            talk.say(f"  load {i + 1}: {load_text(load)}{needless}")
         talk.say(
             f"expected: the predicted TCP known to {millimetres(plan.expected.tcp_std)} (1 sigma "
             f"over workspace and loads; {millimetres(plan.expected.tcp_std_worst)} at worst)"
@@ -56,12 +58,20 @@ class WholeJob(Job):
         for note in plan.notes:
             talk.say(f"  note: {note}")
 
+    def _wanted(self, lacking: tuple[str, ...]) -> bool:
+        """Return whether effects that the readings ask for are to be fitted as well."""
+        question = f"The readings ask for {', '.join(lacking)} as well. Fit again with it?"
+        return self.order.yes or self.talk.confirm(question)
+
     def finish(self) -> None:
         """Fit, tell, report, and write the new cell once a person says yes."""
         talk, folder, order = self.talk, self.folder, self.order
         talk.say()
         found = fitted(self.cell, order, talk, self.book)
         tell_calibration(talk, found)
+        if found.lacking and self._wanted(found.lacking):
+            found = fitted(self.cell, order, talk, self.book, found.lacking)
+            tell_calibration(talk, found)
         metrology = metrology_of(self.cell, order.instrument, self.book.places)
         write_log(found.readings, metrology.registered, folder / "readings.csv")
         promise = document_of(found, sigma=metrology.sigma)

@@ -87,13 +87,14 @@ def _type(name: str, arms: dict[str, list[Outcome]]) -> FittedType:
     evidence = [_evidence(o) for o in given]
     nominal = np.median([o.result["nominal"] for o in given], axis=0)
     fit = fit_type(evidence, number, nominal, float(given[0].result["usual"]))
-    found: list[FittedArm] = []
-    for i, arm in enumerate(arms):
-        sessions = tuple(
-            _session(o, e, fit, s, i)
-            for s, (o, e) in enumerate(zip(given, evidence, strict=True)) if number[s] == i
-        )  # fmt: skip
-        found.append(FittedArm(arm, fit.arms[i], sessions))
+    sessions = [
+        _session(o, e, fit, s, i)
+        for s, (o, e, i) in enumerate(zip(given, evidence, number, strict=True))
+    ]
+    found, begin = [], 0
+    for i, (arm, own) in enumerate(arms.items()):
+        found.append(FittedArm(arm, fit.arms[i], tuple(sessions[begin : begin + len(own)])))
+        begin += len(own)
     n = len(nominal) // 2
     names = [f"{kind}_compliance_{j + 1}" for kind in ("axial", "radial") for j in range(n)]
     return FittedType(name, tuple(names), fit.scatter, tuple(found))

@@ -1,4 +1,4 @@
-"""Local workers: spawned processes, one session at a time each.
+"""Local workers: spawned processes that do one session at a time.
 
 A pool of the standard library breaks as a whole when one of its processes dies and cannot tell
 over which task; here every process has its own pipe, so that the task in it is known.
@@ -11,7 +11,7 @@ import os
 import signal
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
@@ -23,6 +23,8 @@ from core.errors import RunError
 SINGLE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 STILLBORN = 3  # processes that die before they are ready, one after the other: give up
 READY = "ready"
+AHEAD = 2  # tasks that a process has, so that it never waits for the next
+PLENTY = 4  # tasks per process from which on it gets more than one: at the end all share
 
 
 @dataclass
@@ -32,7 +34,7 @@ class _Worker:
     process: BaseProcess
     pipe: Connection
     ready: bool = False
-    task: Task | None = None
+    tasks: deque[Task] = field(default_factory=deque)  # the first is being done, others wait
 
 
 class LocalWorkers(Workers):
@@ -63,23 +65,19 @@ class LocalWorkers(Workers):
 
     def run(self, tasks: Iterable[Task]) -> Iterator[Outcome]:
         """Give the outcomes as they come; a dead process's task is done again by another."""
-        source = iter(tasks)
-        again: deque[Task] = deque()
-        exhausted = False
+        left = deque(tasks)
         while True:
             for worker in self._workers:
-                if worker.ready and worker.task is None and not (exhausted and not again):
-                    task = again.popleft() if again else next(source, None)
-                    exhausted = exhausted or task is None
-                    if task is not None:
-                        _give(worker, task)
-            if exhausted and not again and not any(w.task for w in self._workers):
+                most = AHEAD if len(left) > PLENTY * self.count else 1
+                while worker.ready and left and len(worker.tasks) < most:
+                    _give(worker, left.popleft())
+            if not left and not any(w.tasks for w in self._workers):
                 return
             for found in self._heard():
                 if isinstance(found, Outcome):
                     yield found
                 else:
-                    again.append(found)
+                    left.appendleft(found)
 
     def _heard(self) -> Iterator[Outcome | Task]:
         """Wait; give outcomes, and tasks whose process has died and that are to be done again."""
@@ -95,7 +93,7 @@ class LocalWorkers(Workers):
             if message == READY:
                 worker.ready, self._stillborn = True, 0
                 continue
-            worker.task = None
+            worker.tasks.popleft()
             yield message
 
     def _buried(self, worker: _Worker) -> Iterator[Outcome | Task]:
@@ -109,9 +107,10 @@ class LocalWorkers(Workers):
                     f"{worker.process.exitcode}), expected them to come up"
                 )
         self._workers[self._workers.index(worker)] = _spawn()
-        task = worker.task
-        if task is None:
+        if not worker.tasks:
             return
+        task, *waiting = worker.tasks
+        yield from waiting
         self._deaths[task.key] = self._deaths.get(task.key, 0) + 1
         yield died(task) if self._deaths[task.key] >= DEATHS else task
 
@@ -136,7 +135,7 @@ def _spawn() -> _Worker:
 
 def _give(worker: _Worker, task: Task) -> None:
     """Send a task; a process that has just died is found out by whoever listens next."""
-    worker.task = task
+    worker.tasks.append(task)
     try:
         worker.pipe.send(task)
     except OSError:

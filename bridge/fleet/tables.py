@@ -15,8 +15,8 @@ FIGURES = {"gap_rms": "float64", "gap_max": "float64", "noise_floor_rms": "float
            "remaining_rms": "float64", "remaining_rms_held_out": "float64"}  # fmt: skip
 SESSION = {
     "arm": "string", "session": "string", "type": "string", "log": "string", "cell": "string",
-    "state": "string", "error": "string", "seconds": "float64", "time": "float64",
-    "poses": "int64", "joints": "int64",
+    "state": "string", "error": "string", "seconds": "float64", "processor": "float64",
+    "time": "float64", "poses": "int64", "joints": "int64",
 }  # fmt: skip
 EFFECT = {
     "arm": "string", "session": "string", "type": "string", "time": "float64",
@@ -62,7 +62,8 @@ def session_rows(outcomes: Sequence[Outcome]) -> Iterator[dict[str, Any]]:
     """Give a row per session, usable or not."""
     for outcome in outcomes:
         row = {name: getattr(outcome, name) for name in
-               ("arm", "session", "log", "cell", "state", "error", "seconds")}  # fmt: skip
+               ("arm", "session", "log", "cell", "state", "error", "seconds",
+                "processor")}  # fmt: skip
         names = ("type", "time", "poses", "joints")
         yield row | {name: outcome.result.get(name) for name in names}
 

@@ -43,7 +43,8 @@ class Outcome:
     log: str
     cell: str
     state: str  # done, bad (input), crashed (an error nobody foresaw), died (took workers along)
-    seconds: float  # the worker's time, reading the log included
+    seconds: float  # by the worker's clock, reading the log included
+    processor: float = 0.0  # s of a processor: what it costs, however busy the machine is
     error: str = ""  # one line
     details: str = ""  # the traceback of a crash
     result: Mapping[str, Any] = field(default_factory=dict)
@@ -77,24 +78,28 @@ def died(task: Task) -> Outcome:
 
 def perform(task: Task) -> Outcome:
     """Do a task; whatever happens but the death of the process becomes an outcome."""
-    begin = time.perf_counter()
+    begin, spent = time.perf_counter(), time.process_time()
+    state, rest = _performed(task)
+    seconds, processor = time.perf_counter() - begin, time.process_time() - spent
+    return outcome(task, state, seconds, processor=processor, **rest)
+
+
+def _performed(task: Task) -> tuple[str, dict[str, Any]]:
+    """Return the state and what belongs to it."""
     try:
         cell = _cell(task.cell, task.cell.stat().st_mtime_ns) if task.cell.is_file() else (
             load_cell(task.cell)
         )  # fmt: skip
-        result = task.work(cell, open_log(task.log, cell), task.options)
+        return DONE, {"result": task.work(cell, open_log(task.log, cell), task.options)}
     except GapbridgeError as error:
         text = " ".join(str(error).split())
-        if str(task.log) not in text:
-            text = f"{task.log}: {text}"
-        return outcome(task, BAD, time.perf_counter() - begin, error=text)
+        return BAD, {"error": text if str(task.log) in text else f"{task.log}: {text}"}
     except Exception as error:
         text = " ".join(str(error).split()) or "no message"
-        return outcome(
-            task, CRASHED, time.perf_counter() - begin,
-            error=f"{task.log}: {type(error).__name__}: {text}", details=traceback.format_exc(),
-        )  # fmt: skip
-    return outcome(task, DONE, time.perf_counter() - begin, result=result)
+        return CRASHED, {
+            "error": f"{task.log}: {type(error).__name__}: {text}",
+            "details": traceback.format_exc(),
+        }
 
 
 @functools.lru_cache(maxsize=64)

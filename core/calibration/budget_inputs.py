@@ -107,7 +107,7 @@ def model_remainder(calibration: Calibration, parameters: float, noise: float) -
     """Return what the held-out poses show beyond parameters, arm and instrument."""
     held_out = len(calibration.held_out_after.vector) > 0
     chosen = calibration.held_out_after if held_out else calibration.after
-    wild = wild_readings(calibration)
+    wild = np.intersect1d(wild_readings(calibration), chosen.rows)
     errors = chosen.vector[~np.isin(chosen.rows, wild)]
     # of readings that show no place the parameters' share is not known: none is taken off
     share = parameters if held_out and calibration.readings.kind in KINDS else 0.0
@@ -116,7 +116,7 @@ def model_remainder(calibration: Calibration, parameters: float, noise: float) -
     where = "held-out poses" if held_out else "fitted poses (none were held out)"
     if len(wild):
         rows = ", ".join(str(int(r) + 1) for r in wild)
-        where += f", wild readings left out ({rows})"
+        where += f", without wild ones (reading {rows})"
     told = "nothing found beyond the lines above" if std == 0 else "what is beyond the lines above"
     return Input(
         "what the model does not explain", "A", "normal", std, "m", 1.0, float(errors.size),

@@ -2,8 +2,8 @@
 
 For n visits of one pose, with l_j the distance of the j-th attained position from their barycentre:
 AP_P is the distance of the barycentre from the commanded position, AP_x, AP_y, AP_z its components,
-RP_l = mean(l) + 3 S_l with S_l the standard deviation of the l_j (n - 1), RP_a = 3 S_a for each
-angle.
+RP_l = mean(l) + 3 S_l with S_l the standard deviation of the l_j (n - 1). For each angle a, AP_a is
+the mean's difference from the commanded one, RP_a is 3 S_a.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ class PoseAccuracy:
     after: Array  # (3,) the same against the calibrated one
     mean_distance: float  # m, of the visits from their barycentre
     deviation: float  # m, S_l
-    angles: Array | None  # (3,) rad, RP_a, RP_b, RP_c about the base's axes; None: not measured
+    turn: Array | None  # (3,) rad, AP_a, AP_b, AP_c after, about the base's axes; None: unmeasured
+    angles: Array | None  # (3,) rad, RP_a, RP_b, RP_c about the base's axes; None: unmeasured
     steered: bool  # True: encoders differed, and what the model makes of that was taken out
 
     @property
@@ -93,20 +94,18 @@ def _accuracy(calibration: Calibration, rows: Index, before: Array, after: Array
     frame = calibration.stations[int(readings.station[0])]
     attained = frame.in_base(readings.value[:, :3])
     steered = bool(np.ptp(readings.q, axis=0).max() > SAME)
+    wanted = calibration.model.predict(readings.q, readings.loads)
     if steered:
-        wanted = calibration.model.predict(readings.q, readings.loads).position
-        attained = attained - (wanted - wanted.mean(axis=0))
+        attained = attained - (wanted.position - wanted.position.mean(axis=0))
     distance = np.linalg.norm(attained - attained.mean(axis=0), axis=1)
-    angles = None
+    turn = angles = None
     if readings.kind == "pose":
-        angles = _angles(frame.rotation_in_base(rotation_matrix(readings.value[:, 3:])))
+        rotation = frame.rotation_in_base(rotation_matrix(readings.value[:, 3:]))
+        # small angles add up like a vector, so that no order of rotations has to be chosen
+        turns = rotation_vector(rotation @ np.swapaxes(wanted.rotation, 1, 2))
+        turn, angles = turns.mean(axis=0), 3 * turns.std(axis=0, ddof=1)
     return PoseAccuracy(
         int(readings.pose[0]), int(readings.load[0]), len(rows), before.mean(axis=0),
-        after.mean(axis=0), float(distance.mean()), float(distance.std(ddof=1)), angles, steered,
+        after.mean(axis=0), float(distance.mean()), float(distance.std(ddof=1)), turn, angles,
+        steered,
     )  # fmt: skip
-
-
-def _angles(rotation: Array) -> Array:
-    """Return 3 standard deviations (3,) of rotations (n, 3, 3) about the base's axes, rad."""
-    turns = rotation_vector(rotation @ rotation[0].T)
-    return np.asarray(3 * turns.std(axis=0, ddof=1))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from core.effects.effect import Effect, Parameter, Site, Term
-from core.rotation import rotation_matrix
+from core.rotation import one_rotation_matrix
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -30,7 +31,13 @@ class LinkForm(NamedTuple):
 
 def link_form(arm: Arm, joint: int) -> LinkForm:
     """Return the common normal of link ``joint`` (from 1), in the frame of that link."""
-    step = arm.link_in_link[joint]
+    return _form(arm.link_in_link[joint].tobytes())
+
+
+@lru_cache(maxsize=256)  # a fit asks for the few links of one arm thousands of times
+def _form(link: bytes) -> LinkForm:
+    """Return the form of a link from the bytes of its transform (4, 4)."""
+    step = np.frombuffer(link).reshape(4, 4)
     z, next_z, p = np.array([0, 0, 1.0]), step[:3, 2], step[:3, 3]
     sine = float(np.hypot(next_z[0], next_z[1]))
     parallel = sine < PARALLEL
@@ -83,12 +90,12 @@ class LinkGeometry(Effect):
         assert joint is not None
         form = link_form(arm, joint)
         a, d, alpha = term.values[:3]
-        twist = rotation_matrix(form.x * alpha)
+        twist = one_rotation_matrix(form.x * alpha)
         old = chain.rotation[joint].copy()
         turned = twist @ old
         if form.parallel and len(term.values) > 3:
             y_in_link = twist @ np.cross(form.next_z, form.x)
-            turned = rotation_matrix(y_in_link * term.values[3]) @ turned
+            turned = one_rotation_matrix(y_in_link * term.values[3]) @ turned
         chain.rotation[joint] = turned
         moved = form.shift * (twist @ form.next_z - form.next_z)
         chain.position[joint] += d * form.z + a * form.x + moved

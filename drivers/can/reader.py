@@ -16,6 +16,7 @@ from drivers.can.sample import Assembler, Sample
 from drivers.can.settings import CanSettings
 
 Vector = NDArray[np.float64]
+LONGEST_WAY, LEAST_WAY = 4.0, 0.03  # cycles, s: what has lain here for longer is not fresh
 BACKLOG_TIME = 0.05  # s that reading what has piled up may take
 
 
@@ -39,6 +40,8 @@ class FrameReader:
         self.identifiers: set[int] = set()  # heard at all, for messages
         self._targets = {f.key: f for f in profile.setpoint if f.joints}
         self._motors = sum(len(incoming.enabled) for incoming in profile.incoming.values())
+        self._longest = max(LONGEST_WAY / settings.rate, LEAST_WAY)  # s
+        self._empty = 0.0  # s, monotonic: when nothing was waiting to be read
         self._foreign_wire = np.full(profile.n, np.nan)
 
     def open(self) -> None:
@@ -54,6 +57,7 @@ class FrameReader:
         ]
         in_kernel = self._settings.interface == "socketcan"
         self.bus = open_bus(self._settings, filters if in_kernel else None)
+        self._empty = time.monotonic()
 
     def close(self) -> None:
         """Close the bus; may be repeated."""
@@ -67,17 +71,28 @@ class FrameReader:
         Raises LinkError where the bus has gone.
         """
         frame = self._receive(timeout)
-        return None if frame is None else self._take(frame, time.monotonic())
+        if frame is None:
+            return None
+        return self._fresh(self._take(frame, time.monotonic()), self._empty)
 
     def newest(self) -> Sample | None:
         """Take everything that has piled up; returns the newest complete sample of it."""
         newest, until = None, time.monotonic() + BACKLOG_TIME
+        empty = self._empty  # before all that is read now
         while (frame := self._receive(0.0)) is not None:
             now = time.monotonic()
             newest = self._take(frame, now) or newest
             if now > until:
                 break
-        return newest
+        return self._fresh(newest, empty)
+
+    def _fresh(self, sample: Sample | None, empty: float) -> Sample | None:
+        """Return a sample unless it may have lain here for long, this process being late.
+
+        ``empty`` (s, monotonic): when nothing was waiting, the last time before it came.
+        """
+        late = sample is not None and sample.received - empty > self._longest
+        return None if late else sample
 
     def listen(self, seconds: float) -> Sample | None:
         """Take frames for a while; returns the newest complete sample of them."""
@@ -90,7 +105,11 @@ class FrameReader:
         if self.bus is None:
             raise LinkError(f"{self._settings.where()}: found no bus, expected connect() first")
         try:
-            return self.bus.recv(timeout)
+            asked = time.monotonic()
+            if (frame := self.bus.recv(0.0)) is not None:
+                return frame
+            self._empty = asked
+            return self.bus.recv(timeout) if timeout > 0.0 else None
         except Exception as error:  # CanError, OSError, serial's, or a broken text on the wire
             raise LinkError(f"{self._settings.where()}: {first_line(error)}") from None
 

@@ -125,16 +125,13 @@ class ModbusDriver(Driver):
 
         An answer that was long under way, or lay here while this process stood still, is none.
         """
+        if not self.transport.is_open:
+            self.transport.open()  # raises LinkError where nobody is there any more
         asked = time.monotonic()
         try:
             sample = self._decoder.decode(self._read_blocks())
         except StaleStateError:
-            self.transport.open()  # raises LinkError where nobody is there any more
             return None
-        except InvalidStateError:
-            if not self.transport.is_open:
-                self.transport.open()
-            raise
         return None if time.monotonic() - asked > self._longest_answer else sample
 
     def _read_blocks(self) -> dict[Block, Sequence[int]]:

@@ -152,6 +152,17 @@ def test_what_takes_the_watchdog_too_long_to_hear_lets_nothing_old_leave(bench: 
     assert bench.count("late") == 1
 
 
+def test_a_process_that_was_stopped_while_it_sent_says_so_and_ends_the_motion(
+    bench: Bench,
+) -> None:
+    bench.driver.write_setpoint = lambda _: time.sleep(0.03)  # type: ignore[method-assign]
+    state = bench.state()
+    expiry = time.monotonic() + 0.02
+    assert bench.writing.write(state, Q, bench.loads.update(state), expiry) is not None
+    assert bench.supervisor.state == State.HOLDING
+    assert bench.count("overrun") == 1
+
+
 def test_a_setpoint_that_left_in_part_is_followed_by_a_whole_one(bench: Bench) -> None:
     bench.cycles(10)
     bench.driver.error = PartialWriteError("1 of 3 frames")

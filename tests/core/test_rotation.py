@@ -7,7 +7,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from core.rotation import rotation_matrix, rotation_vector, rpy_matrix, skew, transform
+from core.rotation import (
+    one_rotation_matrix,
+    rotation_matrix,
+    rotation_vector,
+    rpy_matrix,
+    skew,
+    transform,
+)
 
 number = st.floats(-3, 3)
 vectors = arrays(float, 3, elements=number)
@@ -87,3 +94,13 @@ def test_a_transform_turns_first_and_shifts_then():
     T = transform(rotation_matrix(np.array([0, 0, np.pi / 2])), np.array([1.0, 2, 3]))
     np.testing.assert_allclose(T @ [1, 0, 0, 1], [1, 3, 3, 1], atol=1e-15)
     np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-12, 1e-8, 1e-3, 1.0, np.pi, 10.0])
+def test_one_matrix_in_plain_numbers_is_that_of_many(size):
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        vector = size * rng.normal(size=3)
+        np.testing.assert_allclose(
+            one_rotation_matrix(vector), rotation_matrix(vector), rtol=0, atol=1e-14
+        )

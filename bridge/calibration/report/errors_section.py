@@ -38,6 +38,8 @@ def _caption(material: Material) -> str:
         f"On {material.judged_words}. Distribution: the share of the readings whose error is at "
         "most so large, errors in powers of ten."
     )
+    if material.wild:
+        text += " The table counts wild readings too."
     if len(material.axes) > 1:
         noise = mm(material.calibration.noise)
         text += f" Arm and instrument together scatter by {noise} along an axis (1 sigma)."

@@ -4,15 +4,10 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
-from functools import cache
-from html import escape
-from importlib.resources import as_file, files
 
 from reportlab.lib.colors import HexColor
 from reportlab.lib.pagesizes import A4
 from reportlab.lib.units import mm
-from reportlab.pdfbase import pdfmetrics
-from reportlab.pdfbase.ttfonts import TTFont
 from reportlab.pdfgen.canvas import Canvas
 from reportlab.platypus import (
     BaseDocTemplate,
@@ -38,9 +33,10 @@ from bridge.calibration.report.blocks import (
     Tiles,
     Verdict,
 )
-from bridge.calibration.report.pdf_drawing import BOLD, PLAIN, DrawnRow
+from bridge.calibration.report.pdf_drawing import DrawnRow
 from bridge.calibration.report.pdf_style import STYLES, badge_markup
 from bridge.calibration.report.pdf_table import columns_table, table, tiles_table
+from bridge.calibration.report.pdf_text import PLAIN, load_fonts, markup
 
 SIDE, TOP, BOTTOM = 18 * mm, 16 * mm, 18 * mm
 WIDTH = A4[0] - 2 * SIDE
@@ -50,7 +46,7 @@ WHOLE = 14  # rows of a table up to which it is not divided between pages
 
 def pdf(document: Document) -> bytes:
     """Return the whole file."""
-    _load_fonts()
+    load_fonts()
     file = io.BytesIO()
     template = BaseDocTemplate(
         file, pagesize=A4, title=document.title, author="Gapbridge", subject=document.subtitle,
@@ -59,8 +55,8 @@ def pdf(document: Document) -> bytes:
     frame = Frame(SIDE, BOTTOM, WIDTH, A4[1] - TOP - BOTTOM, 0, 0, 0, 0)
     template.addPageTemplates([PageTemplate("page", [frame], onPage=_footer(document.footer))])
     story: list[Flowable] = [
-        Text(escape(document.title), STYLES["title"]),
-        Text(escape(document.subtitle), STYLES["subtitle"]),
+        Text(markup(document.title), STYLES["title"]),
+        Text(markup(document.subtitle), STYLES["subtitle"]),
     ]
     for part in document.parts:
         story += _part(part)
@@ -68,21 +64,14 @@ def pdf(document: Document) -> bytes:
     return file.getvalue()
 
 
-@cache
-def _load_fonts() -> None:
-    folder = files("bridge.calibration.report").joinpath("fonts")
-    for name, file in ((PLAIN, "DejaVuSansCondensed.ttf"), (BOLD, "DejaVuSansCondensed-Bold.ttf")):
-        with as_file(folder.joinpath(file)) as path:
-            pdfmetrics.registerFont(TTFont(name, str(path)))
-    pdfmetrics.registerFontFamily(PLAIN, PLAIN, BOLD, PLAIN, BOLD)
-
-
 def _footer(text: str) -> Callable[[Canvas, BaseDocTemplate], None]:
     def draw(canvas: Canvas, template: BaseDocTemplate) -> None:
         canvas.saveState()
+        line = Text(markup(text), STYLES["tile_label"])
+        line.wrap(WIDTH - 60, 20)
+        line.drawOn(canvas, SIDE, 9.3 * mm)
         canvas.setFont(PLAIN, 7.5)
         canvas.setFillColor(HexColor("#5b6770"))
-        canvas.drawString(SIDE, 10 * mm, text)
         canvas.drawRightString(A4[0] - SIDE, 10 * mm, f"page {canvas.getPageNumber()}")
         canvas.restoreState()
 
@@ -91,9 +80,9 @@ def _footer(text: str) -> Callable[[Canvas, BaseDocTemplate], None]:
 
 def _part(part: Part) -> list[Flowable]:
     """Return a section; its heading never stands alone at the foot of a page."""
-    head: list[Flowable] = [Text(escape(part.title), STYLES["h2"])]
+    head: list[Flowable] = [Text(markup(part.title), STYLES["h2"])]
     if part.about:
-        head.append(Text(escape(part.about), STYLES["note"]))
+        head.append(Text(markup(part.about), STYLES["note"]))
     kept: list[list[Flowable]] = [head]
     for block in part.blocks:
         groups = _block(block)
@@ -115,14 +104,14 @@ def _is_heading(flowable: Flowable) -> bool:
 def _block(block: Block) -> list[list[Flowable]]:
     """Return what a block is made of, in groups that no page's end divides."""
     if isinstance(block, Paragraph):
-        return [[Text(escape(block.text), STYLES[block.kind or "text"])]]
+        return [[Text(markup(block.text), STYLES[block.kind or "text"])]]
     if isinstance(block, Heading):
-        return [[Text(escape(block.text), STYLES["h3"])]]
+        return [[Text(markup(block.text), STYLES["h3"])]]
     if isinstance(block, Bullets):
-        return [[Text(escape(i), STYLES["bullet"], bulletText="•")] for i in block.items]
+        return [[Text(markup(i), STYLES["bullet"], bulletText="•")] for i in block.items]
     if isinstance(block, Verdict):
         word = Text(badge_markup(block.badge), STYLES["verdict"])
-        return [[word, Text(escape(block.text), STYLES["lead"])]]
+        return [[word, Text(markup(block.text), STYLES["lead"])]]
     if isinstance(block, Tiles):
         return [[tiles_table(block, WIDTH), Spacer(1, 8)]]
     if isinstance(block, Columns):
@@ -140,5 +129,5 @@ def _pictures(block: Pictures) -> list[list[Flowable]]:
         [DrawnRow(block.drawings[i : i + 2])] for i in range(0, len(block.drawings), 2)
     ]
     if block.caption:
-        rows[-1].append(Text(escape(block.caption), STYLES["note"]))
+        rows[-1].append(Text(markup(block.caption), STYLES["note"]))
     return rows

@@ -7,8 +7,7 @@ from reportlab.pdfgen.canvas import Canvas
 from reportlab.platypus import Flowable
 
 from bridge.calibration.report.drawing import Circle, Drawing, Line, Rectangle, Shape, Stroke, Text
-
-PLAIN, BOLD = "Gapbridge", "Gapbridge-Bold"
+from bridge.calibration.report.pdf_text import BOLD, PLAIN
 
 
 class DrawnRow(Flowable):

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from html import escape
 from typing import Any
 
 from reportlab.lib.colors import HexColor
 from reportlab.lib.styles import ParagraphStyle
 
 from bridge.calibration.report.blocks import Badge
-from bridge.calibration.report.pdf_drawing import BOLD, PLAIN
+from bridge.calibration.report.pdf_text import BOLD, PLAIN, markup
 
 INK, SOFT = HexColor("#1c2730"), HexColor("#5b6770")
 GROUNDS = {"good": ("#e2f4e9", "#1d6b42"), "doubtful": ("#fdf0d9", "#8a5a0b"),
@@ -49,5 +48,5 @@ def badge_markup(badge: Badge) -> str:
     ground, ink = GROUNDS[badge.kind]
     return (
         f'<font name="{BOLD}" color="{ink}" backColor="{ground}">'
-        f"&nbsp;{escape(badge.text)}&nbsp;</font>"
+        f"&nbsp;{markup(badge.text)}&nbsp;</font>"
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from html import escape
 from typing import Any
 
 from reportlab.lib.colors import HexColor
@@ -12,6 +11,7 @@ from reportlab.platypus import Table as Grid
 
 from bridge.calibration.report.blocks import Badge, Bar, Cell, Columns, Pairs, Strong, Table, Tiles
 from bridge.calibration.report.pdf_style import STYLES, badge_markup
+from bridge.calibration.report.pdf_text import markup
 
 LINE, RULE = HexColor("#e3e8ec"), HexColor("#9aa5b1")
 Command = tuple[str, tuple[int, int], tuple[int, int], *tuple[Any, ...]]
@@ -23,7 +23,7 @@ def table(block: Table, width: float) -> Flowable:
     shares = block.widths or (1.0,) * len(block.heads)
     widths = [width * share / sum(shares) for share in shares]
     heads = [
-        Paragraph(escape(h), STYLES["head_number" if i in block.numbers else "head"])
+        Paragraph(markup(h), STYLES["head_number" if i in block.numbers else "head"])
         for i, h in enumerate(block.heads)
     ]
     first_sum = len(block.rows) - block.sums
@@ -49,9 +49,9 @@ def tiles_table(block: Tiles, width: float) -> Flowable:
     cells = [
         [
             [
-                Paragraph(escape(t.label), STYLES["tile_label"]),
-                Paragraph(escape(t.value), STYLES["tile_value"]),
-                Paragraph(escape(t.note), STYLES["tile_label"]),
+                Paragraph(markup(t.label), STYLES["tile_label"]),
+                Paragraph(markup(t.value), STYLES["tile_value"]),
+                Paragraph(markup(t.note), STYLES["tile_label"]),
             ]
             for t in row
         ]
@@ -72,7 +72,7 @@ def columns_table(block: Columns, width: float) -> Flowable:
     """Return pairs side by side."""
     each = width / len(block.columns)
     cells = [
-        [Paragraph(escape(p.title), STYLES["h3"]), _pairs(p, each - 14)] if p.title else
+        [Paragraph(markup(p.title), STYLES["h3"]), _pairs(p, each - 14)] if p.title else
         [_pairs(p, each - 14)]
         for p in block.columns
     ]  # fmt: skip
@@ -85,7 +85,7 @@ def columns_table(block: Columns, width: float) -> Flowable:
 
 def _pairs(block: Pairs, width: float) -> Flowable:
     rows = [
-        [Paragraph(escape(k), STYLES["name"]), Paragraph(escape(v), STYLES["cell"])]
+        [Paragraph(markup(k), STYLES["name"]), Paragraph(markup(v), STYLES["cell"])]
         for k, v in block.pairs
     ]
     style = [
@@ -100,7 +100,7 @@ def _cell(cell: Cell, number: bool, strong: bool) -> Flowable:
         return _Bar(cell)
     if isinstance(cell, Badge):
         return Paragraph(badge_markup(cell), STYLES["cell"])
-    text = escape(cell.text if isinstance(cell, Strong) else cell)
+    text = markup(cell.text if isinstance(cell, Strong) else cell)
     if strong or isinstance(cell, Strong):
         text = f"<b>{text}</b>"
     return Paragraph(text, STYLES["number" if number else "cell"])
@@ -112,7 +112,7 @@ class _Bar(Flowable):
     def __init__(self, bar: Bar) -> None:
         super().__init__()
         self.share = min(max(bar.share, 0.0), 1.0) if math.isfinite(bar.share) else 0.0
-        self.text = Paragraph(escape(bar.text), STYLES["cell"])
+        self.text = Paragraph(markup(bar.text), STYLES["cell"])
 
     def wrap(self, available_width: float, available_height: float) -> tuple[float, float]:
         """Return the size that the bar takes, pt."""

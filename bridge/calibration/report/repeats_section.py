@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bridge.calibration.report.blocks import Block, Paragraph, Table
 from bridge.calibration.report.figures import counted, fixed, mm, mrad, plain
@@ -51,15 +52,19 @@ def _table(found: tuple[PoseAccuracy, ...]) -> Table:
         row = [f"pose {p.pose + 1}", str(p.load + 1), str(p.visits), mm(before), mm(after)]
         row += [_axes(p), mm(p.repeatability)]
         if turning:
-            row.append("–" if p.angles is None else mrad(float(np.max(p.angles))))
+            row += [_largest(p.turn), _largest(p.angles)]
         rows.append(row)
     heads = ["pose", "load", "visits", "AP before", "AP after", "AP after along x, y, z (mm)",
              "RP"]  # fmt: skip
     widths = [0.6, 0.6, 0.7, 1.1, 1.1, 2.2, 1.0]
     if turning:
-        heads.append("RP of angles, largest")
-        widths.append(1.2)
+        heads += ["AP of angles after", "RP of angles"]
+        widths += [1.1, 1.1]
     return Table(tuple(heads), rows, tuple(widths), tuple(range(1, len(heads))))
+
+
+def _largest(angles: NDArray[np.float64] | None) -> str:
+    return "–" if angles is None else mrad(float(np.abs(angles).max()))
 
 
 def _axes(p: PoseAccuracy) -> str:
@@ -78,6 +83,8 @@ def _note(found: tuple[PoseAccuracy, ...]) -> str:
         f"that a standard deviation is itself known to about {plain(round(unsure))} %. RP includes "
         "the instrument's noise."
     )
+    if any(p.angles is not None for p in found):
+        text += " Of the three angles the largest is told."
     if any(p.steered for p in found):
         text += (
             " Where the arm was brought back by hand, what the encoders showed of it was taken out."

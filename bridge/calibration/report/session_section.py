@@ -8,7 +8,7 @@ from bridge.calibration.report.blocks import Block, Bullets, Columns, Heading, P
 from bridge.calibration.report.facts import SessionFacts
 from bridge.calibration.report.figures import load_words, mm, plain
 from bridge.calibration.report.material import Material
-from bridge.calibration.report.names import spoken
+from bridge.calibration.report.names import sentence
 from bridge.calibration.report.section import Section
 
 KINDS = {
@@ -50,7 +50,7 @@ def facts_blocks(
             Pairs(tuple(_instrument(facts, places)), "Instrument"),
         ))
     ]  # fmt: skip
-    remarks = tuple(spoken(text) for text in (*facts.remarks, *notes))
+    remarks = tuple(sentence(text) for text in (*facts.remarks, *notes))
     return [*blocks, Heading("Remarks"), Bullets(remarks)] if remarks else blocks
 
 
@@ -75,6 +75,7 @@ def _front(facts: SessionFacts) -> list[tuple[str, str]]:
 def _instrument(facts: SessionFacts, stations: int) -> list[tuple[str, str]]:
     tool = facts.instrument
     noise = error = ""
+    far = tool.distance > 0 and tool.kind in ("position", "pose", "distance")
     if tool.kind not in ("wrench", "touch"):
         noise = f"{mm(tool.sigma)} (1 sigma of one coordinate)"
     if tool.error is not None:
@@ -87,7 +88,7 @@ def _instrument(facts: SessionFacts, stations: int) -> list[tuple[str, str]]:
         ("measures", KINDS.get(tool.kind, tool.kind)),
         ("noise, declared", noise),
         ("largest permissible error", error),
-        ("distance", f"{plain(tool.distance)} m" if tool.distance else ""),
+        ("distance", f"{plain(tool.distance)} m" if far else ""),
         ("places", f"{stations}" if stations > 1 else ""),
     ]  # fmt: skip
     return [(name, text) for name, text in given if text]

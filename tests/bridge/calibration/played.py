@@ -108,7 +108,7 @@ def positions(plan: Plan, seed: int = 0, frame: Registration | None = FRAME) -> 
 
 
 def typed(value: Array, factor: float = 1.0) -> str:
-    return " ".join(f"{v * factor:.6f}" for v in value)
+    return " ".join(f"{v * factor:.9f}" for v in value)
 
 
 def script(plan: Plan, readings: Sequence[str]) -> list[str]:

@@ -86,18 +86,28 @@ def test_mistakes_on_the_way_leave_the_same_calibration(
     plan = plan_in(tmp_path / "s")
     good, after = positions(plan), positions(plan, 1, KNOCKED)
     wrong = good[6] + np.array([0.0, 0.09, 0.0])
-    first = ["", *(typed(v) for v in good[:5]), "1 2", typed(good[5], 1e3), "take",
-             typed(wrong), "", "undo", typed(good[5]), "note it rains"]  # fmt: skip
+    first = ["", *(typed(v) for v in good[:5]), "1 2", typed(good[5], 1e3)]
+    first += [
+        typed(good[5], 1e-3),
+        "take",
+        typed(wrong),
+        "",
+        typed(good[6]),
+        "undo",
+        typed(good[6]),
+    ]
+    first += ["note the door stood open"]
     played = play(cell, "--session", tmp_path / "s", lines=first)
     assert played.code == 0
-    assert "millimetres taken for metres" in played.out
+    assert "is the unit right?" in played.out
+    assert "metres taken for millimetres" in played.out
     assert "y alone is off" in played.out
     assert "found 2 numbers" in played.out
     assert "go on with: gapbridge calibrate" in played.out
-    assert len(_kept(tmp_path)) == 6
+    assert len(_kept(tmp_path)) == 7
     load = [p.load for p in plan.poses]
-    last = load.index(1) - 1  # the tracker is knocked before the last stop with the first load
-    second = [*(typed(v) for v in good[6:last]), typed(after[last]), "back"]
+    last = next(k for k in range(9, len(load)) if len(set(load[k - 3 : k + 1])) == 1)
+    second = [*(typed(v) for v in good[7:last]), typed(after[last]), "back"]
     second += [typed(after[k]) for k in (last - 1, last - 2, last - 3)]
     second += ["", *script_after(load, after, last), "yes"]
     played = play(cell, "--session", tmp_path / "s", "--apply", tmp_path / "new.yaml", lines=second)
@@ -161,7 +171,6 @@ def test_an_ended_input_and_quit_end_in_order_and_tell_how_to_go_on(tmp_path: Pa
         ([], {"instrument": "{kind: sphere}"}, "calibration.instrument_at: found nothing"),
         ([], {"instrument": "{kind: file, unit: mm, file: none/x.csv}"}, "no such file"),
         (["--apply", "none/new.yaml"], {}, "found no folder none"),
-        (["--poses", "6"], {"held_out": 0}, "poses"),
     ],
 )
 def test_unusable_input_is_refused_in_one_line(

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from core.calibration.pose_accuracy import pose_accuracies
 from core.registration import Registration
-from core.rotation import rotation_matrix
+from core.rotation import rotation_matrix, rotation_vector
 
 MM = 1e-3
 
@@ -69,11 +69,14 @@ def test_what_a_hand_made_of_the_command_is_no_repeatability():
 
 
 def test_angles_repeat_within_three_deviations_about_each_axis():
-    turn = np.array([[0.01, 0, 0], [-0.01, 0, 0], [0.01, 0, 0], [-0.01, 0, 0]]) / 10
-    calibration = hand_made(np.zeros((4, 3)), pose=[0] * 4, kind="pose", turn=turn)
-    (found,) = pose_accuracies(calibration)
-    assert found.angles is not None
-    assert found.angles == pytest.approx([3 * np.std(turn[:, 0], ddof=1), 0, 0], abs=1e-12)
+    # about x, the flange is off by 3, -1, 3, -1 mrad: 1 in the mean, 2 around it
+    off = np.outer([3e-3, -1e-3, 3e-3, -1e-3], [1.0, 0, 0])
+    plain = hand_made(np.zeros((4, 3)), pose=[0] * 4)
+    rotation = plain.model.predict(plain.readings.q).rotation
+    turn = rotation_vector(rotation_matrix(off) @ rotation)
+    (found,) = pose_accuracies(hand_made(np.zeros((4, 3)), pose=[0] * 4, kind="pose", turn=turn))
+    assert found.turn == pytest.approx([1e-3, 0, 0], abs=1e-9)
+    assert found.angles == pytest.approx([3 * 2e-3 * np.sqrt(4 / 3), 0, 0], abs=1e-9)
 
 
 def test_instruments_that_show_no_place_have_neither():

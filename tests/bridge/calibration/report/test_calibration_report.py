@@ -50,6 +50,16 @@ def test_names_are_written_as_they_are_and_nothing_of_them_is_markup(written):
     assert "M. Łukasik" in words
 
 
+def test_names_in_other_scripts_are_not_lost(tmp_path):
+    names = {"customer": "株式会社ロボット", "operator": "Елена Ψαρρά", "place": "서울 2"}
+    facts = session(cell="机器人 3", **names)
+    page, paper = write_report(calibration(), None, facts, tmp_path)
+    html, words = page.read_text("utf-8"), text_of(paper)
+    for name in (*names.values(), "机器人 3"):
+        assert name in html
+        assert name in words
+
+
 def test_nothing_is_loaded_from_outside(written):
     html = written[0].read_text("utf-8")
     assert "<script" not in html

@@ -1,0 +1,146 @@
+"""Verification months later: does the promise hold, and if not, what moved."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.blind.arms import ARMS
+from benchmarks.blind.measuring import Instrument
+from benchmarks.blind.mechanics import RealArm
+from benchmarks.calibration.drawings import model_of, real_arm
+from benchmarks.calibration.laid_out import (
+    Layout,
+    arm_with,
+    draw_values,
+    instrument_for,
+    lay_out,
+    readings_of,
+    with_values,
+)
+from core.calibration.fit import calibrate
+from core.calibration.observables import make_observable
+from core.calibration.parameters import Parameters
+from core.calibration.promise import document_of, effects_of, promise_in
+from core.calibration.readings import Readings
+from core.calibration.result import Calibration
+from core.calibration.verify import verify
+from core.errors import ExcitationError, InputError
+from core.metrology import Metrology
+
+KIND = ARMS["cobot10"]
+LAYOUT = Layout(poses=18, held_out=12, repeated=3)
+METROLOGY = Metrology(registered=False, sigma=LAYOUT.sigma)
+Calibrated = tuple[Calibration, dict[str, Any], RealArm, Instrument]
+
+
+@pytest.fixture(scope="module")
+def calibrated() -> Calibrated:
+    rng = np.random.default_rng(1)
+    model = model_of(real_arm(KIND))
+    parameters = Parameters.of(model, observable=make_observable("position"))
+    real = arm_with(KIND, draw_values(KIND, parameters.names, rng))
+    instrument = instrument_for(KIND, LAYOUT, rng)
+    readings = readings_of(real, lay_out(KIND, LAYOUT, rng), instrument, rng)
+    found = calibrate(model, readings, parameters, METROLOGY, diagnose=False)
+    document = json.loads(json.dumps(document_of(found, METROLOGY.sigma)))
+    return found, document, real, instrument
+
+
+def _again(real: RealArm, instrument: Instrument, seed: int = 0, poses: int = 4) -> Readings:
+    """Return readings of a later day: new poses, the instrument elsewhere."""
+    rng = np.random.default_rng([seed, 9])
+    laid = lay_out(KIND, Layout(poses=poses, repeated=0, held_out=0), rng)
+    elsewhere = replace(instrument, position=rng.uniform(-2, 2, 3))
+    return readings_of(real, laid, elsewhere, rng)
+
+
+def test_an_arm_that_did_not_change_holds(calibrated: Calibrated) -> None:
+    found, document, real, instrument = calibrated
+    chances = [
+        verify(found.model, _again(real, instrument, seed), document, METROLOGY).chance
+        for seed in range(12)
+    ]
+    assert min(chances) > 1e-3
+    assert 0.15 < np.mean(chances) < 0.85  # neither too proud nor too shy
+
+
+def test_a_joint_whose_zero_moved_is_named_with_how_far(calibrated: Calibrated) -> None:
+    found, document, real, instrument = calibrated
+    bumped = with_values(real, {"joint_offset_3": 4e-4})
+    seen = verify(found.model, _again(bumped, instrument), document, METROLOGY)
+    assert not seen.holds
+    assert seen.moved is not None
+    assert seen.moved.name == "joint_offset_3"
+    low, high = seen.moved.estimates[0].interval
+    assert low < 4e-4 < high
+    assert "joint 3" in seen.verdict
+
+
+def test_a_tool_that_was_bent_is_named(calibrated: Calibrated) -> None:
+    found, document, real, instrument = calibrated
+    bent = with_values(real, {"tool_frame_x": 4e-4, "tool_frame_z": -2e-4})
+    seen = verify(found.model, _again(bent, instrument), document, METROLOGY)
+    assert seen.moved is not None
+    assert seen.moved.name == "tool_frame"
+
+
+def test_one_bad_reading_is_not_blamed_on_the_arm(calibrated: Calibrated) -> None:
+    found, document, real, instrument = calibrated
+    readings = _again(real, instrument)
+    value = readings.value.copy()
+    value[4] += [1e-3, 0, 0]
+    seen = verify(found.model, replace(readings, value=value), document, METROLOGY)
+    assert not seen.holds
+    assert seen.moved is not None
+    assert seen.moved.name == "reading_5"
+
+
+def test_what_no_single_change_explains_asks_for_a_new_calibration(calibrated: Calibrated) -> None:
+    found, document, real, instrument = calibrated
+    rng = np.random.default_rng(3)
+    other = with_values(real, {f"joint_offset_{j}": 1e-3 * rng.normal() for j in range(2, 6)})
+    seen = verify(found.model, _again(other, instrument, poses=6), document, METROLOGY)
+    assert not seen.holds
+    assert seen.moved is None
+    assert "calibrate anew" in seen.verdict
+
+
+def test_a_registered_instrument_that_was_knocked_is_named(calibrated: Calibrated) -> None:
+    found, document, real, instrument = calibrated
+    laid = lay_out(KIND, Layout(poses=4, repeated=0, held_out=0), np.random.default_rng(4))
+    place = found.stations[0]
+    here = replace(instrument, rotation=place.rotation, position=place.position)
+    readings = readings_of(real, laid, here, np.random.default_rng(5))
+    in_base = replace(readings, value=place.in_base(readings.value))
+    in_base = replace(in_base, value=in_base.value + np.array([2e-3, 0, 1e-3]))
+    seen = verify(found.model, in_base, document, Metrology(True, LAYOUT.sigma))
+    assert seen.moved is not None
+    assert seen.moved.name == "instrument"
+
+
+def test_too_few_readings_say_so(calibrated: Calibrated) -> None:
+    found, document, real, instrument = calibrated
+    with pytest.raises(ExcitationError, match="expected more poses"):
+        verify(found.model, _again(real, instrument)[np.arange(2)], document, METROLOGY)
+
+
+def test_a_document_that_is_none_is_named(calibrated: Calibrated) -> None:
+    document = calibrated[1]
+    with pytest.raises(InputError, match="schema"):
+        promise_in({"schema": "other"}, "calibration.json")
+    with pytest.raises(InputError, match="'noise'"):
+        promise_in({k: v for k, v in document.items() if k != "noise"}, "calibration.json")
+
+
+def test_effects_are_read_off_the_parameters_names() -> None:
+    assert effects_of(("joint_offset_2", "link_geometry_1_a", "joint_offset_3")) == (
+        "joint_offset",
+        "link_geometry",
+    )
+    with pytest.raises(InputError, match="nonsense"):
+        effects_of(("nonsense_1",))
