@@ -30,6 +30,7 @@ from bridge.report.words import number, percent, told
 
 SESSION_HEADS = ("poses", "gap with the cell", "with the fit", "foretold by the others")
 MICRO = 1e6
+DRAWN = 80  # arms in the picture
 
 
 def answer(together: Fitted) -> str:
@@ -114,11 +115,27 @@ def _arm(kind: FittedType, arm: FittedArm) -> list[Cell]:
             bar(own, percent(own), AFTER), far]  # fmt: skip
 
 
+def _drawn(kind: FittedType) -> Sequence[FittedArm]:
+    """Return the arms of the picture: of many those farthest from their type."""
+    if len(kind.arms) <= DRAWN:
+        return kind.arms
+    shown = kind.scatter.shown
+    far = [float(np.max(np.abs(a.fit.beside_type[shown]), initial=0.0)) for a in kind.arms]
+    return [kind.arms[i] for i in sorted(np.argsort(far)[-DRAWN:])]
+
+
+def _which(drawn: Sequence[FittedArm], kind: FittedType) -> str:
+    if len(drawn) == len(kind.arms):
+        return "Every arm's"
+    return f"The {len(drawn)} arms farthest from their type, of {len(kind.arms)}: each one's"
+
+
 def _picture(kind: FittedType) -> Figure:
     """Return each arm's flexibilities with their intervals; the menu says which."""
-    names = [arm.name for arm in kind.arms]
-    value = np.array([arm.fit.flexibility for arm in kind.arms]) * MICRO
-    std = np.array([arm.fit.std for arm in kind.arms]) * MICRO
+    drawn = _drawn(kind)
+    names = [arm.name for arm in drawn]
+    value = np.array([arm.fit.flexibility for arm in drawn]) * MICRO
+    std = np.array([arm.fit.std for arm in drawn]) * MICRO
     own = np.mean([arm.fit.own for arm in kind.arms], axis=0)
     order = sorted(
         range(len(kind.parameters)),
@@ -151,7 +168,8 @@ def _picture(kind: FittedType) -> Figure:
         {"xaxis": {"type": "category", "tickangle": -45 if len(names) > 12 else 0,
                    "automargin": True},
          "yaxis": {"title": {"text": first.title}, "rangemode": "tozero"}},
-        "Every arm's flexibility with what is believed of it; the dotted line is the type.", 400,
+        f"{_which(drawn, kind)} flexibility with what is believed of it; the dotted line is the "
+        "type.", 400,
         {"y": choices},
     )  # fmt: skip
 
