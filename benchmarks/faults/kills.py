@@ -13,7 +13,6 @@ import socket
 import sys
 import tempfile
 import time
-from collections import Counter
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -38,7 +37,7 @@ VICTIMS = ("daemon", "loop_main", "recording", "web", "metrics")
 class Deaths:
     """What came of killing."""
 
-    kills: Counter[str] = field(default_factory=Counter)
+    kills: dict[str, int] = field(default_factory=lambda: dict.fromkeys(VICTIMS, 0))
     longest_gone: dict[str, float] = field(default_factory=dict)  # s until it was there again
     most_lost: float = 0.0  # s of recording before a kill
     wrong: list[str] = field(default_factory=list)
@@ -159,7 +158,7 @@ def run_kills(count: int, seed: int, folder: Path, link: str, limit: float) -> D
                 scene.run.stop()
                 scene.begin()
             if sum(found.kills.values()) % 20 == 0:
-                click.echo(f"{dict(found.kills)}: {len(found.wrong)} wrong")
+                click.echo(f"{found.kills}: {len(found.wrong)} wrong")
             (folder / "kills.json").write_text(json.dumps(asdict(found)), encoding="utf-8")
     finally:
         scene.run.stop()

@@ -36,6 +36,13 @@ def matrix(rows: Iterable[Row], results: Sequence[Result]) -> str:
         for (key, link), found in by_case.items():
             if key == row.key:
                 lines.append(_line(row, link, found))
+    again, wrong = sum(r.again for r in results), sum(bool(r.wrong) for r in results)
+    broken = sum(r.violated for r in results)
+    lines += [
+        "",
+        f"{len(results)} faults made, {wrong} not as expected, {broken} with an invariant violated; "
+        f"{again} made again because the machine missed deadlines by itself.",
+    ]
     return "\n".join(lines)
 
 
