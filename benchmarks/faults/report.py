@@ -40,7 +40,7 @@ def matrix(rows: Iterable[Row], results: Sequence[Result]) -> str:
     broken = sum(r.violated for r in results)
     lines += [
         "",
-        f"{len(results)} faults made, {wrong} not as expected, {broken} with an invariant violated; "
+        f"{len(results)} faults made, {wrong} not as expected, {broken} with an invariant broken; "
         f"{again} made again because the machine missed deadlines by itself.",
     ]
     return "\n".join(lines)
