@@ -15,7 +15,7 @@ from bridge.calibration.book import Book
 from bridge.calibration.bringing import Bringing
 from bridge.calibration.conversation import Conversation
 from bridge.calibration.folders import begun_entry, check_begun, session_folder
-from bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
+from bridge.calibration.instruments.instrument import AnyInstrument, ReadingError, Surroundings
 from bridge.calibration.job import Job
 from bridge.calibration.jobs import make_job
 from bridge.calibration.joint_sources import make_joints
@@ -113,15 +113,26 @@ def _open(talk: Talk, stack: ExitStack, joints: JointSource) -> None:
         stack.enter_context(joints)
 
 
+def _begin(job: Job, joints: JointSource) -> Array:
+    """Return where the arm stands before the plan is made (n,), rad."""
+    n = job.cell.arm.n
+    here = joints.now()
+    while here is None:
+        try:
+            told = joints.stand(PlannedPose(0, np.full(n, np.nan), 0, np.zeros(n))).q
+        except ReadingError as error:
+            job.talk.warn(str(error))
+            continue
+        if np.isfinite(told).all():
+            here = told
+        else:
+            job.talk.warn("found nothing, expected where the arm stands now: the plan begins there")
+    return here
+
+
 def _make_plan(job: Job, joints: JointSource) -> None:
     talk, book = job.talk, job.book
-    begin = None
-    if job.from_here:
-        n = job.cell.arm.n
-        here = joints.now()
-        begin = (
-            joints.stand(PlannedPose(0, np.zeros(n), 0, np.zeros(n))).q if here is None else here
-        )
+    begin = _begin(job, joints) if job.from_here else None
     with talk.waiting("planning") as tell:
         plan = job.plan(begin, lambda text, share: tell(f"planning: {text} ({share:.0%})"))
     book.keep_plan(plan)
