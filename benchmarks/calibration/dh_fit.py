@@ -58,9 +58,11 @@ def fit_dh(model: Model, q: Array, measured: Array) -> DhFit:
     begin = start.values.copy()
     begin[-6:-3] = frame.position
     begin[-3:] = Rotation.from_matrix(frame.rotation).as_rotvec()
-    found = least_squares(
-        lambda v: (DhFit(v).predict(q) - measured).ravel(), begin, x_scale="jac", method="trf"
-    )
+
+    def left(values: Array) -> Array:
+        return np.asarray((DhFit(values).predict(q) - measured).ravel())
+
+    found = least_squares(left, begin, x_scale="jac", method="trf")
     return DhFit(found.x)
 
 

@@ -17,11 +17,11 @@ from typing import Any
 def main(folder: Path) -> dict[str, Any]:
     """Return the held-out rms (m, of one coordinate), the time and what was fitted."""
     import numpy as np
-    from figaroh.calibration.base_calibration import BaseCalibration
-    from figaroh.calibration.calibration_tools import calc_updated_fkm
-    from figaroh.tools.robot import Robot
+    from figaroh.calibration.base_calibration import BaseCalibration  # type: ignore[import-not-found]
+    from figaroh.calibration.calibration_tools import calc_updated_fkm  # type: ignore[import-not-found]
+    from figaroh.tools.robot import Robot  # type: ignore[import-not-found]
 
-    class Calibration(BaseCalibration):
+    class Calibration(BaseCalibration):  # type: ignore[misc]
         """The library's own calibration, with its own residuals."""
 
         def cost_function(self, var: Any) -> Any:
