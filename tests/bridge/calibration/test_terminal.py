@@ -144,21 +144,20 @@ def test_the_arm_is_driven_after_a_yes_and_ctrl_c_tells_how_to_go_on(tmp_path: P
     # where the arm begins it hangs low: above a near floor no straight way would be free
     cell.write_text(cell.read_text().replace("floor: 0.1", "floor: -1.0"), encoding="utf-8")
     hands = Hands(host)
-    with ServedCell(cell, 3):
-        with Terminal(cell, "--session", tmp_path / "s", "--move") as terminal:
-            assert "hangs there" in str(terminal.question())
-            heavy = terminal.shown.rfind("· 9.5 kg") > terminal.shown.rfind("· 1.5 kg")
-            hands.hang(*LOADS[heavy])
-            before = hands.bench("truth")
-            terminal.type("")
-            assert "Drive it?" in str(terminal.question())
-            assert hands.bench("truth").split('"true_tcp"')[0] == before.split('"true_tcp"')[0]
-            terminal.type("yes")
-            while terminal.shown.count("  kept  ") < 1:
-                terminal.watch()
-            terminal.signal(signal.SIGINT)
-            shown = terminal.rest()
-            assert terminal.code == 1
+    with ServedCell(cell, 3), Terminal(cell, "--session", tmp_path / "s", "--move") as terminal:
+        assert "hangs there" in str(terminal.question())
+        heavy = terminal.shown.rfind("· 9.5 kg") > terminal.shown.rfind("· 1.5 kg")
+        hands.hang(*LOADS[heavy])
+        before = hands.bench("truth")
+        terminal.type("")
+        assert "Drive it?" in str(terminal.question())
+        assert hands.bench("truth").split('"true_tcp"')[0] == before.split('"true_tcp"')[0]
+        terminal.type("yes")
+        while terminal.shown.count("  kept  ") < 1:
+            terminal.watch()
+        terminal.signal(signal.SIGINT)
+        shown = terminal.rest()
+        assert terminal.code == 1
     assert "interrupted" in shown
     assert "go on with: gapbridge calibrate" in shown
     kept = [e for e in read_entries(tmp_path / "s" / FILE) if e["kind"] == "reading"]
