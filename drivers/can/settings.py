@@ -34,7 +34,7 @@ class CanSettings(DriverSettings, BusSettings):
     )
     rate: float = Field(200.0, gt=0.0, le=1000.0, description="cycles per second asked for")
     send_timeout: float = Field(
-        0.005, gt=0.0, le=0.1, description="s that one frame may take to leave"
+        0.005, gt=0.0, le=0.25, description="s that one frame may take to leave"
     )
     foreign_quiet: float = Field(
         1.0, gt=0.0, le=10.0,

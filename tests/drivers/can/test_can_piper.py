@@ -96,6 +96,7 @@ def test_the_vendors_client_reads_and_commands_our_arm_and_we_notice_it(served, 
 def test_simulate_serves_the_cell_to_another_process(tmp_path):
     cell = tmp_path / "cell.yaml"
     text = CELL.read_text().replace("127.0.0.2", "127.0.0.9").replace("piper.urdf", "p.urdf")
+    text = text.replace("state_timeout: 0.1", "state_timeout: 1.0")
     cell.write_text(text)
     (tmp_path / "p.urdf").write_text((CONFIG / "piper.urdf").read_text())
     code = [sys.executable, "-m", "bridge.cli", "simulate", str(cell)]
