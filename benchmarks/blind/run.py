@@ -9,6 +9,7 @@ import os
 import shlex
 import signal
 import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -41,8 +42,14 @@ class Command:
 
     @classmethod
     def parse(cls, text: str) -> Command:
-        """Return the command of a line as one would type it."""
-        return cls(tuple(shlex.split(text)))
+        """Return the command of a line as one would type it.
+
+        A ``gapbridge`` beside the running interpreter goes before one on the path: nobody has to
+        activate the environment.
+        """
+        first, *others = shlex.split(text)
+        own = Path(sys.executable).with_name(first)
+        return cls((str(own) if own.is_file() and os.sep not in first else first, *others))
 
     def __call__(self, log: Path, cell: Path, withhold: tuple[str, ...]) -> dict[str, Any]:
         """Return the diagnosis' JSON; raises DiagnosisError with what the program said."""

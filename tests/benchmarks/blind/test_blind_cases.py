@@ -1,5 +1,7 @@
 import csv
 import json
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -192,3 +194,10 @@ def test_the_cramer_rao_bound_of_an_offset_is_that_of_its_only_number():
     # one number, 70 poses of 3 coordinates: its deviation is gap / (floor sqrt(210)), where
     # rotations are not measured too
     assert 0.5 * SURE / np.sqrt(210) < cramer_rao("joint_offset", range(8)) < 1.02 * SURE / 210**0.5
+
+
+def test_the_command_is_found_without_an_activated_environment(monkeypatch):
+    monkeypatch.setenv("PATH", "/nowhere")
+    first = Path(Command.parse("gapbridge diagnose").words[0])
+    assert first.parent == Path(sys.executable).parent
+    assert Command.parse("./mine diagnose").words == ("./mine", "diagnose")
