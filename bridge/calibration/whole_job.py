@@ -16,6 +16,7 @@ from bridge.calibration.planning import metrology_of, planned
 from bridge.calibration.words import duration, load_text, millimetres, parameter
 from core.calibration.plan import Plan
 from core.calibration.promise import document_of
+from core.calibration.result import Errors
 
 Array = NDArray[np.float64]
 
@@ -84,10 +85,24 @@ class WholeJob(Job):
             talk.say(f"{file}: written")
         if not found.complete:
             talk.warn("something is left that these effects do not explain: see the report")
+        if (why := worse_than_before(found.held_out_before, found.held_out_after)) is not None:
+            self.book.add("ended", applied=None)
+            talk.warn(why)
+            return
         target = self.hand_over(found.model, "the calibrated cell")
         if target is not None:
             write_document(promise_beside(target), promise)
             talk.say(f"  months later: gapbridge calibrate {target} --verify")
+
+
+def worse_than_before(before: Errors, after: Errors) -> str | None:
+    """Return why a fit is not written: it ran away on unseen poses; None: it did not."""
+    if not after.rms > before.rms:  # without held-out poses both are nan
+        return None
+    return (
+        f"on poses that the fit never saw the error rises from {1e3 * before.rms:.3f} to "
+        f"{1e3 * after.rms:.3f} mm rms: nothing is applied; fit fewer effects, or more poses"
+    )
 
 
 def _hardly_told(plan: Plan) -> list[str]:

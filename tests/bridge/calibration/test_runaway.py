@@ -1,0 +1,23 @@
+"""A fit that ran away is never written, whatever is answered."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bridge.calibration.whole_job import worse_than_before
+from core.calibration.result import Errors
+
+
+def errors(size: float, count: int = 4) -> Errors:
+    return Errors(np.full((count, 3), size), np.arange(count))
+
+
+def test_a_fit_that_is_worse_on_unseen_poses_is_refused_with_both_figures() -> None:
+    said = worse_than_before(errors(1e-3), errors(2e-2))
+    assert said is not None
+    assert "from 1.732 to 34.641 mm rms: nothing is applied" in said
+
+
+def test_a_better_fit_is_not_refused_nor_one_without_held_out_poses() -> None:
+    assert worse_than_before(errors(1e-3), errors(1e-4)) is None
+    assert worse_than_before(errors(0, 0), errors(0, 0)) is None
