@@ -17,9 +17,15 @@ from watched_feed import free_port
 
 
 class Watched:
-    """``gapbridge run --log json`` in a process of its own, as a plant starts it."""
+    """``gapbridge run --log json`` in a process of its own, as a plant starts it.
 
-    def __init__(self, robot: Robot, *options: str, web: int | None = None) -> None:
+    The way is within the start's tolerance (0.02 rad) everywhere: it can be armed again after a
+    machine that was too busy.
+    """
+
+    def __init__(
+        self, robot: Robot, *options: str, web: int | None = None, swing: float = 0.009
+    ) -> None:
         self.web, self.metrics = web or free_port(), free_port()
         self.cell = robot.cell(
             ", rate: 125",
@@ -27,7 +33,7 @@ class Watched:
             setpoints="{source: trajectory, file: way.csv}",
         ).rename(robot.folder / "press_3.yaml")  # fmt: skip
         t = np.arange(0.0, 120.0, 0.02)
-        way = 0.12 * (1 - np.cos(0.6 * t))[:, None] * [1, 0.4, -0.6, 0.3, 0.5, 1.0]
+        way = swing * (1 - np.cos(0.6 * t))[:, None] * [1, 0.4, -0.6, 0.3, 0.5, 1.0]
         rows = np.column_stack([t, np.array(robot.settings.start_q) + way])
         header = ",".join(["timestamp", *(f"target_q_{i}" for i in range(6))])
         np.savetxt(robot.folder / "way.csv", rows, "%.9g", ",", header=header, comments="")
