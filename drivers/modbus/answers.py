@@ -1,72 +1,39 @@
-"""Answers and requests of pymodbus whose registers are unpacked and packed at once.
-
-The library's own take a block register by register and write all of it into a text for the log at
-each answer, whatever the log's level: most of what a reading costs. It has a way for answers of
-one's own, ``client.register``; what is on the wire is the same.
-"""
+"""What the library gives as an answer, checked: it takes nearly anything for one."""
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Sequence
 from typing import Any
 
-from pymodbus.exceptions import ModbusIOException
-from pymodbus.pdu import ModbusPDU
-from pymodbus.pdu.register_message import (
-    ReadHoldingRegistersResponse,
-    ReadInputRegistersResponse,
-    ReadWriteMultipleRegistersResponse,
-    WriteMultipleRegistersRequest,
-    WriteMultipleRegistersResponse,
-)
+from core.errors import InvalidStateError
+from drivers.modbus.tcp_requests import refusal
 
 
-class Registers(ReadHoldingRegistersResponse):
-    """Registers read by function 3; 16 bits each, since they come out of two bytes."""
-
-    def decode(self, data: bytes) -> None:
-        """Take the registers out of an answer. Raises as the library's own does."""
-        if (size := data[0]) >= len(data):
-            raise ModbusIOException(f"byte_count {size} > length of packet {len(data)}")
-        self.registers = struct.unpack_from(f">{size // 2}H", data, 1)
-
-    def __str__(self) -> str:
-        """Return a short text: one is made for each answer, logged or not."""
-        return type(self).__name__
-
-
-class InputRegisters(Registers, ReadInputRegistersResponse):
-    """Registers read by function 4."""
-
-    function_code = 4
+def check_answer(answer: Any, function: int, count: int, where: str) -> list[int]:
+    """Return the registers or bits of an answer. Raises InvalidStateError where it is not one."""
+    _check_function(answer, function, where)
+    found = answer.bits[:count] if function in (1, 2) else answer.registers
+    if len(found) != count:
+        raise InvalidStateError(f"{where}: found {len(found)} registers, expected {count}")
+    if function in (1, 2):
+        return [int(v) for v in found]
+    if min(found) < 0 or max(found) > 0xFFFF:
+        raise InvalidStateError(f"{where}: found a register beyond 16 bits")
+    return list(found)
 
 
-class ExchangedRegisters(Registers, ReadWriteMultipleRegistersResponse):
-    """Registers read by function 23."""
-
-    function_code = 23
-
-
-class Written(WriteMultipleRegistersResponse):
-    """The answer to function 16."""
-
-    def __str__(self) -> str:
-        """Return a short text: one is made for each answer, logged or not."""
-        return type(self).__name__
+def check_written(answer: Any, function: int, address: int, where: str) -> None:
+    """Refuse an answer that does not confirm a write. Raises InvalidStateError."""
+    _check_function(answer, function, where)
+    if answer.address != address:
+        raise InvalidStateError(f"{where}: found address {answer.address}, expected {address}")
 
 
-class WriteRegisters(WriteMultipleRegistersRequest):
-    """Function 16."""
-
-    def encode(self) -> bytes:
-        """Return the request's bytes. Raises struct.error for what is no register."""
-        count = self.count
-        return struct.pack(f">HHB{count}H", self.address, count, 2 * count, *self.registers)
-
-
-def take_answers(client: Any) -> None:
-    """Have a client (pymodbus) use the answers above."""
-    answers: Sequence[type[ModbusPDU]] = (Registers, InputRegisters, ExchangedRegisters, Written)
-    for answer in answers:
-        client.register(answer)
+def _check_function(answer: Any, function: int, where: str) -> None:
+    if answer is None:
+        raise InvalidStateError(f"{where}: found no answer")
+    if answer.isError():
+        raise InvalidStateError(f"{where}: {refusal(getattr(answer, 'exception_code', 0))}")
+    if answer.function_code != function:
+        raise InvalidStateError(
+            f"{where}: found an answer to function {answer.function_code}, expected {function}"
+        )

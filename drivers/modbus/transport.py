@@ -2,6 +2,7 @@
 
 The library takes an answer of another function or with too few registers for good, and raises its
 own errors as well as the operating system's; here an answer is what was asked for, or a LinkError.
+Over TCP the requests of every cycle go round the library (drivers/modbus/tcp_requests.py).
 """
 
 from __future__ import annotations
@@ -10,24 +11,21 @@ import logging
 import socket
 import ssl
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient, ModbusTlsClient
 from pymodbus.exceptions import ModbusException, ModbusIOException
 from pymodbus.pdu import ModbusPDU
 
 from core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
-from drivers.modbus.answers import Registers, WriteRegisters, Written, take_answers
+from drivers.modbus import tcp_requests
+from drivers.modbus.answers import check_answer, check_written
 from drivers.modbus.map import Block, RegisterMap
-from drivers.modbus.registers import Table
+from drivers.modbus.registers import BIT_TABLES, Table
 from drivers.modbus.settings import ModbusSettings
+from drivers.modbus.tcp_requests import TcpRequests
 
 READ_FUNCTIONS: dict[Table, int] = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
-EXCEPTIONS = {
-    1: "illegal function", 2: "illegal address", 3: "illegal value", 4: "device failure",
-    5: "acknowledge", 6: "device busy", 10: "no path to the device",
-    11: "the device does not answer",
-}  # fmt: skip
 
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # told by our own errors instead
 
@@ -40,6 +38,7 @@ class Transport:
         self._writable: frozenset[tuple[Table, int]] = frozenset()
         self._allowed: set[tuple[Table, int, int]] = set()  # runs that were looked up before
         self._client: Any = None
+        self._tcp: TcpRequests | None = None
         self._calls: dict[Table, Any] = {}  # the client's methods that read
 
     def allow(self, compiled: RegisterMap) -> None:
@@ -71,7 +70,7 @@ class Transport:
             raise LinkError(f"{self.name}: cannot be reached: no answer or refused")
         if settings_are_tcp(self._settings) and client.socket is not None:
             client.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        take_answers(client)
+            self._tcp = TcpRequests(client.socket, self._device, self._settings.timeout)
         self._calls = {
             "coil": client.read_coils, "discrete": client.read_discrete_inputs,
             "holding": client.read_holding_registers, "input": client.read_input_registers,
@@ -99,7 +98,7 @@ class Transport:
 
     def close(self) -> None:
         """Close the socket, which the library leaves open after some errors; may be repeated."""
-        client, self._client = self._client, None
+        client, self._client, self._tcp = self._client, None, None
         if client is not None:
             client.close()
 
@@ -110,25 +109,34 @@ class Transport:
 
         Raises LinkError where the link broke, InvalidStateError for an answer that is none.
         """
-        self._opened()
         table = block.table
-        answer = self._ask(
+        function = READ_FUNCTIONS[table]
+        if self._tcp is not None and table not in BIT_TABLES:
+            answer = self._ask_tcp(tcp_requests.read_request(function, block.first, block.count))
+            return self._registers(answer, function, block.count, table)
+        self._opened()
+        found = self._ask(
             self._calls[table], block.first, count=block.count, device_id=self._device
         )
-        function = READ_FUNCTIONS[table]
-        fine = isinstance(answer, Registers) and answer.function_code == function
-        if fine and len(answer.registers) == block.count:
-            return answer.registers  # of 16 bits each: they were taken out of bytes here
-        return check_answer(answer, function, block.count, f"{self.name}: {table}")
+        return check_answer(found, function, block.count, f"{self.name}: {table}")
 
     def exchange(self, block: Block, address: int, values: Sequence[int]) -> Sequence[int]:
         """Write holding registers, then read a block of them, in one request (function 23)."""
         self._check_allowed("holding", address, values)
+        if self._tcp is not None:
+            request = tcp_requests.exchange_request(block.first, block.count, address, values)
+            return self._registers(self._ask_tcp(request), 23, block.count, "holding")
         answer = self._ask(
             self._opened().readwrite_registers, read_address=block.first, read_count=block.count,
             write_address=address, values=list(values), device_id=self._device,
         )  # fmt: skip
         return check_answer(answer, 23, block.count, f"{self.name}: holding")
+
+    def _registers(self, answer: bytes, function: int, count: int, table: Table) -> tuple[int, ...]:
+        try:
+            return tcp_requests.read_registers(answer, function, count)
+        except InvalidStateError as error:
+            raise InvalidStateError(f"{self.name}: {table}: {error}") from None
 
     # -- writing ----------------------------------------------------------------------------------
 
@@ -165,10 +173,16 @@ class Transport:
 
     def _write_registers(self, client: Any, address: int, values: Sequence[int]) -> None:
         """Write holding registers in one request. Raises InvalidStateError, LinkError."""
-        request = WriteRegisters(dev_id=self._device, address=address, registers=values)
-        answer = self._ask(client.execute, False, request)
-        if type(answer) is not Written or answer.address != address:
-            check_written(answer, 16, address, f"{self.name}: holding")
+        where = f"{self.name}: holding"
+        if self._tcp is None:
+            found = self._ask(client.write_registers, address, list(values), device_id=self._device)
+            check_written(found, 16, address, where)
+            return
+        answer = self._ask_tcp(tcp_requests.write_request(address, values))
+        try:
+            tcp_requests.check_written(answer, address, len(values))
+        except InvalidStateError as error:
+            raise InvalidStateError(f"{where}: {error}") from None
 
     def _check_allowed(self, table: Table, address: int, values: Sequence[int]) -> None:
         run = (table, address, len(values))
@@ -189,65 +203,45 @@ class Transport:
             raise LinkError(f"{self.name}: found no connection, expected connect() first")
         return self._client
 
+    def _ask_tcp(self, request: bytes) -> bytes:
+        """Return the PDU that answers one. Raises LinkError; the socket is closed then."""
+        assert self._tcp is not None
+        try:
+            return self._tcp.ask(request)
+        except TimeoutError:
+            self._give_up(StaleStateError(self._silence()))
+        except InvalidStateError as error:
+            self._give_up(InvalidStateError(f"{self.name}: {error}"))
+        except OSError as error:
+            self._give_up(LinkError(f"{self.name}: no answer: {_words(error)}"))
+
     def _ask(self, call: Any, *arguments: Any, **keys: Any) -> ModbusPDU:
+        """Return the library's answer. Raises LinkError; the socket is closed then."""
         try:
             answer: ModbusPDU = call(*arguments, **keys)
         except ModbusIOException as error:
-            self._fresh_socket()
             if "but received" in str(error):  # the library's words for another device's or number
-                raise InvalidStateError(
-                    f"{self.name}: found the answer to another request"
-                ) from None
-            raise StaleStateError(
-                f"{self.name}: no answer within {self._settings.timeout:g} s"
-            ) from None
+                self._give_up(
+                    InvalidStateError(f"{self.name}: found the answer to another request")
+                )
+            self._give_up(StaleStateError(self._silence()))
         except (ModbusException, OSError) as error:
-            self._fresh_socket()
-            raise LinkError(f"{self.name}: no answer: {_words(error)}") from None
+            self._give_up(LinkError(f"{self.name}: no answer: {_words(error)}"))
         except Exception as error:  # the library's own mistakes over broken frames
-            self._fresh_socket()
-            raise InvalidStateError(
-                f"{self.name}: found an answer that cannot be read: {type(error).__name__}"
-            ) from None
+            self._give_up(
+                InvalidStateError(
+                    f"{self.name}: found an answer that cannot be read: {type(error).__name__}"
+                )
+            )
         return answer
 
-    def _fresh_socket(self) -> None:
-        """Close the socket: an answer that comes late must not be taken for the next one's."""
+    def _silence(self) -> str:
+        return f"{self.name}: no answer within {self._settings.timeout:g} s"
+
+    def _give_up(self, error: LinkError) -> NoReturn:
+        """Raise; an answer that comes late must not be taken for the next one's."""
         self.close()
-
-
-def check_answer(answer: Any, function: int, count: int, where: str) -> list[int]:
-    """Return the registers or bits of an answer. Raises InvalidStateError where it is not one."""
-    _check_function(answer, function, where)
-    found = answer.bits[:count] if function in (1, 2) else answer.registers
-    if len(found) != count:
-        raise InvalidStateError(f"{where}: found {len(found)} registers, expected {count}")
-    if function in (1, 2):
-        return [int(v) for v in found]
-    if min(found) < 0 or max(found) > 0xFFFF:
-        raise InvalidStateError(f"{where}: found a register beyond 16 bits")
-    return list(found)
-
-
-def check_written(answer: Any, function: int, address: int, where: str) -> None:
-    """Refuse an answer that does not confirm a write. Raises InvalidStateError."""
-    _check_function(answer, function, where)
-    if answer.address != address:
-        raise InvalidStateError(f"{where}: found address {answer.address}, expected {address}")
-
-
-def _check_function(answer: Any, function: int, where: str) -> None:
-    if answer is None:
-        raise InvalidStateError(f"{where}: found no answer")
-    if answer.isError():
-        code = getattr(answer, "exception_code", 0)
-        raise InvalidStateError(
-            f"{where}: the controller refuses: {EXCEPTIONS.get(code, f'exception {code}')}"
-        )
-    if answer.function_code != function:
-        raise InvalidStateError(
-            f"{where}: found an answer to function {answer.function_code}, expected {function}"
-        )
+        raise error from None
 
 
 def settings_are_tcp(settings: ModbusSettings) -> bool:
