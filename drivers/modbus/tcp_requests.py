@@ -1,11 +1,11 @@
 """Register requests over Modbus TCP, plain or TLS, on the socket that pymodbus has opened.
 
-The library makes objects, calls and texts for its log of every request and answer: twice the work
-of a whole cycle of ours. What every cycle asks for (functions 3, 4, 16 and 23) is a header and some
-numbers. Everything else (coils, single registers, serial lines) goes through the library.
+Framing is the library's. What stands between its framer and its calls (objects of requests and
+answers, a register at a time, texts of both for a log that nobody reads) costs more than a whole
+cycle of ours, so that what every cycle asks for (functions 3, 4, 16, 23) goes round it. Everything
+else (coils, single registers, serial lines) goes through it.
 
-Source: MODBUS Messaging on TCP/IP Implementation Guide V1.0b, 3.1.3 (header); MODBUS Application
-Protocol Specification V1.1b3, 6.3, 6.4, 6.12, 6.17.
+Source: MODBUS Application Protocol Specification V1.1b3, 6.3, 6.4, 6.12, 6.17.
 """
 
 from __future__ import annotations
@@ -14,10 +14,12 @@ import socket
 import struct
 import time
 from collections.abc import Sequence
+from typing import Any
+
+from pymodbus.framer import FramerBase
 
 from core.errors import InvalidStateError
 
-HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), bytes that follow, device
 LONGEST = 260  # bytes of header and PDU
 REFUSED = 0x80  # added to the function where the controller refuses
 SPAN = struct.Struct(">BHH")  # function, first register, how many
@@ -31,8 +33,11 @@ EXCEPTIONS = {
 class TcpRequests:
     """One request after the other on one socket; an answer is that of the last request or none."""
 
-    def __init__(self, link: socket.socket, device_id: int, timeout: float) -> None:
-        self._link, self._device, self._timeout = link, device_id, timeout
+    def __init__(self, client: Any, device_id: int, timeout: float) -> None:
+        """Take a client of pymodbus that is connected."""
+        self._link: socket.socket = client.socket
+        self._framer: FramerBase = client.framer
+        self._device, self._timeout = device_id, timeout
         self._transaction = 0
 
     def ask(self, request: bytes) -> bytes:
@@ -41,36 +46,33 @@ class TcpRequests:
         Raises InvalidStateError where what comes is no answer to it, TimeoutError where nothing
         comes, OSError where the link broke. The socket is of no more use after any of them.
         """
-        link = self._link
+        link, framer = self._link, self._framer
         link.settimeout(self._timeout)  # the library leaves it at another one
         self._transaction = number = self._transaction % 0xFFFF + 1
-        link.sendall(HEADER.pack(number, 0, len(request) + 1, self._device) + request)
+        link.sendall(framer.encode(request, self._device, number))
         data = link.recv(LONGEST)
-        if len(data) < HEADER.size or len(data) < 6 + int.from_bytes(data[4:6], "big"):
+        size, device, found, answer = framer.decode(data)
+        if not size:  # it comes in pieces
             data = self._rest(data)
-        found, protocol, length, device = HEADER.unpack_from(data)
-        if (found, protocol, device) != (number, 0, self._device) or len(data) != 6 + length:
+            size, device, found, answer = framer.decode(data)
+        if (found, device, size) != (number, self._device, len(data)):
             raise InvalidStateError("found the answer to another request")
-        return data[HEADER.size :]
+        return answer
 
     def _rest(self, data: bytes) -> bytes:
-        """Return an answer that comes in pieces. Raises as ``ask`` does."""
+        """Return data with as much as makes a frame. Raises as ``ask`` does."""
         until = time.monotonic() + self._timeout
-        while True:
-            if not data:
-                raise ConnectionResetError("the controller has hung up")
-            if len(data) >= HEADER.size:
-                size = 6 + int.from_bytes(data[4:6], "big")
-                if not HEADER.size < size <= LONGEST:
-                    raise InvalidStateError(f"found an answer of {size} bytes")
-                if len(data) >= size:
-                    return data
+        more = data
+        while not self._framer.decode(data)[0]:
             left = until - time.monotonic()
-            if left <= 0.0:
+            if not more:
+                raise ConnectionResetError("the controller has hung up")
+            if left <= 0.0 or len(data) >= LONGEST:
                 raise TimeoutError
             self._link.settimeout(left)
             more = self._link.recv(LONGEST)
-            data = data + more if more else b""
+            data += more
+        return data
 
 
 def read_request(function: int, first: int, count: int) -> bytes:

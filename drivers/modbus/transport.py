@@ -70,7 +70,7 @@ class Transport:
             raise LinkError(f"{self.name}: cannot be reached: no answer or refused")
         if settings_are_tcp(self._settings) and client.socket is not None:
             client.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._tcp = TcpRequests(client.socket, self._device, self._settings.timeout)
+            self._tcp = TcpRequests(client, self._device, self._settings.timeout)
         self._calls = {
             "coil": client.read_coils, "discrete": client.read_discrete_inputs,
             "holding": client.read_holding_registers, "input": client.read_input_registers,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -78,7 +79,8 @@ def answered(data: bytes) -> bytes:
     with ours, theirs:
         theirs.sendall(data)
         theirs.shutdown(socket.SHUT_WR)
-        return TcpRequests(ours, 1, 1.0).ask(read_request(3, 0, 1))
+        client = SimpleNamespace(socket=ours, framer=FramerSocket(DecodePDU(False)))
+        return TcpRequests(client, 1, 1.0).ask(read_request(3, 0, 1))
 
 
 def mutations(frame: bytes, random: np.random.Generator, count: int):
