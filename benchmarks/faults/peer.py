@@ -35,8 +35,9 @@ class Peer:
 
     @property
     def pid(self) -> int:
-        """Return its process id."""
-        assert self._process is not None
+        """Return its process id. Raises ProcessLookupError where it is dead."""
+        if self._process is None:
+            raise ProcessLookupError("the simulated controller is dead")
         return self._process.pid
 
     def start(self) -> None:
@@ -62,9 +63,9 @@ class Peer:
             said += more
 
     def stand_still(self) -> None:
-        """SIGSTOP."""
-        self._still = True
+        """SIGSTOP. Raises ProcessLookupError where it is dead."""
         os.kill(self.pid, signal.SIGSTOP)
+        self._still = True
 
     def go_on(self) -> None:
         """SIGCONT."""
@@ -79,7 +80,7 @@ class Peer:
             self._process.wait()
             assert self._process.stdout is not None
             self._process.stdout.close()
-            self._process = None
+            self._process, self._still = None, False
 
     @property
     def runs(self) -> bool:
@@ -97,6 +98,6 @@ class Peer:
 
     def stop(self) -> None:
         """End it."""
-        with contextlib.suppress(ProcessLookupError, AssertionError):
+        with contextlib.suppress(ProcessLookupError):
             self.go_on()
         self.kill()
