@@ -7,6 +7,7 @@ import resource
 import socket
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -23,6 +24,7 @@ from drivers.simulated.can.hub import Hub
 from drivers.simulated.ft_sensor.robotous_node import RobotousNode
 
 MOVING, GOES_ON = ("ur_servoj", "can"), ("compensating",)
+REACH = 1.3  # m from the farthest joint's axis to the TCP, of the longer arm
 ROOM = 0.02  # rad that a joint has to its limit where a planner is to go beyond it
 LINE = 0.02  # s between two lines of a planner
 WEIGHT = (0.0, 0.0, 49.0, 0.0, 0.0, 0.0)  # N
@@ -36,22 +38,26 @@ class PlannedRig(Rig):
     def __init__(self, link: Link, folder: Path) -> None:
         with socket.create_server(("127.0.0.1", 0)) as free:
             port = int(free.getsockname()[1])
-        arm_q, self.joint, self.way, margin = self._nearest_limit(link, folder)
+        arm_q, self.joint, self.way, margin, self._fastest = self._nearest_limit(link, folder)
         limits = LIMITS.replace("ramp_time", f"joint_margin: {margin:.4f}\n  ramp_time")
         super().__init__(link, folder, f"{limits}setpoints: {{source: tcp, port: {port}}}\n")
         self.goal, self._port, self._over = arm_q, port, threading.Event()
         self._planner = threading.Thread(target=self._plan, daemon=True, name="planner")
 
     @staticmethod
-    def _nearest_limit(link: Link, folder: Path) -> tuple[list[float], int, float, float]:
-        """Return where the arm stands, the joint nearest to its limit, which way, and a margin."""
+    def _nearest_limit(link: Link, folder: Path) -> tuple[list[float], int, float, float, float]:
+        """Return where the arm stands, the joint nearest to its limit, which way, and a margin.
+
+        The last is how fast the joint may be, rad/s.
+        """
         cell, _ = link.write_cells(folder, "127.0.0.1", "127.0.0.1", "")
         arm = load_cell(cell).arm
         q = np.array(link.start_q)
         up, down = arm.limits.upper - q, q - arm.limits.lower
         joint = int(np.argmin(np.minimum(up, down)))
         way = 1.0 if up[joint] < down[joint] else -1.0
-        return q.tolist(), joint, way, float(min(up[joint], down[joint])) - ROOM
+        room, fastest = min(up[joint], down[joint]), arm.limits.velocity[joint]
+        return q.tolist(), joint, way, float(room) - ROOM, float(fastest)
 
     def __enter__(self) -> Self:
         self._planner.start()
@@ -74,7 +80,17 @@ class PlannedRig(Rig):
                 continue  # no loop listens just now
 
     def leap(self, by: float) -> None:
-        """Ask for a setpoint that is too far away, and then again for where the arm stands."""
+        """Ask for a setpoint that is too far away, and then again for where the arm stands.
+
+        On its way there it is followed for as long as it is no faster than the joint may be, and
+        the tap takes that for an offset's: the envelope must hold all of it, the rate cannot.
+        """
+        bounds = self.checker.bounds
+        speed = self._fastest * REACH
+        self.checker.bounds = replace(
+            bounds, offset_rate=bounds.offset_rate + speed,
+            rotation_rate=bounds.rotation_rate + self._fastest,
+        )  # fmt: skip
         home = list(self.goal)
         self.goal = [q + by * (i == self.joint) for i, q in enumerate(home)]
         self.pass_time(0.1)
