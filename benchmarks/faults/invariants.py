@@ -155,6 +155,7 @@ class Checker:
             found.add(f"{write.where}: {write.values}")
             return
         if write.kind == "offset" and not any(write.values) and write.state not in WRITING:
+            self._end_stream(write.early)
             return  # an offset of zero takes out what may be there; it may always leave
         if write.kind == "joints" and write.state not in WRITING and self._holds(write):
             return
