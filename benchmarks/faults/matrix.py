@@ -11,7 +11,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from benchmarks.faults.injection import make_fault
-from benchmarks.faults.links import LINKS, Link
+from benchmarks.faults.links import LINKS, OFFSET_RATE, Link
 from benchmarks.faults.rig import Rig
 from benchmarks.faults.row import Result, Row
 from benchmarks.faults.table import rows_of
@@ -49,11 +49,18 @@ def run_matrix(
 
 def run_alone(row: Row, link: Link, folder: Path) -> Result:
     """Make a fault that has a rig, or even a daemon, of its own."""
-    if row.apart is not None:
-        return row.apart(row, link, folder)
-    assert row.own is not None
-    with row.own(link, folder) as rig:
-        return _patiently(rig, row)
+    try:
+        if row.apart is not None:
+            return row.apart(row, link, folder)
+        assert row.own is not None
+        with row.own(link, folder) as rig:
+            return _patiently(rig, row)
+    except Exception as error:  # it did not come up
+        traceback.print_exc(file=sys.stderr)
+        return Result(
+            row.key, link.name, link.cycle, None, "not made", 0.0, OFFSET_RATE * link.cycle,
+            (f"{type(error).__name__}: {error}",),
+        )  # fmt: skip
 
 
 def _on_one_rig(
