@@ -138,15 +138,20 @@ class MailboxWriter:
         words = self._words()
         if self._together:
             self._pending = words
-        else:
-            self._send(words)
+            return
+        try:
+            self._transport.write("holding", self._box.address, words)
+        except StaleStateError:
+            # not again: its state would be old by then. The next one carries the offset on, and
+            # the echo says whether any has come
+            self._transport.open()
 
     def _words(self) -> list[int]:
         self._heartbeat = encode.next_number(self._heartbeat)
         return encode.mailbox_words(self._sequence, self._counts, self._heartbeat)
 
     def _send(self, words: list[int]) -> None:
-        """Write a mailbox; a lost one once more, which does no harm: the number is the same."""
+        """Write a mailbox of zeros; a lost one once more."""
         try:
             self._transport.write("holding", self._box.address, words)
         except StaleStateError:
