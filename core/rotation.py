@@ -42,6 +42,21 @@ def one_rotation_matrix(vector: Array) -> Array:
     ])  # fmt: skip
 
 
+def left_jacobian(vector: Array) -> Array:
+    """Return the turns (3, 3), as columns, that one more rad of each number of a vector makes.
+
+    exp(v + dv) = exp(J dv) exp(v) to first order; ``vector`` (3,) in rad.
+    """
+    K = skew(vector)
+    square = float(np.dot(vector, vector))
+    angle = sqrt(square)
+    if angle < 1e-3:
+        second, third = 0.5 - square / 24, 1 / 6 - square / 120
+    else:
+        second, third = 2 * (sin(angle / 2) / angle) ** 2, (angle - sin(angle)) / (angle * square)
+    return np.asarray(np.eye(3) + second * K + third * (K @ K))
+
+
 def rotation_vector(matrix: Array) -> Array:
     """Return the rotation vectors (..., 3), angle in [0, pi], of rotation matrices (..., 3, 3)."""
     R = np.asarray(matrix, dtype=float)

@@ -9,6 +9,7 @@ from core.effects.effect import JointEffect, Parameter, Site, Term, typical_mome
 if TYPE_CHECKING:
     from core.arm import Arm
     from core.kernel import Chain
+    from core.kernels.rates import ChainRate
 
 
 class AxialCompliance(JointEffect):
@@ -31,3 +32,9 @@ class AxialCompliance(JointEffect):
         """Soften the joint about z."""
         assert term.site.joint is not None
         chain.compliance[term.site.joint - 1, 2] += term.values[0]
+
+    def shape_rate(self, term: Term, arm: Arm, chain: Chain, value: int, rate: ChainRate) -> bool:
+        """Write the softer joint."""
+        assert term.site.joint is not None
+        rate.compliance[term.site.joint - 1, 2] = 1.0
+        return True

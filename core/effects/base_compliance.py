@@ -9,6 +9,7 @@ from core.effects.effect import Effect, Parameter, Site, Term, typical_moment
 if TYPE_CHECKING:
     from core.arm import Arm
     from core.kernel import Chain
+    from core.kernels.rates import ChainRate
 
 
 class BaseCompliance(Effect):
@@ -32,3 +33,8 @@ class BaseCompliance(Effect):
     def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
         """Soften the base."""
         chain.base_compliance[:2] += term.values
+
+    def shape_rate(self, term: Term, arm: Arm, chain: Chain, value: int, rate: ChainRate) -> bool:
+        """Write the softer base."""
+        rate.base_compliance[value] = 1.0
+        return True

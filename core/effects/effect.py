@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from core.arm import Arm
     from core.kernel import Chain, Rows
+    from core.kernels.rates import ChainRate
     from core.loads import Loads
     from core.motion import Motion
 
@@ -87,6 +88,13 @@ class Effect(ABC):
 
     def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
         """Change the chain in place: what holds for all rows (position channel)."""
+
+    def shape_rate(self, term: Term, arm: Arm, chain: Chain, value: int, rate: ChainRate) -> bool:
+        """Write how the finished chain changes with one of the term's values, into zeros.
+
+        Returns whether that is known; where not, derivatives are differences of predictions.
+        """
+        return False
 
     def condition(self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: Array) -> None:
         """Change the rows in place; ``q`` (N, n) are the encoder angles (position channel)."""

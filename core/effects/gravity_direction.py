@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from core.effects.effect import Effect, Parameter, Site, Term
-from core.rotation import rotation_matrix
+from core.rotation import left_jacobian, rotation_matrix
 
 if TYPE_CHECKING:
     from core.arm import Arm
     from core.kernel import Chain
+    from core.kernels.rates import ChainRate
 
 
 class GravityDirection(Effect):
@@ -33,3 +34,9 @@ class GravityDirection(Effect):
         """Turn gravity."""
         turn = rotation_matrix(np.array([term.values[0], term.values[1], 0.0]))
         chain.gravity[:] = turn @ chain.gravity
+
+    def shape_rate(self, term: Term, arm: Arm, chain: Chain, value: int, rate: ChainRate) -> bool:
+        """Write how gravity turns."""
+        turn = left_jacobian(np.array([term.values[0], term.values[1], 0.0]))[:, value]
+        rate.gravity[:] = np.cross(turn, chain.gravity)
+        return True

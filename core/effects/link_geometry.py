@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from core.arm import Arm
     from core.kernel import Chain
+    from core.kernels.rates import ChainRate
 
 PARALLEL = 1e-6  # sine of the angle below which two axes count as parallel
 
@@ -25,6 +26,7 @@ class LinkForm(NamedTuple):
     z: NDArray[np.float64]
     x: NDArray[np.float64]  # the common normal
     next_z: NDArray[np.float64]
+    y: NDArray[np.float64]  # across both
     shift: float  # m, how far the next frame lies along its own axis from the common normal
     parallel: bool
 
@@ -47,12 +49,12 @@ def _form(link: bytes) -> LinkForm:
         # standard DH rows have x along the frame's own x, whatever the sign of a
         along_x = length < 1e-9 or abs(p[1]) < 1e-9
         x = np.array([1.0, 0, 0]) if along_x else across / length
-        return LinkForm(z, x, next_z, 0.0, True)
+        return LinkForm(z, x, next_z, np.cross(next_z, x), 0.0, True)
     x = np.cross(z, next_z) / sine
     if abs(next_z[0]) < 1e-9:
         x = np.array([1.0, 0, 0])
     _, _, shift = np.linalg.solve(np.column_stack([z, x, next_z]), p)
-    return LinkForm(z, x, next_z, float(shift), False)
+    return LinkForm(z, x, next_z, np.cross(next_z, x), float(shift), False)
 
 
 class LinkGeometry(Effect):
@@ -91,11 +93,26 @@ class LinkGeometry(Effect):
         form = link_form(arm, joint)
         a, d, alpha = term.values[:3]
         twist = one_rotation_matrix(form.x * alpha)
-        old = chain.rotation[joint].copy()
-        turned = twist @ old
+        turned = twist @ chain.rotation[joint]
         if form.parallel and len(term.values) > 3:
-            y_in_link = twist @ np.cross(form.next_z, form.x)
-            turned = one_rotation_matrix(y_in_link * term.values[3]) @ turned
+            turned = one_rotation_matrix(twist @ form.y * term.values[3]) @ turned
         chain.rotation[joint] = turned
         moved = form.shift * (twist @ form.next_z - form.next_z)
         chain.position[joint] += d * form.z + a * form.x + moved
+
+    def shape_rate(self, term: Term, arm: Arm, chain: Chain, value: int, rate: ChainRate) -> bool:
+        """Write the way along z or the common normal, or the turn about it or across."""
+        assert term.site.joint is not None
+        form, link = link_form(arm, term.site.joint), rate.link[term.site.joint]
+        if value == 0:
+            link[:3] = form.x
+        elif value == 1:
+            link[:3] = form.z
+        else:
+            twist = one_rotation_matrix(form.x * term.values[2])
+            if value == 2:  # beta turns about an axis that alpha has turned: so both turn at once
+                link[3:] = form.x
+                link[:3] = form.shift * np.cross(form.x, twist @ form.next_z)
+            else:
+                link[3:] = twist @ form.y
+        return True

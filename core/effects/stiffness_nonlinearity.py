@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     from core.arm import Arm
     from core.kernel import Chain
+    from core.kernels.rates import ChainRate
 
 
 class StiffnessNonlinearity(JointEffect):
@@ -42,6 +43,16 @@ class StiffnessNonlinearity(JointEffect):
         i = term.site.joint - 1
         chain.compliance[i, 2] += term.values[0]
         chain.softening[i] += term.values[1]
+
+    def shape_rate(self, term: Term, arm: Arm, chain: Chain, value: int, rate: ChainRate) -> bool:
+        """Write the softer joint, or the bent curve."""
+        assert term.site.joint is not None
+        i = term.site.joint - 1
+        if value == 0:
+            rate.compliance[i, 2] = 1.0
+        else:
+            rate.softening[i] = 1.0
+        return True
 
     def reported(
         self, arm: Arm, term: Term, covariance: NDArray[np.float64] | None

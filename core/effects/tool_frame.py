@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from core.effects.effect import Effect, Parameter, Site, Term
-from core.rotation import rotation_matrix
+from core.rotation import left_jacobian, one_rotation_matrix
 
 if TYPE_CHECKING:
     from core.arm import Arm
     from core.kernel import Chain
+    from core.kernels.rates import ChainRate
 
 
 class ToolFrame(Effect):
@@ -33,5 +34,13 @@ class ToolFrame(Effect):
     def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
         """Move the TCP."""
         chain.tool_position[:] += term.values[:3]
-        turn = rotation_matrix(np.array(term.values[3:]))
+        turn = one_rotation_matrix(np.array(term.values[3:]))
         chain.tool_rotation[:] = turn @ chain.tool_rotation
+
+    def shape_rate(self, term: Term, arm: Arm, chain: Chain, value: int, rate: ChainRate) -> bool:
+        """Write the shift, or the turn."""
+        if value < 3:
+            rate.tool[value] = 1.0
+        else:
+            rate.tool[3:] = left_jacobian(np.array(term.values[3:]))[:, value - 3]
+        return True

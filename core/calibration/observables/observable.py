@@ -1,8 +1,8 @@
 """The base of the observables: what a reading is, and how it depends on arm and instrument.
 
 A member says what its instrument reads at given poses of the TCP and how a reading differs from
-that; derivatives are taken numerically of the whole prediction, so that every effect of the
-catalogue enters every kind of reading by one and the same code.
+that; derivatives of the poses come from the effects (core.pose_columns) and are chained with
+those of the reading, so that every effect of the catalogue enters every kind by the same code.
 """
 
 from __future__ import annotations
@@ -13,17 +13,18 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from core.calibration.moved_poses import moved_poses
 from core.calibration.observables.nuisance import Layout, Nuisance
 from core.calibration.readings import Readings
 from core.errors import ExcitationError
 from core.model import Model, Poses
+from core.rotation import one_rotation_matrix
 
 if TYPE_CHECKING:
     from core.calibration.parameters import Parameters
 
 Array = NDArray[np.float64]
 STEP = 1e-5  # m and rad, of a nuisance: the gap is all but linear in it
-SHARE = 0.01  # of a parameter's usual size, as its step
 SETTLED = 1e-9  # m and rad: a smaller step moves nothing that anybody measures
 ROUNDS = 30
 
@@ -94,18 +95,35 @@ class Observable(ABC):
 
         ``layout`` of all readings, where these are a part of them.
         """
-        poses = parameters.model(values).predict(readings.q, readings.loads)
-        J = np.empty((len(readings) * self.equations, len(values)))
-        for i in range(len(values)):
-            step = np.zeros(len(values))
-            step[i] = SHARE * parameters.scales[i]
+        moved = moved_poses(parameters, values, readings)
+        slopes = self.slopes(moved.poses, readings, nuisance)
+        J = -np.matmul(slopes, moved.slopes.transpose(2, 0, 1)).reshape(-1, len(values))
+        return J, self.nuisance_columns(moved.poses, readings, nuisance, layout)
+
+    def slopes(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
+        """Return how the gap changes (N, k, 6) with the TCP's shift and turn, base axes.
+
+        By differences, which cost no prediction; members whose slopes are plain say them.
+        """
+        found = np.empty((len(readings), self.equations, 6))
+        for axis in range(3):
+            shift = np.zeros(3)
+            shift[axis] = STEP
+            turn = one_rotation_matrix(shift)
             ends = [
-                parameters.model(values + way * step).predict(readings.q, readings.loads)
-                for way in (1, -1)
+                (
+                    Poses(poses.position + shift, poses.rotation),
+                    Poses(poses.position - shift, poses.rotation),
+                ),
+                (
+                    Poses(poses.position, turn @ poses.rotation),
+                    Poses(poses.position, turn.T @ poses.rotation),
+                ),
             ]
-            one, other = (self.gap(end, readings, nuisance) for end in ends)
-            J[:, i] = (other - one).ravel() / (2 * step[i])
-        return J, self.nuisance_columns(poses, readings, nuisance, layout)
+            for k, (one, other) in enumerate(ends):
+                change = self.gap(one, readings, nuisance) - self.gap(other, readings, nuisance)
+                found[:, :, 3 * k + axis] = change / (2 * STEP)
+        return found
 
     def nuisance_columns(
         self, poses: Poses, readings: Readings, nuisance: Nuisance, layout: Layout | None = None

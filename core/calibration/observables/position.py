@@ -13,6 +13,7 @@ from core.calibration.observables.observable import Observable
 from core.calibration.readings import Readings
 from core.model import Poses
 from core.registration import Registration, register_robustly
+from core.rotation import skew
 
 Array = NDArray[np.float64]
 FEWEST = 3  # points that fix a frame
@@ -31,6 +32,12 @@ class Position(Observable):
     def gap(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
         """Return measured minus predicted position (N, 3), base axes."""
         return measured_in_base(readings, nuisance) - self.seen(poses, readings, nuisance)
+
+    def slopes(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
+        """Return how the gap changes (N, 3, 6) with the TCP's shift and turn."""
+        lever = np.einsum("nij,nj->ni", poses.rotation, nuisance.targets[readings.target])
+        shift = np.broadcast_to(-np.eye(3), (len(lever), 3, 3))
+        return np.concatenate([shift, skew(lever)], axis=2)
 
     def reading(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
         """Return the position in the instrument's frame (N, 3)."""
