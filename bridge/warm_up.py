@@ -13,6 +13,7 @@ from core.compensation import correct
 from core.kernels.factor import factor_blocks
 from core.limits import Limiter, Limits
 from core.model import Model
+from core.pose_columns import pose_columns
 from drivers.ur_rtde.nominal import Nominal
 
 
@@ -24,6 +25,7 @@ def warm_up() -> None:
     for rows in (q, np.repeat(q, 4, axis=0)):  # one by one, and in blocks
         model.predict(rows)
         model.linear_form(rows)
+    pose_columns(model, q, None, [(0, 0)], np.array([1e-9]))
     gap, factor = np.zeros((1, 3)), np.zeros((2 * n + 1, 2 * n + 1))
     factor_blocks(model.chain(), model.rows(q), gap, gap, 0, 0, 1, factor)
     corrected = correct(model, q)

@@ -12,10 +12,10 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from benchmarks.speed import diagnosis, geometry, growth, rows, setpoint, start
+from benchmarks.speed import diagnosis, geometry, growth, loop, rows, setpoint, start
 
 PACKAGES = ("numpy", "scipy", "numba", "pin", "casadi")
-PARTS = ("setpoint", "rows", "geometry", "start", "diagnosis", "growth")
+PARTS = ("setpoint", "loop", "rows", "geometry", "start", "diagnosis", "growth")
 
 
 def main() -> None:
@@ -30,6 +30,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=15, help="turns of each side")
     parser.add_argument("--rows", type=int, default=1_000_000, help="of the regressor and the fit")
     parser.add_argument("--poses", type=int, default=1000, help="of the calibrations")
+    parser.add_argument("--seconds", type=float, default=60.0, help="of the daemon's loop")
     given = parser.parse_args()
     chosen = given.parts.split(",")
     if unknown := set(chosen) - set(PARTS):
@@ -56,6 +57,8 @@ def _measured(chosen: list[str], given: argparse.Namespace) -> Any:
         yield setpoint.hot(given.rounds)
         yield setpoint.cold(given.rounds)
         yield setpoint.stream(given.rounds)
+    if "loop" in chosen:
+        yield loop.loop(given.seconds)
     if "rows" in chosen:
         yield rows.regressor(given.rows, few)
         yield rows.fit(given.rows, few)

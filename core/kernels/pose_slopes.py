@@ -234,10 +234,10 @@ def _columns(B, rates, varying, first, count, J, column):  # type: ignore[no-unt
 def slope_blocks(chain, rows, rates, varying, first, last, position, rotation, J):  # type: ignore[no-untyped-def]
     """Write TCP poses of rows first..last, and their derivatives J (3 or 6, p, N).
 
-    Derivatives by p parameters, of the position (m) and of the turn (rad), base axes. ``rates``: for parameter c
-    the entries start[c]..start[c+1] of (slot, rate); ``varying`` likewise, with a rate per row
-    (entries, N). Slots: ``rates.ChainRate``. Returns the first row of a block that does not settle
-    at once, or -1. The arm's links must not bend themselves.
+    Derivatives by p parameters, of the position (m) and of the turn (rad), base axes. ``rates``:
+    for parameter c the entries start[c]..start[c+1] of (slot, rate); ``varying`` likewise, with a
+    rate per row (entries, N). Slots: ``rates.ChainRate``. Returns the first row of a block that
+    does not settle at once, or -1. The arm's links must not bend themselves.
     """
     n = chain.mass.shape[0]
     w, v = np.empty((n + 2) * RECORD * _L), np.empty(ROW * _L)

@@ -89,6 +89,18 @@ def test_columns_foretell_how_the_residual_changes(model, kind, options) -> None
 
 
 @pytest.mark.parametrize(("kind", "options"), KINDS)
+def test_slopes_are_differences_of_the_gap(model, kind, options) -> None:
+    observable = make_observable(kind, **options)
+    readings, nuisance = two_places(model, observable)
+    poses = model.predict(readings.q, readings.loads)
+    said = observable.slopes(poses, readings, nuisance)
+    expected = Observable.slopes(observable, poses, readings, nuisance)
+    assert said.shape == (len(readings), observable.equations, 6)
+    assert np.abs(said).max() > 0.1
+    assert np.abs(said - expected).max() < 1e-8
+
+
+@pytest.mark.parametrize(("kind", "options"), KINDS)
 def test_start_finds_instruments_and_targets_among_wild_readings(model, kind, options) -> None:
     observable = make_observable(kind, **options)
     readings, nuisance = two_places(model, observable, 120)
