@@ -54,7 +54,7 @@ def pose_columns(
     poses = _swept(chain, rows, _entries(rates), varying, slopes)
     if poses is None:
         poses, known = model.predict(q, loads), np.zeros(len(values), dtype=bool)
-    for c in np.flatnonzero(~(known & told)):
+    for c in np.flatnonzero(~(known & told)).tolist():
         slopes[:, c] = _difference(model, q, loads, values[c], float(steps[c]))
     return PoseColumns(poses, slopes)
 
