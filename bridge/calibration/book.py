@@ -30,6 +30,7 @@ class Book:
     skipped: set[int] = field(default_factory=set)
     mounted: int | None = None  # load that hangs on the flange
     station: int = 0
+    place: int = 0  # of the plan's, at which the instrument stands
     target: int = 0
     notes: list[str] = field(default_factory=list)
     used: set[str] = field(default_factory=set)
@@ -87,6 +88,7 @@ class Book:
     def _moved(self, entry: Entry) -> None:
         self.station = int(entry["station"])
         self.target = int(entry["target"])
+        self.place = int(entry.get("place", self.place))
         since = entry.get("since")  # readings from this one on were of the new place already
         if since is not None:
             for i in range(int(since), len(self.taken)):

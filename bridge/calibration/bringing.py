@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,14 +32,25 @@ class Bringing:
     def __init__(
         self, talk: Talk, book: Book, joints: JointSource, clear: Callable[[Array], Array],
         speed: float, minutes_per_load: float, instrument: AnyInstrument,
+        places: Sequence[Sequence[float]] = (),
     ) -> None:  # fmt: skip
         self.talk, self.book, self.joints = talk, book, joints
         self.minutes_per_load = minutes_per_load
         self._clear, self._speed = clear, speed
-        self._instrument = instrument
+        self._instrument, self._places = instrument, places
         self._asked: int | None = None  # load for which driving was asked about
         self._driven = False
         self._warned: set[int] = set()
+
+    def place(self, number: int) -> None:
+        """Have the instrument carried to one of its planned places."""
+        at = ", ".join(f"{v:g}" for v in self._places[number]) if self._places[number:] else "?"
+        self.talk.say()
+        self.talk.say(
+            f"place {number + 1} · {self._instrument.stands} at about ({at}) m in base",
+            "bold cyan",
+        )
+        self.talk.ask("  Enter when it stands there")
 
     def mount(self, load: int) -> None:
         """Have a load mounted, and ask whether the arm may be driven with it."""

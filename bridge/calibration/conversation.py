@@ -40,12 +40,26 @@ class Conversation:
         """Go on until no stop is left. Raises Word where the person wants to end."""
         while (stop := self.book.next) is not None:
             try:
+                self._put(self.book.stops[stop].station)
                 self.bringing.mount(self.book.stops[stop].load)
                 self.talk.say()
                 self.talk.say(header(self.book, stop, self.bringing.minutes_per_load), "bold")
                 self._stop(stop)
             except Word as word:
                 self._word(word, stop)
+
+    def _put(self, place: int) -> None:
+        """Have the instrument where the plan has it: a place of its own, as after a knock."""
+        if place != self.book.place:
+            self.bringing.place(place)
+            station = self.book.station + self._measured_here()
+            self.book.add("moved", station=station, target=self.book.target, place=place)
+
+    def _measured_here(self) -> bool:
+        """Return whether anything was measured by this place of instrument and target."""
+        book = self.book
+        here = (book.station, book.target)
+        return any((t.station, t.target - book.stops[t.stop].target) == here for t in book.taken)
 
     def _stop(self, stop: int) -> None:
         """Measure one stop, again and again until a reading of it is kept."""
@@ -190,8 +204,7 @@ class Conversation:
     def mark_moved(self, what: str, since: int | None = None) -> None:
         """Begin a new place of the instrument, or of the target, from a reading on."""
         book = self.book
-        here = (book.station, book.target)
-        if all((t.station, t.target - book.stops[t.stop].target) != here for t in book.taken):
+        if not self._measured_here():
             self.talk.say("  nothing has been measured from where it stands: it is that place")
             return
         station = book.station + (what == "moved")

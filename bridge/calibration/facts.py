@@ -19,6 +19,7 @@ NAMES = {
     "dial_gauge": "dial gauge or ballbar, read by a person",
     "two_balls": "two balls, read by a person",
     "sphere": "probe on a fixed sphere",
+    "point": "tip on a fixed point",
     "simulated_tracker": "simulated laser tracker",
 }
 

@@ -16,8 +16,8 @@ def seconds_left(book: Book, minutes_per_load: float) -> float:
     """Return s until the last stop, by the pace so far."""
     paces = [s for s in book.seconds if s < PAUSE][-20:]
     done = {t.stop for t in book.taken} | book.skipped
-    loads = {p.load for i, p in enumerate(book.stops) if i not in done}
-    changes = len(loads - {book.mounted})
+    blocks = {(p.station, p.load) for i, p in enumerate(book.stops) if i not in done}
+    changes = len(blocks - {(book.place, book.mounted)})
     return book.left * (median(paces) if paces else FIRST) + changes * 60.0 * minutes_per_load
 
 
@@ -26,7 +26,7 @@ def header(book: Book, stop: int, minutes_per_load: float) -> str:
     count, done = len(book.stops), len(book.stops) - book.left
     pose = book.stops[stop]
     drawn = "█" * round(done / count * WIDTH)
-    more = []
+    more = [f"place {pose.station + 1}"] if any(p.station for p in book.stops) else []
     if pose.repeat:
         first = next(i for i, p in enumerate(book.stops) if p.number == pose.number)
         more.append(f"stop {first + 1} once more")

@@ -50,11 +50,11 @@ def _vector3(values: list[Any]) -> tuple[float, float, float]:
 
 
 def write_poses(plan: Plan, path: Path) -> None:
-    """Write the stops as CSV, in the order of travel: stop from 1, load, joints in rad."""
+    """Write the stops as CSV, in the order of travel: stop from 1, place, load, joints in rad."""
     n = len(plan.poses[0].q)
     rows = [
-        (i + 1, p.number, p.load, plan.loads[p.load].mass, float(p.held_out), p.repeat, *p.q)
+        (i + 1, p.number, p.station, p.load, plan.loads[p.load].mass, p.held_out, p.repeat, *p.q)
         for i, p in enumerate(plan.poses)
     ]
-    names = ["stop", "pose", "load", "payload", "held_out", "repeat"]
+    names = ["stop", "pose", "place", "load", "payload", "held_out", "repeat"]
     write_table(path, [*names, *(f"target_q_{i}" for i in range(n))], np.array(rows, dtype=float))

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from bridge.calibration.instruments.settings import Base
 from bridge.calibration.order import Order
-from bridge.calibration.settings import BoxEntry, CalibrationSettings, JointRange
+from bridge.calibration.settings import BoxEntry, CalibrationSettings, JointRange, RangeEntry
 from bridge.cell import Cell
 from core.calibration.capsules import Box
-from core.calibration.design import plan
+from core.calibration.design import far_end, plan
 from core.calibration.observables import Observable, make_observable
 from core.calibration.parameters import DEFAULT, Parameters
 from core.calibration.plan import Payload, Plan
@@ -20,7 +21,9 @@ from core.errors import CellError
 from core.metrology import Metrology
 
 REPEATABILITY = 5e-5  # m, 1 sigma of one coordinate, where the cell does not tell it
-NEEDS_PLACE = ("distance", "sphere")  # kinds that are planned around a fixed point
+NEEDS_PLACE = {"distance": "fixed end", "sphere": "sphere", "point": "point"}
+"""Kinds that are planned around something fixed in the cell, and what that is."""
+TOUCHED = ("sphere", "point")  # kinds without anything that looks at the tool
 
 
 def effects_of(cell: Cell) -> tuple[str, ...]:
@@ -64,12 +67,13 @@ def loads_of(cell: Cell) -> tuple[Payload, ...]:
 def planned(cell: Cell, order: Order, tell: Callable[[str, float], None]) -> Plan:
     """Return the plan of a whole session. Raises InputError where there can be none."""
     given, instrument = cell.calibration, order.instrument
-    observable = observable_of(cell, instrument)
+    space = space_of(cell, instrument.measures)
+    observable = observable_of(cell, instrument, max(len(space.places), 1))
     return plan(
         parameters_of(cell, observable),
         observable,
         loads_of(cell),
-        space_of(cell, instrument.measures),
+        space,
         poses=order.poses or given.poses,
         held_out=given.held_out,
         repeats=given.repeats,
@@ -82,18 +86,57 @@ def planned(cell: Cell, order: Order, tell: Callable[[str, float], None]) -> Pla
 
 def space_of(cell: Cell, kind: str) -> Space:
     """Return where the arm may be measured. Raises CellError."""
-    given = cell.calibration
-    if kind in NEEDS_PLACE and given.instrument_at is None:
-        raise CellError(
-            f"{cell.path}: calibration.instrument_at: found nothing, expected where the "
-            f"{'sphere' if kind == 'sphere' else 'fixed point'} is, m, in base, about"
-        )
-    places = [] if given.instrument_at is None else [Place(_three(given.instrument_at))]
+    given, seen = cell.calibration, cell.calibration.reflector
+    places = _places(cell, kind)
     lower, upper = _range(cell, given.joint_range)
     return Space.of(
         cell.model, lower=lower, upper=upper, floor=given.floor, places=places,
         keep_out=[Box(_three(b.lower), _three(b.upper)) for b in _boxes(cell, given)],
+        looks=None if seen is None else seen.looks,
+        acceptance=np.pi if seen is None else seen.acceptance,
     )  # fmt: skip
+
+
+def _places(cell: Cell, kind: str) -> list[Place]:
+    """Return where the instrument stands in turn, with its range. Raises CellError."""
+    given, where = cell.calibration, f"{cell.path}: calibration"
+    if given.instrument_at is None:
+        if kind in NEEDS_PLACE:
+            raise CellError(
+                f"{where}.instrument_at: found nothing, expected where the {NEEDS_PLACE[kind]} is, "
+                "m, in base, about"
+            )
+        for key in ("further_places", "instrument_range", "reflector"):
+            if getattr(given, key):
+                raise CellError(
+                    f"{where}.instrument_at: found nothing beside {key}, expected where the "
+                    "instrument stands first, m, in base, about"
+                )
+        return []
+    for key in ("instrument_range", "reflector") if kind in TOUCHED else ():
+        if getattr(given, key):
+            raise CellError(
+                f"{where}.{key}: found it with a {NEEDS_PLACE[kind]} that is touched, expected it "
+                "only where an instrument looks at the tool"
+            )
+    if given.reflector is not None and not any(given.reflector.looks):
+        raise CellError(f"{where}.reflector.looks: found no length, expected a direction")
+    ends = given.instrument_range or RangeEntry()
+    farthest = np.inf if ends.farthest is None else ends.farthest
+    if ends.nearest >= farthest:
+        raise CellError(
+            f"{where}.instrument_range: found nearest {ends.nearest:g} and farthest {farthest:g}, "
+            "expected nearest below farthest"
+        )
+    return [
+        Place(_three(at), ends.nearest, farthest)
+        for at in (given.instrument_at, *given.further_places)
+    ]
+
+
+def with_loads(space: Space, loads: Sequence[Payload]) -> Space:
+    """Return the space of an arm on whose flange such loads hang, in turn."""
+    return replace(space, hung=(*space.hung, *(far_end(load) for load in loads)))
 
 
 def _boxes(cell: Cell, given: CalibrationSettings) -> list[BoxEntry]:

@@ -22,7 +22,7 @@ from bridge.calibration.joint_sources import make_joints
 from bridge.calibration.journal import Journal
 from bridge.calibration.order import Order
 from bridge.calibration.plan_document import write_poses
-from bridge.calibration.planning import metrology_of, space_of
+from bridge.calibration.planning import loads_of, metrology_of, space_of, with_loads
 from bridge.calibration.stand import JointSource, PlannedJoints
 from bridge.calibration.talk import InputEnded, Talk, Word
 from bridge.calibration.words import load_text
@@ -171,13 +171,14 @@ def _measure(job: Job, joints: JointSource, instrument: AnyInstrument) -> None:
     talk.say("at every question: Enter goes on, `undo`, `back`, `skip`, `quit`, `?`")
     bringing = Bringing(
         talk, job.book, joints, _clear(job), given.speed, given.minutes_per_load, instrument,
+        [given.instrument_at or [], *given.further_places],
     )  # fmt: skip
     sigma = metrology_of(job.cell, order.instrument).sigma
     Conversation(talk, job.book, bringing, instrument, job.foresight(), sigma, given.samples).lead()
 
 
 def _clear(job: Job) -> Callable[[Array], Array]:
-    space = space_of(job.cell, "position")
+    space = with_loads(space_of(job.cell, "position"), loads_of(job.cell))
     return lambda q: np.asarray(space.clear(q), dtype=float)
 
 

@@ -41,6 +41,22 @@ class JointRange(_Section):
     upper: list[Number] = Field(description="rad, one value per joint")
 
 
+class RangeEntry(_Section):
+    """How far the instrument reaches."""
+
+    nearest: NotNegative = Field(default=0.0, description="m")
+    farthest: Positive | None = Field(default=None, description="m; default: as far as it sees")
+
+
+class ReflectorEntry(_Section):
+    """Which way the reflector on the tool looks, and from how far aside it is still seen."""
+
+    looks: Vector3 = Field(description="direction in the tool's axes")
+    acceptance: Annotated[Number, Field(gt=0, le=3.1416)] = Field(
+        description="rad, half the cone in which it is seen"
+    )
+
+
 class CalibrationSettings(_Section):
     """The whole section. Everything has a default but what hangs on the flange."""
 
@@ -62,6 +78,15 @@ class CalibrationSettings(_Section):
     )
     instrument_at: Vector3 | None = Field(
         default=None, description="m, in base, about: poses that it cannot see are left out"
+    )
+    further_places: list[Vector3] = Field(
+        default=[], description="m, in base, about: where it is carried to afterwards, in turn"
+    )
+    instrument_range: RangeEntry | None = Field(
+        default=None, description="m: poses out of it are left out"
+    )
+    reflector: ReflectorEntry | None = Field(
+        default=None, description="poses that turn it away from the instrument are left out"
     )
     keep_out: list[BoxEntry] = Field(default=[], description="boxes that the arm stays out of")
     floor: Number | None = Field(default=0.0, description="m, in base: nothing comes below")

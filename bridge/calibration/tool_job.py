@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from bridge.calibration.book import Book
 from bridge.calibration.foresight import Foresight
 from bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
-from bridge.calibration.instruments.settings import SphereSettings
-from bridge.calibration.instruments.sphere import TipOnPoint
+from bridge.calibration.instruments.point import TipOnPoint
+from bridge.calibration.instruments.settings import PointSettings
 from bridge.calibration.job import Job, bare_plan
 from bridge.calibration.order import Order
 from bridge.calibration.planning import loads_of
@@ -59,7 +59,7 @@ class ToolJob(Job):
 
     def instrument(self, around: Surroundings) -> AnyInstrument:
         """Return the fixed point."""
-        return TipOnPoint(SphereSettings(kind="sphere"), around)
+        return TipOnPoint(PointSettings(kind="point"), around)
 
     def foresight(self) -> Foresight | None:
         """Return nobody: the touches are judged at the end."""

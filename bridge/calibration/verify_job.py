@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,13 @@ from numpy.typing import NDArray
 from bridge.calibration.job import Job, bare_plan
 from bridge.calibration.log_of import write_log
 from bridge.calibration.pace import seconds_left
-from bridge.calibration.planning import loads_of, metrology_of, observable_of, space_of
+from bridge.calibration.planning import (
+    loads_of,
+    metrology_of,
+    observable_of,
+    space_of,
+    with_loads,
+)
 from bridge.calibration.whole_job import promise_beside
 from bridge.calibration.words import duration, millimetres, parameter
 from core.calibration.candidates import candidates_of
@@ -55,7 +62,8 @@ class VerifyJob(Job):
                 f"expected one by {self.order.instrument.measures}: verify it as it was made"
             )
         loads = tuple(sorted(loads_of(self.cell), key=lambda load: load.mass))
-        space = space_of(self.cell, promise.kind)
+        space = with_loads(space_of(self.cell, promise.kind), loads)
+        space = replace(space, places=space.places[:1])  # a few poses from one place
         observable = observable_of(self.cell, self.order.instrument)
         tell("looking for poses", 0.2)
         found = candidates_of(

@@ -43,6 +43,7 @@ class WholeJob(Job):
             f"plan: {fit} poses to fit, {held} to verify, {again} once more for the repeatability: "
             f"{len(plan.poses)} stops, {duration(seconds_left(self.book, minutes) + plan.travel)}"
         )
+        self._tell_places(plan)
         used = {p.load for p in plan.poses}
         for i, load in enumerate(plan.loads):
             needless = "" if i in used else " (not needed: it would tell nothing more)"
@@ -58,6 +59,17 @@ class WholeJob(Job):
             talk.say(f"  these poses hardly tell: {', '.join(weak)}")
         for note in plan.notes:
             talk.say(f"  note: {note}")
+
+    def _tell_places(self, plan: Plan) -> None:
+        """Say where the instrument stands in turn, where it is carried about."""
+        given = self.cell.calibration
+        for i, at in enumerate(
+            given.further_places and [given.instrument_at, *given.further_places]
+        ):
+            count = sum(p.station == i for p in plan.poses)
+            place = ", ".join(f"{v:g}" for v in at or ())
+            needless = "" if count else " (not needed: nothing more is seen from there)"
+            self.talk.say(f"  place {i + 1}: ({place}) m in base, {count} stops{needless}")
 
     def _wanted(self, lacking: tuple[str, ...]) -> bool:
         """Return whether effects that the readings ask for are to be fitted as well."""

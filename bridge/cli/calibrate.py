@@ -52,10 +52,12 @@ At every question:
 )
 @click.option("--verify", is_flag=True, help="Measure a few poses: does the calibration hold?")
 @click.option(
-    "--payload-only", is_flag=True, help="Find mass and centre of gravity of what the arm carries."
+    "--payload-only",
+    is_flag=True,
+    help="Find mass and centre of what the arm carries, and the bias of its sensor.",
 )
 @click.option(
-    "--tool-only", is_flag=True, help="Find the force sensor's bias and the tool's mass and centre."
+    "--tool-only", is_flag=True, help="Find the tip of a new tool, brought onto one fixed point."
 )
 @click.option("--yes", is_flag=True, help="Write the new cell without asking. Never moves the arm.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True,

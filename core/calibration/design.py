@@ -86,7 +86,7 @@ def _planned(
 ) -> Plan:
     loads = _in_order(parameters, loads)
     tell("looking for poses", 0.0)
-    space = replace(space, hung=(*space.hung, *(_far_end(load) for load in loads)))
+    space = replace(space, hung=(*space.hung, *(far_end(load) for load in loads)))
     found = candidates_of(parameters, observable, loads, space, wish.seed, wish.stops)
     _require_enough(parameters, observable, found, wish)
     tell("working out what each pose tells", 0.1)
@@ -135,7 +135,7 @@ def _in_order(parameters: Parameters, loads: Sequence[Payload]) -> list[Payload]
     return sorted(loads, key=lambda load: load.mass)
 
 
-def _far_end(load: Payload) -> tuple[float, float, float]:
+def far_end(load: Payload) -> tuple[float, float, float]:
     """Return how far a load reaches (m, flange axes): as far beyond its middle as before."""
     return (2 * load.cog[0], 2 * load.cog[1], 2 * load.cog[2])
 

@@ -18,6 +18,7 @@ INSTRUMENTS: dict[str, str] = {
     "dial_gauge": f"{_HERE}.dial_gauge:DialGauge",
     "two_balls": f"{_HERE}.two_balls:TwoBalls",
     "sphere": f"{_HERE}.sphere:Sphere",
+    "point": f"{_HERE}.point:TipOnPoint",
     "simulated_tracker": f"{_HERE}.simulated_tracker:SimulatedTracker",
 }
 """Name in a cell file (calibration.instrument.kind) -> ``module:Class``, imported on use."""

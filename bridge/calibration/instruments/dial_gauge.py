@@ -14,6 +14,7 @@ class DialGauge(Instrument[DialGaugeSettings]):
 
     manual = True
     waits = True
+    stands = "its fixed end"
 
     @property
     def name(self) -> str:

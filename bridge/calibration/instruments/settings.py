@@ -164,6 +164,17 @@ class SphereSettings(Base):
         return "sphere"
 
 
+class PointSettings(Base):
+    """A fixed point that the tool's tip is brought onto: joint angles alone are the reading."""
+
+    kind: Literal["point"]
+
+    @property
+    def measures(self) -> str:
+        """Return ``point``."""
+        return "point"
+
+
 class SimulatedTrackerSettings(Base):
     """The laser tracker beside `gapbridge simulate`."""
 
@@ -186,6 +197,7 @@ InstrumentSettings = Annotated[
     | DialGaugeSettings
     | TwoBallsSettings
     | SphereSettings
+    | PointSettings
     | SimulatedTrackerSettings,
     Field(discriminator="kind"),
 ]

@@ -13,7 +13,7 @@ class Sphere(Instrument[SphereSettings]):
 
     waits = True
     seats = True
-    question = "probe seated on the sphere? Enter"
+    stands = "the sphere"
 
     @property
     def name(self) -> str:
@@ -22,21 +22,5 @@ class Sphere(Instrument[SphereSettings]):
 
     def read(self, where: Where) -> Samples:
         """Return one sample without any number (1, 0), once the probe sits on the sphere."""
-        self.around.ask(self.question)
+        self.around.ask("probe seated on the sphere? Enter")
         return Samples(np.zeros((1, 0)))
-
-
-class TipOnPoint(Sphere):
-    """A person brings the tool's tip onto one fixed point and says so."""
-
-    question = "tip on the point? Enter"
-
-    @property
-    def kind(self) -> str:
-        """Return ``point``."""
-        return "point"
-
-    @property
-    def name(self) -> str:
-        """Return what is done."""
-        return "tip on a fixed point"

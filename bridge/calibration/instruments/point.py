@@ -1,0 +1,26 @@
+"""A fixed point met with the tool's tip: joint angles alone, no metrology at all."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bridge.calibration.instruments.instrument import Instrument, Samples, Where
+from bridge.calibration.instruments.settings import PointSettings
+
+
+class TipOnPoint(Instrument[PointSettings]):
+    """A person brings the tool's tip onto one fixed point and says so."""
+
+    waits = True
+    seats = True
+    stands = "the point"
+
+    @property
+    def name(self) -> str:
+        """Return what is done."""
+        return "tip on a fixed point"
+
+    def read(self, where: Where) -> Samples:
+        """Return one sample without any number (1, 0), once the tip is on the point."""
+        self.around.ask("tip on the point? Enter")
+        return Samples(np.zeros((1, 0)))

@@ -1,0 +1,145 @@
+"""What a cell says of the instrument has its effect on the plan, and on what is asked on the way."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from played import FRAME, KNOCKED, plan_in, play, positions, typed, write_cell
+
+from bridge.calibration.journal import FILE, read_entries
+from bridge.calibration.order import Order
+from bridge.calibration.planning import planned, space_of
+from bridge.cell import load_cell
+from core.calibration.plan import Plan
+from core.model import Model
+
+AT = (2.5, -0.8, 0.6)
+
+
+def cell_with(folder: Path, *lines: str, **changed: object) -> Path:
+    path = write_cell(folder, **{"poses": 12, "held_out": 2, **changed})
+    with path.open("a", encoding="utf-8") as file:
+        file.write("".join(f"  {line}\n" for line in lines))
+    return path
+
+
+def plan_with(folder: Path, *lines: str, **changed: object) -> tuple[Plan, Model]:
+    cell = load_cell(cell_with(folder, *lines, **changed))
+    order = Order("whole", None, cell.calibration.instrument)
+    return planned(cell, order, lambda text, share: None), cell.model
+
+
+def test_poses_that_turn_the_reflector_away_are_not_planned(tmp_path: Path) -> None:
+    plan, model = plan_with(
+        tmp_path, f"instrument_at: {list(AT)}", "reflector: {looks: [0, 0, 2], acceptance: 0.5}"
+    )
+    free, _ = plan_with(tmp_path, f"instrument_at: {list(AT)}")
+    turned = [_angle(p, model) for p in (plan, free)]
+    assert turned[0].max() < 0.5
+    assert turned[1].max() > 0.5
+
+
+def _angle(plan: Plan, model: Model) -> np.ndarray:
+    poses = model.rigid_pose(np.array([p.q for p in plan.poses]))
+    way = np.array(AT) - poses.position
+    cosine = np.einsum("ni,ni->n", way, poses.rotation[:, :, 2]) / np.linalg.norm(way, axis=1)
+    return np.asarray(np.arccos(cosine))
+
+
+@pytest.mark.parametrize(
+    ("kind", "near", "far"),
+    [("{kind: typed, unit: m}", 2.0, 2.6), ("{kind: dial_gauge, unit: mm}", 1.9, 2.7)],
+)
+def test_poses_out_of_the_instruments_range_are_not_planned(
+    tmp_path: Path, kind: str, near: float, far: float
+) -> None:
+    plan, model = plan_with(
+        tmp_path, f"instrument_at: {list(AT)}",
+        f"instrument_range: {{nearest: {near}, farthest: {far}}}", instrument=kind, poses=24,
+    )  # fmt: skip
+    position = model.rigid_pose(np.array([p.q for p in plan.poses])).position
+    apart = np.linalg.norm(position - np.array(AT), axis=1)
+    assert near <= apart.min() + 1e-9
+    assert apart.max() - 1e-9 <= far
+
+
+def test_an_instrument_that_is_carried_about_is_led_from_place_to_place(tmp_path: Path) -> None:
+    cell = cell_with(
+        tmp_path, f"instrument_at: {list(AT)}", "further_places: [[-2.0, 1.0, 0.5]]",
+        "reflector: {looks: [0, 0, 1], acceptance: 0.7}", registered="true", poses=20,
+    )  # fmt: skip
+    session = tmp_path / "s"
+    played = play(cell, "--plan-only", "--session", session)
+    assert played.code == 0, played.err
+    assert "place 2: (-2, 1, 0.5) m in base" in played.out
+    plan = plan_in(session)
+    stations = [p.station for p in plan.poses]
+    assert set(stations) == {0, 1}
+    assert stations == sorted(stations)
+    table = np.genfromtxt(session / "poses.csv", delimiter=",", names=True)
+    np.testing.assert_array_equal(table["place"], stations)
+    one, other = positions(plan, frame=FRAME), positions(plan, frame=KNOCKED)
+    lines: list[str] = []
+    for i, pose in enumerate(plan.poses):
+        if i and pose.station != plan.poses[i - 1].station:
+            lines.append("")  # it stands there
+        if not i or pose.load != plan.poses[i - 1].load:
+            lines.append("")  # it hangs there
+        lines.append(typed((other if pose.station else one)[i]))
+    played = play(cell, "--session", session, lines=[*lines, "yes"])
+    assert played.code == 0, played.err + played.out[-1500:]
+    assert "place 2 · the instrument at about (-2, 1, 0.5) m in base" in played.out
+    readings = [e for e in read_entries(session / FILE) if e["kind"] == "reading"]
+    assert [e["station"] for e in readings] == stations
+
+
+def test_a_tip_on_one_point_is_planned_and_needs_its_place(tmp_path: Path) -> None:
+    plan, model = plan_with(
+        tmp_path, "instrument_at: [0.7, 0.2, 0.4]", instrument="{kind: point}", poses=16
+    )
+    position = model.rigid_pose(np.array([p.q for p in plan.poses])).position
+    np.testing.assert_allclose(position - [0.7, 0.2, 0.4], 0.0, atol=5e-3)  # the arm bends
+
+
+@pytest.mark.parametrize(
+    ("lines", "changed", "words"),
+    [
+        ([], {"instrument": "{kind: point}"}, "expected where the point is"),
+        (["further_places: [[1, 2, 3]]"], {}, "found nothing beside further_places"),
+        (["reflector: {looks: [0, 0, 1], acceptance: 0.5}"], {}, "found nothing beside reflector"),
+        (["instrument_range: {nearest: 1}"], {}, "found nothing beside instrument_range"),
+        (
+            ["instrument_at: [2, 0, 1]", "reflector: {looks: [0, 0, 0], acceptance: 0.5}"], {},
+            "reflector.looks: found no length",
+        ),
+        (
+            ["instrument_at: [2, 0, 1]", "instrument_range: {nearest: 3, farthest: 2}"], {},
+            "found nearest 3 and farthest 2",
+        ),
+        (
+            ["instrument_at: [1, 0, 0]", "instrument_range: {nearest: 1}"],
+            {"instrument": "{kind: sphere}"}, "found it with a sphere that is touched",
+        ),
+        (["instrument_at: [2, 0, 1]", "reflector: {looks: [0, 0, 1]}"], {}, "acceptance"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_meant_is_refused_in_one_line(
+    tmp_path: Path, lines: list[str], changed: dict[str, object], words: str
+) -> None:
+    played = play(cell_with(tmp_path, *lines, **changed), "--plan-only", "--session", tmp_path / "s")
+    assert played.code == 2
+    assert words in played.err
+    assert played.err.count("\n") == 1
+
+
+def test_loads_reach_as_far_on_the_way_as_in_the_plan(tmp_path: Path) -> None:
+    from bridge.calibration.planning import loads_of, with_loads
+
+    cell = load_cell(cell_with(tmp_path))
+    bare = space_of(cell, "position")
+    loaded = with_loads(bare, loads_of(cell))
+    q = bare.draw(2000, np.random.default_rng(0))
+    assert (loaded.clear(q) & ~bare.clear(q)).sum() == 0
+    assert loaded.clear(q).sum() < bare.clear(q).sum()
