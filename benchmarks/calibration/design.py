@@ -4,9 +4,10 @@
 
 For each random cell: the predicted TCP's 1 sigma that the planned poses leave (rms over the
 workspace and all loads, and at its worst place), and how many random poses it takes to equal them;
-random ones are drawn from the same reachable, visible poses under the same loads. Then the scatter
-of every parameter, and of the predicted TCP, over repeated simulated sessions, as a share of what
-the plan had promised.
+random ones are drawn uniformly from the same reachable, visible poses under the same loads. Beside
+it, how many random poses would equal the best that any choice of as many poses could reach
+(``best_possible.py``): no planner gets beyond that. Then the scatter of every parameter, and of the
+predicted TCP, over repeated simulated sessions, as a share of what the plan had promised.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import argparse
 import json
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +25,11 @@ from rich.console import Console
 from rich.table import Table
 from threadpoolctl import threadpool_limits
 
+from benchmarks.calibration.best_possible import least_possible
 from benchmarks.calibration.random_cells import RandomCell, random_cell
 from benchmarks.calibration.repeated import Scatter, repeated_sessions
 from core.calibration.candidates import candidates_of
-from core.calibration.design import plan, reference_of
+from core.calibration.design import far_end, plan, reference_of
 from core.calibration.foreseen import empty_readings
 from core.calibration.information import Reference, blocks, gathered, inverse
 from core.calibration.observables import Nuisance, Observable, make_observable
@@ -40,6 +42,7 @@ Array = NDArray[np.float64]
 SIGMA = 3e-5
 DRAWS = 15  # random choices of each number of poses
 TIMES = (1.0, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0)  # of the planned number
+POOL = 2000  # poses over which the best possible choice is bounded
 SHOWN = 3.0  # a parameter counts as told where the weak prior is this many times as wide
 
 
@@ -56,6 +59,8 @@ class Row:
     random_worst: dict[str, float]
     equal: float  # times as many random poses give the plan's rms; inf: more than 3
     equal_worst: float  # the same for the worst place
+    possible: float  # rms that no choice of as many poses can come below
+    equal_possible: float  # times as many random poses give that
     told: int  # parameters that the plan shows
     scatter: list[float]  # scatter / expected of each of them
     scatter_tcp: float  # of the predicted TCP, rms
@@ -91,8 +96,11 @@ def row_of(cell: RandomCell, observable: Observable, poses: int, sessions: int, 
         seed=seed,
     )  # fmt: skip
     seconds = time.process_time() - begin
+    hung = tuple(far_end(load) for load in planned.loads)
+    cell = replace(cell, space=replace(cell.space, hung=hung))  # the planner's, loads and all
     reference = reference_of(parameters, planned.loads, cell.space, seed)
     rms, worst = chosen_at_random(cell, parameters, observable, reference, poses, seed)
+    possible = least_of_all(cell, parameters, observable, reference, planned)
     scatter = repeated_sessions(
         parameters, observable, readings_of(planned, observable.kind), Nuisance.zero(),
         sigma=SIGMA, sessions=sessions, seed=seed,
@@ -102,7 +110,8 @@ def row_of(cell: RandomCell, observable: Observable, poses: int, sessions: int, 
     return Row(
         cell.name, len(parameters), len(cell.loads), expected.tcp_std, expected.tcp_std_worst,
         _named(rms), _named(worst), equal_to(expected.tcp_std, rms),
-        equal_to(expected.tcp_std_worst, worst), int(shown.sum()),
+        equal_to(expected.tcp_std_worst, worst), possible, equal_to(possible, rms),
+        int(shown.sum()),
         [float(r) for r in scatter.std[shown] / expected.std[shown]],
         tcp_scatter(scatter, parameters, reference) / expected.tcp_std, planned.travel, seconds,
     )  # fmt: skip
@@ -132,6 +141,22 @@ def chosen_at_random(
     return rms, worst
 
 
+def least_of_all(
+    cell: RandomCell, parameters: Parameters, observable: Observable, reference: Reference,
+    planned: Plan,
+) -> float:  # fmt: skip
+    """Return the rms below which no choice of as many poses comes, of a pool and the planned."""
+    found = candidates_of(parameters, observable, planned.loads, cell.space, 0, POOL)
+    own = readings_of(planned, observable.kind)
+    own = own[~own.held_out]
+    own = replace(own, value=observable.predict(parameters.nominal, own, found.nuisance))
+    rows = np.concatenate([
+        blocks(parameters, observable, given, found.nuisance, SIGMA)
+        for given in (found.readings, own)
+    ])  # fmt: skip
+    return least_possible(rows, reference.weight(rows.shape[2]), len(own))
+
+
 def equal_to(planned: float, chance: list[float]) -> float:
     """Return how many times as many random poses give the planned deviation."""
     return float(np.interp(-planned, [-value for value in chance], TIMES, right=np.inf))
@@ -153,7 +178,8 @@ def table_of(rows: list[Row]) -> Table:
     table = Table(title="planned against random poses; promised against found")
     for column in (
         "cell", "p", "loads", "planned um", "random um", "2x random um", "equals", "worst um",
-        "2x random um", "equals", "scatter/expected", "worst", "TCP", "travel s", "CPU s",
+        "2x random um", "equals", "best um", "equals", "scatter/expected", "worst", "TCP",
+        "travel s", "CPU s",
     ):  # fmt: skip
         table.add_column(column, justify="left" if column == "cell" else "right")
     for row in rows:
@@ -162,7 +188,8 @@ def table_of(rows: list[Row]) -> Table:
             row.cell, str(row.parameters), str(row.loads), f"{1e6 * row.planned:.1f}",
             f"{1e6 * row.random['1']:.1f}", f"{1e6 * row.random['2']:.1f}", f"{row.equal:.2f}x",
             f"{1e6 * row.planned_worst:.1f}", f"{1e6 * row.random_worst['2']:.1f}",
-            f"{row.equal_worst:.2f}x", f"{ratio.mean():.3f}",
+            f"{row.equal_worst:.2f}x", f"{1e6 * row.possible:.1f}", f"{row.equal_possible:.2f}x",
+            f"{ratio.mean():.3f}",
             f"{ratio[np.argmax(np.abs(ratio - 1))]:.3f}", f"{row.scatter_tcp:.3f}",
             f"{row.travel:.0f}", f"{row.seconds:.1f}",
         )  # fmt: skip
@@ -178,6 +205,12 @@ def summary_of(rows: list[Row]) -> dict[str, float]:
         "cells": len(rows),
         "random poses equal to the plan, rms, median": float(np.median(equal)),
         "random poses equal to the plan, rms, least": float(equal.min()),
+        "random poses equal to the best possible choice, rms, median": float(
+            np.median([row.equal_possible for row in rows])
+        ),
+        "planned rms over the best possible, median": float(
+            np.median([row.planned / row.possible for row in rows])
+        ),
         "random poses equal to the plan, worst place, median": float(np.median(worst)),
         "random poses equal to the plan, worst place, least": float(worst.min()),
         "parameters told": len(ratio),

@@ -5,17 +5,21 @@ people. The command is killed at random moments after it has begun to measure; e
 had told of before ("kept") must stand in the journal, unchanged, and the same command must go on.
 
     python -m benchmarks.calibration.kills --kills 100
+
+The first ``--whole`` kills start the command anew, as a terminal does; the others fork it from this
+process, which has its libraries loaded already: the same code from its first line on, without the
+seconds that Python takes to begin.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import os
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from dataclasses import dataclass
@@ -23,6 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.calibration.children import PYTHON, Child, Start, environment, forked, started
 from bridge.calibration.journal import FILE, read_entries
 from bridge.calibration.plan_document import plan_of
 from core.arm import builtin_arm
@@ -59,16 +64,23 @@ class Tally:
     refused: int = 0  # starts that did not go on
 
 
-def run(kills: int, seed: int, say: bool = True) -> Tally:
-    """Kill sessions ``kills`` times; returns what was lost."""
+def run(kills: int, seed: int, say: bool = True, whole: int | None = None) -> Tally:
+    """Kill sessions ``kills`` times, after ``whole`` (None: all) real starts forked ones.
+
+    Returns what was lost.
+    """
     rng, tally = np.random.default_rng(seed), Tally()
+    start: Start = started
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         template = _planned(folder)
         session = _fresh(folder, template, tally.sessions)
         while tally.kills < kills:
             when = int(rng.integers(0, MOST_KEPT)), float(rng.uniform(0.0, LONGEST_WAIT))
-            ended = _killed_once(folder, session, when, tally)
+            if whole is not None and tally.kills >= whole and start is started:
+                importlib.import_module("bridge.calibration.whole_job")
+                start = forked
+            ended = _killed_once(start(_command(folder, session)), session, when, tally)
             if say:
                 print(f"\r{tally}", end="", flush=True)
             if ended:
@@ -82,8 +94,9 @@ def _planned(folder: Path) -> Path:
     (folder / "cell.yaml").write_text(CELL, encoding="utf-8")
     session = folder / "template"
     subprocess.run(
-        _command(folder, session, "--plan-only"), check=True, stdout=subprocess.DEVNULL, env=_env()
-    )
+        [*PYTHON, *_command(folder, session, "--plan-only")], check=True,
+        stdout=subprocess.DEVNULL, env=environment(),
+    )  # fmt: skip
     entries = read_entries(session / FILE)
     plan = plan_of(next(e["plan"] for e in entries if e["kind"] == "plan"))
     q = np.array([p.q for p in plan.poses])
@@ -106,33 +119,18 @@ def _fresh(folder: Path, template: Path, number: int) -> Path:
 
 
 def _command(folder: Path, session: Path, *more: str) -> list[str]:
-    return [
-        sys.executable, "-m", "bridge.cli", "calibrate", str(folder / "cell.yaml"),
-        "--session", str(session), *more,
-    ]  # fmt: skip
+    return ["calibrate", str(folder / "cell.yaml"), "--session", str(session), *more]
 
 
-def _env() -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-
-
-def _killed_once(folder: Path, session: Path, when: tuple[int, float], tally: Tally) -> bool:
-    """Start the session and kill it; returns whether all stops were measured by then.
+def _killed_once(child: Child, session: Path, when: tuple[int, float], tally: Tally) -> bool:
+    """Kill a session that goes on; returns whether all stops were measured by then.
 
     ``when``: after how many readings, and how long after the last of them, s.
     """
     before = [e for e in read_entries(session / FILE) if e["kind"] == "reading"]
-    process = subprocess.Popen(
-        _command(folder, session), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT, env=_env(), start_new_session=True,
-    )  # fmt: skip
-    assert process.stdin is not None
-    assert process.stdout is not None
-    process.stdin.write(b"\n\n")  # the loads hang
-    process.stdin.flush()
     told, kept, begun = b"", 0, False
     count = min(when[0], _stops(session) - len(before))
-    for line in process.stdout:
+    for line in child.shown:
         told += line
         begun |= line.startswith(b"instrument:")
         kept += line.startswith(b"  kept")
@@ -142,11 +140,9 @@ def _killed_once(folder: Path, session: Path, when: tuple[int, float], tally: Ta
         tally.refused += 1
         raise RuntimeError(f"the session did not go on: {told.decode()[-600:]}")
     time.sleep(when[1])
-    os.killpg(process.pid, signal.SIGKILL)
-    told += process.stdout.read()
-    process.wait()
-    process.stdin.close()
-    process.stdout.close()
+    os.killpg(child.pid, signal.SIGKILL)
+    told += child.shown.read()
+    child.close()
     _count(session, before, told, tally)
     done = sum(e["kind"] == "reading" for e in read_entries(session / FILE))
     return done >= _stops(session)
@@ -179,9 +175,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--whole", type=int, default=10, help="kills of commands begun anew")
     given = parser.parse_args()
     begun = time.monotonic()
-    tally = run(given.kills, given.seed)
+    tally = run(given.kills, given.seed, whole=given.whole)
     print(f"\r{tally.kills} kills in {tally.sessions} sessions, {time.monotonic() - begun:.0f} s: "
           f"{tally.acknowledged} readings told of, {tally.lost} lost, {tally.torn} torn lines, "
           f"{tally.refused} starts refused")  # fmt: skip

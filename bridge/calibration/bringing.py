@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from bridge.calibration.book import Book
 from bridge.calibration.instruments.instrument import AnyInstrument, ReadingError
+from bridge.calibration.route import route
 from bridge.calibration.stand import JointSource, PlannedJoints, Stand
 from bridge.calibration.talk import Talk
 from bridge.calibration.words import degrees, load_text
@@ -20,7 +21,6 @@ FAR = np.radians(3.0)  # an arm farther from the pose than this is asked about
 THERE = 2e-3  # rad: an arm this near need not be driven
 HEAVY = 0.05  # kg, and share: the controller's payload may differ from the plan's by as much
 PULL = 12.0  # N at a tool that nothing touches
-CHECKED = 60  # points of a way that are looked at
 
 
 class Bringing:
@@ -81,10 +81,11 @@ class Bringing:
 
         None where the instrument has it seated by hand afterwards.
         """
-        if self._driven and not self._there(pose) and self._way_is_clear(pose):
+        via = None if not self._driven or self._there(pose) else self._way(pose)
+        if via is not None:
             try:
                 with self.talk.waiting("driving"):
-                    self.joints.drive(pose)
+                    self.joints.drive(pose, via)
             except RunError as error:
                 self.talk.warn(str(error))
                 self.talk.say("  jog it to this pose, or `quit` and look at the arm")
@@ -102,17 +103,21 @@ class Bringing:
         now = self.joints.now()
         return now is not None and bool(np.abs(now - pose.q).max() < THERE)
 
-    def _way_is_clear(self, pose: PlannedPose) -> bool:
-        """Return whether the straight way in joint space is free of what the cell names."""
+    def _way(self, pose: PlannedPose) -> list[Array] | None:
+        """Return the poses to go by, free of what the cell names; None: no way is known."""
         begin = self.joints.now()
         if begin is None:
-            return False
-        way = begin + np.linspace(0, 1, CHECKED)[:, None] * (pose.q - begin)
-        if bool(np.all(self._clear(way))):
-            return True
-        self.talk.warn("no straight way to this pose is free: jog the arm there, or `skip`")
-        self.talk.say(f"  {degrees(pose.q)}")
-        return False
+            return None
+        known = [t.q for t in self.book.taken] + [p.q for p in self.book.stops]
+        via = route(self._clear, begin, pose.q, known)
+        if via is None:
+            self.talk.warn("no way to this pose is known to be free: jog the arm there, or `skip`")
+            self.talk.say(f"  {degrees(pose.q)}")
+        elif via:
+            self.talk.say(
+                f"  going round by {len(via)} other pose{'s'[: len(via) > 1]} of the plan"
+            )
+        return via
 
     def _rested(self, pose: PlannedPose) -> Stand:
         while True:

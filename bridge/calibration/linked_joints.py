@@ -7,6 +7,7 @@ pose, through the one limiter, without corrections; once it rests there the daem
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -98,15 +99,15 @@ class LinkedJoints(JointSource):
         here = rows[:, self._part("actual_q")].mean(axis=0)
         return bool(np.abs(here - stand.q).max() < MOVED)
 
-    def drive(self, pose: PlannedPose) -> None:
+    def drive(self, pose: PlannedPose, via: Sequence[Array] = ()) -> None:
         """Move the arm to a pose, slowly, and wait until it rests there. Raises RunError."""
         if not self.drives:
-            return super().drive(pose)
+            return super().drive(pose, via)
         begin = self.now()
         if begin is None:
             raise LinkError("the arm tells no joints, expected where it stands before a move")
         file = self._folder / "move.csv"
-        length = write_move(file, begin, pose.q, self._speed)
+        length = write_move(file, [begin, *via, pose.q], self._speed)
         moving = SetpointSettings(source="trajectory", file=file.resolve())
         self.close()
         self._start(self._settings.model_copy(update={"setpoints": moving}), write=True)

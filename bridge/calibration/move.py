@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -25,9 +27,12 @@ def move_between(begin: Array, end: Array, speed: float) -> Array:
     return np.asarray(np.vstack([path, np.tile(end, (int(HOLD / PERIOD), 1))]))
 
 
-def write_move(path: Path, begin: Array, end: Array, speed: float) -> float:
-    """Write the move as the daemon's trajectory; returns how long it takes, s."""
-    q = move_between(begin, end, speed)
+def write_move(path: Path, stops: Sequence[Array], speed: float) -> float:
+    """Write the move from stop to stop, at rest in each, as the daemon's trajectory.
+
+    Returns how long it takes, s.
+    """
+    q = np.vstack([move_between(begin, end, speed) for begin, end in pairwise(stops)])
     t = np.arange(len(q)) * PERIOD
     names = ["timestamp", *(f"target_q_{i}" for i in range(q.shape[1]))]
     write_table(path, names, np.column_stack([t, q]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
@@ -58,8 +59,8 @@ class JointSource(ABC):
         """Return whether the arm has not moved since."""
         return True
 
-    def drive(self, pose: PlannedPose) -> None:
-        """Move the arm to a pose. Raises RunError."""
+    def drive(self, pose: PlannedPose, via: Sequence[Array] = ()) -> None:
+        """Move the arm to a pose, by joints ``via`` (n,) in turn. Raises RunError."""
         raise RunError("this session does not move the arm")
 
     def __enter__(self) -> Self:

@@ -40,7 +40,7 @@ class Wish:
     repeats: int = 3  # visits to a pose a second time
     seed: int = 0
     sigma: float = 3e-5  # m, 1 sigma of one coordinate: instrument and arm together
-    travel_weight: float = 0.1  # a usual leg more at every pose is worth this share of the std
+    travel_weight: float = 0.02  # a usual leg more at every pose is worth this share of the std
     stops: int = STOPS  # candidates
 
 
@@ -55,7 +55,7 @@ def plan(
     repeats: int = 3,
     seed: int = 0,
     sigma: float = 3e-5,
-    travel_weight: float = 0.1,
+    travel_weight: float = 0.02,
     stops: int = STOPS,
     progress: Progress | None = None,
 ) -> Plan:

@@ -1,0 +1,199 @@
+"""Sessions of every kind of instrument, whole through the command, ending with a new cell."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from played import AXIAL, FRAME, Played, plan_in, play, truth, typed, write_cell
+
+from bridge.calibration.journal import FILE, read_entries
+from bridge.calibration.planning import observable_of
+from bridge.cell import load_cell
+from core.calibration.foreseen import foreseen
+from core.calibration.observables import Nuisance, fixed_at
+from core.calibration.plan import Plan
+from core.calibration.promise import promise_in
+from core.calibration.readings import Readings
+from core.loads import Loads
+
+AT = np.array([0.7, 0.25, 0.5])  # where people say that it is
+TRUE_AT = np.array([0.704, 0.247, 0.505])  # where it is
+SEAT = 1e-5  # rad, 1 sigma: a seated joint is read no better
+OFFSETS = {"joint_offset_2": 8e-4, "joint_offset_3": -6e-4, "joint_offset_5": 5e-4}
+
+
+@dataclass
+class Session:
+    """A planned session, and what its instrument reads at each stop."""
+
+    folder: Path
+    cell: Path
+    plan: Plan
+    readings: Readings
+
+    def lines(self, *each: Callable[[int], str]) -> list[str]:
+        """Return what is typed: at each stop a line from each of ``each``; loads hung before."""
+        lines, hung = [], None
+        for i, pose in enumerate(self.plan.poses):
+            if pose.load != hung:
+                lines.append("")
+                hung = pose.load
+            lines += [line(i) for line in each]
+        return [*lines, "yes"]
+
+    def play(self, lines: list[str]) -> Played:
+        played = play(
+            self.cell, "--session", self.folder / "s", "--apply", self.folder / "new.yaml",
+            lines=lines,
+        )  # fmt: skip
+        assert played.code == 0, played.err + played.out[-1500:]
+        return played
+
+
+def begun(
+    folder: Path, instrument: str, poses: int, nuisance: Nuisance, joints: str = "planned",
+    tool: tuple[float, float, float] | None = None,
+) -> Session:  # fmt: skip
+    """Return a session that is planned, and its readings with noise."""
+    cell = write_cell(folder, instrument=instrument, joints=joints, poses=poses)
+    with cell.open("a", encoding="utf-8") as file:
+        file.write(f"  instrument_at: {AT.tolist()}\n  floor: -0.2\n")
+    assert play(cell, "--plan-only", "--session", folder / "s").code == 0
+    plan, loaded = plan_in(folder / "s"), load_cell(cell)
+    load = np.array([p.load for p in plan.poses])
+    count = len(load)
+    blank = Readings(
+        loaded.calibration.instrument.measures, np.array([p.q for p in plan.poses]),
+        np.zeros((count, 0)), np.full(count, np.nan),
+        Loads(
+            payload_mass=np.array([one.mass for one in plan.loads])[load],
+            payload_cog=np.array([one.cog for one in plan.loads])[load],
+        ),
+        load, np.zeros(count, dtype=np.int64), np.array([p.target for p in plan.poses]),
+        np.zeros(count, dtype=bool), np.arange(count),
+    )  # fmt: skip
+    observable = observable_of(loaded, loaded.calibration.instrument)
+    found = foreseen(observable, truth(), blank, nuisance)
+    assert len(found) == count
+    random = np.random.default_rng(5)
+    found.value[:] += random.normal(0, 2e-5, found.value.shape)
+    found.q[:] += random.normal(0, SEAT, found.q.shape) if observable.closes else 0.0
+    return Session(folder, cell, plan, found)
+
+
+def finds_the_arm(session: Session, played: Played) -> None:
+    """Check that the new cell has what is hidden in the arm, as well as it says."""
+    assert load_cell(session.folder / "new.yaml").model.terms
+    assert (session.folder / "s" / "calibration.html").exists()
+    assert "kept" in played.out
+    told = json.loads((session.folder / "s" / "promise.json").read_text())
+    promise = promise_in(told)
+    true = {**OFFSETS, **{f"axial_compliance_{i + 1}": c for i, c in enumerate(AXIAL)}}
+    apart = promise.values - [true.get(name, 0.0) for name in promise.names]
+    assert (np.abs(apart) < 5.0 * np.sqrt(np.diag(promise.covariance))).all(), promise.names
+    assert {"axial_compliance_2", "axial_compliance_3"} <= set(promise.names)
+
+
+def at_the_point(length: float = 0.0, balls: int = 1) -> Nuisance:
+    return Nuisance((fixed_at(TRUE_AT),), np.zeros((balls, 3)), np.array([length]))
+
+
+def in_degrees(q: np.ndarray) -> str:
+    return " ".join(f"{v:.6f}" for v in np.degrees(q))
+
+
+def test_a_dial_gauge_whose_zero_nobody_knows(tmp_path: Path) -> None:
+    session = begun(tmp_path, "{kind: dial_gauge, unit: mm}", 26, at_the_point(0.2))
+    dial = [f"{1e3 * v:.3f}" for v in session.readings.value[:, 0]]
+    finds_the_arm(session, session.play(session.lines(lambda i: dial[i])))
+
+
+def test_two_balls_measured_from_anywhere(tmp_path: Path) -> None:
+    balls = Nuisance((FRAME,), np.array([[0.0, 0.0, 0.0], [0.21, 0.02, 0.0]]), np.zeros(1))
+    session = begun(tmp_path, "{kind: two_balls, unit: in}", 16, balls)
+    first = np.random.default_rng(1).uniform(-2, 2, session.readings.value.shape)
+    second = first + session.readings.value
+    finds_the_arm(session, session.play(session.lines(
+        lambda i: typed(first[i], 1 / 0.0254), lambda i: typed(second[i], 1 / 0.0254)
+    )))  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("instrument", "poses", "radius"),
+    [("{kind: sphere, radius: 0.03}", 28, 0.03), ("{kind: point}", 16, 0.0)],
+)
+def test_joint_angles_alone_where_the_probe_sits(
+    tmp_path: Path, instrument: str, poses: int, radius: float
+) -> None:
+    session = begun(tmp_path, instrument, poses, at_the_point(radius), joints="typed")
+    q = session.readings.q
+    finds_the_arm(session, session.play(session.lines(lambda i: "", lambda i: in_degrees(q[i]))))
+
+
+def test_files_that_the_trackers_software_exports(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    session = begun(
+        tmp_path, "{kind: folder, unit: mm, folder: out, pattern: 'M*.txt'}", 14,
+        Nuisance((FRAME,), np.zeros((1, 3)), np.zeros(1)),
+    )  # fmt: skip
+    since = read_entries(tmp_path / "s" / FILE)[0]["time"]
+    for i, value in enumerate(session.readings.value):
+        # the names are not in their order, other files lie beside
+        path = out / f"M{(7 * i) % 97}.txt"
+        point = ";".join(f"{1e3 * v:.4f}".replace(".", ",") for v in value)
+        path.write_text(f"X;Y;Z\n{point}\n", encoding="utf-8")
+        os.utime(path, (since + 1e-3 * i, since + 1e-3 * i))
+    (out / "log.csv").write_text("nothing", encoding="utf-8")
+    finds_the_arm(session, session.play(session.lines()))
+
+
+@pytest.fixture
+def feed() -> Iterator[tuple[int, list[np.ndarray]]]:
+    """Serve lines: a connection that asks is told the next of the readings, as often as it asks."""
+    values: list[np.ndarray] = []
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        thread = threading.Thread(target=_serve, args=(server, values), daemon=True)
+        thread.start()
+        yield server.getsockname()[1], values
+        server.shutdown(socket.SHUT_RDWR)
+    thread.join(10.0)
+
+
+def _serve(server: socket.socket, values: list[np.ndarray]) -> None:
+    random, number = np.random.default_rng(3), 0
+    while True:
+        try:
+            link, _ = server.accept()
+        except OSError:
+            return
+        with link, link.makefile("rw", encoding="utf-8", newline="\r\n") as lines:
+            asked = False
+            for _ in lines:
+                value = 1e3 * (values[number] + random.normal(0, 1e-5, 3))
+                lines.write(" ".join(f"{v:.5f}" for v in value) + "\n")
+                lines.flush()
+                asked = True
+            number += asked
+
+
+def test_lines_that_the_trackers_software_sends_on_demand(
+    tmp_path: Path, feed: tuple[int, list[np.ndarray]]
+) -> None:
+    port, values = feed
+    session = begun(
+        tmp_path, f"{{kind: line_feed, unit: mm, port: {port}, trigger: MEASURE}}", 14,
+        Nuisance((FRAME,), np.zeros((1, 3)), np.zeros(1)),
+    )  # fmt: skip
+    values.extend(session.readings.value)
+    played = session.play(session.lines(lambda i: ""))
+    assert "mean of 10" in played.out
+    finds_the_arm(session, played)
