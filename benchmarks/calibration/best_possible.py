@@ -4,7 +4,8 @@ A design that may measure each candidate pose any fraction of a time is at least
 plan of whole poses. It is found by the multiplicative algorithm, and the equivalence theorem tells
 what is still missing: for the mean variance ``f`` of the prediction, convex in the weights ``w``,
 ``f(best) >= f(w) - (n max d - sum w d)`` with ``d = -df/dw``. Source: Silvey, Titterington,
-Torsney, Comm. Stat. A7 (1978); Atkinson, Donev, Tobias, Optimum Experimental Designs (2007), ch. 9-10.
+Torsney, Comm. Stat. A7 (1978); Atkinson, Donev, Tobias, Optimum Experimental Designs (2007),
+ch. 9-10.
 """
 
 from __future__ import annotations

@@ -72,7 +72,10 @@ class Bringing:
         what = self.book.plan.loads[load]
         self.talk.say()
         self.talk.say(f"load {load + 1} · {load_text(what)}", "bold cyan")
-        self.talk.say("  hang it on the flange, and tell the controller its mass and centre")
+        if self._instrument.needs_wrench:
+            self.talk.say("  it hangs on the flange, and nothing touches it?")
+        else:
+            self.talk.say("  hang it on the flange, and tell the controller its mass and centre")
         self.talk.ask("  Enter when it hangs there")
         self.book.add("mounted", load=load)
 
@@ -156,7 +159,7 @@ class Bringing:
         assert self.book.plan is not None
         meant = self.book.plan.loads[pose.load].mass
         told = stand.payload
-        if pose.load in self._warned:
+        if pose.load in self._warned or self._instrument.needs_wrench:  # which is to be found
             return
         if told is not None and abs(told - meant) > HEAVY * max(1.0, meant):
             self._warned.add(pose.load)

@@ -17,7 +17,7 @@ from bridge.calibration.pace import header
 from bridge.calibration.stand import Stand, TypedJoints
 from bridge.calibration.taken import Taken
 from bridge.calibration.talk import Talk, Word
-from bridge.calibration.words import millimetres, point
+from bridge.calibration.words import force, millimetres, point
 
 Array = NDArray[np.float64]
 SHAKY = 10.0  # times the instrument's sigma: samples that scatter more are doubted
@@ -141,7 +141,8 @@ class Conversation:
 
     def _keep(self, taken: Taken, verdict: Verdict) -> None:
         self.book.add("reading", **{**taken.entry(), "off": verdict.off})
-        told = [f"  kept  {point(taken.value)}"]
+        weighs = self.instrument.needs_wrench
+        told = [f"  kept  {force(taken.raw_wrench) if weighs else point(taken.value)}"]
         if taken.samples > 1:
             told.append(f"mean of {taken.samples}, ±{millimetres(taken.scatter)}")
         if np.isfinite(verdict.off):

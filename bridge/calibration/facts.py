@@ -34,7 +34,8 @@ def session_facts(
     given, instrument = cell.calibration, order.instrument
     name, kind = what or (NAMES[instrument.kind], instrument.measures)
     times = [t.time for t in book.taken] or [float(book.begun["time"])]
-    distances = [np.linalg.norm(t.value[:3]) for t in book.taken if len(t.value) >= 3]
+    wide = {"position": 3, "pose": 3, "distance": 1}.get(kind, 0)  # the others look from nowhere
+    distances = [np.linalg.norm(t.value[:wide]) for t in book.taken if wide]
     return SessionFacts(
         cell=cell.path.stem,
         arm=cell.arm.name,

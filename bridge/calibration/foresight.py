@@ -32,6 +32,7 @@ UNITS = {
     1 / 25.4: "25.4 times too large: millimetres taken for inches?",
     25.4: "25.4 times too small: inches taken for millimetres?",
 }
+SPARE = 4  # distances more than unknowns, until which the fixed point may be told on a wrong side
 EXCHANGED = ((1, 0, 2), (2, 1, 0), (0, 2, 1), (1, 2, 0), (2, 0, 1))
 
 
@@ -108,7 +109,8 @@ class Foresight:
         before, new = here(before), here(new)
         observable = make_observable(self._kind, registered=registered, **self._options)
         layout = observable.layout(before if len(before) else new)
-        few = len(before) * observable.equations <= layout.size
+        spare = SPARE if observable.equations == 1 else 0
+        few = len(before) * observable.equations <= layout.size + spare
         if observable.closes or (few and layout.size):
             return None
         if registered not in self._parameters:

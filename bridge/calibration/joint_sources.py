@@ -6,6 +6,7 @@ from pathlib import Path
 
 from bridge.calibration.instruments.instrument import Ask
 from bridge.calibration.order import Order
+from bridge.calibration.planning import TOUCHED
 from bridge.calibration.stand import JointSource, PlannedJoints, TypedJoints
 from bridge.cell import Cell
 from core.errors import CellError
@@ -20,7 +21,8 @@ def make_joints(cell: Cell, order: Order, ask: Ask, folder: Path) -> JointSource
             raise CellError(
                 f"{cell.path}: calibration.joints: found {source!r} with --move, expected 'link'"
             )
-        return TypedJoints(ask) if source == "typed" else PlannedJoints()
+        seated = order.kind == "tool" or order.instrument.measures in TOUCHED
+        return TypedJoints(ask, seated) if source == "typed" else PlannedJoints()
     if cell.link is None:
         raise CellError(f"{cell.path}: link: found nothing, expected the robot's address")
     if order.move and not cell.link.moves_arm:

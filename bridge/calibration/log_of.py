@@ -16,7 +16,8 @@ def write_log(readings: Readings, registered: bool, path: Path) -> None:
     A log has one frame: of an instrument that was moved, rows of its first place alone are written.
     """
     rows = readings if registered else readings[readings.station == 0]
-    rows = rows[rows.target == 0]
+    if rows.kind in ("position", "pose"):
+        rows = rows[rows.target == 0]
     n, loads = rows.q.shape[1], rows.loads
     columns: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.float64]]] = {
         "timestamp": np.arange(len(rows), dtype=float),

@@ -42,7 +42,7 @@ class PayloadJob(Job):
         """Return orientations of the flange around where the arm stands."""
         assert begin is not None
         own = self.cell.file.payload
-        load = Payload(own.mass, (own.cog[0], own.cog[1], own.cog[2]), "what is to be weighed")
+        load = Payload(own.mass, (own.cog[0], own.cog[1], own.cog[2]), "to be weighed; so far")
         found = plan_payload(self.cell.model, begin, poses=self.order.poses, seed=self.order.seed)
         free = np.zeros(len(begin))
         poses = [PlannedPose(i, q, 0, free) for i, q in enumerate(found.poses)]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Clear = Callable[[Array], Array]
 CHECKED = 60  # points of a straight way that are looked at
+AT_ONCE = 40  # ways
 
 
 def route(clear: Clear, begin: Array, end: Array, known: Sequence[Array]) -> list[Array] | None:
@@ -23,21 +24,27 @@ def route(clear: Clear, begin: Array, end: Array, known: Sequence[Array]) -> lis
     nodes = np.array(known, dtype=float).reshape(-1, len(begin))
     out = np.flatnonzero(all_free(clear, np.broadcast_to(begin, nodes.shape), nodes))
     back = np.flatnonzero(all_free(clear, nodes, np.broadcast_to(end, nodes.shape)))
-    ways = [[i] for i in np.intersect1d(out, back)]
-    if not ways:
-        pairs = [(i, j) for i in out for j in back if i != j]
-        if pairs:
-            first, second = np.array(pairs).T
-            free = all_free(clear, nodes[first], nodes[second])
-            ways = [list(pair) for pair, good in zip(pairs, free, strict=True) if good]
-    if not ways:
-        return None
+    for ways in ([(i,) for i in np.intersect1d(out, back)], [(i, j) for i in out for j in back]):
+        found = _first_free(clear, [[begin, *nodes[list(way)], end] for way in ways])
+        if found is not None:
+            return found[1:-1]
+    return None
 
-    def length(way: Sequence[int]) -> float:
-        along = np.vstack([begin, nodes[list(way)], end])
-        return float(np.abs(np.diff(along, axis=0)).max(axis=1).sum())
 
-    return [nodes[i] for i in min(ways, key=length)]
+def _first_free(clear: Clear, ways: list[list[Array]]) -> list[Array] | None:
+    """Return the shortest way whose every leg is free."""
+
+    def length(way: list[Array]) -> float:
+        return float(np.abs(np.diff(way, axis=0)).max(axis=1).sum())
+
+    ways = sorted(ways, key=length)
+    for at in range(0, len(ways), AT_ONCE):
+        some = np.array(ways[at : at + AT_ONCE])
+        legs = [all_free(clear, some[:, k], some[:, k + 1]) for k in range(1, some.shape[1] - 2)]
+        free = np.flatnonzero(np.all(legs, axis=0)) if legs else np.arange(len(some))
+        if len(free):
+            return list(some[free[0]])
+    return None
 
 
 def all_free(clear: Clear, begin: Array, end: Array) -> NDArray[np.bool_]:

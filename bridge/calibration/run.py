@@ -167,6 +167,11 @@ def _measure(job: Job, joints: JointSource, instrument: AnyInstrument) -> None:
             f"{job.cell.path}: calibration.instrument.kind: found {order.instrument.kind!r} with "
             "--move, expected another: the tool is brought onto something by hand"
         )
+    if instrument.seats and isinstance(joints, PlannedJoints):
+        raise CellError(
+            f"{job.cell.path}: calibration.joints: found 'planned' with an instrument of kind "
+            f"{order.instrument.kind!r}, expected 'link' or 'typed': the joints are the reading"
+        )
     talk.say(f"instrument: {instrument.name}; joints: {_told(joints, order)}")
     talk.say("at every question: Enter goes on, `undo`, `back`, `skip`, `quit`, `?`")
     bringing = Bringing(

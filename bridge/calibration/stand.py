@@ -87,13 +87,19 @@ class PlannedJoints(JointSource):
 class TypedJoints(JointSource):
     """A person reads the pendant, in degrees."""
 
-    def __init__(self, ask: Ask) -> None:
-        self._ask = ask
+    def __init__(self, ask: Ask, seated: bool = False) -> None:
+        self._ask, self._seated = ask, seated
 
     def stand(self, pose: PlannedPose) -> Stand:
-        """Return what is typed; Enter alone: exactly as planned. Raises ReadingError."""
+        """Return what is typed; Enter alone: exactly as planned. Raises ReadingError.
+
+        Where the tool is ``seated`` by hand the joints are the reading, and Enter tells none.
+        """
         n = len(pose.q)
-        line = self._ask(f"joints J1..J{n}, deg (Enter: exactly as planned)")
+        exactly = "" if self._seated else " (Enter: exactly as planned)"
+        line = self._ask(f"joints J1..J{n}, deg{exactly}")
+        if not line and self._seated:
+            raise ReadingError("found nothing, expected where the arm stands now, in degrees")
         if not line:
             return Stand(pose.q)
         given = np.array(numbers(line, n, "deg"))

@@ -32,6 +32,13 @@ def point(value: Array) -> str:
     return f"{lengths} mm" + (f", {turns} mrad" if turns else "")
 
 
+def force(wrench: Array | None) -> str:
+    """Return a flange sensor's reading (6,): its force in N."""
+    if wrench is None:
+        return "nothing"
+    return " ".join(f"{v:+.2f}" for v in wrench[:3]) + " N"
+
+
 def load_text(load: Payload) -> str:
     """Return a load: name, mass, centre of gravity."""
     cog = ", ".join(f"{v * 1e3:g}" for v in load.cog)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from technician import PATIENCE, Hands, Terminal, last_pose
+from technician import PATIENCE, Hands, Terminal
 
 from core.model import Model
 from core.rotation import rotation_matrix
@@ -77,6 +77,3 @@ def lead(terminal: Terminal, answers: dict[str, object], most: int = 400) -> str
         if line is not None:
             terminal.type(str(line))
     raise AssertionError(f"{most} questions, and no end: {terminal.shown[-2000:]}")
-
-
-__all__ = ["BenchHand", "Hands", "Terminal", "last_pose", "lead"]

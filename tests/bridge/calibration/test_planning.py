@@ -1,4 +1,4 @@
-"""What a cell says of the instrument has its effect on the plan, and on what is asked on the way."""
+"""What a cell says of the instrument has its effect on the plan, and on what is asked."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from played import FRAME, KNOCKED, plan_in, play, positions, typed, write_cell
+from played import FRAME, plan_in, play, positions, typed, write_cell
 
 from bridge.calibration.journal import FILE, read_entries
 from bridge.calibration.order import Order
@@ -80,7 +80,7 @@ def test_an_instrument_that_is_carried_about_is_led_from_place_to_place(tmp_path
     assert stations == sorted(stations)
     table = np.genfromtxt(session / "poses.csv", delimiter=",", names=True)
     np.testing.assert_array_equal(table["place"], stations)
-    one, other = positions(plan, frame=FRAME), positions(plan, frame=KNOCKED)
+    one, other = positions(plan, frame=None), positions(plan, frame=FRAME)
     lines: list[str] = []
     for i, pose in enumerate(plan.poses):
         if i and pose.station != plan.poses[i - 1].station:
@@ -90,7 +90,8 @@ def test_an_instrument_that_is_carried_about_is_led_from_place_to_place(tmp_path
         lines.append(typed((other if pose.station else one)[i]))
     played = play(cell, "--session", session, lines=[*lines, "yes"])
     assert played.code == 0, played.err + played.out[-1500:]
-    assert "place 2 · the instrument at about (-2, 1, 0.5) m in base" in played.out
+    carried = "place 2 · the instrument at about (-2, 1, 0.5) m in base"
+    assert carried in played.out, played.out[-1500:]
     readings = [e for e in read_entries(session / FILE) if e["kind"] == "reading"]
     assert [e["station"] for e in readings] == stations
 
@@ -128,7 +129,9 @@ def test_a_tip_on_one_point_is_planned_and_needs_its_place(tmp_path: Path) -> No
 def test_what_cannot_be_meant_is_refused_in_one_line(
     tmp_path: Path, lines: list[str], changed: dict[str, object], words: str
 ) -> None:
-    played = play(cell_with(tmp_path, *lines, **changed), "--plan-only", "--session", tmp_path / "s")
+    played = play(
+        cell_with(tmp_path, *lines, **changed), "--plan-only", "--session", tmp_path / "s"
+    )
     assert played.code == 2
     assert words in played.err
     assert played.err.count("\n") == 1

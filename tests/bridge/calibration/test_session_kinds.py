@@ -55,6 +55,7 @@ class Session:
             lines=lines,
         )  # fmt: skip
         assert played.code == 0, played.err + played.out[-1500:]
+        assert (self.folder / "new.yaml").exists(), played.out[-4000:]
         return played
 
 
@@ -197,3 +198,14 @@ def test_lines_that_the_trackers_software_sends_on_demand(
     played = session.play(session.lines(lambda i: ""))
     assert "mean of 10" in played.out
     finds_the_arm(session, played)
+
+
+def test_what_touches_is_told_by_joints_that_somebody_read(tmp_path: Path) -> None:
+    session = begun(tmp_path, "{kind: point}", 12, at_the_point(), joints="typed")
+    lines = ["", "", "", in_degrees(session.readings.q[0])]  # hung, seated, Enter for the joints
+    played = play(session.cell, "--session", tmp_path / "s", lines=lines)
+    assert "found nothing, expected where the arm stands now" in played.out
+    session.cell.write_text(session.cell.read_text().replace("joints: typed", "joints: planned"))
+    played = play(session.cell, "--session", tmp_path / "s", lines=lines)
+    assert played.code == 2
+    assert "the joints are the reading" in played.err
