@@ -32,7 +32,8 @@ UNITS = {
     1 / 25.4: "25.4 times too large: millimetres taken for inches?",
     25.4: "25.4 times too small: inches taken for millimetres?",
 }
-SPARE = 4  # distances more than unknowns, until which the fixed point may be told on a wrong side
+SPARE = {"distance": 4, "relative": 9}
+"""Numbers beyond the unknowns, by kind: with fewer the instrument may be told in a wrong place."""
 EXCHANGED = ((1, 0, 2), (2, 1, 0), (0, 2, 1), (1, 2, 0), (2, 0, 1))
 
 
@@ -109,8 +110,8 @@ class Foresight:
         before, new = here(before), here(new)
         observable = make_observable(self._kind, registered=registered, **self._options)
         layout = observable.layout(before if len(before) else new)
-        spare = SPARE if observable.equations == 1 else 0
-        few = len(before) * observable.equations <= layout.size + spare
+        needed = layout.size + SPARE.get(self._kind, 0)
+        few = len(before) * observable.equations <= needed
         if observable.closes or (few and layout.size):
             return None
         if registered not in self._parameters:

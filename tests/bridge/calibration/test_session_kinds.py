@@ -90,7 +90,7 @@ def begun(
     return Session(folder, cell, plan, found)
 
 
-def finds_the_arm(session: Session, played: Played) -> None:
+def finds_the_arm(session: Session, played: Played, of: str = "") -> None:
     """Check that the new cell has what is hidden in the arm, as well as it says."""
     assert load_cell(session.folder / "new.yaml").model.terms
     assert (session.folder / "s" / "calibration.html").exists()
@@ -99,7 +99,8 @@ def finds_the_arm(session: Session, played: Played) -> None:
     promise = promise_in(told)
     true = {**OFFSETS, **{f"axial_compliance_{i + 1}": c for i, c in enumerate(AXIAL)}}
     apart = promise.values - [true.get(name, 0.0) for name in promise.names]
-    assert (np.abs(apart) < 5.0 * np.sqrt(np.diag(promise.covariance))).all(), promise.names
+    own = np.array([name.startswith(of) for name in promise.names])
+    assert (np.abs(apart) < 5.0 * np.sqrt(np.diag(promise.covariance)))[own].all(), promise.names
     assert {"axial_compliance_2", "axial_compliance_3"} <= set(promise.names)
 
 
@@ -122,9 +123,11 @@ def test_two_balls_measured_from_anywhere(tmp_path: Path) -> None:
     session = begun(tmp_path, "{kind: two_balls, unit: in}", 16, balls)
     first = np.random.default_rng(1).uniform(-2, 2, session.readings.value.shape)
     second = first + session.readings.value
-    finds_the_arm(session, session.play(session.lines(
+    played = session.play(session.lines(
         lambda i: typed(first[i], 1 / 0.0254), lambda i: typed(second[i], 1 / 0.0254)
-    )))  # fmt: skip
+    ))  # fmt: skip
+    # of parallel joints' zeros the sum alone is shown
+    finds_the_arm(session, played, of="axial_compliance")
 
 
 @pytest.mark.parametrize(
@@ -176,12 +179,11 @@ def _serve(server: socket.socket, values: list[np.ndarray]) -> None:
             link, _ = server.accept()
         except OSError:
             return
-        with link, link.makefile("rw", encoding="utf-8", newline="\r\n") as lines:
+        with link, link.makefile() as lines:
             asked = False
             for _ in lines:
                 value = 1e3 * (values[number] + random.normal(0, 1e-5, 3))
-                lines.write(" ".join(f"{v:.5f}" for v in value) + "\n")
-                lines.flush()
+                link.sendall((" ".join(f"{v:.5f}" for v in value) + "\r\n").encode())
                 asked = True
             number += asked
 
