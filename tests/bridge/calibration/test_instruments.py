@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
@@ -71,6 +71,7 @@ def test_what_is_no_point_is_told_with_the_reason(line: str, words: str) -> None
         instrument("typed", line, unit="mm").read(Where())
 
 
+@settings(deadline=None)
 @given(st.lists(st.floats(-9e4, 9e4), min_size=3, max_size=3), st.sampled_from([" ", ", ", "; "]))
 def test_numbers_read_back_exactly_whatever_stands_between_them(
     values: list[float], between: str
