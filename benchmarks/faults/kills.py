@@ -29,6 +29,7 @@ from core.errors import GapbridgeError
 from core.recording.reading import last_batch
 
 LOST = 1.0  # s before a kill that a recording may lack
+CAUGHT_UP = 5.0  # s that a new recorder has for what the killed one had not written
 LIMIT = 120.0  # s to start, or to go on
 VICTIMS = ("daemon", "loop_main", "recording", "web", "metrics")
 
@@ -122,12 +123,8 @@ def kill(scene: Scene, name: str, found: Deaths) -> None:
         _, left = psutil.wait_procs(before.values(), END_LIMIT + 10.0)
         if left:
             found.wrong.append(f"the daemon was killed, and {left} lived on")
-    if name in ("daemon", "recording"):
-        lost = last - scene.recorded()
-        found.most_lost = max(found.most_lost, lost)
-        if lost > LOST:
-            found.wrong.append(f"{name}: the recording lacks {lost:.2f} s")
     if name == "daemon":
+        _lost(found, name, last - scene.recorded())
         gone = scene.begin()
     else:
         until = begun + LIMIT
@@ -137,7 +134,19 @@ def kill(scene: Scene, name: str, found: Deaths) -> None:
             time.sleep(0.02)
         gone = time.monotonic() - begun
         scene.reach(State.COMPENSATING)
+        if name == "recording":  # the next one takes what it has not written out of the ring
+            until = time.monotonic() + CAUGHT_UP
+            while (lost := last - scene.recorded()) > 0.0 and time.monotonic() < until:
+                time.sleep(0.05)
+            _lost(found, name, lost)
     found.longest_gone[name] = max(found.longest_gone.get(name, 0.0), gone)
+
+
+def _lost(found: Deaths, name: str, seconds: float) -> None:
+    """Note how much of a recording cannot be read, s."""
+    found.most_lost = max(found.most_lost, seconds)
+    if seconds > LOST:
+        found.wrong.append(f"{name}: the recording lacks {seconds:.2f} s")
 
 
 def run_kills(count: int, seed: int, folder: Path, link: str, limit: float) -> Deaths:
