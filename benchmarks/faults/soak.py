@@ -149,11 +149,13 @@ def main(
         click.echo(f"  VIOLATION: {words}")
     if page:
         slope, size, span = memory.slope("loop")
+        allowed = 1e6 * bounds.offset_rate * bounds.cycle
         fill(PAGE, f"soak {rig.link.rate:g}", (
-            f"| {rig.link.name} | {rig.link.rate:g} | {minutes:g} | {sum(made.values())} | "
-            f"{found.frames} | {found.violated or 'none'} | {step} "
-            f"({1e6 * bounds.offset_rate * bounds.cycle:.0f}) | {quiet.share:.3f} | "
-            f"{slope:+.2f} |"
+            f"- **{rig.link.rate:g} Hz**, {rig.link.name}, {minutes:g} minutes: "
+            f"{sum(made.values())} faults, {found.frames} frames written, "
+            f"{found.violated or 'no'} violations; largest step {step} µm ({allowed:.0f} a cycle); "
+            f"{quiet.share:.3f} % of the cycles outside faults missed; the loop's memory "
+            f"{slope:+.2f} MB a minute."
         ))  # fmt: skip
     sys.exit(1 if found.violated else 0)
 
