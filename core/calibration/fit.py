@@ -15,9 +15,10 @@ from core.calibration.observables.nuisance import Nuisance
 from core.calibration.observables.observable import Observable
 from core.calibration.parameters import Parameters
 from core.calibration.plan import Expectation
+from core.calibration.problem import Problem
 from core.calibration.readings import Readings
 from core.calibration.remainder import carried, diagnosed, repeatability_of
-from core.calibration.rest import Problem, Rest, come_to_rest
+from core.calibration.rest import Rest, come_to_rest
 from core.calibration.result import Calibration, Errors, Estimate
 from core.calibration.staging import at_odds
 from core.calibration.telling import combinations, notes_of, verdict_of

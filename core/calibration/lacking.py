@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.calibration.parameters import Parameters
-from core.calibration.rest import Problem, Rest
+from core.calibration.problem import Problem
+from core.calibration.rest import Rest
 from core.effects import CATALOGUE
 
 Array = NDArray[np.float64]

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from scipy.stats import f as fisher
 
 from core.calibration.noise import presumed
+from core.calibration.problem import Problem
 from core.calibration.readings import Readings
-from core.calibration.rest import Problem, Rest
+from core.calibration.rest import Rest
 from core.diagnosis.diagnosis import Diagnosis, diagnose
 from core.errors import InputError
 from core.log import Log

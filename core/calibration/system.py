@@ -38,18 +38,20 @@ class System:
         return System(self.J * root[:, None], self.F * root[:, None], self.left * root)
 
 
-def solve(system: System, at: Array, bounds: Bounds, free: Mask) -> tuple[Array, Array, Mask]:
+def solve(
+    system: System, at: Array, bounds: Bounds, free: Mask, damping: float = 0.0
+) -> tuple[Array, Array, Mask]:
     """Return the steps of parameters (p,) and nuisances (m,), and who ends on a bound (p,).
 
     Parameters not ``free`` do not move. One that would pass its bound stops on it and the others
-    are found anew.
+    are found anew. ``damping`` shortens the parameters' steps, in lengths of their columns.
     """
     p, moving = len(at), free.copy()
     step = np.zeros(p)
     stuck = np.zeros(p, dtype=bool)
     while True:
         fixed = System(system.J[:, moving], system.F, system.left - system.J @ (step * ~moving))
-        part, nuisance = _least_squares(fixed, at[moving], bounds, moving)
+        part, nuisance = _least_squares(fixed, at[moving], bounds, moving, damping)
         step[moving] = part
         low, high = at + step < bounds.lower, at + step > bounds.upper
         out = (low | high) & moving
@@ -62,16 +64,23 @@ def solve(system: System, at: Array, bounds: Bounds, free: Mask) -> tuple[Array,
         moving[first], stuck[first] = False, True
 
 
-def _least_squares(system: System, at: Array, bounds: Bounds, moving: Mask) -> tuple[Array, Array]:
+def _least_squares(
+    system: System, at: Array, bounds: Bounds, moving: Mask, damping: float
+) -> tuple[Array, Array]:
     p, m = system.J.shape[1], system.F.shape[1]
-    A = np.vstack([
+    rows = [
         np.hstack([system.J, system.F]),
         np.hstack([np.diag(1 / bounds.held[moving]), np.zeros((p, m))]),
-    ])  # fmt: skip
-    right = np.concatenate([system.left, (bounds.begin[moving] - at) / bounds.held[moving]])
+    ]
+    right = [system.left, (bounds.begin[moving] - at) / bounds.held[moving]]
+    if damping > 0:
+        length = np.hypot(np.linalg.norm(system.J, axis=0), 1 / bounds.held[moving])
+        rows.append(np.hstack([np.diag(np.sqrt(damping) * length), np.zeros((p, m))]))
+        right.append(np.zeros(p))
+    A = np.vstack(rows)
     size = np.linalg.norm(A, axis=0)
     size = np.where(size > 0, size, 1.0)
-    found = np.linalg.lstsq(A / size, right, rcond=1e-13)[0] / size
+    found = np.linalg.lstsq(A / size, np.concatenate(right), rcond=1e-13)[0] / size
     return found[:p], found[p:]
 
 

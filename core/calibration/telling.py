@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from core.calibration.lacking import Lack
 from core.calibration.parameters import Parameters
+from core.calibration.problem import Problem
 from core.calibration.remainder import Remainder
-from core.calibration.rest import Problem, Rest
+from core.calibration.rest import Rest
 from core.calibration.result import Errors, Estimate
 from core.calibration.staging import DOUBT
 from core.diagnosis.diagnosis import Diagnosis

@@ -1,0 +1,154 @@
+"""Levenberg and Marquardt's steps of a calibration: none is taken that makes the fit worse.
+
+A payload times a flexibility bends the arm: such products make Gauss and Newton's full steps
+overshoot. Each step is tried against the exact prediction; one that does not keep what it promises
+is shortened, most along what the readings hardly tell apart (columns scaled to length one,
+Marquardt, J. SIAM 11 (1963) 431). Derivatives are taken anew where they promise too much.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.calibration.noise import Noise
+from core.calibration.observables.nuisance import Nuisance
+from core.calibration.problem import Problem, cost, weighed_system
+from core.calibration.system import Mask, System, posterior, solve
+from core.errors import InputError
+
+Array = NDArray[np.float64]
+Columns = tuple[Array, Array]
+LOOKS = 40  # derivatives taken anew at most
+STEPS = 12  # steps tried with the same derivatives at most
+MOVED = 0.02  # of its deviation: a smaller step changes nothing that anybody reports
+STALE = 3.0  # deviations of movement beyond which derivatives are taken anew
+KEPT = 0.1  # share of its promise that a step must keep to be taken
+POOR = 0.5  # share below which the next step is shorter, with new derivatives
+GOOD = 0.8  # share above which the next step may be longer
+LEAST, MOST = 1e-4, 1e8  # damping: below it is none; above it nothing is gained any more
+GROWTH = 8.0
+NOTHING = 1e-6  # of the sum of squares, in which one is a standard deviation: rounding
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Where a fit stands, with derivatives that hold there."""
+
+    values: Array  # (p,)
+    nuisance: Nuisance
+    columns: Columns  # J (N*k, p) and F (N*k, m)
+    anchor: Array  # (p,) where the derivatives were taken
+    system: System  # divided by the noise, weighed
+    weights: Array  # (N,) 0 wild, 1 calm
+    stuck: Mask  # (p,) on a bound
+    covariance: Array  # (p, p)
+    spent: float  # numbers that the fit spent
+    share: Array  # (N,) of them on each reading
+    settled: bool  # no step would change anything any more
+
+    def stale(self) -> bool:
+        """Return whether the derivatives were taken too far away."""
+        return bool(_sizes(self.values - self.anchor, self.covariance) > STALE)
+
+
+def standing(
+    problem: Problem, values: Array, nuisance: Nuisance, noise: Noise,
+    columns: Columns | None = None, anchor: Array | None = None, share: Array | None = None,
+) -> Standing:  # fmt: skip
+    """Return the standing at values, derivatives taken there where none are given.
+
+    Raises InputError where the arm finds no equilibrium.
+    """
+    left = problem.left(values, nuisance)
+    if left is None:
+        raise InputError("the arm finds no equilibrium where the fit begins; expected one")
+    if columns is None:
+        columns = problem.observable.columns(
+            problem.parameters, values, problem.readings, nuisance
+        )  # fmt: skip
+        anchor = values
+    system, weights = weighed_system(left, noise, columns, share)
+    covariance, spent, each = posterior(system, problem.bounds)
+    share = each.reshape(left.shape).sum(axis=1)
+    return Standing(
+        values, nuisance, columns, values if anchor is None else anchor, system, weights,
+        np.zeros(len(values), dtype=bool), covariance, spent, share, False,
+    )  # fmt: skip
+
+
+def descended(problem: Problem, at: Standing, noise: Noise) -> Standing:
+    """Return where steps from ``at`` come to rest under this noise, or where patience ends."""
+    damping = 0.0
+    at = standing(
+        problem, at.values, at.nuisance, noise, at.columns, at.anchor, at.share
+    )  # fmt: skip
+    for _ in range(LOOKS):
+        if at.stale():
+            at = standing(problem, at.values, at.nuisance, noise, share=at.share)
+        at, damping, renew = _stepped(problem, at, noise, damping)
+        if not renew and ((at.settled and not at.stale()) or damping > MOST):
+            break
+        if renew:
+            at = standing(problem, at.values, at.nuisance, noise, share=at.share)
+    return at
+
+
+def _stepped(
+    problem: Problem, at: Standing, noise: Noise, damping: float
+) -> tuple[Standing, float, bool]:
+    """Return the standing after steps with the same derivatives, and the damping.
+
+    Last comes whether the derivatives promised too much.
+    """
+    layout, bounds = problem.observable.layout(problem.readings), problem.bounds
+    free = np.ones(len(at.values), dtype=bool)
+    for _ in range(STEPS):
+        step, shift, stuck = solve(at.system, at.values, bounds, free, damping)
+        small = _sizes(step, at.covariance) < MOVED
+        values, nuisance = at.values + step, at.nuisance.moved(shift, layout)
+        kept = _kept(problem, at, noise, step, shift, (values, nuisance))
+        fresh = bool((at.anchor == at.values).all())
+        if kept < KEPT:
+            if not fresh:
+                return at, damping, True
+            if small and damping == 0.0:
+                return replace(at, stuck=stuck, settled=True), damping, False
+            damping = max(GROWTH * damping, LEAST)
+            if damping > MOST:
+                return at, damping, False
+            continue
+        at = standing(problem, values, nuisance, noise, at.columns, at.anchor, at.share)
+        at = replace(at, stuck=stuck, settled=small and damping == 0.0)
+        if at.settled:
+            return at, damping, False
+        if kept < POOR:
+            return at, max(damping * 2, LEAST), True
+        if kept > GOOD:
+            damping = damping / GROWTH if damping > LEAST else 0.0
+    return at, damping, True
+
+
+def _kept(
+    problem: Problem, at: Standing, noise: Noise, step: Array, shift: Array,
+    trial: tuple[Array, Nuisance],
+) -> float:  # fmt: skip
+    """Return the share of its promise that a step keeps; what promises nothing keeps it."""
+    before = float(at.system.left @ at.system.left) + problem.prior(at.values)
+    rest = at.system.left - at.system.J @ step - at.system.F @ shift
+    promised = before - float(rest @ rest) - problem.prior(trial[0])
+    left = problem.left(*trial)
+    if left is None:
+        return -1.0
+    found = before - cost(left, noise, at.weights) - problem.prior(trial[0])
+    tiny = NOTHING * (1 + before)
+    if abs(promised) < tiny and abs(found) < tiny:
+        return 1.0
+    return found / promised if promised > 0 else -1.0
+
+
+def _sizes(step: Array, covariance: Array) -> float:
+    """Return the largest part of a step in its standard deviation."""
+    return float((np.abs(step) / np.sqrt(np.diag(covariance))).max(initial=0.0))

@@ -1,0 +1,104 @@
+"""What a calibration fits to what, and how far given values are from it, in units of the noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.calibration.noise import Known, Noise
+from core.calibration.observables.nuisance import Nuisance
+from core.calibration.observables.observable import Observable
+from core.calibration.parameters import Parameters
+from core.calibration.readings import Readings
+from core.calibration.robust import scaled_length, weights_of
+from core.calibration.staging import Stages
+from core.calibration.system import Bounds, System
+from core.errors import ExcitationError, InputError
+
+Array = NDArray[np.float64]
+HELD = 10.0  # usual sizes within which a parameter is weakly held at its beginning
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is fitted to what."""
+
+    parameters: Parameters
+    observable: Observable
+    readings: Readings  # those to fit
+    bounds: Bounds
+    stages: Stages
+    known: Known
+
+    def left(self, values: Array, nuisance: Nuisance) -> Array | None:
+        """Return measured minus predicted (N, k), m; None where the arm finds no equilibrium."""
+        try:
+            model = self.parameters.model(values)
+            return self.observable.residual(model, self.readings, nuisance)
+        except InputError:
+            return None
+
+    def prior(self, values: Array) -> float:
+        """Return how far values are from their beginning, as a sum of squares."""
+        return float(np.sum(((values - self.bounds.begin) / self.bounds.held) ** 2))
+
+
+def bounds_of(parameters: Parameters, readings: Readings) -> Bounds:
+    """Return the parameters' bounds, and how firmly each is held at its beginning.
+
+    Nothing that hangs on an arm weighs less than nothing: with what is declared, a payload that is
+    to be found is 0 or more at every reading.
+    """
+    held, lower = HELD * parameters.scales, parameters.lower.copy()
+    declared = readings.loads.payload_mass
+    nominal = parameters.nominal
+    lightest = nominal.payload_mass if declared is None else float(np.min(declared))
+    had = sum(t.values[0] for t in nominal.terms if t.effect == "payload")
+    for i, (t, _) in enumerate(parameters.place):
+        if parameters.terms[t].effect == "payload":
+            lower[i] = max(lower[i], -max(lightest + had, 0.0))
+    return Bounds(lower, parameters.upper, held, parameters.begin)
+
+
+def require_enough(parameters: Parameters, observable: Observable, readings: Readings) -> None:
+    """Raise ExcitationError where there are fewer readings than numbers to find."""
+    unknown = len(parameters) + observable.layout(readings).size
+    found = len(readings) * observable.equations
+    if found <= unknown:
+        raise ExcitationError(
+            f"{len(readings)} reading(s) to fit give {found} numbers, expected more than the "
+            f"{unknown} that are to be found; measure more poses or ask for fewer effects"
+        )
+
+
+def weighed_system(
+    left: Array, noise: Noise, columns: tuple[Array, Array], share: Array | None = None
+) -> tuple[System, Array]:
+    """Return the system of ``left`` (N, k) divided by the noise and weighed, and the weights (N,).
+
+    ``share`` (N,) are the numbers that the fit spent on each reading, so that small residuals of
+    readings with much influence are not taken for calm.
+    """
+    N, k = left.shape
+    W = noise.whitener
+    J, F = ((W @ c.reshape(N, k, -1)).reshape(N * k, -1) for c in columns)
+    e = (W @ left[..., None])[..., 0]
+    cells = np.full(N, float(k)) if share is None else np.maximum(k - share, 0.3 * k)
+    square = np.sum(e**2, axis=1)
+    # while much is still to be found, what remains is larger than the noise: its middle counts
+    usual = max(float(np.median(square / cells)) / _middle(k), 1.0)
+    weights = weights_of(scaled_length(square / usual, cells))
+    return System(J, F, e.ravel()).weighed(np.repeat(np.sqrt(weights), k)), weights
+
+
+def cost(left: Array, noise: Noise, weights: Array) -> float:
+    """Return the weighed sum of squares of ``left`` (N, k) in units of the noise."""
+    e = (noise.whitener @ left[..., None])[..., 0]
+    return float(np.sum(weights * np.sum(e**2, axis=1)))
+
+
+def _middle(k: int) -> float:
+    """Return the median of chi-square over its k degrees of freedom."""
+    return (1 - 2 / (9 * k)) ** 3
