@@ -16,9 +16,11 @@ from bridge.calibration.planning import metrology_of, planned
 from bridge.calibration.words import duration, load_text, millimetres, parameter
 from core.calibration.plan import Plan
 from core.calibration.promise import document_of
-from core.calibration.result import Errors
+from core.calibration.result import Calibration, Errors
 
 Array = NDArray[np.float64]
+REFITS = 3  # times at most that the readings may ask for more
+WORSE = 1.1  # times the error on unseen poses above which a further fit is not taken
 
 
 def promise_beside(cell: Path) -> Path:
@@ -76,15 +78,36 @@ class WholeJob(Job):
         question = f"The readings ask for {', '.join(lacking)} as well. Fit again with it?"
         return self.order.yes or self.talk.confirm(question)
 
+    def _completed(self, found: Calibration) -> Calibration:
+        """Return the fit with what the readings ask for as well, as long as a person wants it.
+
+        One that is worse on poses that no fit saw is told and not taken.
+        """
+        asked: tuple[str, ...] = ()
+        for _ in range(REFITS):
+            new = tuple(name for name in found.lacking if name not in asked)
+            if not new or not self._wanted(new):
+                break
+            asked += new
+            further = fitted(self.cell, self.order, self.talk, self.book, asked)
+            tell_calibration(self.talk, further)
+            if further.held_out_after.rms > WORSE * found.held_out_after.rms:
+                self.talk.warn(
+                    f"with {', '.join(new)} unseen poses are "
+                    f"{further.held_out_after.rms / found.held_out_after.rms:.1f} times as far "
+                    "off: the fit without stays"
+                )
+                break
+            found = further
+        return found
+
     def finish(self) -> None:
         """Fit, tell, report, and write the new cell once a person says yes."""
         talk, folder, order = self.talk, self.folder, self.order
         talk.say()
         found = fitted(self.cell, order, talk, self.book)
         tell_calibration(talk, found)
-        if found.lacking and self._wanted(found.lacking):
-            found = fitted(self.cell, order, talk, self.book, found.lacking)
-            tell_calibration(talk, found)
+        found = self._completed(found)
         metrology = metrology_of(self.cell, order.instrument, self.book.places)
         write_log(found.readings, metrology.registered, folder / "readings.csv")
         promise = document_of(found, sigma=metrology.sigma)

@@ -1,7 +1,10 @@
 """Which parameters no readings can tell from the others, whatever the poses.
 
 Parameters are taken one after the other; one stays if it changes readings at random poses in a way
-that the frames of the instrument and those before it do not.
+that the frames of the instrument and those before it do not. What is the sum of others is taken
+after them, wherever it was named: a tilt of joint 1 that is alike in all directions stands for two
+equal tilts of the base, but a base that gives way more about y than about x would need the sum and
+a flexibility below zero.
 """
 
 from __future__ import annotations
@@ -28,6 +31,9 @@ VISIBLE = 3e-7  # m, rms: a usual size that changes readings by less shows nothi
 APART = 2e-3  # share of what a parameter changes that the others must leave over
 MEMBER = 0.1  # share from which a parameter is named as one that stands for another
 USUAL_PAYLOAD = 5.0  # kg, where the arm's rating is unknown
+PARTS = {"radial_compliance": "base_compliance"}  # what can be the sum of what
+BENDING = ("payload", "gravity_direction")  # shown by an arm that bends, by no rigid one
+SOFT = ("axial_compliance", "radial_compliance", "link_flexibility", "base_compliance")
 
 
 @dataclass(frozen=True)
@@ -43,14 +49,14 @@ def redundancy(
 ) -> Redundancy:
     """Return which parameters readings of this kind can show at all."""
     readings, nuisance = _anywhere(parameters.nominal, observable, pulls, seed)
-    J, F = observable.columns(parameters, parameters.begin, readings, nuisance)
+    J, F = _columns(parameters, observable, readings, nuisance)
     weight = np.tile(1 / observable.sigmas, len(readings))[:, None]
     J, F = J * parameters.scales * weight, F * weight
     base = list(np.linalg.svd(F, full_matrices=False)[0].T[: np.linalg.matrix_rank(F)])
     kept: list[int] = []
     told = []
     limit = VISIBLE * np.sqrt(len(J))
-    for i in range(J.shape[1]):
+    for i in _turns(parameters):
         Q = np.array(base).reshape(-1, len(J))
         left = J[:, i] - Q.T @ (Q @ J[:, i])
         left -= Q.T @ (Q @ left)  # once more: rounding of the first pass
@@ -63,7 +69,32 @@ def redundancy(
         else:
             names = [parameters.names[k] for k in kept]
             told.append(f"{parameters.names[i]}: {_stand_in(J[:, i], F, J[:, kept], names)}")
-    return Redundancy(kept, tuple(told))
+    return Redundancy(sorted(kept), tuple(told))
+
+
+def _turns(parameters: Parameters) -> list[int]:
+    """Return the parameters' numbers in the order in which they are taken."""
+    named = [parameters.terms[t].effect for t, _ in parameters.place]
+    first = [i for i, effect in enumerate(named) if effect in PARTS.values()]
+    turns: list[int] = []
+    for i, effect in enumerate(named):
+        turns += [k for k in first if k not in turns and named[k] == PARTS.get(effect)]
+        turns += [] if i in turns else [i]
+    return turns
+
+
+def _columns(
+    parameters: Parameters, observable: Observable, readings: Readings, nuisance: Nuisance
+) -> tuple[Array, Array]:
+    """Return J and F where a fit begins; what only bending shows, for an arm that bends."""
+    J, F = observable.columns(parameters, parameters.begin, readings, nuisance)
+    named = [parameters.terms[t].effect for t, _ in parameters.place]
+    only = np.array([effect in BENDING for effect in named], dtype=bool)
+    soft = np.array([effect in SOFT for effect in named], dtype=bool)
+    if only.any() and soft.any():
+        bent = np.where(soft, parameters.begin + 0.3 * parameters.scales, parameters.begin)
+        J[:, only] = observable.columns(parameters, bent, readings, nuisance)[0][:, only]
+    return J, F
 
 
 def _stand_in(column: Array, F: Array, J: Array, names: list[str]) -> str:

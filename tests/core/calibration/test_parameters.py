@@ -114,3 +114,19 @@ def test_unusable_effects_are_declined_in_one_line(model: Model, effect, expecte
     with pytest.raises(InputError, match=expected) as caught:
         Parameters.of(model, (effect,), observable=POSITION)
     assert "\n" not in str(caught.value)
+
+
+def test_a_base_that_gives_way_is_found_about_both_axes_wherever_it_is_named(model: Model) -> None:
+    # the tilt of joint 1 is their sum; beside it one of them would have to fall below zero
+    chosen = [(*DEFAULT, "base_compliance"), ("base_compliance", *DEFAULT)]
+    found = [Parameters.of(model, effects, observable=POSITION) for effects in chosen]
+    assert set(found[0].names) == set(found[1].names)
+    assert {"base_compliance_x", "base_compliance_y"} <= set(found[0].names)
+    told = dict(line.split(": ", 1) for line in found[0].redundant)
+    assert "base_compliance_x and base_compliance_y" in told["radial_compliance_1"]
+
+
+def test_a_payload_is_a_parameter_of_an_arm_whose_softness_is_to_be_found(model: Model) -> None:
+    assert "payload" in Parameters.of(model, (*DEFAULT, "payload"), observable=POSITION).names
+    rigid = Parameters.of(model, ("joint_offset", "payload"), observable=POSITION)
+    assert "payload" not in rigid.names

@@ -1,0 +1,85 @@
+"""Steps that are tried before they are taken: products of parameters do not make a fit run away."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.blind.arms import ARMS
+from benchmarks.calibration.drawings import model_of, real_arm
+from benchmarks.calibration.laid_out import (
+    Layout,
+    arm_with,
+    draw_values,
+    instrument_for,
+    lay_out,
+    readings_of,
+)
+from core.calibration.fit import calibrate
+from core.calibration.observables import make_observable
+from core.calibration.parameters import DEFAULT, Parameters
+from core.calibration.problem import bounds_of
+from core.calibration.readings import Readings
+from core.calibration.system import Bounds, System, solve
+from core.metrology import Metrology
+from core.model import Model
+
+KIND = ARMS["cobot5"]
+LAYOUT = Layout(poses=18, held_out=10, repeated=3)
+POSITION = make_observable("position")
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return model_of(real_arm(KIND))
+
+
+@pytest.fixture(scope="module")
+def parameters(model: Model) -> Parameters:
+    return Parameters.of(model, ("payload", *DEFAULT), observable=POSITION)
+
+
+def _session(parameters: Parameters, extra: float) -> Readings:
+    """Return readings under loads that are heavier than declared by ``extra`` kg."""
+    rng = np.random.default_rng(3)
+    names = [n for n in parameters.names if n != "payload"]
+    real = arm_with(KIND, draw_values(KIND, names, rng))
+    laid, instrument = lay_out(KIND, LAYOUT, rng), instrument_for(KIND, LAYOUT, rng)
+    mass = laid.session.payload_mass
+    heavy = replace(laid.session, payload_mass=mass + extra)
+    readings = readings_of(real, replace(laid, session=heavy), instrument, rng)
+    return replace(readings, loads=replace(readings.loads, payload_mass=mass))
+
+
+def test_a_payload_beside_flexibilities_is_found_and_does_not_run_away(
+    model: Model, parameters: Parameters
+) -> None:
+    readings = _session(parameters, 2.5)
+    metrology = Metrology(registered=False, sigma=LAYOUT.sigma)
+    found = calibrate(model, readings, parameters, metrology, diagnose=False)
+    payload = next(e for e in found.estimates if e.name == "payload")
+    assert payload.interval[0] < 2.5 < payload.interval[1]
+    assert found.held_out_after.rms < 1.5 * np.sqrt(3) * found.noise
+    assert found.held_out_before.rms > 20 * found.held_out_after.rms
+
+
+def test_what_hangs_on_an_arm_weighs_nothing_or_more(parameters: Parameters) -> None:
+    readings = _session(parameters, 0.0)
+    lightest = float(readings.loads.payload_mass.min())  # type: ignore[union-attr]
+    bounds = bounds_of(parameters, readings)
+    assert bounds.lower[parameters.names.index("payload")] == pytest.approx(-lightest)
+
+
+def test_damping_shortens_what_two_parameters_hardly_tell_apart_most() -> None:
+    rng = np.random.default_rng(0)
+    first, other = rng.normal(size=(2, 40))
+    J = np.column_stack([first, first + 1e-3 * other])  # their difference is hardly told
+    system = System(J, np.zeros((40, 0)), J @ [3.0, -2.0])
+    wide = Bounds(np.full(2, -np.inf), np.full(2, np.inf), np.full(2, 1e6), np.zeros(2))
+    free = np.ones(2, dtype=bool)
+    full, damped = (solve(system, np.zeros(2), wide, free, d)[0] for d in (0.0, 1e-3))
+    assert full == pytest.approx([3.0, -2.0], abs=1e-4)
+    assert damped.sum() == pytest.approx(1.0, rel=0.01)
+    assert abs(damped[0] - damped[1]) < 0.1
