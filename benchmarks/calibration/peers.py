@@ -46,7 +46,7 @@ from core.model import Model
 
 MEASURED = ("tsinghua_ur5_grid", "ipa_ur10_b", "barrett_wam_grid")
 MOST = 200  # rows to fit of a measured set
-PATIENCE = 900.0  # s
+PATIENCE = 120.0  # s, for one program on one set
 
 
 @dataclass(frozen=True)
@@ -125,16 +125,19 @@ def by_scipy(data: DataSet) -> tuple[float, float, int, str]:
     return _coordinate(away.value - fit.predict(away.q)), seconds, fit.count, ""
 
 
-def by_figaroh(data: DataSet, python: str) -> tuple[float, float, int, str]:
+def by_figaroh(data: DataSet, python: str, patience: float) -> tuple[float, float, int, str]:
     """Return the same for FIGAROH's full_params with its joint elasticity where links weigh."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         _figaroh_files(data, folder)
         script = Path(__file__).with_name("figaroh_fit.py")
-        done = subprocess.run(
-            [python, str(script), str(folder)], capture_output=True, text=True, timeout=PATIENCE,
-            check=False,
-        )  # fmt: skip
+        try:
+            done = subprocess.run(
+                [python, str(script), str(folder)], capture_output=True, text=True,
+                timeout=patience, check=False,
+            )  # fmt: skip
+        except subprocess.TimeoutExpired:
+            return float("nan"), float("nan"), 0, f"failed: no result within {patience:g} s"
     lines = [x for x in done.stdout.splitlines() if x.startswith("RESULT ")]
     if not lines:
         last = (done.stderr or done.stdout).strip().splitlines()[-1:]
@@ -195,8 +198,12 @@ def _coordinate(gap: Array) -> float:
 @click.option("--measured", "folder", type=click.Path(path_type=Path), default=None,
               help="Folder of the measured sets; left out: simulated ones alone.")  # fmt: skip
 @click.option("--seed", default=0, show_default=True)
+@click.option("--patience", default=PATIENCE, show_default=True,
+              help="Seconds that FIGAROH has for one set.")  # fmt: skip
 @click.option("--json", "out", type=click.Path(path_type=Path), default=None, help="Write figures.")
-def main(figaroh: str | None, folder: Path | None, seed: int, out: Path | None) -> None:
+def main(
+    figaroh: str | None, folder: Path | None, seed: int, patience: float, out: Path | None
+) -> None:
     """Compare programs on the same rows."""
     sets = [simulated(arm, seed) for arm in ARMS]
     if folder is not None:
@@ -205,7 +212,7 @@ def main(figaroh: str | None, folder: Path | None, seed: int, out: Path | None) 
         "Gapbridge": by_gapbridge, "scipy, DH": by_scipy,
     }  # fmt: skip
     if figaroh is not None:
-        programs["FIGAROH"] = lambda data: by_figaroh(data, figaroh)
+        programs["FIGAROH"] = lambda data: by_figaroh(data, figaroh, patience)
     done = []
     for data in sets:
         before = nominal(data)

@@ -1,0 +1,71 @@
+"""A session that ends with the fit that its readings ask for: told, asked, fitted, written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from played import FRAME, Played, plan_in, play, script, truth, typed, write_cell
+
+from bridge.cell import load_cell
+from core.calibration.plan import Plan
+from core.effects import Site, Term
+from core.loads import Loads
+from core.model import Model
+from core.registration import register
+
+WAVE = Term("transmission_error", Site(2, 2.0), (3e-4, -2e-4))
+
+
+def waving() -> Model:
+    """Return the hidden arm, joint 2 with an error that the cell's effects do not name."""
+    return truth().with_terms([WAVE])
+
+
+def told(plan: Plan) -> list[str]:
+    """Return what a tracker reads at each stop, as a person types it."""
+    found = there(plan) + np.random.default_rng(4).normal(0, 2e-5, (len(plan.poses), 3))
+    return [typed(v) for v in found @ FRAME.rotation.T + FRAME.position]
+
+
+def there(plan: Plan, model: Model | None = None) -> np.ndarray:
+    """Return where a model's TCP is at each stop (N, 3), base."""
+    loads = Loads(
+        payload_mass=np.array([plan.loads[p.load].mass for p in plan.poses]),
+        payload_cog=np.array([plan.loads[p.load].cog for p in plan.poses]),
+    )
+    q = np.array([p.q for p in plan.poses])
+    return (model or waving()).predict(q, loads).position
+
+
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Played]:
+    folder = tmp_path_factory.mktemp("refit")
+    cell = write_cell(folder, poses=18)
+    assert play(cell, "--plan-only", "--session", folder / "s").code == 0
+    plan = plan_in(folder / "s")
+    lines = [*script(plan, told(plan)), "yes", "yes"]
+    return folder, play(
+        cell, "--session", folder / "s", "--apply", folder / "new.yaml", lines=lines
+    )
+
+
+@pytest.mark.slow
+def test_what_is_lacking_is_offered_and_fitted_on_a_yes(ended: tuple[Path, Played]) -> None:
+    folder, played = ended
+    assert played.code == 0, played.err
+    assert "not complete: to be added" in played.out
+    assert "ask for transmission_error_2 as well. Fit again with it?" in played.out
+    found = [t for t in load_cell(folder / "new.yaml").model.terms if t.effect == WAVE.effect]
+    second = next(t for t in found if t.site == WAVE.site)
+    assert second.values == pytest.approx(WAVE.values, abs=6e-5)
+
+
+@pytest.mark.slow
+def test_the_cell_that_comes_of_it_predicts_the_arm(ended: tuple[Path, Played]) -> None:
+    folder, _ = ended
+    plan = plan_in(folder / "s")
+    said = there(plan, load_cell(folder / "new.yaml").model)
+    off = np.linalg.norm(register(there(plan), said).in_base(there(plan)) - said, axis=1)
+    assert off.max() < 1e-4
