@@ -45,6 +45,7 @@ from core.metrology import Metrology
 from core.model import Model
 
 MEASURED = ("tsinghua_ur5_grid", "ipa_ur10_b", "barrett_wam_grid")
+ALONE = ("cobot10", "seven14")  # under one load as well
 MOST = 200  # rows to fit of a measured set
 PATIENCE = 120.0  # s, for one program on one set
 
@@ -73,17 +74,24 @@ class Row:
     note: str = ""
 
 
-def simulated(arm: str, seed: int) -> DataSet:
-    """Return a simulated session under loads, every parameter of geometry and softness drawn."""
-    rng, kind, layout = np.random.default_rng([seed, 5]), ARMS[arm], Layout(held_out=60)
+def simulated(arm: str, seed: int, *, loads: bool = True) -> DataSet:
+    """Return a simulated session, every parameter of geometry and softness drawn.
+
+    ``loads``: three, else the lightest alone, with as many poses.
+    """
+    rng, kind = np.random.default_rng([seed, 5]), ARMS[arm]
+    layout = Layout(held_out=60) if loads else Layout(poses=60, held_out=180)
     model = model_of(real_arm(kind))
     names = [n for n in Parameters.every(model, DEFAULT).names if "tool_frame_r" not in n]
     real, laid = arm_with(kind, draw_values(kind, names, rng)), lay_out(kind, layout, rng)
     instrument = instrument_for(kind, layout, rng)
     readings = readings_of(real, laid, instrument, rng)
     exact = readings_of(real, laid, instrument, None)
+    kept = np.flatnonzero(readings.load >= 0 if loads else readings.load == 0)
+    readings, exact = readings[kept], exact[kept]
     floor = float(np.sqrt(np.mean((readings.value - exact.value)[readings.held_out] ** 2)))
-    return DataSet(f"simulated {arm}, loads", model, readings, floor)
+    name = f"simulated {arm}, {'three loads' if loads else 'one load'}"
+    return DataSet(name, model, readings, floor)
 
 
 def measured(name: str, folder: Path) -> DataSet:
@@ -206,6 +214,7 @@ def main(
 ) -> None:
     """Compare programs on the same rows."""
     sets = [simulated(arm, seed) for arm in ARMS]
+    sets += [simulated(arm, seed, loads=False) for arm in ALONE]
     if folder is not None:
         sets += [measured(name, folder) for name in MEASURED if (folder / name).is_dir()]
     programs: dict[str, Callable[[DataSet], tuple[float, float, int, str]]] = {

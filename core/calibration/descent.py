@@ -21,9 +21,10 @@ from core.errors import InputError
 
 Array = NDArray[np.float64]
 Columns = tuple[Array, Array]
-LOOKS = 40  # derivatives taken anew at most
+LOOKS = 20  # derivatives taken anew at most
 STEPS = 12  # steps tried with the same derivatives at most
 MOVED = 0.02  # of its deviation: a smaller step changes nothing that anybody reports
+LOOSE = 0.2  # of its deviation: what weights that still sway may leave at the end of patience
 STALE = 3.0  # deviations of movement beyond which derivatives are taken anew
 KEPT = 0.1  # share of its promise that a step must keep to be taken
 POOR = 0.5  # share below which the next step is shorter, with new derivatives
@@ -105,9 +106,11 @@ def _stepped(
     """
     layout, bounds = problem.observable.layout(problem.readings), problem.bounds
     free = np.ones(len(at.values), dtype=bool)
+    size = np.inf
     for _ in range(STEPS):
         step, shift, stuck = solve(at.system, at.values, bounds, free, damping)
-        small = _sizes(step, at.covariance) < MOVED
+        size = _sizes(step, at.covariance)
+        small = size < MOVED
         values, nuisance = at.values + step, at.nuisance.moved(shift, layout)
         kept = _kept(problem, at, noise, step, shift, (values, nuisance))
         fresh = bool((at.anchor == at.values).all())
@@ -128,7 +131,8 @@ def _stepped(
             return at, max(damping * 2, LEAST), True
         if kept > GOOD:
             damping = damping / GROWTH if damping > LEAST else 0.0
-    return at, damping, True
+    calm = size < LOOSE and damping == 0.0
+    return replace(at, settled=calm), damping, not calm
 
 
 def _kept(

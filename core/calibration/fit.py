@@ -68,7 +68,8 @@ def calibrate(
     errors = _errors(model, found, how, readings, rest.nuisance)
     odds = _stages_at_odds(problem, rest)
     lacks = lacking(problem, rest)
-    complete = remainder.calm and not lacks and (told is None or told.verdict == "no_gap")
+    complete = rest.settled and remainder.calm and not lacks
+    complete = complete and (told is None or told.verdict == "no_gap")
     notes = notes_of(problem, rest, remainder, odds, estimates)
     return Calibration(
         model=found, nominal=model, readings=readings, estimates=estimates,

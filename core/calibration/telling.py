@@ -31,6 +31,9 @@ def combinations(parameters: Parameters, rest: Rest, shown: NDArray[np.bool_]) -
         if best >= 0 and abs(correlation[i, best]) > CLOSE:
             what = "difference" if correlation[i, best] > 0 else "sum"
             told.append(f"{names[i]}: these readings tell only its {what} with {names[best]}")
+        elif others := _company(correlation, i):
+            company = ", ".join(names[j] for j in others)
+            told.append(f"{names[i]}: these readings tell it only together with {company}")
         else:
             told.append(f"{names[i]}: these readings hardly show it; it stays near its beginning")
     for i in np.flatnonzero(shown):
@@ -44,12 +47,29 @@ def combinations(parameters: Parameters, rest: Rest, shown: NDArray[np.bool_]) -
     return tuple(told)
 
 
+def _company(correlation: Array, i: int) -> list[int]:
+    """Return the parameters (three at most) that move along with one, none where it is alone.
+
+    Together they make up for it where they leave a small share of its variance.
+    """
+    own = float(np.linalg.pinv(correlation, rcond=1e-12, hermitian=True)[i, i])
+    if own * (1 - CLOSE**2) < 1:
+        return []
+    far = np.abs(correlation[i])
+    return [int(j) for j in np.argsort(-far) if j != i and far[j] > MEMBER][:3]
+
+
 def notes_of(
     problem: Problem, rest: Rest, remainder: Remainder, odds: float | None,
     estimates: tuple[Estimate, ...],
 ) -> tuple[str, ...]:  # fmt: skip
     """Return what deserves a second look."""
     notes = []
+    if not rest.settled:
+        notes.append(
+            "the fit did not come to rest: take its figures for where it stood, and fit fewer "
+            "effects or measure more poses"
+        )
     bound = [e.name for e in estimates if e.on_bound]
     if bound:
         notes.append(f"on their bound: {', '.join(bound)}")

@@ -65,6 +65,20 @@ def test_a_payload_beside_flexibilities_is_found_and_does_not_run_away(
     assert found.held_out_before.rms > 20 * found.held_out_after.rms
 
 
+def test_what_one_load_cannot_tell_is_said_and_harms_no_prediction(
+    model: Model, parameters: Parameters
+) -> None:
+    readings = _session(parameters, 1.0)
+    one = readings[np.flatnonzero(readings.load == 0)]
+    metrology = Metrology(registered=False, sigma=LAYOUT.sigma)
+    found = calibrate(model, one, parameters, metrology, diagnose=False)
+    payload = next(e for e in found.estimates if e.name == "payload")
+    assert payload.interval[0] < 1.0 < payload.interval[1]
+    assert not payload.shown or payload.std > 0.2
+    assert any(line.startswith("payload") for line in found.combinations) or payload.shown
+    assert found.held_out_after.rms < 0.3 * found.held_out_before.rms
+
+
 def test_what_hangs_on_an_arm_weighs_nothing_or_more(parameters: Parameters) -> None:
     readings = _session(parameters, 0.0)
     lightest = float(readings.loads.payload_mass.min())  # type: ignore[union-attr]
