@@ -174,9 +174,13 @@ def main(seeds: int, seed: int, effects: str, asked: bool, out: Path | None) -> 
     """Calibrate every arm with every effect, and check it on poses that the fit never saw."""
     console = Console()
     chosen = effects.split(",")
-    jobs = [(a, e, seed + s) for a in ARMS for e in chosen
-            for s in range(seeds)]  # fmt: skip
-    done = [run(*job, asked) for job in track(jobs, "arms", console=console)]
+    jobs = [(a, e, seed + s) for s in range(seeds) for e in chosen for a in ARMS]
+    done = []
+    for job in track(jobs, "arms", console=console):
+        done.append(run(*job, asked))
+        if out is not None:  # what is done is kept, whatever comes after
+            rows = [asdict(o) | {"ratio": o.ratio} for o in done]
+            out.write_text(json.dumps(rows, indent=1), encoding="utf-8")
     table = Table(*TITLES)
     for name in (*ARMS, *chosen, "all"):
         own = [o for o in done if name in (o.arm, o.effect, "all")]
@@ -187,9 +191,6 @@ def main(seeds: int, seed: int, effects: str, asked: bool, out: Path | None) -> 
         console.print(f"over {LIMIT}: {o.arm} {o.effect} {o.ratio:.2f}")
     for o in [o for o in done if asked and not o.named]:
         console.print(f"asked for {', '.join(o.lacking) or 'nothing'}: {o.arm} {o.effect}")
-    if out is not None:
-        rows = [asdict(o) | {"ratio": o.ratio} for o in done]
-        out.write_text(json.dumps(rows, indent=1), encoding="utf-8")
 
 
 def _cells(own: list[Outcome]) -> list[str]:
