@@ -31,7 +31,7 @@ def combinations(parameters: Parameters, rest: Rest, shown: NDArray[np.bool_]) -
         if best >= 0 and abs(correlation[i, best]) > CLOSE:
             what = "difference" if correlation[i, best] > 0 else "sum"
             told.append(f"{names[i]}: these readings tell only its {what} with {names[best]}")
-        elif others := _company(correlation, i):
+        elif others := _company(correlation, int(i)):
             company = ", ".join(names[j] for j in others)
             told.append(f"{names[i]}: these readings tell it only together with {company}")
         else:
