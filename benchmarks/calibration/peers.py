@@ -2,7 +2,7 @@
 
 Gapbridge, a plain scipy fit of the DH table, and FIGAROH (``--figaroh PYTHON``: a Python of its own
 that has it) calibrate from the same rows and are judged on the same held-out rows: the rms of one
-coordinate, and the time. Simulated sessions with loads, and the measured sets that suit.
+coordinate, and the CPU time. Simulated sessions with loads, and the measured sets that suit.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Row:
     before: float  # m, rms of one coordinate, held out, nominal arm with its frame fitted
     held_out: float  # m
     floor: float  # m
-    seconds: float
+    seconds: float  # of CPU, whatever else the machine does
     parameters: int
     note: str = ""
 
@@ -113,22 +113,22 @@ def measured(name: str, folder: Path) -> DataSet:
 
 def by_gapbridge(data: DataSet) -> tuple[float, float, int, str]:
     """Return held-out rms, seconds, number of parameters, and what it says of the result."""
-    begun = time.perf_counter()
+    begun = time.process_time()
     how = make_observable("position")
     loaded = data.readings.loads.payload_mass is not None
     effects = DEFAULT if loaded else ("tool_frame", "joint_offset", "link_geometry")
     parameters = Parameters.of(data.model, effects, observable=how)
     found = calibrate(data.model, data.readings, parameters, Metrology(), diagnose=False)
-    seconds = time.perf_counter() - begun
+    seconds = time.process_time() - begun
     return _coordinate(found.held_out_after.vector), seconds, len(parameters), found.verdict
 
 
 def by_scipy(data: DataSet) -> tuple[float, float, int, str]:
     """Return the same for scipy's least squares on the DH table, tool and frame along."""
     fitted = ~data.readings.held_out
-    begun = time.perf_counter()
+    begun = time.process_time()
     fit = fit_dh(data.model, data.readings.q[fitted], data.readings.value[fitted])
-    seconds = time.perf_counter() - begun
+    seconds = time.process_time() - begun
     away = data.readings[data.readings.held_out]
     return _coordinate(away.value - fit.predict(away.q)), seconds, fit.count, ""
 

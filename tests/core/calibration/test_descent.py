@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from benchmarks.blind.arms import ARMS
+from benchmarks.blind.mechanics import RealArm
 from benchmarks.calibration.drawings import model_of, real_arm
 from benchmarks.calibration.laid_out import (
     Layout,
-    arm_with,
     draw_values,
     instrument_for,
     lay_out,
     readings_of,
+    with_values,
 )
 from core.calibration.fit import calibrate
 from core.calibration.observables import make_observable
@@ -28,12 +29,18 @@ from core.model import Model
 
 KIND = ARMS["cobot5"]
 LAYOUT = Layout(poses=18, held_out=10, repeated=3)
+SEED = 6  # undamped steps came to rest 15 deviations away from it
 POSITION = make_observable("position")
+
+
+def _drawn() -> RealArm:
+    """Return the arm as its cell has it: it is softer than that."""
+    return real_arm(KIND, axial=0.7 * np.array(KIND.axial), radial=0.7 * np.array(KIND.radial))
 
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    return model_of(real_arm(KIND))
+    return model_of(_drawn())
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +50,9 @@ def parameters(model: Model) -> Parameters:
 
 def _session(parameters: Parameters, extra: float) -> Readings:
     """Return readings under loads that are heavier than declared by ``extra`` kg."""
-    rng = np.random.default_rng(3)
+    rng = np.random.default_rng(SEED)
     names = [n for n in parameters.names if n != "payload"]
-    real = arm_with(KIND, draw_values(KIND, names, rng))
+    real = with_values(_drawn(), draw_values(KIND, names, rng))
     laid, instrument = lay_out(KIND, LAYOUT, rng), instrument_for(KIND, LAYOUT, rng)
     mass = laid.session.payload_mass
     heavy = replace(laid.session, payload_mass=mass + extra)
