@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.blind.arms import ARMS
+from benchmarks.calibration.drawings import model_of, real_arm
 from core.arm import builtin_arm
 from core.calibration.observables import make_observable
 from core.calibration.parameters import DEFAULT, Parameters
@@ -130,3 +132,12 @@ def test_a_payload_is_a_parameter_of_an_arm_whose_softness_is_to_be_found(model:
     assert "payload" in Parameters.of(model, (*DEFAULT, "payload"), observable=POSITION).names
     rigid = Parameters.of(model, ("joint_offset", "payload"), observable=POSITION)
     assert "payload" not in rigid.names
+
+
+def test_a_heavy_arm_without_a_rating_is_judged_under_loads_that_it_carries() -> None:
+    # under a few kilograms the tilt of its last joint would pass for those before it
+    kind = ARMS["heavy210"]
+    heavy = model_of(real_arm(kind, tool_position=np.array([0.0, 0.0, 0.6 * kind.tool])))
+    registered = make_observable("position", registered=True)
+    found = Parameters.of(heavy, observable=registered, pulls=True)
+    assert found.joints("radial_compliance") == (1, 2, 3, 4, 5, 6)
