@@ -29,6 +29,7 @@ DEFAULT = (
 )
 ORDERS = (1.0, 2.0)  # cycles a turn at which a transmission error is looked for
 PRIOR = 10.0  # usual sizes
+LEAST_LEVER = 0.05  # of the arm's reach, beyond a joint
 NONNEGATIVE = ("axial_compliance", "radial_compliance", "link_flexibility")
 
 
@@ -81,9 +82,10 @@ class Parameters:
                 names.append(_name(term, effect.label(term.site, parameter), parameter.name))
                 units.append(parameter.unit)
                 low = 0.0 if term.effect in NONNEGATIVE else parameter.lower
-                start = parameter.scale if term.effect == "stiffness_nonlinearity" else 0.0
+                scale = parameter.scale * _smaller(model, term, k)
+                start = scale if term.effect == "stiffness_nonlinearity" else 0.0
                 bounds = low - had[k], parameter.upper - had[k]
-                numbers.append((parameter.scale, *bounds, start))
+                numbers.append((scale, *bounds, start))
         scales, lower, upper, begin = np.array(numbers).T
         return cls(
             model, terms, tuple(place), tuple(names), tuple(units), scales, lower, upper, begin
@@ -174,6 +176,21 @@ def _sites(model: Model, named: str) -> list[tuple[str, Site]]:
     if effect.identifier == "transmission_error":
         sites = [replace(s, order=order) for s in sites for order in ORDERS]
     return [(effect.identifier, site) for site in sites]
+
+
+def _smaller(model: Model, term: Term, value: int) -> float:
+    """Return how a joint that carries less than the arm's foot changes a usual size.
+
+    Where a curve bends is told by the moment at the joint itself: a wrist's is reached long before
+    the moment that the whole arm puts on its first joint.
+    """
+    if term.effect != "stiffness_nonlinearity" or term.site.joint is None:
+        return 1.0
+    arm, i = model.arm, term.site.joint - 1
+    length = np.linalg.norm(arm.link_in_link[:, :3, 3], axis=1)
+    tool = float(np.linalg.norm(model.tool_in_flange[:3, 3]))
+    share = (float(length[i + 1 :].sum()) + tool) / (float(length.sum()) + tool)
+    return max(share, LEAST_LEVER) ** -(1 + value)
 
 
 def _had(model: Model, term: Term) -> Array:

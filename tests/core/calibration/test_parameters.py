@@ -141,3 +141,11 @@ def test_a_heavy_arm_without_a_rating_is_judged_under_loads_that_it_carries() ->
     registered = make_observable("position", registered=True)
     found = Parameters.of(heavy, observable=registered, pulls=True)
     assert found.joints("radial_compliance") == (1, 2, 3, 4, 5, 6)
+
+
+def test_where_a_wrist_stiffens_is_looked_for_at_the_wrists_own_moment() -> None:
+    # at the moment of the whole arm its softening would pass for nothing, and be left out
+    heavy = model_of(real_arm(ARMS["heavy210"]))
+    effects = (*DEFAULT, "stiffness_nonlinearity_5")
+    found = Parameters.of(heavy, effects, observable=POSITION, pulls=True)
+    assert "stiffness_nonlinearity_5_softening" in found.names
