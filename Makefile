@@ -19,15 +19,18 @@ help:
 demo: .venv/.main
 	$(BIN)/gapbridge demo
 
+# Two processes side by side: what goes over wires mostly waits.
+SIDE_BY_SIDE := -n 2 --dist loadgroup
+
 test: .venv/.test
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(SIDE_BY_SIDE)
 
 check: .venv/.test
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(SIDE_BY_SIDE)
 
 # Compiled kernels run unseen: the tests that check them run once more, as plain Python.
 KERNEL_TESTS := $(addprefix tests/core/test_,kinematics.py statics.py equilibrium.py \
