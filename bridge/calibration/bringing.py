@@ -84,16 +84,8 @@ class Bringing:
 
         None where the instrument has it seated by hand afterwards.
         """
-        via = None if not self._driven or self._there(pose) else self._way(pose)
-        if via is not None:
-            try:
-                with self.talk.waiting("driving"):
-                    self.joints.drive(pose, via)
-            except RunError as error:
-                self.talk.warn(str(error))
-                self.talk.say("  jog it to this pose, or `quit` and look at the arm")
-                self._driven = False
-                self._asked = None
+        if self._driven and not self._there(pose):
+            self._drive(pose)
         if not self._driven:
             self.talk.say(f"  {degrees(pose.q)}")
         if self._instrument.seats:
@@ -101,6 +93,23 @@ class Bringing:
         stand = self._rested(pose)
         self._look_at_load(pose, stand)
         return stand
+
+    def _drive(self, pose: PlannedPose) -> None:
+        """Move the arm to the pose; a person says whether to go on where a move broke off."""
+        via = self._way(pose)
+        while via is not None:
+            try:
+                with self.talk.waiting("driving"):
+                    self.joints.drive(pose, via)
+            except RunError as error:
+                self.talk.warn(str(error))
+                if self.talk.confirm("  Drive on from where it stands?"):
+                    via = self._way(pose)
+                    continue
+                self.talk.say("  jog it to this pose, or `quit` and look at the arm")
+                self._driven = False
+                self._asked = None
+            return
 
     def _there(self, pose: PlannedPose) -> bool:
         now = self.joints.now()

@@ -153,8 +153,12 @@ def test_the_arm_is_driven_after_a_yes_and_ctrl_c_tells_how_to_go_on(tmp_path: P
         assert "Drive it?" in str(terminal.question())
         assert hands.bench("truth").split('"true_tcp"')[0] == before.split('"true_tcp"')[0]
         terminal.type("yes")
+        broken = 0
         while terminal.shown.count("  kept  ") < 1:
             terminal.watch()
+            if terminal.shown.count("Drive on") > broken:  # the machine missed deadlines
+                broken += 1
+                terminal.type("yes")
         terminal.signal(signal.SIGINT)
         shown = terminal.rest()
         assert terminal.code == 1
