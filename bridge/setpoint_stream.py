@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 
 import numpy as np
@@ -67,9 +68,9 @@ class SetpointStream:
         """Return the correction alone, neither ramped nor limited."""
         correction = self._compensator.correct(nominal_q, loads)
         self.residual = float(correction.residual)
-        self.finite = bool(
-            np.isfinite(correction.q).all() and np.isfinite(correction.offset_in_base).all()
-        )
+        # plain numbers: twelve of them cost four calls on arrays more
+        numbers = correction.q.tolist() + correction.offset_in_base.tolist()
+        self.finite = math.isfinite(sum(numbers))
         return correction
 
     def start(self, own_q: Vector, timestamp: float, led: bool = False) -> None:

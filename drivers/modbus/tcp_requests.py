@@ -11,7 +11,9 @@ Source: MODBUS Application Protocol Specification V1.1b3, 6.3, 6.4, 6.12, 6.17.
 from __future__ import annotations
 
 import socket
+import ssl
 import struct
+import sys
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -39,6 +41,13 @@ class TcpRequests:
         self._framer: FramerBase = client.framer
         self._device, self._timeout = device_id, timeout
         self._transaction = 0
+        self._mode: float | None = timeout
+        if sys.platform.startswith("linux") and not isinstance(self._link, ssl.SSLSocket):
+            # the kernel itself gives up: no call that waits before each that sends or receives
+            limit = struct.pack("@ll", *divmod(int(1e6 * timeout), 1_000_000))
+            self._link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
+            self._link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
+            self._mode = None
 
     def ask(self, request: bytes) -> bytes:
         """Send a PDU; returns the answer's.
@@ -46,8 +55,15 @@ class TcpRequests:
         Raises InvalidStateError where what comes is no answer to it, TimeoutError where nothing
         comes, OSError where the link broke. The socket is of no more use after any of them.
         """
+        try:
+            return self._ask(request)
+        except BlockingIOError:
+            raise TimeoutError from None
+
+    def _ask(self, request: bytes) -> bytes:
         link, framer = self._link, self._framer
-        link.settimeout(self._timeout)  # the library leaves it at another one
+        if link.gettimeout() != self._mode:
+            link.settimeout(self._mode)  # the library leaves it at another one
         self._transaction = number = self._transaction % 0xFFFF + 1
         link.sendall(framer.encode(request, self._device, number))
         data = link.recv(LONGEST)
