@@ -12,6 +12,8 @@ from drivers.modbus.schema import Mailbox, Vector
 SEQUENCES = 0x8000  # sequence numbers and heartbeats run from 1 to this less one; 0: nothing sent
 MODULUS, SEED = 65521, 0x4742  # of the checksum: the largest prime below 65536
 
+LARGEST = 0x7FFF  # counts
+
 ABSENT, RUNNING, EXPIRED, REJECTED = 0, 1, 2, 3  # what the robot's program says of itself
 
 
@@ -31,15 +33,19 @@ def offset_counts(box: Mailbox, offset_in_base: Sequence[float]) -> list[int]:
     Raises ValueError for one that is not finite or does not fit 16 bits.
     """
     found: list[int] = []
-    for i, value in enumerate(offset_in_base):
-        unit = box.length_count if i < 3 else box.angle_count
-        if not math.isfinite(value) or abs(round(value / unit)) > 32767:
+    for i, (value, unit) in enumerate(zip(offset_in_base, _units(box), strict=True)):
+        if not math.isfinite(value) or abs(count := round(value / unit)) > LARGEST:
             raise ValueError(
                 f"found an offset of {value:g} {'m' if i < 3 else 'rad'}, expected at most "
-                f"{32767 * unit:g}: what 16 bits hold"
+                f"{LARGEST * unit:g}: what 16 bits hold"
             )
-        found.append(round(value / unit))
+        found.append(count)
     return found
+
+
+def _units(box: Mailbox) -> list[float]:
+    """Return m or rad per count of an offset's six numbers."""
+    return [box.length_count] * 3 + [box.angle_count] * 3
 
 
 def mailbox_words(sequence: int, counts: Sequence[int], heartbeat: int) -> list[int]:
@@ -55,8 +61,7 @@ def signed(word: int) -> int:
 
 def offset_of(box: Mailbox, words: Sequence[int]) -> list[float]:
     """Return the offset (6,), m and rad, in six registers."""
-    units = [box.length_count] * 3 + [box.angle_count] * 3
-    return [signed(word) * unit for word, unit in zip(words, units, strict=True)]
+    return [signed(word) * unit for word, unit in zip(words, _units(box), strict=True)]
 
 
 def vector_registers(entry: Vector, values: Sequence[float]) -> dict[int, int]:

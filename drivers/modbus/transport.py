@@ -173,16 +173,15 @@ class Transport:
 
     def _write_registers(self, client: Any, address: int, values: Sequence[int]) -> None:
         """Write holding registers in one request. Raises InvalidStateError, LinkError."""
-        where = f"{self.name}: holding"
         if self._tcp is None:
             found = self._ask(client.write_registers, address, list(values), device_id=self._device)
-            check_written(found, 16, address, where)
+            check_written(found, 16, address, f"{self.name}: holding")
             return
         answer = self._ask_tcp(tcp_requests.write_request(address, values))
         try:
             tcp_requests.check_written(answer, address, len(values))
         except InvalidStateError as error:
-            raise InvalidStateError(f"{where}: {error}") from None
+            raise InvalidStateError(f"{self.name}: holding: {error}") from None
 
     def _check_allowed(self, table: Table, address: int, values: Sequence[int]) -> None:
         run = (table, address, len(values))
