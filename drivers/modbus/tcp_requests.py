@@ -1,9 +1,9 @@
 """Register requests over Modbus TCP, plain or TLS, on the socket that pymodbus has opened.
 
-Framing is the library's. What stands between its framer and its calls (objects of requests and
-answers, a register at a time, texts of both for a log that nobody reads) costs more than a whole
-cycle of ours, so that what every cycle asks for (functions 3, 4, 16, 23) goes round it. Everything
-else (coils, single registers, serial lines) goes through it.
+Framing is the library's. What stands between its framer and its calls makes objects of requests and
+answers, register by register, and texts of both for its log, so that what every cycle asks for
+(functions 3, 4, 16, 23) goes round it. Everything else (coils, single registers, serial lines) goes
+through it.
 
 Source: MODBUS Application Protocol Specification V1.1b3, 6.3, 6.4, 6.12, 6.17.
 """
