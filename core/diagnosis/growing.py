@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ class State:
     """A set that grows: what its terms leave of the columns and of the gap."""
 
     chosen: tuple[int, ...]
-    P: Array  # columns with the chosen ones projected out
+    basis: Array  # (m, r) orthonormal, of the chosen columns
     r: Array
     rss: float
     score: float
@@ -56,10 +56,14 @@ def clash(space: Space, chosen: Sequence[int], new: int) -> bool:
 
 def grow(space: Space, state: State, new: int, score: float) -> State:
     """Return the state with one more term."""
-    U = _directions(state.P[:, space.start[new] : space.start[new + 1]])
-    P = state.P - U @ (U.T @ state.P)
-    r = state.r - U @ (U.T @ state.r)
-    return State((*state.chosen, new), P, r, float(r @ r), score)
+    block = _without(state.basis, space.X[:, space.start[new] : space.start[new + 1]])
+    U = _directions(block)
+    r = _without(U, state.r)
+    return State((*state.chosen, new), np.hstack([state.basis, U]), r, float(r @ r), score)
+
+
+def _without(basis: Array, columns: Array) -> Array:
+    return np.asarray(columns - basis @ (basis.T @ columns))
 
 
 def _directions(block: Array) -> Array:
@@ -72,17 +76,17 @@ def _directions(block: Array) -> Array:
 def projected(space: Space, chosen: Sequence[int]) -> State:
     """Return the state of a whole set."""
     if not chosen:
-        return State((), space.X, space.y, float(space.y @ space.y), 0.0)
+        return State((), np.zeros((len(space.y), 0)), space.y, float(space.y @ space.y), 0.0)
     U = _directions(space.columns(chosen))
-    r = space.y - U @ (U.T @ space.y)
-    return State(tuple(chosen), space.X - U @ (U.T @ space.X), r, float(r @ r), 0.0)
+    r = _without(U, space.y)
+    return State(tuple(chosen), U, r, float(r @ r), 0.0)
 
 
 def offspring(
     space: Space, state: State, width: int, named_only: bool = False
 ) -> list[tuple[float, int]]:
     """Return the best terms to join a state: (score of the joint set, index), best first."""
-    gain, sign = gains(space, state.P, state.r)
+    gain, sign = gains(space, state.r, state.basis)
     score = space.misfit(np.maximum(state.rss - gain, 1e-300)) + space.price
     score += space.price[list(state.chosen)].sum()
     found: list[tuple[float, int]] = []
@@ -111,7 +115,7 @@ def beam_search(
 ) -> list[Found]:
     """Return the best sets met, best first (the empty one among them)."""
     rss = float(space.y @ space.y)
-    empty = State((), space.X, space.y, rss, float(space.misfit(np.array(rss))))
+    empty = replace(projected(space, ()), score=float(space.misfit(np.array(rss))))
     states, best, waited = [empty], empty.score, 0
     met: dict[frozenset[int], Found] = {frozenset(): Found((), empty.score, rss)}
     for _ in range(allowed_depth):

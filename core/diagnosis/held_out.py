@@ -30,8 +30,8 @@ class HeldOut:
 
     def __init__(self, selection: Selection, seed: int = 0) -> None:
         self._space = selection.space
-        self._raw, self._target = selection.raw, selection.raw_target
-        self._nuisance = selection.raw_nuisance
+        self._raw, self._target = selection.raw, selection.raw.target
+        self._nuisance = selection.raw.nuisance
         k = selection.observation.measured.shape[1]
         own = {"position": 3, "wrench": 3}.get(selection.observation.channel, k)
         self._unwhiten = np.linalg.inv(selection.noise.whitener[selection.kept])
@@ -61,8 +61,7 @@ class HeldOut:
 
     def _left(self, chosen: tuple[int, ...]) -> Array:
         space = self._space
-        parts = [self._raw[:, space.start[c] : space.start[c + 1]] for c in chosen]
-        A = np.hstack([*parts, self._nuisance])
+        A = np.hstack([self._raw.columns(space, chosen), self._nuisance])
         if not A.shape[1]:
             return self._target
         unit = 1 / np.sqrt(np.einsum("ij,ij->j", A, A) + 1e-300)

@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.growing import children, clash, grow, offspring, projected
+from core.diagnosis.growing import (
+    children,
+    clash,
+    grow,
+    offspring,
+    projected,
+)
 from core.diagnosis.space import Found, Space, fit, gains
 
 Array = NDArray[np.float64]
@@ -192,7 +198,7 @@ def _lines(space: Space, rest: tuple[int, ...], joint: int) -> list[Found]:
         step: list[Found] = []
         for chosen in sets:
             state = projected(space, chosen)
-            gain, _ = gains(space, state.P, state.r)
+            gain, _ = gains(space, state.r, state.basis)
             ranked = sorted(own, key=lambda k: -gain[k])[:6]
             step += [fit(space, (*chosen, k)) for k in ranked if not clash(space, chosen, k)]
         step.sort(key=lambda f: f.score)

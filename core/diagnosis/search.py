@@ -100,7 +100,7 @@ def screened(space: Space, base: Sequence[int] = ()) -> NDArray[np.int64]:
         state = projected(space, base)
         targets.append(state.r)
     for r in targets:
-        gain, _ = gains(space, space.X, r)
+        gain, _ = gains(space, r)
         pools: dict[tuple[str, int | None], list[int]] = {}
         for c in np.flatnonzero(many)[np.argsort(-(gain[many] / space.price[many]))]:
             candidate = space.candidates[c]

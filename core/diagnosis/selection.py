@@ -28,7 +28,7 @@ from core.diagnosis.search import LARGE, screened_search
 from core.diagnosis.smooth import smooth_candidates
 from core.diagnosis.space import Found, Space, fit
 from core.diagnosis.wild import look_again, look_for_wild, with_wild_explained
-from core.diagnosis.work import Work, flat, locate, sample_space
+from core.diagnosis.work import Raw, Work, flat, locate, sample_space
 from core.effects import CATALOGUE, Term
 from core.errors import InputError
 from core.model import Model
@@ -54,20 +54,17 @@ class Selection:
     noise: Noise
     residual: Array  # (N, k) measured - predicted by the named terms, frame estimated along
     base: tuple[Term, ...]
-    raw: Array  # (m, K) columns before the nuisance was projected out, kept samples
-    raw_nuisance: Array  # (m, p)
-    raw_target: Array  # (m,)
+    raw: Raw  # the space before the nuisance was projected out
 
     @property
     def nuisance_basis(self) -> Array:
         """Return an orthonormal basis (m, p) of the nuisance in the sample space."""
-        p = self.raw_nuisance.shape[1]
-        return np.linalg.qr(self.raw_nuisance)[0] if p else self.raw_nuisance
+        return self.raw.basis
 
     @property
     def used(self) -> float:
         """Return the number of fitted unknowns, nuisance included."""
-        return float(self.raw_nuisance.shape[1] + sum(len(v) for v in self.found.values))
+        return float(self.raw.nuisance.shape[1] + sum(len(v) for v in self.found.values))
 
     @property
     def groups(self) -> NDArray[np.int64]:
@@ -96,6 +93,7 @@ def select(
     work = Work(observation, arm, [], first, kept)
     found: Found | None = None
     space: Space | None = None
+    columns: list[Array] = []
     smooth = smooth_candidates(observation, arm)
     for turn in range(ROUNDS):
         if progress:
@@ -105,16 +103,15 @@ def select(
             for c in named_candidates(arm, observation.channel, withheld, rotation, base, turns)
             if _has_what_it_needs(c, observation)
         ]
+        space, columns = None, []  # the last round's, as large as the new ones: not both at a time
         columns = [exact_columns(work.observation, c, base) for c in work.candidates]
         if turn == 0:
             look_for_wild(work, columns)
-        space, raw, nuisance, target = sample_space(work, columns, base, smooth)
+        space, raw = sample_space(work, columns, base, smooth)
         inside = [locate(work.candidates, t)[0] for t in base]
         best = screened_search(space, base=inside)
         if turn > 0 and not work.kept.all():
-            space, raw, nuisance, target, best = with_wild_explained(
-                work, columns, base, smooth, (space, raw, nuisance, target, best)
-            )
+            space, raw, best = with_wild_explained(work, columns, base, smooth, (space, raw, best))
         counted, whitened_by = work.kept.copy(), work.noise
         framed = work.observation
         try:
@@ -142,7 +139,7 @@ def select(
         terms, index, covariance, residual = refit(work, space, alone)
     return Selection(
         work.observation, space, found, terms, index, covariance, counted, whitened_by,
-        residual, base, raw, nuisance, target,
+        residual, base, raw,
     )  # fmt: skip
 
 

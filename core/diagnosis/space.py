@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +12,35 @@ from numpy.typing import NDArray
 from core.diagnosis.candidate import Candidate
 
 Array = NDArray[np.float64]
-RANK = 1e-10  # share of a block's own size below which a direction counts as already explained
+RANK = 1e-10  # share of a column's square below which it counts as already explained
+DEPENDENT = 1e-8  # the same of a direction among several columns
+AT_ONCE = 250_000  # numbers of a temporary: 2 MB
 SMOOTH_PRICE = 18.0  # what an unnamed function pays beyond a named cause
 MARGIN = 6.0  # what every accusation pays: keeps clean logs clean
 ABSURD = 200.0  # times a parameter's usual size: beyond, a fit is no explanation
 SENSED = ("N", "Nm", "N/s", "Nm/s")  # units of sensor biases, which may have any size
 SHARP = 6000.0  # times the usual softening of a stiffness curve
 USUAL_ORDERS = (1.0, 2.0, 3.0, 4.0)  # eccentricity and its kin
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Candidates with equally many columns, these at unit size."""
+
+    index: NDArray[np.int64]  # (n,) candidates
+    columns: NDArray[np.int64]  # (n, d)
+    unit: Array  # (n, d) one over each column's size
+    gram: Array  # (n, d, d) of the unit columns
+
+
+def _blocks(X: Array, index: NDArray[np.int64], columns: NDArray[np.int64]) -> Blocks:
+    n, d = columns.shape
+    gram = np.empty((n, d, d))
+    for few in np.array_split(np.arange(n), 1 + n * d * len(X) // AT_ONCE):
+        block = X[:, columns[few].ravel()].T.reshape(len(few), d, len(X))
+        gram[few] = block @ block.transpose(0, 2, 1)
+    unit = 1 / np.sqrt(np.einsum("cii->ci", gram) + 1e-300)
+    return Blocks(index, columns, unit, gram * unit[:, :, None] * unit[:, None, :])
 
 
 @dataclass(frozen=True)
@@ -32,10 +55,25 @@ class Space:
     freedom: float  # m minus nuisance
     floor: float  # variance of one coordinate that is known to be there
 
+    @cached_property
+    def blocks(self) -> tuple[Blocks, ...]:
+        """Return the candidates by their number of columns."""
+        size = np.diff(self.start)
+        return tuple(
+            _blocks(self.X, index, self.start[index][:, None] + np.arange(d))
+            for d in np.unique(size)
+            for index in [np.flatnonzero(size == d)]
+        )
+
     def columns(self, chosen: Sequence[int]) -> Array:
         """Return the columns of a set of candidates (m, sum d)."""
         parts = [self.X[:, self.start[c] : self.start[c + 1]] for c in chosen]
         return np.hstack(parts) if parts else np.zeros((len(self.y), 0))
+
+    def column_indices(self, chosen: Sequence[int]) -> NDArray[np.int64]:
+        """Return where in ``X`` the columns of a set of candidates are (sum d,)."""
+        parts = [np.arange(self.start[c], self.start[c + 1]) for c in chosen]
+        return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
 
     def misfit(self, rss: Array) -> Array:
         """Return -2 log likelihood of residual sums of squares, variance profiled out."""
@@ -78,30 +116,30 @@ def _kind(candidate: Candidate) -> str:
     return candidate.family
 
 
-def gains(space: Space, P: Array, r: Array) -> tuple[Array, Array]:
-    """Return how much of |r|^2 each candidate takes (C,), and its first value's sign (C,)."""
-    size = np.diff(space.start)
-    gain, sign = np.zeros(len(size)), np.ones(len(size))
-    g = P.T @ r
-    square = np.einsum("ij,ij->j", P, P)
-    whole = np.einsum("ij,ij->j", space.X, space.X)
-    for d in np.unique(size):
-        index = np.flatnonzero(size == d)
-        columns = space.start[index][:, None] + np.arange(d)
-        if d == 1:
-            c = columns[:, 0]
-            alive = square[c] > RANK * whole[c] + 1e-300
-            gain[index] = np.where(alive, g[c] ** 2 / np.where(alive, square[c], 1), 0)
-            sign[index] = np.sign(g[c])
-            continue
-        unit = 1 / np.sqrt(whole[columns] + 1e-300)
-        block = P[:, columns.ravel()].reshape(len(P), len(index), d)
-        G = np.einsum("mci,mcj->cij", block, block, optimize=True)
-        G *= unit[:, :, None] * unit[:, None, :]
-        values, vectors = np.linalg.eigh(G)
-        along = np.einsum("cji,cj->ci", vectors, g[columns] * unit)
-        alive = values > 1e-8
-        gain[index] = (np.where(alive, along**2 / np.where(alive, values, 1), 0)).sum(axis=1)
+def gains(space: Space, r: Array, basis: Array | None = None) -> tuple[Array, Array]:
+    """Return how much of |r|^2 each candidate takes (C,), and its first value's sign (C,).
+
+    ``basis`` (m, p), orthonormal, is projected out of the columns; of them all only their parts
+    along it are formed, so that a step of a search costs little beside the columns themselves.
+    """
+    within = np.zeros((0, space.X.shape[1])) if basis is None else basis.T @ space.X
+    g = space.X.T @ r
+    if basis is not None:
+        g -= within.T @ (basis.T @ r)
+    gain, sign = np.zeros(len(space.candidates)), np.ones(len(space.candidates))
+    for blocks in space.blocks:
+        own = g[blocks.columns] * blocks.unit
+        taken = (within[:, blocks.columns] * blocks.unit).transpose(1, 2, 0)
+        if blocks.columns.shape[1] == 1:
+            left = blocks.gram[:, 0, 0] - np.sum(taken[:, 0] ** 2, axis=1)
+            along, alive = own, (left > RANK)[:, None]
+            left = left[:, None]
+            sign[blocks.index] = np.sign(own[:, 0])
+        else:
+            left, vectors = np.linalg.eigh(blocks.gram - taken @ taken.transpose(0, 2, 1))
+            along, alive = np.einsum("cji,cj->ci", vectors, own), left > DEPENDENT
+        share = np.where(alive, along**2 / np.where(alive, left, 1), 0)
+        gain[blocks.index] = share.sum(axis=1)
     return gain, sign
 
 

@@ -9,7 +9,7 @@ from core.diagnosis.candidate import Candidate
 from core.diagnosis.growing import children
 from core.diagnosis.noise import estimate_noise
 from core.diagnosis.space import Found, Space, fit
-from core.diagnosis.work import Work, sample_space
+from core.diagnosis.work import Raw, Work, sample_space
 from core.effects import Term
 
 Array = NDArray[np.float64]
@@ -74,15 +74,15 @@ def with_wild_explained(
     columns: list[Array],
     base: tuple[Term, ...],
     smooth: list[tuple[Candidate, Array]],
-    known: tuple[Space, Array, Array, Array, Found],
-) -> tuple[Space, Array, Array, Array, Found]:
+    known: tuple[Space, Raw, Found],
+) -> tuple[Space, Raw, Found]:
     """Take wild readings back in where one local or smooth function makes them ordinary.
 
     A chipped tooth or a knocked instrument looks like a few wild readings; bad luck has no place.
     """
     kept, found = work.kept, known[-1]
     work.kept = np.ones_like(kept)
-    space, raw, nuisance, target = sample_space(work, columns, base, smooth)
+    space, raw = sample_space(work, columns, base, smooth)
     wild = np.flatnonzero(~kept)
     for _, c in children(space, found.chosen, 12):
         if space.candidates[c].named:
@@ -93,11 +93,10 @@ def with_wild_explained(
         distance = np.sqrt(np.mean(left.reshape(-1, k) ** 2, axis=1))
         if not (distance[wild] < WILD_SIGMA * np.median(distance)).all():
             continue
-        block = [np.arange(space.start[o], space.start[o + 1]) for o in trial.chosen]
-        A = np.hstack([nuisance, raw[:, np.concatenate(block)]])
+        A = np.hstack([raw.nuisance, raw.columns(space, trial.chosen)])
         d = int(space.start[c + 1] - space.start[c])
-        if _foretold(A, target, wild, k, d):
-            return space, raw, nuisance, target, trial
+        if _foretold(A, raw.target, wild, k, d):
+            return space, raw, trial
     work.kept = kept
     return known
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ from core.arm import Arm
 from core.diagnosis.candidate import Candidate
 from core.diagnosis.noise import Noise
 from core.diagnosis.observation import Observation
-from core.diagnosis.space import Space, prices
+from core.diagnosis.space import AT_ONCE, Space, prices
 from core.effects import Term
 
 Array = NDArray[np.float64]
@@ -31,6 +32,24 @@ class Work:
     kept: NDArray[np.bool_]
 
 
+@dataclass(frozen=True)
+class Raw:
+    """The whitened rows of the kept samples before the nuisance was projected out.
+
+    All columns are as large as the sample space itself, so they are put together when asked for.
+    """
+
+    nuisance: Array  # (m, p)
+    target: Array  # (m,)
+    basis: Array  # (m, p) orthonormal, of the nuisance
+    taken: Array  # (p, K) what the nuisance took of every column
+
+    def columns(self, space: Space, chosen: Sequence[int]) -> Array:
+        """Return the columns (m, sum d) of a set of candidates as they were."""
+        taken = self.taken[:, space.column_indices(chosen)]
+        return np.asarray(space.columns(chosen) + self.basis @ taken)
+
+
 def flat(columns: Array, work: Work) -> Array:
     """Return (N, k, d) columns as whitened (m, d) rows of the kept samples."""
     kept = work.noise.whitener[work.kept] @ columns[work.kept]
@@ -42,15 +61,15 @@ def sample_space(
     columns: list[Array],
     base: tuple[Term, ...],
     smooth: list[tuple[Candidate, Array]],
-) -> tuple[Space, Array, Array, Array]:
-    """Return the sample space at the model found so far, and its raw columns, nuisance, target."""
+) -> tuple[Space, Raw]:
+    """Return the sample space at the model found so far, and what it was before projection."""
     observation = work.observation
     candidates = [*work.candidates, *(c for c, _ in smooth)]
     size = np.array([len(c.parameters) for c in candidates])
     start = np.concatenate([[0], np.cumsum(size)])
-    raw = np.empty((int(work.kept.sum()) * observation.measured.shape[1], int(start[-1])))
+    X = np.empty((int(work.kept.sum()) * observation.measured.shape[1], int(start[-1])))
     for c, block in enumerate([*columns, *(s for _, s in smooth)]):
-        raw[:, start[c] : start[c + 1]] = flat(block, work)
+        X[:, start[c] : start[c + 1]] = flat(block, work)
     chords = observation.channel == "tracking"  # from nothing: nothing has to be put back
     gap = (observation.measured - observation.predict(() if chords else base))[..., None]
     # what the terms already in the model explain is put back, in the linear form at hand
@@ -60,17 +79,22 @@ def sample_space(
     target = flat(gap, work)[:, 0]
     nuisance = flat(observation.nuisance, work)
     Q = np.linalg.qr(nuisance)[0] if nuisance.shape[1] else nuisance
-    X, y = Q @ (Q.T @ raw), target - Q @ (Q.T @ target)
-    np.subtract(raw, X, out=X)
-    whole, left = (np.sqrt(np.einsum("ij,ij->j", A, A)) for A in (raw, X))
-    X[:, left < DEAD * whole] = 0.0  # the frame takes it up wholly; the rest is rounding
+    whole = _sizes(X)
+    taken, y = Q.T @ X, target - Q @ (Q.T @ target)
+    for few in np.array_split(np.arange(X.shape[1]), 1 + X.size // AT_ONCE):
+        X[:, few] -= Q @ taken[:, few]
+    X[:, _sizes(X) < DEAD * whole] = 0.0  # the frame takes it up wholly; the rest is rounding
     freedom = float(len(target) - Q.shape[1])
     price = prices(candidates, freedom) + np.array([_unseen(c, observation) for c in candidates])
     space = Space(
         y, X, start, tuple(candidates), price, freedom,
         KNOWN_SHARE if observation.sigma_is_whole else work.noise.floor_share,
     )  # fmt: skip
-    return space, raw, nuisance, target
+    return space, Raw(nuisance, target, Q, taken)
+
+
+def _sizes(X: Array) -> Array:
+    return np.asarray(np.sqrt(np.einsum("ij,ij->j", X, X)))
 
 
 def _unseen(candidate: Candidate, observation: Observation) -> float:

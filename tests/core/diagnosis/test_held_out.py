@@ -18,11 +18,15 @@ def selection():
     return small.diagnosed("backlash").channels[0].selection
 
 
+def with_target(selection, target: np.ndarray):
+    return replace(selection, raw=replace(selection.raw, target=target))
+
+
 def jolted(selection, sample: int, size: float = JOLT):
     """Return the selection with one kept sample's reading moved."""
-    target = selection.raw_target.copy()
+    target = selection.raw.target.copy()
     target[3 * sample : 3 * sample + 3] += size
-    return replace(selection, raw_target=target)
+    return with_target(selection, target)
 
 
 def paired(selection):
@@ -73,8 +77,8 @@ def test_held_out_figures_are_those_of_a_cross_validation_by_hand(selection):
     assert held.possible
     # noise-free exact linear data: nothing is left, whatever pose was out
     space = selection.space
-    block = selection.raw[:, space.start[chosen[0]] : space.start[chosen[0] + 1]]
-    exact = replace(selection, raw_target=block @ np.ones(block.shape[1]))
+    block = selection.raw.columns(space, chosen[:1])
+    exact = with_target(selection, block @ np.ones(block.shape[1]))
     assert HeldOut(exact).rms(chosen) < 1e-9 * HeldOut(exact).rms(())
     assert held.rms(chosen) == pytest.approx(np.sqrt(np.mean(held.squares(chosen))))
     assert held.rms(chosen) == pytest.approx(small.FLOOR, rel=0.2)

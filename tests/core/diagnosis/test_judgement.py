@@ -79,7 +79,8 @@ def test_what_does_not_hold_on_unseen_samples_is_withdrawn():
     channel = channel_of("backlash")
     selection = channel.selection
     rng = np.random.default_rng(0)
-    noise = replace(selection, raw_target=rng.normal(size=len(selection.raw_target)))
+    drawn = rng.normal(size=len(selection.raw.target))
+    noise = replace(selection, raw=replace(selection.raw, target=drawn))
     believed = replace(judge(selection), structured=True)
     assert believed.accused
     left = holding(noise, believed, HeldOut(noise))
