@@ -88,16 +88,6 @@ def next_offset(chain, rows, r, shape, position, rotation, lever, offset):  # ty
 
 
 @njit(**JIT)
-def newton_step(chain, rows, r, shape, position, rotation, lever, dq):  # type: ignore[no-untyped-def]
-    """Write the joint step of row r towards the wanted pose; returns the present distance.
-
-    ``next_offset`` for joints that hold no offset yet.
-    """
-    dq[:] = 0.0
-    return next_offset(chain, rows, r, shape, position, rotation, lever, dq)
-
-
-@njit(**JIT)
 def _turned(A, B, out):  # type: ignore[no-untyped-def]
     """Write the rotation vector of A B^T; accurate at zero, where it is needed."""
     x = y = z = trace = 0.0

@@ -22,7 +22,7 @@ FLANGE = 24
 
 
 @njit(**FAST)
-def _turn(x, y, z):  # type: ignore[no-untyped-def]
+def turn(x, y, z):  # type: ignore[no-untyped-def]
     """Return the two factors of Rodrigues' formula for a rotation vector."""
     q = x * x + y * y + z * z
     if q < 1e-3:  # the series are exact to rounding here
@@ -37,7 +37,7 @@ def _turn(x, y, z):  # type: ignore[no-untyped-def]
 @njit(**FAST)
 def place(b, n, w, bent, tx, ty, tz):  # type: ignore[no-untyped-def]
     """Place all frames of the block's row for the present bending and tilt of the base."""
-    first, second = _turn(tx, ty, tz)
+    first, second = turn(tx, ty, tz)
     a00, a01, a02 = 1.0 - second * (ty * ty + tz * tz), second * tx * ty - first * tz, (
         second * tx * tz + first * ty)  # fmt: skip
     a10, a11, a12 = second * tx * ty + first * tz, 1.0 - second * (tx * tx + tz * tz), (
@@ -80,7 +80,7 @@ def place(b, n, w, bent, tx, ty, tz):  # type: ignore[no-untyped-def]
             b[U(j + AXIS)], b[U(j + AXIS + 1)], b[U(j + AXIS + 2)] = b02, b12, b22
         if bent and i < n:
             x, y, z = b[U(j + BEND)], b[U(j + BEND + 1)], b[U(j + BEND + 2)]
-            first, second = _turn(x, y, z)
+            first, second = turn(x, y, z)
             t00, t11, t22 = (
                 1.0 - second * (y * y + z * z), 1.0 - second * (x * x + z * z),
                 1.0 - second * (x * x + y * y),

@@ -1,4 +1,4 @@
-"""The correction of one setpoint in one call, over blocks (core.kernels.one_row)."""
+"""The correction of one setpoint in one call, and its inverse, over blocks (kernels.one_row)."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from core.kernels.one_row import (
     TCP_ROTATION,
     equilibrium,
     place,
+    turn,
 )
 from core.least_offset import LARGEST_OFFSET, REGULAR, smallest_offset
 from core.packed import sizes_of
@@ -189,3 +190,53 @@ def _motion(r, wanted, found, n, moves):  # type: ignore[no-untyped-def]
     if not moves:
         scale = 0.0
     found[U(n + 3)], found[U(n + 4)], found[U(n + 5)] = scale * x, scale * y, scale * z
+
+
+@njit(**JIT)
+def take_out(b, given, found, lever, tolerance, most):  # type: ignore[no-untyped-def]
+    """Write the joints (n,) at which the rigid TCP is an offset short of where a target has it.
+
+    ``b``: chain, row, workspace of the rigid arm, joint offset (n,), scratch (42,), wanted pose
+    (12,); kept from call to call. ``given``: target (n,), offset (6,) in base. Returns the
+    distance (m) that is left.
+    """
+    n = found.shape[0]
+    c, size = sizes_of(n)
+    w, row = c + size, c
+    at = w + (RECORD + 6) * n + FLANGE
+    wanted = at + n + 42
+    if not np.any(given[n:] != 0.0):  # no offset changes no bit
+        for i in range(n):
+            found[i], b[U(at + i)] = given[i], 0.0
+        return 0.0
+    rigid_pose(b, n, w, given, 0, wanted)
+    _move_back(b, wanted, given, n)
+    distance = np.inf
+    for _ in range(most):
+        for i in range(n):
+            b[U(row + i)] = given[i] + b[U(at + i)]
+        distance = next_offset(b, n, w, b, wanted, lever)
+        if distance < tolerance:
+            break
+    distance = distance if distance >= 0.0 else np.inf
+    for i in range(n):
+        found[i] = b[U(row + i)]
+        if not distance < tolerance:
+            b[U(at + i)] = 0.0  # the next search begins from nothing
+    return distance
+
+
+@njit(**FAST)
+def _move_back(b, pose, given, n):  # type: ignore[no-untyped-def]
+    """Move a pose (12,) of the block by the opposite of the offset behind the target."""
+    for k in range(3):
+        b[U(pose + k)] -= given[n + k]
+    x, y, z = -given[n + 3], -given[n + 4], -given[n + 5]
+    first, second = turn(x, y, z)
+    for k in range(3):
+        r = pose + 3 + k
+        b0, b1, b2 = b[U(r)], b[U(r + 3)], b[U(r + 6)]
+        u, v, s = y * b2 - z * b1, z * b0 - x * b2, x * b1 - y * b0  # vector x column
+        b[U(r)] = b0 + first * u + second * (y * s - z * v)
+        b[U(r + 3)] = b1 + first * v + second * (z * u - x * s)
+        b[U(r + 6)] = b2 + first * s + second * (x * v - y * u)

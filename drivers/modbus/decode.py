@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +20,7 @@ from drivers.modbus.schema import Condition, Place, ProfileFile, Trouble, Vector
 
 Array = NDArray[np.float64]
 Registers = Mapping[Block, Sequence[int]]
+Spot = tuple[Block, int, Coding]  # a number's first register in its block
 
 BOUNDS = {
     "position": 20.0, "velocity": 30.0, "target": 20.0, "joint_torque": 1e5, "temperature": 300.0,
@@ -69,10 +72,11 @@ class Decoder:
         self._others = [field for field in self._fields if not self._planned(field)]
         self._plan.compile()
         self._conditions = [(self._spot(c), c) for c in profile.status]
-        self._said: list[Sequence[int]] = []  # registers of the conditions, last time
+        self._looked = _getters(spot for spot, _ in self._conditions)
+        self._said: list[Any] = []  # registers of the conditions, last time
         self._troubles: tuple[tuple[Trouble, str], ...] = ()
         clock, write = profile.clock, profile.write
-        self._motion: list[tuple[str, tuple[Block, int, Coding], Condition]] = []
+        self._motion: list[tuple[str, Spot, Condition]] = []
         if write.mode == "target_trigger":
             self._motion = [
                 (name, self._spot(condition), condition)
@@ -118,7 +122,7 @@ class Decoder:
         block = self._map.block_of(entry.table, places[0], words)
         return block, tuple(a - block.first + k for a in places for k in range(words))
 
-    def _spot(self, place: Place) -> tuple[Block, int, Coding]:
+    def _spot(self, place: Place) -> Spot:
         coding = Coding("bit") if place.table in BIT_TABLES else place.coding
         block = self._map.block_of(place.table, place.address, coding.words)
         return block, place.address - block.first, coding
@@ -160,10 +164,7 @@ class Decoder:
 
     def _troubles_of(self, registers: Registers) -> tuple[tuple[Trouble, str], ...]:
         """Return the conditions that are not met; looked at anew where a register has changed."""
-        said = [
-            registers[block][start : start + coding.words]
-            for (block, start, coding), _ in self._conditions
-        ]
+        said = [words_of(registers[block]) for block, words_of in self._looked]
         if said != self._said:
             self._troubles = tuple(
                 (condition.otherwise, _words(condition, count))
@@ -210,6 +211,14 @@ class Decoder:
         return tuple(registers[block][start : start + ECHO_WORDS])
 
 
+def _getters(spots: Iterable[Spot]) -> list[tuple[Block, Callable[[Sequence[int]], Any]]]:
+    """Return for each block what takes the spots' registers out of it, all at once."""
+    places: dict[Block, list[int]] = {}
+    for block, start, coding in spots:
+        places.setdefault(block, []).extend(range(start, start + coding.words))
+    return [(block, itemgetter(*indices)) for block, indices in places.items()]
+
+
 def check_identity(profile: ProfileFile, compiled: RegisterMap, registers: Registers) -> None:
     """Refuse a controller that is another than the profile's. Raises InvalidStateError."""
     for condition in profile.identity:
@@ -220,22 +229,21 @@ def check_identity(profile: ProfileFile, compiled: RegisterMap, registers: Regis
             raise InvalidStateError(f"{_words(condition, count)}: not the profile's controller")
 
 
-def check_step(q: Array, before: Array, gap: float, fastest: Array | float) -> None:
+def check_step(q: Array, before: Array, gap: float, fastest: Sequence[float]) -> None:
     """Refuse joints that cannot have come there in ``gap`` s: a torn or a wrong sample.
 
-    ``fastest`` is in rad/s, one number or (n,). Raises InvalidStateError.
+    ``fastest`` (n,) is in rad/s. Raises InvalidStateError.
     """
     # plain numbers: six of them cost an array more
-    most = [fastest] * len(q) if isinstance(fastest, float | int) else fastest.tolist()
-    way = [abs(now - then) for now, then in zip(q.tolist(), before.tolist(), strict=True)]
-    if any(step > speed * gap + JITTER for step, speed in zip(way, most, strict=True)):
-        joint = way.index(max(way))
-        raise InvalidStateError(
-            f"position {joint + 1}: found a step of {way[joint]:.4f} rad in {gap:.3f} s"
-        )
+    joints = zip(q.tolist(), before.tolist(), fastest, strict=True)
+    for i, (now, then, speed) in enumerate(joints):
+        if abs(now - then) > speed * gap + JITTER:
+            raise InvalidStateError(
+                f"position {i + 1}: found a step of {abs(now - then):.4f} rad in {gap:.3f} s"
+            )
 
 
-def _number(registers: Registers, spot: tuple[Block, int, Coding]) -> float:
+def _number(registers: Registers, spot: Spot) -> float:
     block, start, coding = spot
     return coding.decode(registers[block][start : start + coding.words])[0]
 

@@ -57,7 +57,8 @@ class ModbusDriver(Driver):
         self._sample: Sample | None = None
         self._q: Vector | None = None  # of the last sample that was believed
         self._first: tuple[Vector, float] = (np.zeros(0), 0.0)  # what the first must agree with
-        self._fastest = np.minimum(profile.fastest, MARGIN * model.arm.limits.velocity)
+        fastest = np.minimum(profile.fastest, MARGIN * model.arm.limits.velocity)
+        self._fastest = fastest.tolist()
         self._longest_answer = max(LONGEST_ANSWER / self.rate, LEAST_ANSWER)  # s
         self._given = 0.0  # s, monotonic: when the last setpoint was given
         self._connected = False
@@ -205,8 +206,7 @@ class ModbusDriver(Driver):
         box, sample = self.profile.write, self._sample
         if self._nominal is None or box.mode != "mailbox" or sample is None or not sample.echo:
             return state.target_q
-        applied = np.array(encode.offset_of(box, sample.echo[2:]))
-        return self._nominal.without(state.target_q, applied)
+        return self._nominal.without(state.target_q, encode.offset_of(box, sample.echo[2:]))
 
     # -- writing ----------------------------------------------------------------------------------
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Sequence
 
 from drivers.modbus.profile import addresses, turns_of
@@ -13,6 +14,7 @@ SEQUENCES = 0x8000  # sequence numbers and heartbeats run from 1 to this less on
 MODULUS, SEED = 65521, 0x4742  # of the checksum: the largest prime below 65536
 
 LARGEST = 0x7FFF  # counts
+_UNSIGNED, _SIGNED = struct.Struct("6H"), struct.Struct("6h")
 
 ABSENT, RUNNING, EXPIRED, REJECTED = 0, 1, 2, 3  # what the robot's program says of itself
 
@@ -54,14 +56,10 @@ def mailbox_words(sequence: int, counts: Sequence[int], heartbeat: int) -> list[
     return [*words, checksum(words)]
 
 
-def signed(word: int) -> int:
-    """Return a register as a signed number."""
-    return word - 0x10000 if word & 0x8000 else word
-
-
 def offset_of(box: Mailbox, words: Sequence[int]) -> list[float]:
     """Return the offset (6,), m and rad, in six registers."""
-    return [signed(word) * unit for word, unit in zip(words, _units(box), strict=True)]
+    signed = _SIGNED.unpack(_UNSIGNED.pack(*words))
+    return [count * unit for count, unit in zip(signed, _units(box), strict=True)]
 
 
 def vector_registers(entry: Vector, values: Sequence[float]) -> dict[int, int]:

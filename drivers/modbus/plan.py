@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -31,17 +30,17 @@ def _float_of(bits, words):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
-def _taken(registers, places, factors, bounds, found):  # type: ignore[no-untyped-def]
+def _taken(registers, places, found):  # type: ignore[no-untyped-def]
     """Write all numbers, SI; returns whether each is finite and within its bound.
 
-    ``places`` (m, 8): target, kind, words, adds to what is there, then the registers, the high word
-    first; ``factors`` (m,).
+    ``places`` (m, 10): target, kind, words, adds to what is there, four registers, the high word
+    first, SI units per count, bound: one array, because each is unwrapped anew in every call.
     """
     for k in range(places.shape[0]):
-        target, kind, words = places[k, 0], places[k, 1], places[k, 2]
+        target, kind, words = int(places[k, 0]), int(places[k, 1]), int(places[k, 2])
         bits = np.uint64(0)
         for i in range(words):
-            bits = (bits << np.uint64(16)) | np.uint64(registers[places[k, 4 + i]])
+            bits = (bits << np.uint64(16)) | np.uint64(registers[int(places[k, 4 + i])])
         top = np.uint64(1) << np.uint64(16 * words - 1)
         if kind == FLOAT:
             value = _float_of(bits, words)
@@ -52,11 +51,12 @@ def _taken(registers, places, factors, bounds, found):  # type: ignore[no-untype
             value = np.float64(np.int64(bits | ~(top | (top - np.uint64(1)))))
         else:
             value = np.float64(bits)
-        value *= factors[k]
-        found[target] = found[target] + value if places[k, 3] else value
+        value *= places[k, 8]
+        found[target] = found[target] + value if places[k, 3] != 0.0 else value
     fine = True
-    for i in range(found.shape[0]):
-        fine = fine and -bounds[i] <= found[i] <= bounds[i]  # NaN is not either
+    for k in range(places.shape[0]):
+        value, bound = found[int(places[k, 0])], places[k, 9]
+        fine = fine and -bound <= value <= bound  # NaN is not either
     return fine
 
 
@@ -73,20 +73,19 @@ class BlockPlan:
         self._pack = struct.Struct(f"{count}H")
         self._memory = bytearray(2 * count)
         self._registers = np.frombuffer(self._memory, np.uint16)
-        self._rows: list[tuple[int, ...]] = []
-        self._factors: list[float] = []
+        self._rows: list[tuple[float, ...]] = []
         self._limits: list[float] = []
         self._slices: list[tuple[str, int, int]] = []
-        self._compiled: tuple[NDArray[Any], ...] = ()
+        self._compiled: Array = np.empty((0, 10))
 
     def add(
         self, name: str, indices: Sequence[int], coding: Coding, size: float, bound: float
     ) -> None:
         """Add a vector: its registers, SI units per count, largest magnitude."""
         start = len(self._limits)
-        self._place(start, indices, coding, size, False)
         end = start + len(indices) // coding.words
         self._limits += [bound] * (end - start)
+        self._place(start, indices, coding, size, False)
         self._slices.append((name, start, end))
 
     def add_turns(self, indices: Sequence[int], coding: Coding) -> None:
@@ -102,15 +101,11 @@ class BlockPlan:
             if coding.order == "low_first":
                 own.reverse()
             row = (start + i, kind_of(coding), words, int(adds), *own, *[0] * (4 - words))
-            self._rows.append(row)
-            self._factors.append(size)
+            self._rows.append((*row, size, self._limits[start + i]))
 
     def compile(self) -> None:
         """Make ready, once everything has been added: a first sample waits for no compiler."""
-        self._compiled = (
-            np.array(self._rows, np.int64).reshape(-1, 8), np.array(self._factors),
-            np.array(self._limits),
-        )  # fmt: skip
+        self._compiled = np.array(self._rows, float).reshape(-1, 10)
         self.vectors([0] * (len(self._memory) // 2))
 
     def vectors(self, registers: Sequence[int]) -> dict[str, Array] | None:
@@ -120,6 +115,6 @@ class BlockPlan:
         """
         found = np.empty(len(self._limits))
         self._pack.pack_into(self._memory, 0, *registers)
-        if not _taken(self._registers, *self._compiled, found):
+        if not _taken(self._registers, self._compiled, found):
             return None
         return {name: found[start:end] for name, start, end in self._slices}

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from core.compensation import wanted_pose
 from core.errors import LinkError, WriteError
 from core.model import Model
 from core.setpoint import Setpoint
@@ -35,7 +36,7 @@ class UrRtdeDriver(Driver):
             raise LinkError(f"link: found an arm of {model.arm.n} joints, a UR has 6")
         self.settings = settings
         self.reader = StateReader(settings)
-        self._nominal = Nominal(model)
+        self._model, self._nominal = model, Nominal(model)
         self._writer: Writer = (
             ServoWriter(settings) if settings.mode == "servoj" else OffsetWriter(settings)
         )
@@ -73,8 +74,8 @@ class UrRtdeDriver(Driver):
         said = self.reader.tcp_pose()
         if said is None:
             return
-        position, _ = self._nominal.tcp(state.actual_q)
-        apart = float(np.linalg.norm(said[:3] - position))
+        wanted = wanted_pose(self._model, state.actual_q).position[0]
+        apart = float(np.linalg.norm(said[:3] - wanted))
         if apart > TCP_APART:
             raise WriteError(
                 f"{self.settings.host}: the controller's TCP is {1e3 * apart:.1f} mm from the "

@@ -1,4 +1,4 @@
-"""The memory of a diagnosis: columns by the thousand are kept once, and worked on a few at a time."""
+"""The memory of a diagnosis: thousands of columns are kept once, and worked on a few at a time."""
 
 from __future__ import annotations
 
