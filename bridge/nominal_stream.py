@@ -3,11 +3,26 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
+
+from core.kernel import JIT
 
 Vector = NDArray[np.float64]
 DECELERATION = 8.0  # rad/s^2 of the fastest joint
 SMOOTHING = 0.02  # s: over which the velocity is averaged
+PLACE, RATE, LIMIT, GIVEN = range(4)  # rows of what is kept
+
+
+@njit(**JIT)
+def _followed(kept, gap):  # type: ignore[no-untyped-def]
+    """Take the given setpoint over: the velocity to it, averaged, and its place."""
+    share = min(gap / SMOOTHING, 1.0)
+    for i in range(kept.shape[1]):
+        most = kept[LIMIT, i]
+        rate = min(max((kept[GIVEN, i] - kept[PLACE, i]) / gap, -most), most)
+        kept[RATE, i] += share * (rate - kept[RATE, i])
+        kept[PLACE, i] = kept[GIVEN, i]
 
 
 class NominalStream:
@@ -18,30 +33,30 @@ class NominalStream:
     """
 
     def __init__(self, velocity_limit: Vector) -> None:
-        self._limit = velocity_limit
-        self.q = np.zeros_like(velocity_limit)
-        self._rate = np.zeros_like(velocity_limit)
+        # one array: each that is handed to compiled code is unwrapped anew in every call
+        self._kept = np.zeros((4, len(velocity_limit)))
+        self._kept[LIMIT] = velocity_limit
+        self.q, self._rate, self._given = (self._kept[row] for row in (PLACE, RATE, GIVEN))
+        _followed(self._kept, 1.0)  # compiled now: the loop waits for no compiler
 
     def start(self, q: Vector) -> None:
         """Begin at rest at ``q`` (n,) rad."""
-        self.q = q.copy()
+        self.q[:] = q
         self._rate[:] = 0.0
 
-    def follow(self, q: Vector, gap: float) -> Vector:
+    def follow(self, q: Vector, gap: float) -> None:
         """Take the source's setpoint (n,), ``gap`` s after the last one."""
-        rate = np.clip((q - self.q) / gap, -self._limit, self._limit)
-        self._rate += min(gap / SMOOTHING, 1.0) * (rate - self._rate)
-        self.q = q.copy()
-        return self.q
+        self._given[:] = q
+        _followed(self._kept, gap)
 
     def brake(self, gap: float) -> Vector:
-        """Return the setpoint ``gap`` s later on the way to rest."""
+        """Return the setpoint ``gap`` s later on the way to rest; it holds until the next call."""
         fastest = float(np.abs(self._rate).max())
         if fastest > 0.0:
             left = max(fastest - DECELERATION * gap, 0.0)
             after = self._rate * (left / fastest)
-            self.q = self.q + 0.5 * gap * (self._rate + after)
-            self._rate = after
+            self.q += 0.5 * gap * (self._rate + after)
+            self._rate[:] = after
         return self.q
 
     @property

@@ -17,6 +17,7 @@ from core.errors import LimitError
 Array = NDArray[np.float64]
 LONGEST_GAP = 5.0  # cycles: after a longer one, no more than this many cycles' steps are allowed
 HUGE = 1e6  # rad, m: no number of a setpoint is that large
+NUMBERS = 7  # limits that are one number each, first in the limiter's block
 SLACK = 1.0 - 1e-12  # keeps rounding on the allowed side
 
 ENVELOPE, RATE, JOINT_OFFSET, JOINT_LIMIT, VELOCITY = range(5)
@@ -83,16 +84,14 @@ class Limiter:
                 raise LimitError(f"limits: {name}: found shape {found}, expected ({n},)")
         self.limits = limits
         self.counts = np.zeros(len(CLAMPS), dtype=np.int64)  # of each of CLAMPS
-        self._numbers = np.array(
-            [limits.offset, limits.offset_rotation, limits.offset_rate,
-             limits.offset_rotation_rate, limits.joint_offset, limits.following,
-             LONGEST_GAP * limits.cycle]
-        )  # fmt: skip
-        self._bounds = np.array([limits.lower, limits.upper, limits.velocity], dtype=float)
-        self._q = np.full(n, np.nan)  # the last command
-        self._nominal = np.full(n, np.nan)
-        self._delta = np.zeros(n)  # its joint offset
-        self._offset = np.zeros(6)  # its TCP offset
+        numbers = [limits.offset, limits.offset_rotation, limits.offset_rate,
+                   limits.offset_rotation_rate, limits.joint_offset, limits.following,
+                   LONGEST_GAP * limits.cycle]  # fmt: skip
+        bounds = (limits.lower, limits.upper, limits.velocity)
+        # one block: each array handed to compiled code is unwrapped anew in every call
+        self._block = np.concatenate([numbers, *bounds, np.zeros(3 * n + 6)])
+        self._q, self._nominal, self._delta, self._offset = _kept(self._block)
+        self._q[:] = self._nominal[:] = np.nan
 
     @property
     def started(self) -> bool:
@@ -141,9 +140,8 @@ class Limiter:
         limits or has jumped, or the command would be too far from the actual joints.
         """
         code, clamped = _limit(
-            self._numbers, self._bounds, nominal_q, corrected_q, offset_in_base, ramp, actual_q,
-            dt, self._q, self._nominal, self._delta, self._offset,
-        )  # fmt: skip
+            self._block, nominal_q, corrected_q, offset_in_base, ramp, actual_q, dt
+        )
         if code != _FINE:
             raise LimitError(self._reason(code, nominal_q, actual_q, dt))
         if clamped:
@@ -177,6 +175,19 @@ class Limiter:
         if not self.started:
             return "setpoint: found no start of the stream, expected start() before limit()"
         return "setpoint: found a number that is not finite, expected finite ones"
+
+
+def _kept(block):  # type: ignore[no-untyped-def]
+    """Return the last command, its nominal joints, joint offset (n,) and TCP offset (6,): views."""
+    n = (block.shape[0] - NUMBERS - 6) // 6
+    at = NUMBERS + 3 * n
+    return (
+        block[at : at + n], block[at + n : at + 2 * n], block[at + 2 * n : at + 3 * n],
+        block[at + 3 * n :],
+    )  # fmt: skip
+
+
+_kept_of = njit(cache=True, nogil=True, error_model="numpy")(_kept)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -235,14 +246,15 @@ def _whole(numbers, bounds, nominal, corrected, offset, ramp):  # type: ignore[n
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _limit(  # type: ignore[no-untyped-def]
-    numbers, bounds, nominal, corrected, offset, ramp, actual, dt, q, before, delta, applied
-):
-    """Advance q, before, delta and applied by one setpoint; returns (reason, clamped bits)."""
+def _limit(block, nominal, corrected, offset, ramp, actual, dt):  # type: ignore[no-untyped-def]
+    """Advance what the block keeps by one setpoint; returns (reason, clamped bits)."""
+    q, before, delta, applied = _kept_of(block)
+    n = q.shape[0]
+    numbers, bounds = block[:NUMBERS], block[NUMBERS : NUMBERS + 3 * n].reshape((3, n))
     code = _check(numbers, bounds, nominal, corrected, offset, ramp, actual, dt, q, before)
     if code != _FINE:
         return code, 0
-    n, gap = q.shape[0], min(dt, numbers[6])
+    gap = min(dt, numbers[6])
     share, clamped = _whole(numbers, bounds, nominal, corrected, offset, min(max(ramp, 0.0), 1.0))
 
     # approached no faster than the rates allow

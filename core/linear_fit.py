@@ -82,17 +82,16 @@ def _views(model: Model, q: Array, loads: Loads) -> Callable[[slice], Rows]:
     """Return what gives a part of the rows: views, where no effect changes them row by row."""
     if model.conditions():
         return lambda part: model.rows(q[part], loads[part])
-    chunk, n = min(CHUNK, len(q)), model.arm.n
-    plain = model.rows(np.zeros((chunk, n)))
+    plain = model.rows(np.zeros((1, model.arm.n)))
 
     def view(column: Array | None, same: Array, part: slice) -> Array:
         if column is None:
-            return same[: part.stop - part.start]
+            return same
         return np.ascontiguousarray(column[part], dtype=float)
 
     return lambda part: Rows(
         view(q, plain.q, part),
-        view(None, plain.growth, part),
+        plain.growth,
         view(loads.payload_mass, plain.payload_mass, part),
         view(loads.payload_cog, plain.payload_cog, part),
         view(loads.wrench, plain.wrench, part),

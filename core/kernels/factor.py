@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from core.kernel import JIT
-from core.kernels.lanes import bends, gather, settle
+from core.kernels.lanes import bends, gather, lanes_of, settle
 from core.kernels.layout import (
     FAST,
     LANES,
@@ -14,7 +14,6 @@ from core.kernels.layout import (
     ORIGIN,
     RECORD,
     ROTATION,
-    ROW,
     TCP,
     TCP_ROTATION,
     U,
@@ -32,29 +31,37 @@ def flexibility_columns(w, v, X, first, n, width):  # type: ignore[no-untyped-de
     """
     size = width * LANES
     for i in range(n):
-        b = (i + 1) * RECORD * LANES
-        for k in range(LANES):
-            zx = w[U(b + (ROTATION + 2) * LANES + k)]
-            zy = w[U(b + (ROTATION + 5) * LANES + k)]
-            zz = w[U(b + (ROTATION + 8) * LANES + k)]
-            mx = w[U(b + MOMENT * LANES + k)]
-            my = w[U(b + (MOMENT + 1) * LANES + k)]
-            mz = w[U(b + (MOMENT + 2) * LANES + k)]
-            dx = v[U(TCP * LANES + k)] - w[U(b + ORIGIN * LANES + k)]
-            dy = v[U((TCP + 1) * LANES + k)] - w[U(b + (ORIGIN + 1) * LANES + k)]
-            dz = v[U((TCP + 2) * LANES + k)] - w[U(b + (ORIGIN + 2) * LANES + k)]
-            along = zx * mx + zy * my + zz * mz
-            ax, ay, az = along * zx, along * zy, along * zz
-            rx, ry, rz = mx - ax, my - ay, mz - az
-            e, f = (first + i) * size, (first + n + i) * size
-            X[U(e + k)] = ay * dz - az * dy
-            X[U(e + LANES + k)] = az * dx - ax * dz
-            X[U(e + 2 * LANES + k)] = ax * dy - ay * dx
-            X[U(f + k)] = ry * dz - rz * dy
-            X[U(f + LANES + k)] = rz * dx - rx * dz
-            X[U(f + 2 * LANES + k)] = rx * dy - ry * dx
+        b, e, f = (i + 1) * RECORD * LANES, (first + i) * size, (first + n + i) * size
+        _shift_columns(w, v, X, b, e, f)
         if width == 6:
-            _turning_columns(w, X, (first + i) * size, (first + n + i) * size, b)
+            _turning_columns(w, X, e, f, b)
+
+
+@njit(**FAST)
+def _shift_columns(w, v, X, b, e, f):  # type: ignore[no-untyped-def]
+    """Write the position rows of a joint's two columns, which begin at ``e`` and ``f``.
+
+    A function of its own: in a loop over joints the compiler makes no vector instructions of it.
+    """
+    for k in range(LANES):
+        zx = w[U(b + (ROTATION + 2) * LANES + k)]
+        zy = w[U(b + (ROTATION + 5) * LANES + k)]
+        zz = w[U(b + (ROTATION + 8) * LANES + k)]
+        mx = w[U(b + MOMENT * LANES + k)]
+        my = w[U(b + (MOMENT + 1) * LANES + k)]
+        mz = w[U(b + (MOMENT + 2) * LANES + k)]
+        dx = v[U(TCP * LANES + k)] - w[U(b + ORIGIN * LANES + k)]
+        dy = v[U((TCP + 1) * LANES + k)] - w[U(b + (ORIGIN + 1) * LANES + k)]
+        dz = v[U((TCP + 2) * LANES + k)] - w[U(b + (ORIGIN + 2) * LANES + k)]
+        along = zx * mx + zy * my + zz * mz
+        ax, ay, az = along * zx, along * zy, along * zz
+        rx, ry, rz = mx - ax, my - ay, mz - az
+        X[U(e + k)] = ay * dz - az * dy
+        X[U(e + LANES + k)] = az * dx - ax * dz
+        X[U(e + 2 * LANES + k)] = ax * dy - ay * dx
+        X[U(f + k)] = ry * dz - rz * dy
+        X[U(f + LANES + k)] = rz * dx - rx * dz
+        X[U(f + 2 * LANES + k)] = rx * dy - ry * dx
 
 
 @njit(**FAST)
@@ -128,7 +135,7 @@ def factor_blocks(chain, rows, gap, per_cell, nuisances, first, last, R):  # typ
     """
     n, width = chain.mass.shape[0], gap.shape[1]
     columns, size = nuisances + 2 * n + 1, width * LANES
-    w, v = np.empty((n + 2) * RECORD * LANES), np.empty(ROW * LANES)
+    w, v = lanes_of(n)
     X, cells = np.empty(columns * size), np.empty(size)
     bent = bends(chain)
     for r in range(first, last, LANES):
@@ -151,7 +158,7 @@ def normal_blocks(chain, rows, gap, first, last, G):  # type: ignore[no-untyped-
     """
     n, width, columns = chain.mass.shape[0], gap.shape[1], G.shape[0]
     size = width * LANES
-    w, v = np.empty((n + 2) * RECORD * LANES), np.empty(ROW * LANES)
+    w, v = lanes_of(n)
     X = np.zeros(columns * size)
     bent = bends(chain)
     for r in range(first, last, LANES):
@@ -175,7 +182,7 @@ def regressor_blocks(chain, rows, first, last, A):  # type: ignore[no-untyped-de
     Returns the first row of a block that core.kernel must solve, or -1.
     """
     n, width = chain.mass.shape[0], A.shape[1]
-    w, v = np.empty((n + 2) * RECORD * LANES), np.empty(ROW * LANES)
+    w, v = lanes_of(n)
     X = np.empty(2 * n * width * LANES)
     bent = bends(chain)
     for r in range(first, last, LANES):

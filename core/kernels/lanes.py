@@ -19,15 +19,18 @@ from core.kernels.layout import (
     CHANGE,
     COG,
     FARTHEST,
+    FAST,
     GROWTH,
     LANES,
     MASS,
     MOST_ROUNDS,
     RECORD,
     ROTATION,
+    ROW,
     STEEPEST,
     TOTAL,
     WRENCH,
+    U,
 )
 from core.kernels.mechanics import (
     bend_base,
@@ -42,6 +45,14 @@ from core.kernels.mechanics import (
 
 
 @njit(**JIT)
+def lanes_of(n):  # type: ignore[no-untyped-def]
+    """Return the workspaces for arms of n joints: records, and what belongs to whole rows."""
+    w, v = np.zeros((n + 2) * RECORD * LANES), np.zeros(ROW * LANES)
+    _level(w)
+    return w, v
+
+
+@njit(**JIT)
 def _level(w):  # type: ignore[no-untyped-def]
     """Write the base's record as it stands without tilt."""
     for s in range(RECORD * LANES):
@@ -53,27 +64,43 @@ def _level(w):  # type: ignore[no-untyped-def]
 
 @njit(**JIT)
 def gather(chain, rows, first, w, v):  # type: ignore[no-untyped-def]
-    """Bring rows first.. into the lanes (the last row fills lanes that are over), unbent.
+    """Bring rows first.. into the lanes (the last row fills lanes that are over).
 
-    Returns False where an angle is too large for ``sines``, or is no number.
+    All but ``q`` may have a single row, which then counts for all. Returns False where an angle is
+    too large for ``sines``, or is no number.
     """
-    n, last = chain.mass.shape[0], rows.q.shape[0] - 1
-    fine = True
-    _level(w)
-    for k in range(LANES):
-        r = min(first + k, last)
-        for i in range(n):
-            a = (i + 1) * RECORD * LANES + k
-            fine = fine and abs(rows.q[r, i]) < FARTHEST
-            w[a + ANGLE * LANES] = rows.q[r, i]
-            w[a + GROWTH * LANES] = rows.growth[r, i]
-            w[a + BEND * LANES] = w[a + (BEND + 1) * LANES] = w[a + (BEND + 2) * LANES] = 0.0
-        v[MASS * LANES + k] = rows.payload_mass[r]
-        for j in range(3):
-            v[(COG + j) * LANES + k] = rows.payload_cog[r, j]
-        for j in range(6):
-            v[(WRENCH + j) * LANES + k] = rows.wrench[r, j]
-    return fine
+    n, far = chain.mass.shape[0], 0
+    _spread(rows.q, first, n, w, (RECORD + ANGLE) * LANES, RECORD * LANES)
+    for i in range(n):
+        a = ((i + 1) * RECORD + ANGLE) * LANES
+        for k in range(LANES):
+            far += 0 if abs(w[U(a + k)]) < FARTHEST else 1  # what is no number is far, too
+    _spread(rows.growth, first, n, w, (RECORD + GROWTH) * LANES, RECORD * LANES)
+    _spread(rows.payload_mass.reshape((-1, 1)), first, 1, v, MASS * LANES, LANES)
+    _spread(rows.payload_cog, first, 3, v, COG * LANES, LANES)
+    _spread(rows.wrench, first, 6, v, WRENCH * LANES, LANES)
+    return far == 0
+
+
+@njit(**JIT)
+def _spread(given, first, width, to, begin, apart):  # type: ignore[no-untyped-def]
+    """Write rows first.. of ``given`` (N or 1, width) into slots ``apart`` from each other."""
+    last = given.shape[0] - 1
+    if last == 0:
+        for j in range(width):
+            for k in range(LANES):
+                to[U(begin + j * apart + k)] = given[0, j]
+    elif first + LANES <= last:
+        for k in range(0, LANES, 8):  # a cache line of each slot at a time
+            for j in range(width):
+                a = begin + j * apart + k
+                for s in range(8):
+                    to[U(a + s)] = given[U(first + k + s), U(j)]
+    else:
+        for k in range(LANES):
+            r = min(first + k, last)
+            for j in range(width):
+                to[U(begin + j * apart + k)] = given[r, j]
 
 
 @njit(**JIT)
@@ -84,6 +111,10 @@ def settle(chain, w, v, bent):  # type: ignore[no-untyped-def]
     """
     n = chain.mass.shape[0]
     tilts = np.any(chain.base_compliance != 0.0)
+    if tilts:
+        _level(w)
+    if bent:
+        _straighten(w, n)
     for i in range(n):
         sines(w, i + 1)
     for step in range(MOST_ROUNDS):
@@ -108,6 +139,15 @@ def settle(chain, w, v, bent):  # type: ignore[no-untyped-def]
         if state != 0:
             return state > 0
     return False
+
+
+@njit(**FAST)
+def _straighten(w, n):  # type: ignore[no-untyped-def]
+    """Begin with joints that do not bend."""
+    for i in range(n):
+        a = ((i + 1) * RECORD + BEND) * LANES
+        for s in range(3 * LANES):
+            w[U(a + s)] = 0.0
 
 
 @njit(**JIT)

@@ -18,7 +18,7 @@ from core.kernels.adjoint import (
     prepare,
     solve,
 )
-from core.kernels.lanes import bends, gather, settle
+from core.kernels.lanes import bends, gather, lanes_of, settle
 from core.kernels.layout import (
     AXIS,
     COG,
@@ -29,7 +29,6 @@ from core.kernels.layout import (
     ORIGIN,
     RECORD,
     ROTATION,
-    ROW,
     TCP,
     TCP_ROTATION,
     TOTAL,
@@ -240,7 +239,7 @@ def slope_blocks(chain, rows, rates, varying, first, last, position, rotation, J
     does not settle at once, or -1. The arm's links must not bend themselves.
     """
     n = chain.mass.shape[0]
-    w, v = np.empty((n + 2) * RECORD * _L), np.empty(ROW * _L)
+    w, v = lanes_of(n)
     u, s = np.empty((n + 2) * OWN * _L), np.empty(BESIDE * _L)
     B, column = np.zeros(slots(n) * _L), np.empty(_L)
     push, turned = np.empty(3 * _L), np.empty(3 * _L)

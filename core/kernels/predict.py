@@ -8,8 +8,8 @@ from numba import njit
 from core import kernel
 from core.kernel import JIT, Shape
 from core.kernels.factor import flexibility_columns
-from core.kernels.lanes import bends, gather, settle
-from core.kernels.layout import AXIS, LANES, MOMENT, ORIGIN, RECORD, ROW, TCP, TCP_ROTATION
+from core.kernels.lanes import bends, gather, lanes_of, settle
+from core.kernels.layout import AXIS, LANES, MOMENT, ORIGIN, RECORD, TCP, TCP_ROTATION
 
 
 @njit(**JIT)
@@ -20,7 +20,7 @@ def predict_blocks(chain, rows, first, last, position, rotation):  # type: ignor
     core.kernel, which says which of its rows it is.
     """
     n = chain.mass.shape[0]
-    w, v = np.empty((n + 2) * RECORD * LANES), np.empty(ROW * LANES)
+    w, v = lanes_of(n)
     bent, bad = bends(chain), -1
     for r in range(first, last, LANES):
         end = min(r + LANES, last)
@@ -43,7 +43,7 @@ def linear_blocks(chain, rows, first, last, A, jacobians, moments):  # type: ign
     Returns -1, or the first row of a block that does not settle at once: core.kernel's from there.
     """
     n = chain.mass.shape[0]
-    w, v = np.empty((n + 2) * RECORD * LANES), np.empty(ROW * LANES)
+    w, v = lanes_of(n)
     X = np.empty(2 * n * 6 * LANES)
     bent = bends(chain)
     for r in range(first, last, LANES):
