@@ -36,7 +36,9 @@ class NominalStream:
         # one array: each that is handed to compiled code is unwrapped anew in every call
         self._kept = np.zeros((4, len(velocity_limit)))
         self._kept[LIMIT] = velocity_limit
-        self.q, self._rate, self._given = (self._kept[row] for row in (PLACE, RATE, GIVEN))
+        self.q: Vector = self._kept[PLACE]
+        self._rate: Vector = self._kept[RATE]
+        self._given: Vector = self._kept[GIVEN]
         _followed(self._kept, 1.0)  # compiled now: the loop waits for no compiler
 
     def start(self, q: Vector) -> None:

@@ -177,7 +177,7 @@ class Limiter:
         return "setpoint: found a number that is not finite, expected finite ones"
 
 
-def _kept(block):  # type: ignore[no-untyped-def]
+def _kept(block: Array) -> tuple[Array, Array, Array, Array]:
     """Return the last command, its nominal joints, joint offset (n,) and TCP offset (6,): views."""
     n = (block.shape[0] - NUMBERS - 6) // 6
     at = NUMBERS + 3 * n

@@ -1,4 +1,4 @@
-"""How a fleet's cost grows with its sessions: a bare loop, local processes, a Dask cluster.
+"""How a fleet's cost grows with its sessions: bare loops, local processes, a Dask cluster.
 
 All run in turns over the same chunks of sessions, so that what else the machine does meets all of
 them alike; ratios are of a chunk's times, told as the median with the quartiles.
@@ -11,6 +11,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from bridge.fleet.workers import Workers
 
 WORKERS = 2
 POSES = 10
+BARE = "bare loops side by side"  # as many as there are workers: what the machine allows
 Way = Callable[[Sequence[Task]], None]
 
 
@@ -85,7 +87,7 @@ def measure(folder: Path, sessions: int, chunk: int, seed: int, *, dask: bool) -
             for name, ts in spent.items()
         },
         "processor_overhead": _ratios(spent, "loop", set(spent) - {"loop"}, over=True),
-        "faster_than_loop": _ratios(times, "loop", {"processes", "dask"}),
+        "faster_than_loop": _ratios(times, "loop", {BARE, "processes", "dask"}),
         "overhead": {
             name: _spread([t / b - 1 for t, b in zip(times[name], times["loop"], strict=True)])
             for name in times if name.startswith("one ")
@@ -108,6 +110,15 @@ def _ways(
         started[name] = time.perf_counter() - begin
         below[name] = _children() - before
 
+    before = _children()
+    pool = stack.enter_context(get_context("spawn").Pool(WORKERS))
+
+    def side_by_side(tasks: Sequence[Task]) -> None:
+        pool.map(_loop, [tasks[k::WORKERS] for k in range(WORKERS)], 1)
+
+    ways[BARE] = side_by_side
+    ways[BARE]([])
+    below[BARE] = _children() - before
     for name, count in (("one process", 1), ("processes", WORKERS)):
         add(name, LocalWorkers(count), time.perf_counter(), _children())
     if dask:

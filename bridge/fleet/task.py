@@ -6,7 +6,7 @@ import functools
 import time
 import traceback
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -55,8 +55,8 @@ class Outcome:
         return self.state in (DONE, BAD)
 
     def document(self) -> dict[str, Any]:
-        """Return it as JSON values."""
-        return asdict(self)
+        """Return it as JSON values; ``result`` is the outcome's own, not a copy."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
 def outcome(task: Task, state: str, seconds: float = 0.0, **rest: Any) -> Outcome:
