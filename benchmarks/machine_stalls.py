@@ -11,6 +11,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Self
 
@@ -18,6 +19,7 @@ PRIORITY = 90  # SCHED_FIFO: before every loop, controller and interrupt thread
 EVERY = 0.001  # s between two looks
 LATE = 0.0005  # s: a timer that comes later has been kept waiting
 Span = tuple[float, float]  # s, monotonic: due and come
+Missed = tuple[float, int]  # when the next cycle was seen (s, monotonic), how many were missed
 
 
 class MachineStalls:
@@ -64,6 +66,12 @@ class MachineStalls:
     def during(self, begin: float, end: float) -> bool:
         """Return whether a core stood still at any time between two moments (s, monotonic)."""
         return any(due < end and come > begin for due, come in self.spans or ())
+
+    def not_among(self, missed: Sequence[Missed], cycle: float) -> list[Missed]:
+        """Return the missed cycles (of ``cycle`` s) during which no core stood still."""
+        return [
+            (at, count) for at, count in missed if not self.during(at - (count + 2) * cycle, at)
+        ]
 
 
 def watch(core: int) -> list[Span]:

@@ -23,10 +23,9 @@ from benchmarks.faults.links import LIMITS, LINKS
 from benchmarks.faults.report import PAGE, fill
 from benchmarks.faults.rig import Rig
 from benchmarks.faults.table import rows_of
-from benchmarks.machine_stalls import MachineStalls
+from benchmarks.machine_stalls import MachineStalls, Missed
 
 Array = NDArray[np.float64]
-Missed = tuple[float, int]  # when the next one was seen (s, monotonic), how many
 QUIET = 1.0  # s of compensating after a fault that do not count as quiet
 SAMPLE = 1.0  # s between two looks at the memory
 
@@ -84,14 +83,6 @@ class Quiet:
         all_missed = sum(count for _, count in self.missed)
         return 100.0 * sum(count for _, count in counted) / max(self.cycles + all_missed, 1)
 
-    def not_of(self, stalls: MachineStalls, cycle: float) -> list[Missed]:
-        """Return the missed cycles during which no core of the machine stood still."""
-        return [
-            (at, count)
-            for at, count in self.missed
-            if not stalls.during(at - (count + 2) * cycle, at)
-        ]
-
 
 def soak(
     link: str, rate: float | None, minutes: float, every: float, seed: int, folder: Path,
@@ -132,7 +123,7 @@ def missed_of(quiet: Quiet, stalls: MachineStalls, cycle: float) -> str:
     words = f"{quiet.share(quiet.missed):.3f} % missed"
     if stalls.spans is None:
         return words
-    own = quiet.share(quiet.not_of(stalls, cycle))
+    own = quiet.share(stalls.not_among(quiet.missed, cycle))
     return f"{words} ({own:.3f} % while a bare timer on each core was on time)"
 
 

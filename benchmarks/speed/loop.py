@@ -24,6 +24,8 @@ from typing import Any
 import numpy as np
 import psutil
 
+from benchmarks.machine_stalls import MachineStalls, Missed
+from core.recording.reading import SUFFIX, read_columns
 from drivers.simulated.process import SimulatedController
 from drivers.simulated.settings import simulated_cell
 
@@ -37,22 +39,21 @@ EVERY = 1.0  # s between two scrapes, and two looks at the status
 
 def loop(seconds: float) -> dict[str, Any]:
     """Return the row of the daemon's loop over ``seconds`` of compensating."""
-    with (
-        tempfile.TemporaryDirectory(prefix="loop-") as folder,
-        _served(Path(folder)) as (web, metrics, cell),
-    ):
-        _compensating(web, cell)
-        with _page(web):
-            time.sleep(SETTLED)
-            before, status = _counters(metrics), _status(web)
-            process = psutil.Process(status["status"]["loop"]["pid"])
-            busy = _busy(process)
-            begin = until = time.monotonic()
-            until += seconds
-            while time.monotonic() < until:
-                time.sleep(EVERY)
-                after, status = _counters(metrics), _status(web)
-            took, busy = time.monotonic() - begin, _busy(process) - busy
+    with tempfile.TemporaryDirectory(prefix="loop-") as folder:
+        with MachineStalls() as stalls, _served(Path(folder)) as (web, metrics, cell):
+            _compensating(web, cell)
+            with _page(web):
+                time.sleep(SETTLED)
+                before, status = _counters(metrics), _status(web)
+                process = psutil.Process(status["status"]["loop"]["pid"])
+                busy = _busy(process)
+                begin = until = time.monotonic()
+                until += seconds
+                while time.monotonic() < until:
+                    time.sleep(EVERY)
+                    after, status = _counters(metrics), _status(web)
+                took, busy = time.monotonic() - begin, _busy(process) - busy
+        own = stalls.not_among(_missed(Path(folder) / "recordings", begin, begin + took), 1 / RATE)
     cycles, missed, late = (
         after[name] - before[name] for name in ("cycles", "missed_cycles", "late_cycles")
     )
@@ -69,8 +70,21 @@ def loop(seconds: float) -> dict[str, Any]:
         "ratios": [], "state": status["now"]["state"], "cycles": int(cycles),
         "missed_cycles": int(missed), "late_cycles": int(late),
         "missed_percent": 100.0 * missed / max(cycles + missed, 1.0),
+        "missed_percent_while_bare_timers_were_on_time": None if stalls.spans is None else
+        100.0 * sum(count for _, count in own) / max(cycles + missed, 1.0),
         "age_p99_s": status["timing"]["age"]["p99"], "recorder_lost": after["recorder_lost_cycles"],
     }  # fmt: skip
+
+
+def _missed(folder: Path, begin: float, end: float) -> list[Missed]:
+    """Return the cycles that a recorded run missed between two moments (s, monotonic)."""
+    found: list[Missed] = []
+    for file in sorted(folder.rglob(f"*{SUFFIX}")):
+        columns = read_columns(file)
+        seen, missed = columns["received"], columns["missed"]
+        chosen = (begin < seen) & (seen < end) & (missed > 0)
+        found += zip(seen[chosen].tolist(), missed[chosen].astype(int).tolist(), strict=True)
+    return found
 
 
 @contextmanager

@@ -24,9 +24,9 @@ def test_a_missed_cycle_belongs_to_the_stall_that_it_overlaps() -> None:
     quiet = Quiet()
     quiet.take(np.array([[0.0, 1.0], [1.0, 2.0], [2.0, 3.0]]), slices)
     assert quiet.missed == [(2.0, 1), (3.0, 2)]
-    assert quiet.not_of(stalls_at((1.9955, 1.9985)), CYCLE) == [(3.0, 2)]
-    assert quiet.not_of(stalls_at((2.0001, 2.5)), CYCLE) == quiet.missed
-    assert quiet.not_of(stalls_at((0.0, 9.0)), CYCLE) == []
+    assert stalls_at((1.9955, 1.9985)).not_among(quiet.missed, CYCLE) == [(3.0, 2)]
+    assert stalls_at((2.0001, 2.5)).not_among(quiet.missed, CYCLE) == quiet.missed
+    assert stalls_at((0.0, 9.0)).not_among(quiet.missed, CYCLE) == []
     assert missed_of(quiet, stalls_at((1.9955, 1.9985)), CYCLE).startswith("50.000 % missed (33.33")
 
 
