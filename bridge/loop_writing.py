@@ -139,13 +139,18 @@ class Writing:
             self._end(Count.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))
             return None
         try:
-            if stream.finite:
+            if not stream.finite:
+                self.unsent = _copied(setpoint)
+                words = "the model's correction is no number"
+                self._end(Count.BAD_OUTPUT, Cause.BAD_OUTPUT, words)
+            elif time.monotonic() > expiry:  # the system stopped this process since it was judged
+                self.unsent = _copied(setpoint)
+                self._page.count(Count.LATE)
+            else:
                 self._driver.write_setpoint(setpoint)
                 self._failed = 0
                 self._judge_sending(expiry)
                 return setpoint
-            self.unsent = _copied(setpoint)
-            self._end(Count.BAD_OUTPUT, Cause.BAD_OUTPUT, "the model's correction is no number")
         except WriteError as error:
             self.unsent = _copied(setpoint)
             self._fail(error)

@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from core.calibration.candidates import STOPS, Candidates, candidates_of, joined
 from core.calibration.exchange import Choice, exchanged, grown, shrunk
-from core.calibration.information import Reference, blocks, expectation_of
+from core.calibration.information import Reference, blocks, expectation_of, gathered, inverse
 from core.calibration.itinerary import Stop, itinerary
 from core.calibration.observables.observable import Observable
 from core.calibration.parameters import Parameters
@@ -24,6 +24,7 @@ from core.loads import Loads
 
 Array = NDArray[np.float64]
 REFERENCE = 200  # poses over which the predicted TCP is judged
+LEANING = 4  # power of a place's variance in its weight
 REFINED = 15  # rounds in which the chosen poses are moved
 BOUGHT_ROUNDS = 3
 BOUGHT = (0.5, 0.75, 1.0, 1.5, 2.0)  # of the poses asked for: what these would give
@@ -62,9 +63,9 @@ def plan(
     """Return the poses, loads and approaches that tell most, in the order of travel.
 
     Chosen so that the TCP predicted by the calibrated model is known best over the whole reachable
-    space and under all ``loads``. ``sigma`` (m) is 1 sigma of one coordinate of a reading;
-    ``travel_weight`` the share of the TCP's deviation that a usual leg more at every pose is worth;
-    ``stops`` how many candidate poses are looked at.
+    space and under all ``loads``, the worst places before the others. ``sigma`` (m) is 1 sigma of
+    one coordinate of a reading; ``travel_weight`` the share of the TCP's deviation that a usual leg
+    more at every pose is worth; ``stops`` how many candidate poses are looked at.
     Raises PlanError where no pose is reachable and seen, or where the poses cannot be enough.
     """
     wish = Wish(poses, held_out, repeats, seed, sigma, travel_weight, stops)
@@ -92,9 +93,12 @@ def _planned(
     tell("working out what each pose tells", 0.1)
     rows = blocks(parameters, observable, found.readings, found.nuisance, wish.sigma)
     reference = reference_of(parameters, loads, space, wish.seed)
-    weight = reference.weight(rows.shape[2])
-    choice = Choice.of(rows, weight, _cost(parameters, found, wish))
+    cost = _cost(parameters, found, wish)
+    choice = Choice.of(rows, reference.weight(rows.shape[2]), cost)
     chosen = _chosen(choice, wish, lambda share: tell("choosing poses", 0.2 + 0.3 * share))
+    weight = _leaning(reference, rows[chosen])
+    choice = Choice.of(rows, weight, cost)
+    chosen = exchanged(choice, chosen)
     refiner = Refiner(parameters, observable, space, found, weight, wish.sigma)
     best = refiner.refined(
         Refined(found.readings[np.array(chosen)], rows[chosen]), REFINED,
@@ -102,8 +106,8 @@ def _planned(
         lambda share: tell("moving poses to where they tell more", 0.5 + 0.2 * share),
     )  # fmt: skip
     tell("working out what more or fewer poses buy", 0.7)
-    bought = _bought(choice, chosen, wish, refiner)
-    bought[wish.poses] = refiner.value(best.rows)
+    bought = _bought(choice, chosen, wish, refiner, reference)
+    bought[wish.poses] = _rms(reference, best.rows)
     tell("finding a short way", 0.95)
     checks = [Stop(row, held_out=True) for row in _held_out(found, chosen, wish)]
     found = joined(found, best.readings)
@@ -194,12 +198,30 @@ def _cost(
     return cost
 
 
+def _leaning(reference: Reference, rows: Array) -> Array:
+    """Return the weight that minds the places most that a choice of ``rows`` knows worst.
+
+    The mean over the workspace alone would buy what is known well already with its worst places,
+    and it is the largest error that an integrator has to answer for.
+    """
+    variance = reference.std(inverse(gathered(rows))) ** 2
+    share = variance**LEANING
+    return reference.weight(rows.shape[2], share / share.mean())
+
+
+def _rms(reference: Reference, rows: Array) -> float:
+    """Return the expected rms error of the TCP (m) over the reference, each pose alike."""
+    return float(np.sqrt(np.mean(reference.std(inverse(gathered(rows))) ** 2)))
+
+
 def _chosen(choice: Choice, wish: Wish, told: Callable[[float], None]) -> list[int]:
     size, k = choice.rows.shape[2], choice.rows.shape[1]
     return exchanged(choice, grown(choice, [], wish.poses, -(-size // k)), told=told)
 
 
-def _bought(choice: Choice, chosen: list[int], wish: Wish, refiner: Refiner) -> dict[int, float]:
+def _bought(
+    choice: Choice, chosen: list[int], wish: Wish, refiner: Refiner, reference: Reference
+) -> dict[int, float]:
     """Return what fewer and more poses would give, each number's poses chosen anew."""
     size, k = choice.rows.shape[2], choice.rows.shape[1]
     fewest = -(-size // k)
@@ -213,7 +235,7 @@ def _bought(choice: Choice, chosen: list[int], wish: Wish, refiner: Refiner) -> 
         readings = refiner.found.readings[np.array(some)]
         random = np.random.default_rng(wish.seed)
         best = refiner.refined(Refined(readings, choice.rows[some]), BOUGHT_ROUNDS, random)
-        told[len(some)] = refiner.value(best.rows)
+        told[len(some)] = _rms(reference, best.rows)
     return told
 
 

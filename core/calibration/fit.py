@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +58,8 @@ def calibrate(
     to_fit = np.flatnonzero(~readings.held_out)
     if not len(to_fit):
         raise ExcitationError("found no readings to fit: all are held out, expected others")
+    readings, lonely = _with_places(readings)
+    to_fit = np.flatnonzero(~readings.held_out)
     with threadpool_limits(1, "blas"):  # matrices of this size gain nothing from threads
         problem, rest = come_to_rest(parameters, how, readings[to_fit], metrology, tell)
         tell("judging")
@@ -70,7 +73,7 @@ def calibrate(
     lacks = lacking(problem, rest)
     complete = rest.settled and remainder.calm and not lacks
     complete = complete and (told is None or told.verdict == "no_gap")
-    notes = notes_of(problem, rest, remainder, odds, estimates)
+    notes = (*lonely, *notes_of(problem, rest, remainder, odds, estimates))
     return Calibration(
         model=found, nominal=model, readings=readings, estimates=estimates,
         covariance=rest.covariance[np.ix_(shown, shown)],
@@ -87,6 +90,24 @@ def calibrate(
         joint_noise=rest.noise.joint, freedom=rest.freedom,
         whole_covariance=rest.covariance, lacking=tuple(lack.name for lack in lacks),
     )  # fmt: skip
+
+
+def _with_places(readings: Readings) -> tuple[Readings, tuple[str, ...]]:
+    """Return the readings with those to verify fitted where nothing else tells of their place.
+
+    Where an instrument stands, or a target sits, only readings there can say; and a note of it.
+    """
+    held, fitted = readings.held_out, ~readings.held_out
+    alone = np.zeros(len(readings), dtype=bool)
+    for place in (readings.station, readings.target):
+        alone |= held & ~np.isin(place, place[fitted])
+    if not alone.any():
+        return readings, ()
+    note = (
+        f"{int(alone.sum())} reading(s) to verify were fitted: no others tell where their "
+        "instrument stands, or their target sits"
+    )
+    return replace(readings, held_out=held & ~alone), (note,)
 
 
 def estimates_of(

@@ -42,10 +42,14 @@ class Reference:
             columns[:, :, i] = (one - other) / (2 * step[i]) * parameters.prior[i]
         return cls(q, loads, columns)
 
-    def weight(self, size: int) -> Array:
-        """Return W (size, size): trace(W covariance) is the mean square TCP error, m^2."""
+    def weight(self, size: int, share: Array | None = None) -> Array:
+        """Return W (size, size): trace(W covariance) is the mean square TCP error, m^2.
+
+        ``share`` (M,), of mean 1, weighs the poses.
+        """
         p = self.columns.shape[2]
-        flat = self.columns.reshape(-1, p)
+        root = 1.0 if share is None else np.sqrt(share)[:, None, None]
+        flat = (self.columns * root).reshape(-1, p)
         W = np.zeros((size, size))
         W[:p, :p] = flat.T @ flat / len(self.q)
         return W

@@ -62,7 +62,9 @@ def carried(
 
 def predicted(problem: Problem, rest: Rest, readings: Readings) -> Array:
     """Return the covariance (N, k, k) of what the fit predicts of readings, noise left aside."""
-    J, F = problem.observable.columns(problem.parameters, rest.values, readings, rest.nuisance)
+    layout = problem.observable.layout(problem.readings)  # these may be of some places only
+    given = problem.parameters, rest.values, readings, rest.nuisance, layout
+    J, F = problem.observable.columns(*given)
     X = np.hstack([J, F]).reshape(len(readings), problem.observable.equations, -1)
     return np.asarray(X @ joint_covariance(problem, rest) @ np.swapaxes(X, 1, 2))
 

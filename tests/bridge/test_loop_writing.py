@@ -152,6 +152,28 @@ def test_what_takes_the_watchdog_too_long_to_hear_lets_nothing_old_leave(bench: 
     assert bench.count("late") == 1
 
 
+def test_a_process_that_was_stopped_after_the_judgement_sends_nothing_old(bench: Bench) -> None:
+    bench.cycles(50)
+    sent, limit = len(bench.driver.sent), bench.stream.limiter.limit
+
+    def stopped_after(*given: Any) -> Any:
+        found = limit(*given)
+        time.sleep(0.03)
+        return found
+
+    bench.stream.limiter.limit = stopped_after  # type: ignore[method-assign]
+    state = bench.state()
+    expiry = time.monotonic() + 0.02
+    assert bench.writing.write(state, Q, bench.loads.update(state), expiry) is None
+    assert bench.writing.unsent is not None
+    assert len(bench.driver.sent) == sent
+    assert bench.count("late") == 1
+    assert bench.supervisor.state == State.COMPENSATING
+    bench.stream.limiter.limit = limit  # type: ignore[method-assign]
+    bench.cycles(1)
+    assert len(bench.driver.sent) == sent + 1
+
+
 def test_a_process_that_was_stopped_while_it_sent_says_so_and_ends_the_motion(
     bench: Bench,
 ) -> None:

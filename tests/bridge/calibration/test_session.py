@@ -85,11 +85,13 @@ def test_mistakes_on_the_way_leave_the_same_calibration(
     play(cell, "--plan-only", "--session", tmp_path / "s")
     plan = plan_in(tmp_path / "s")
     good, after = positions(plan), positions(plan, 1, KNOCKED)
+    load = [p.load for p in plan.poses]
     wrong = good[6] + np.array([0.0, 0.09, 0.0])
-    first = ["", *(typed(v) for v in good[:5]), "1 2", typed(good[5], 1e3)]
+    first = [*script_from(load, good, 0, 5), *hung(load, 5), "1 2", typed(good[5], 1e3)]
     first += [
         typed(good[5], 1e-3),
         "take",
+        *hung(load, 6),
         typed(wrong),
         "",
         typed(good[6]),
@@ -105,11 +107,10 @@ def test_mistakes_on_the_way_leave_the_same_calibration(
     assert "found 2 numbers" in played.out
     assert "go on with: gapbridge calibrate" in played.out
     assert len(_kept(tmp_path)) == 7
-    load = [p.load for p in plan.poses]
     last = next(k for k in range(9, len(load)) if len(set(load[k - 3 : k + 1])) == 1)
-    second = [*(typed(v) for v in good[7:last]), typed(after[last]), "back"]
+    second = [*script_from(load, good, 7, last), *hung(load, last), typed(after[last]), "back"]
     second += [typed(after[k]) for k in (last - 1, last - 2, last - 3)]
-    second += ["", *script_after(load, after, last), "yes"]
+    second += ["", *script_from(load, after, last, len(load)), "yes"]
     played = play(cell, "--session", tmp_path / "s", "--apply", tmp_path / "new.yaml", lines=second)
     assert played.code == 0, played.err + played.out[-2000:]
     assert "the instrument has moved" in played.out
@@ -118,14 +119,14 @@ def test_mistakes_on_the_way_leave_the_same_calibration(
     _same_within_intervals(clean[0] / "s", tmp_path / "s")
 
 
-def script_after(load: list[int], values: np.ndarray, first: int) -> list[str]:
-    """Return the lines from a stop on, the second load hung on the way."""
-    lines = []
-    for k in range(first, len(load)):
-        if k and load[k] != load[k - 1]:
-            lines.append("")
-        lines.append(typed(values[k]))
-    return lines
+def hung(load: list[int], stop: int) -> list[str]:
+    """Return Enter where another load is hung before a stop."""
+    return [""] if stop == 0 or load[stop] != load[stop - 1] else []
+
+
+def script_from(load: list[int], values: np.ndarray, first: int, end: int) -> list[str]:
+    """Return the lines of some stops, loads hung on the way."""
+    return [line for k in range(first, end) for line in (*hung(load, k), typed(values[k]))]
 
 
 def _kept(folder: Path) -> list[dict[str, object]]:

@@ -84,6 +84,26 @@ def test_held_out_poses_are_as_near_as_instrument_and_arm_allow(
     assert found.nominal.terms == ()
 
 
+@pytest.mark.parametrize("verified", ["before the knock", "after it"])
+def test_an_instrument_that_moved_leaves_some_poses_to_verify_in_one_place_only(
+    model: Model, parameters: Parameters, session: tuple[Readings, dict[str, float], Instrument],
+    verified: str,
+) -> None:  # fmt: skip
+    """Where it stands now is told by poses there, to verify or not; nothing breaks over it."""
+    readings = session[0]
+    held, second = readings.held_out, np.zeros(len(readings), dtype=np.int64)
+    second[np.flatnonzero(held if verified == "after it" else ~held)[-6:]] = 1
+    some = calibrate(
+        model, replace(readings, station=second), parameters, METROLOGY, diagnose=False
+    )
+    assert len(some.stations) == 2
+    np.testing.assert_allclose(some.stations[1].position, some.stations[0].position, atol=2e-3)
+    lost = verified == "after it"
+    assert len(some.held_out_after.rows) == held.sum() - 6 * lost
+    assert any("were fitted" in note for note in some.notes) == lost
+    assert some.held_out_after.rms < 2e-4
+
+
 def test_noise_of_instrument_and_arm_are_told_apart(
     found: Calibration, session: tuple[Readings, dict[str, float], Instrument]
 ) -> None:
