@@ -1,8 +1,8 @@
 """Optimal choice of readings by exchange, with low-rank updates of the information matrix.
 
-The criterion is the mean variance of the predicted TCP over a reference (I-optimality); the first
-readings are chosen for the volume of the confidence region (D-optimality), which is what a start
-without any information needs. Source: Atkinson, Donev, Tobias, Optimum Experimental Designs (2007),
+The criterion is the weighed mean variance of the predicted TCP (I-optimality); the first readings
+are chosen for the volume of the confidence region (D-optimality), which is what a start without any
+information needs. Source: Atkinson, Donev, Tobias, Optimum Experimental Designs (2007),
 ch. 10-12; Fedorov's exchange.
 """
 

@@ -156,6 +156,18 @@ class Run:
 
         return wait_for(there, limit, f"{state.name} ({self.said})")
 
+    def compensate(self, limit: float = 60.0) -> None:
+        """Arm, again as a person does where a busy machine ended the motion at once."""
+        until, asked = time.monotonic() + limit, 0.0
+        while self.daemon.state != State.COMPENSATING:
+            now = time.monotonic()
+            assert self.error is None, self.error
+            assert now < until, f"{self.daemon.state} ({self.said}): not within {limit:g} s"
+            if self.daemon.state == State.OBSERVING and now - asked > 3.0:
+                self.daemon.arm()
+                asked = now
+            time.sleep(0.002)
+
     def end(self) -> RunSummary:
         """Stop the run and return how it went."""
         self.daemon.stop()

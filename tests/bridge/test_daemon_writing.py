@@ -92,13 +92,11 @@ def test_after_a_run_the_arm_is_where_it_was_and_no_program_is_left(robot: Robot
 def test_a_person_arms_and_disarms_while_it_runs(robot: Robot) -> None:
     with Run(robot.cell()) as run:
         run.wait(State.OBSERVING)
-        run.daemon.arm()
-        run.wait(State.COMPENSATING)
+        run.compensate()
         time.sleep(0.3)
         run.daemon.disarm()
         run.wait(State.OBSERVING)
-        run.daemon.arm()
-        run.wait(State.COMPENSATING)
+        run.compensate()
         summary = run.end()
     assert summary.exit_code == 0
     assert summary.state == "observing"

@@ -64,6 +64,11 @@ class Hands:
         return np.mean(seen, axis=0) @ self.frame.rotation.T + self.frame.position
 
 
+def _heed_interrupts() -> None:
+    """Have Ctrl-C arrive, even where a shell runs the tests in its background, which ignores it."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 class Terminal:
     """`gapbridge calibrate` in a terminal of its own."""
 
@@ -78,6 +83,7 @@ class Terminal:
         self._child = pexpect.spawn(
             self.command[0], self.command[1:], encoding="utf-8", timeout=PATIENCE,
             env={**os.environ, "PYTHONPATH": path, "TERM": "xterm"}, dimensions=(50, 160),
+            preexec_fn=_heed_interrupts,
         )  # fmt: skip
         self._child.delaybeforesend = None
         return self
