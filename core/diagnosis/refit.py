@@ -48,9 +48,7 @@ def refit(
         size = np.sqrt(np.einsum("ij,ij->j", A, A))
         unit = np.where(size > 1e-150, 1 / np.maximum(size, 1e-150), 0.0)  # 0: moves nothing
         pull, towards = _pull(freed, index, x, A.shape[1])
-        step = np.linalg.lstsq(
-            np.vstack([A, pull]) * unit, np.concatenate([b, towards]), rcond=1e-9
-        )[0] * unit  # fmt: skip
+        step = _step(np.vstack([A, pull]), np.concatenate([b, towards]), unit, freed, index, x)
         sizes = [len(v) for v in x]
         cuts = np.cumsum([*sizes, extra.shape[1]])
         parts = np.split(step, cuts)
@@ -77,6 +75,30 @@ def refit(
     if nuisance.shape[2]:
         gap = gap - nuisance @ _along(extra, flat(nuisance, work), gap, work)
     return terms, index, tuple(covariance), gap
+
+
+def _step(
+    A: Array, b: Array, unit: Array, freed: dict[int, Candidate], index: tuple[int, ...],
+    x: list[Array],
+) -> Array:  # fmt: skip
+    """Return the Gauss-Newton step (k,); what stands on a bound and would pass it stays there.
+
+    Cut off afterwards, such a step would no longer be one downhill, and the fit would stand still.
+    """
+    parameters = [p for c in index for p in freed[c].parameters]
+    now = np.concatenate([*x, np.zeros(0)])
+    lower, upper = (np.array([getattr(p, end) for p in parameters]) for end in ("lower", "upper"))
+    free = np.ones(len(unit), dtype=bool)
+    step = np.zeros(len(unit))
+    for _ in range(1 + len(now)):
+        own = unit * free
+        step = np.linalg.lstsq(A * own, b, rcond=1e-9)[0] * own
+        ahead = step[: len(now)]
+        stuck = ((now <= lower) & (ahead < 0)) | ((now >= upper) & (ahead > 0))
+        if not stuck.any():
+            break
+        free[: len(now)] &= ~stuck
+    return step
 
 
 def _along(extra: Array, nuisance: Array, gap: Array, work: Work) -> Array:

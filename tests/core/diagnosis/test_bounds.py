@@ -1,0 +1,39 @@
+"""A refit goes on downhill where one of its parameters has come to its bound."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from core.arm import builtin_arm
+from core.diagnosis.candidate import named_candidates
+from core.diagnosis.refit import _step
+
+ARM = builtin_arm("ur5")
+
+
+@pytest.fixture
+def flexible():
+    """Two candidates of one parameter each, 0 or more."""
+    found = [c for c in named_candidates(ARM, "position", (), False, (), [1.0] * 6)
+             if c.family == "radial_compliance" and len(c.parameters) == 1]  # fmt: skip
+    return {
+        k: replace(c, parameters=(replace(c.parameters[0], lower=0.0),))
+        for k, c in enumerate(found[:2])
+    }
+
+
+def test_what_stands_on_a_bound_stays_and_the_rest_solves_without_it(flexible):
+    rng = np.random.default_rng(1)
+    A = rng.normal(size=(40, 3))
+    A[:, 0] += 0.9 * A[:, 1]
+    b = A @ np.array([-1.0, 2.0, 0.5])
+    x = [np.zeros(1), np.ones(1)]
+    step = _step(A, b, np.ones(3), flexible, (0, 1), x)
+    alone = np.linalg.lstsq(A[:, 1:], b, rcond=None)[0]
+    assert step[0] == 0.0
+    assert step[1:] == pytest.approx(alone)
+    free = _step(A, b, np.ones(3), flexible, (0, 1), [np.ones(1), np.ones(1)])
+    assert free == pytest.approx([-1.0, 2.0, 0.5])
