@@ -5,13 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.growing import (
-    children,
-    clash,
-    grow,
-    offspring,
-    projected,
-)
+from core.diagnosis.growing import children, clash, grow, offspring, projected
 from core.diagnosis.space import Found, Space, fit, gains
 
 Array = NDArray[np.float64]
