@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -243,8 +242,7 @@ class Writing:
 
 def _copied(setpoint: Setpoint) -> Setpoint:
     """Return a setpoint whose arrays stay, whatever the limiter does next."""
-    return replace(
-        setpoint,
+    return setpoint._replace(
         q=setpoint.q.copy(),
         nominal_q=setpoint.nominal_q.copy(),
         offset_in_base=setpoint.offset_in_base.copy(),

@@ -8,7 +8,7 @@ one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -31,14 +31,16 @@ SCRATCH = 42  # numbers that the compiled correction needs besides
 LEVER = 0.5  # m: weighs a rotation against a shift
 
 
-@dataclass(frozen=True)
-class Correction:
-    """Offset-corrected setpoints of N rows (or one: without the first axis)."""
+class Correction(NamedTuple):
+    """Offset-corrected setpoints of N rows (or one: without the first axis).
+
+    A tuple, because one is made in every cycle.
+    """
 
     q: Array  # (N, n) rad
     offset_in_base: Array  # (N, 6) m, rad: rigid TCP pose at q minus that at nominal_q
-    residual: Array | np.float64  # (N,) m: distance of predicted and wanted pose (rotation x lever)
-    steps: NDArray[np.int64] | np.int64  # (N,) Newton steps taken
+    residual: Array | float  # (N,) m: distance of predicted and wanted pose (rotation x lever)
+    steps: NDArray[np.int64] | int  # (N,) Newton steps taken
 
 
 @njit(**JIT)
@@ -201,7 +203,7 @@ class Compensator:
             self._offset[:] = q - nominal if best < np.inf else 0.0
             _want(rigid, self._rigid_row, self._rigid_shape, q, self._pose)
             _moved(self._wanted, self._pose, self._offset, moved)
-        return Correction(q, moved, np.float64(best), np.int64(steps))
+        return Correction(q, moved, best, steps)
 
     def forget(self) -> None:
         """Begin the next correction from nothing, whatever was solved last."""

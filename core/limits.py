@@ -7,6 +7,7 @@ that belongs to it shrink by the same factor, so that its direction is kept.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -61,9 +62,11 @@ class Limits:
             raise LimitError("limits: found a lower joint limit above the upper one")
 
 
-@dataclass(frozen=True, slots=True)
-class Limited:
-    """What may leave; the arrays are the limiter's own and hold until its next call."""
+class Limited(NamedTuple):
+    """What may leave; the arrays are the limiter's own and hold until its next call.
+
+    A tuple, because one is made in every cycle.
+    """
 
     q: Array  # (n,) rad, the command
     offset_in_base: Array  # (6,) m, rad: the TCP offset that the command carries

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 Vector = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
-class Setpoint:
+class Setpoint(NamedTuple):
     """One corrected joint setpoint, as it leaves the limiter.
 
     ``offset_in_base`` is the same correction seen at the rigid arm's TCP: where ``q`` puts it minus
     where ``nominal_q`` puts it, position (m) and rotation vector (rad) in base axes. Drivers whose
-    controller takes a Cartesian offset send it instead of ``q``.
+    controller takes a Cartesian offset send it instead of ``q``. A tuple, as RobotState is.
     """
 
     q: Vector  # (n,) rad, the setpoint to be commanded

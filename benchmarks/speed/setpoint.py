@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from concurrent.futures import ProcessPoolExecutor
 from itertools import cycle
+from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from benchmarks.speed.peers.casadi_task import casadi_setpoint
 from benchmarks.speed.peers.cpp import Cpp, compiler
 from benchmarks.speed.peers.pinocchio_task import PinocchioTask
 from benchmarks.speed.sides import Call, Side, compared, interleaved
+from bridge.realtime import become_realtime
 from core.compensation import LEVER, MAX_STEPS, TOLERANCE, Compensator
 from core.kernels import single
 from core.kernels.first_order import block_of, first_order
@@ -132,7 +135,15 @@ def cold(rounds: int) -> dict[str, Any]:
 
 
 def stream(rounds: int) -> dict[str, Any]:
-    """Return what the daemon's stream takes: state in, setpoint out, the limiter included."""
+    """Return what the daemon's stream takes: state in, setpoint out, the limiter included.
+
+    In a process that is made ready as the daemon's loop is: real-time priority, no collection.
+    """
+    with ProcessPoolExecutor(1, get_context("spawn"), become_realtime) as alone:
+        return alone.submit(_stream, rounds).result()
+
+
+def _stream(rounds: int) -> dict[str, Any]:
     from bridge.setpoint_stream import SetpointStream
     from bridge.settings import LimitSettings
     from core.state import RobotState

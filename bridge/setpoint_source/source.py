@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,8 @@ from core.errors import RunError
 Vector = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
-class Told:
-    """What the loop did in one cycle."""
+class Told(NamedTuple):
+    """What the loop did in one cycle. A tuple, because one is made in each."""
 
     state: int  # of the supervisor
     nominal_q: Vector  # (n,) rad

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +19,11 @@ from drivers.can.profile import CanProfile, Incoming, Key
 Vector = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
+class Sample(NamedTuple):
     """One complete sample, SI units; (n,) each, NaN where a joint has not told yet.
 
-    All quantities are rows of ``table`` (q, n), the position first, then ``others`` in order.
+    All quantities are rows of ``table`` (q, n), the position first, then ``others`` in order. A
+    tuple, because one is made in every cycle.
     """
 
     table: Vector

@@ -5,15 +5,14 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from drivers.canopen.pdo import PdoLayout
 from drivers.canopen.profile import CanopenProfile
 
 
-@dataclass(frozen=True, slots=True)
-class SyncSet:
-    """What all drives told at one SYNC."""
+class SyncSet(NamedTuple):
+    """What all drives told at one SYNC. A tuple, because one is made in every cycle."""
 
     counts: tuple[dict[str, int], ...]  # per joint: object name -> counts
     synced: float  # s, time.monotonic() when the SYNC left

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -62,13 +60,13 @@ class DriverWithSensor(Driver):
             if self.settings.when_lost == "stop":
                 raise
             force = state.actual_TCP_force if self._tcp_force is None else np.full(6, np.nan)
-            return replace(
-                state, ft_raw_wrench=None, actual_TCP_force=force, sensor_lost=str(error)
+            return state._replace(
+                ft_raw_wrench=None, actual_TCP_force=force, sensor_lost=str(error)
             )
         if self._tcp_force is None:
-            return replace(state, ft_raw_wrench=raw)
+            return state._replace(ft_raw_wrench=raw)
         force = self._tcp_force.of(raw, state)
-        return replace(state, ft_raw_wrench=raw, actual_TCP_force=force)
+        return state._replace(ft_raw_wrench=raw, actual_TCP_force=force)
 
     def keep_alive(self) -> None:
         """See Driver.keep_alive."""

@@ -5,20 +5,24 @@ from __future__ import annotations
 from typing import Any
 
 from core.errors import InvalidStateError
+from drivers.modbus.registers import wire_of
 from drivers.modbus.tcp_requests import refusal
 
 
-def check_answer(answer: Any, function: int, count: int, where: str) -> list[int]:
-    """Return the registers or bits of an answer. Raises InvalidStateError where it is not one."""
+def check_answer(answer: Any, function: int, count: int, where: str) -> bytes:
+    """Return the registers or bits of an answer, two bytes each.
+
+    Raises InvalidStateError where it is not one.
+    """
     _check_function(answer, function, where)
     found = answer.bits[:count] if function in (1, 2) else answer.registers
     if len(found) != count:
         raise InvalidStateError(f"{where}: found {len(found)} registers, expected {count}")
     if function in (1, 2):
-        return [int(v) for v in found]
+        return wire_of([int(v) for v in found])
     if min(found) < 0 or max(found) > 0xFFFF:
         raise InvalidStateError(f"{where}: found a register beyond 16 bits")
-    return list(found)
+    return wire_of(found)
 
 
 def check_written(answer: Any, function: int, address: int, where: str) -> None:

@@ -1,44 +1,44 @@
-"""Registers -> one checked sample. Arrays of counts in, SI out; no socket, no clock."""
+"""Registers as they came over the wire -> one checked sample, SI; no socket, no clock."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import InvalidStateError
-from drivers.modbus.map import Block, RegisterMap
+from drivers.modbus.encode import units_of
+from drivers.modbus.map import RegisterMap, place_in
 from drivers.modbus.plan import TURN, BlockPlan
 from drivers.modbus.profile import ECHO_WORDS, addresses, turns_of, vectors
-from drivers.modbus.registers import BIT_TABLES, UNITS, Coding
-from drivers.modbus.schema import Condition, Place, ProfileFile, Trouble, Vector
+from drivers.modbus.registers import BIT_TABLES, UNITS, Coding, words_in
+from drivers.modbus.schema import Condition, Mailbox, Place, ProfileFile, Trouble, Vector
 
 Array = NDArray[np.float64]
-Registers = Mapping[Block, Sequence[int]]
-Spot = tuple[Block, int, Coding]  # a number's first register in its block
+Registers = Sequence[bytes]  # of each of RegisterMap.blocks, two bytes each, as on the wire
+Spot = tuple[int, int, Coding]  # a number's block and its first register there
 
 BOUNDS = {
     "position": 20.0, "velocity": 30.0, "target": 20.0, "joint_torque": 1e5, "temperature": 300.0,
-    "force": 1e5, "moment": 1e5,
+    "force": 1e5, "moment": 1e5, "echo": math.inf,
 }  # fmt: skip
 """Largest plausible magnitudes, SI."""
 JITTER = 0.01  # rad beyond what the fastest joint can have come
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """What one reading of the blocks says."""
+class Sample(NamedTuple):
+    """What one reading of the blocks says. A tuple, because one is made in every cycle."""
 
-    vectors: dict[str, Array]  # by the profile's names, SI
+    vectors: dict[str, Array]  # by the profile's names, SI; echo (6,) m, rad: offset applied
     clock: float | None  # counts of the clock register
     troubles: tuple[tuple[Trouble, str], ...]  # conditions that are not met
     motion: tuple[tuple[str, str], ...]  # of the last target: ("busy" or "result", what it says)
-    echo: tuple[int, ...] | None  # the eight registers of the mailbox's answer
+    answer: tuple[int, int] | None  # the mailbox's: number of the offset applied, what it says
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,14 +46,13 @@ class _Field:
     """A vector compiled: where each of its numbers starts in its block."""
 
     name: str
-    block: Block
+    block: int  # of RegisterMap.blocks
     indices: tuple[int, ...]  # register indices in the block, all words of all numbers
     coding: Coding
-    size: float  # SI units per count
-    turn_block: Block | None
+    sizes: tuple[float, ...]  # SI units per count, of each number
+    turn_block: int | None
     turn_indices: tuple[int, ...]
     turn_coding: Coding | None
-    contiguous: bool
 
 
 class Decoder:
@@ -66,14 +65,17 @@ class Decoder:
             for keys, _, entry, count in vectors(profile)
             if keys[0] == "state"
         ]
+        self._answer: tuple[int, int] | None = None
+        if isinstance(profile.write, Mailbox):
+            self._fields.append(self._echo(profile.write))
+        self._sizes = [(block, 2 * block.count) for block in compiled.blocks]
         # the block of the joints by its plan; vectors that lie elsewhere one by one
-        self._block = compiled.fast[0]
-        self._plan = BlockPlan(self._block.count)
+        self._plan = BlockPlan(compiled.fast[0].count)
         self._others = [field for field in self._fields if not self._planned(field)]
         self._plan.compile()
         self._conditions = [(self._spot(c), c) for c in profile.status]
         self._looked = _getters(spot for spot, _ in self._conditions)
-        self._said: list[Any] = []  # registers of the conditions, last time
+        self._said: list[Any] = []  # bytes of the conditions, last time
         self._troubles: tuple[tuple[Trouble, str], ...] = ()
         clock, write = profile.clock, profile.write
         self._motion: list[tuple[str, Spot, Condition]] = []
@@ -89,19 +91,13 @@ class Decoder:
             if clock is not None and clock.again is not None
             else None
         )
-        self._echo: tuple[Block, int] | None = None
-        if write.mode == "mailbox":
-            block = compiled.block_of(write.echo_table, write.echo_address, ECHO_WORDS)
-            self._echo = (block, write.echo_address - block.first)
 
     def _planned(self, field: _Field) -> bool:
         """Add a vector to the block's plan; False where it does not lie there alone."""
-        if field.block != self._block or field.turn_block not in (None, self._block):
-            return False
-        if field.coding.type == "bit":
+        if field.block != 0 or field.turn_block not in (None, 0):
             return False
         plan = self._plan
-        plan.add(field.name, field.indices, field.coding, field.size, BOUNDS[field.name])
+        plan.add(field.name, field.indices, field.coding, field.sizes, BOUNDS[field.name])
         if field.turn_coding is not None:
             plan.add_turns(field.turn_indices, field.turn_coding)
         return True
@@ -111,21 +107,26 @@ class Decoder:
         turns = None if entry.turns is None else turns_of(entry, entry.turns)
         turn_block, turn_indices = (None, ()) if turns is None else self._indices(turns, count)
         return _Field(
-            name, block, indices, entry.coding, entry.scale * UNITS[entry.unit][1],
+            name, block, indices, entry.coding, (entry.scale * UNITS[entry.unit][1],) * count,
             turn_block, turn_indices, None if turns is None else turns.coding,
-            indices == tuple(range(indices[0], indices[0] + len(indices))),
         )  # fmt: skip
 
-    def _indices(self, entry: Vector, count: int) -> tuple[Block, tuple[int, ...]]:
+    def _echo(self, box: Mailbox) -> _Field:
+        """Return the offset that the robot's program says it applies."""
+        block, first = self._map.place_of(box.echo_table, box.echo_address, ECHO_WORDS)
+        self._answer = (block, first)
+        indices = tuple(range(first + 2, first + ECHO_WORDS))
+        return _Field("echo", block, indices, Coding("i16"), units_of(box), None, (), None)
+
+    def _indices(self, entry: Vector, count: int) -> tuple[int, tuple[int, ...]]:
         words = entry.coding.words
         places = addresses(entry, count)
-        block = self._map.block_of(entry.table, places[0], words)
-        return block, tuple(a - block.first + k for a in places for k in range(words))
+        block, first = self._map.place_of(entry.table, places[0], words)
+        return block, tuple(first + a - places[0] + k for a in places for k in range(words))
 
     def _spot(self, place: Place) -> Spot:
         coding = Coding("bit") if place.table in BIT_TABLES else place.coding
-        block = self._map.block_of(place.table, place.address, coding.words)
-        return block, place.address - block.first, coding
+        return (*self._map.place_of(place.table, place.address, coding.words), coding)
 
     def decode(self, registers: Registers) -> Sample:
         """Return the sample in the registers of every block.
@@ -151,11 +152,11 @@ class Decoder:
                 for name, spot, condition in self._motion
                 if not condition.fine(count := int(_number(registers, spot)))
             ),
-            self._echo_of(registers),
+            None if self._answer is None else self._answer_of(registers, *self._answer),
         )
 
     def _vectors(self, registers: Registers) -> dict[str, Array]:
-        found = self._plan.vectors(registers[self._block])
+        found = self._plan.vectors(registers[0])
         if found is None:  # the words for it
             return {field.name: self._vector(field, registers) for field in self._fields}
         for field in self._others:
@@ -164,7 +165,7 @@ class Decoder:
 
     def _troubles_of(self, registers: Registers) -> tuple[tuple[Trouble, str], ...]:
         """Return the conditions that are not met; looked at anew where a register has changed."""
-        said = [words_of(registers[block]) for block, words_of in self._looked]
+        said = [bytes_of(registers[block]) for block, bytes_of in self._looked]
         if said != self._said:
             self._troubles = tuple(
                 (condition.otherwise, _words(condition, count))
@@ -175,25 +176,19 @@ class Decoder:
         return self._troubles
 
     def _check_lengths(self, registers: Registers) -> None:
-        for block in (*self._map.fast, *self._map.slow):
-            found = registers.get(block)
-            if found is None or len(found) != block.count:
+        for (block, size), found in zip(self._sizes, registers, strict=True):
+            if len(found) != size:
                 raise InvalidStateError(
-                    f"{block.table} {block.first}: found {0 if found is None else len(found)} "
-                    f"registers, expected {block.count}"
+                    f"{block.table} {block.first}: found {len(found) // 2} registers, expected "
+                    f"{block.count}"
                 )
 
     def _vector(self, field: _Field, registers: Registers) -> Array:
-        raw = registers[field.block]
-        if field.contiguous:
-            words: Sequence[int] = raw[field.indices[0] : field.indices[-1] + 1]
-        else:
-            words = [raw[i] for i in field.indices]
-        size = field.size
-        values = [count * size for count in field.coding.decode(words)]
+        counts = field.coding.decode(_picked(registers[field.block], field.indices))
+        values = [count * size for count, size in zip(counts, field.sizes, strict=True)]
         if field.turn_block is not None and field.turn_coding is not None:
-            turns = registers[field.turn_block]
-            counts = field.turn_coding.decode([turns[i] for i in field.turn_indices])
+            turns = _picked(registers[field.turn_block], field.turn_indices)
+            counts = field.turn_coding.decode(turns)
             values = [v + TURN * t for v, t in zip(values, counts, strict=True)]
         bound = BOUNDS[field.name]
         if not all(-bound <= v <= bound for v in values):  # NaN fails too
@@ -204,27 +199,32 @@ class Decoder:
             )
         return np.array(values)
 
-    def _echo_of(self, registers: Registers) -> tuple[int, ...] | None:
-        if self._echo is None:
-            return None
-        block, start = self._echo
-        return tuple(registers[block][start : start + ECHO_WORDS])
+    def _answer_of(self, registers: Registers, block: int, first: int) -> tuple[int, int]:
+        number, says = words_in(registers[block], first, 2)
+        return number, says
 
 
-def _getters(spots: Iterable[Spot]) -> list[tuple[Block, Callable[[Sequence[int]], Any]]]:
-    """Return for each block what takes the spots' registers out of it, all at once."""
-    places: dict[Block, list[int]] = {}
+def _picked(data: bytes, indices: Sequence[int]) -> list[int]:
+    return [data[2 * i] << 8 | data[2 * i + 1] for i in indices]
+
+
+def _getters(spots: Iterable[Spot]) -> list[tuple[int, Callable[[bytes], Any]]]:
+    """Return for each block what takes the spots' bytes out of it, all at once."""
+    places: dict[int, list[int]] = {}
     for block, start, coding in spots:
-        places.setdefault(block, []).extend(range(start, start + coding.words))
+        places.setdefault(block, []).extend(range(2 * start, 2 * (start + coding.words)))
     return [(block, itemgetter(*indices)) for block, indices in places.items()]
 
 
 def check_identity(profile: ProfileFile, compiled: RegisterMap, registers: Registers) -> None:
-    """Refuse a controller that is another than the profile's. Raises InvalidStateError."""
+    """Refuse a controller that is another than the profile's. Raises InvalidStateError.
+
+    ``registers`` are those of RegisterMap.identity.
+    """
     for condition in profile.identity:
-        block = compiled.block_of(condition.table, condition.address, condition.coding.words)
-        spot = (block, condition.address - block.first, condition.coding)
-        count = int(_number(registers, spot))
+        coding = condition.coding
+        where = place_in(compiled.identity, condition.table, condition.address, coding.words)
+        count = int(_number(registers, (*where, coding)))
         if not condition.fine(count):
             raise InvalidStateError(f"{_words(condition, count)}: not the profile's controller")
 
@@ -245,7 +245,7 @@ def check_step(q: Array, before: Array, gap: float, fastest: Sequence[float]) ->
 
 def _number(registers: Registers, spot: Spot) -> float:
     block, start, coding = spot
-    return coding.decode(registers[block][start : start + coding.words])[0]
+    return coding.decode(words_in(registers[block], start, coding.words))[0]
 
 
 def _words(condition: Condition, count: int) -> str:

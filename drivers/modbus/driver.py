@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +13,9 @@ from core.model import Model
 from core.setpoint import Setpoint
 from core.state import RobotState
 from drivers.driver import Driver
-from drivers.modbus import encode
 from drivers.modbus.decode import Decoder, Sample, check_identity, check_step
 from drivers.modbus.freshness import Freshness
-from drivers.modbus.map import Block, compile_map
+from drivers.modbus.map import compile_map
 from drivers.modbus.profile import read_profile
 from drivers.modbus.registers import UNITS
 from drivers.modbus.settings import ModbusSettings
@@ -50,7 +48,8 @@ class ModbusDriver(Driver):
         self._freshness = Freshness(profile)
         self._writer = make_writer(profile, self.transport, model)
         self._nominal = None if self.moves_arm else Nominal(model)
-        self._slow: dict[Block, Sequence[int]] = {}
+        self._first_block, *self._other_blocks = self.map.fast
+        self._slow: list[bytes] = []
         self._slow_at = 0.0
         self._due = 0.0  # s, monotonic: when the next reading is due
         self._fresh_at = 0.0  # s, monotonic: of the last new sample
@@ -69,9 +68,9 @@ class ModbusDriver(Driver):
         """Open the link and check that it is the profile's controller. Writes nothing."""
         self.transport.open()
         try:
-            found = {block: self.transport.read(block) for block in self.map.identity}
+            found = [self.transport.read(block) for block in self.map.identity]
             check_identity(self.profile, self.map, found)
-            self._slow, self._slow_at = {}, 0.0
+            self._slow_at = 0.0
             sample = self._decoder.decode(self._read_blocks())
             self._check_limits(sample.vectors["position"])
         except InvalidStateError as error:
@@ -135,26 +134,25 @@ class ModbusDriver(Driver):
             return None
         return None if time.monotonic() - asked > self._longest_answer else sample
 
-    def _read_blocks(self) -> dict[Block, Sequence[int]]:
+    def _read_blocks(self) -> list[bytes]:
         """Return the registers of one cycle: one block, where the profile's map allows it."""
         now = time.monotonic()
         if self.map.slow and now - self._slow_at > SLOW_EVERY:
-            self._slow = {block: self.transport.read(block) for block in self.map.slow}
+            self._slow = [self.transport.read(block) for block in self.map.slow]
             self._slow_at = now
-        found = dict(self._slow)
-        first, *others = self.map.fast
+        first = self._first_block
         words = self._writer.pending()
         if now - self._given > self._longest_answer:
             words = None  # of a state that is old by now
         if words is not None and first.table == "holding":
-            found[first] = self.transport.exchange(first, *words)
+            found = [self.transport.exchange(first, *words)]
         else:
             if words is not None:
                 self.transport.write("holding", *words)
-            found[first] = self.transport.read(first)
-        for block in others:
-            found[block] = self.transport.read(block)
-        return found
+            found = [self.transport.read(first)]
+        for block in self._other_blocks:
+            found.append(self.transport.read(block))
+        return found + self._slow
 
     def _believe(self, sample: Sample, received: float) -> RobotState:
         """Return the state of a sample. Raises InvalidStateError where it makes a leap.
@@ -203,10 +201,9 @@ class ModbusDriver(Driver):
 
     def nominal_q(self, state: RobotState) -> Vector:
         """Return what the robot itself wants (n,), rad: with a mailbox, without its offset."""
-        box, sample = self.profile.write, self._sample
-        if self._nominal is None or box.mode != "mailbox" or sample is None or not sample.echo:
+        if self._nominal is None or self._sample is None:
             return state.target_q
-        return self._nominal.without(state.target_q, encode.offset_of(box, sample.echo[2:]))
+        return self._nominal.without(state.target_q, self._sample.vectors["echo"])
 
     # -- writing ----------------------------------------------------------------------------------
 

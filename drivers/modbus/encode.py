@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Sequence
+from operator import mul
 
 from drivers.modbus.profile import addresses, turns_of
-from drivers.modbus.registers import UNITS
+from drivers.modbus.registers import UNITS, Coding
 from drivers.modbus.schema import Mailbox, Vector
 
 SEQUENCES = 0x8000  # sequence numbers and heartbeats run from 1 to this less one; 0: nothing sent
 MODULUS, SEED = 65521, 0x4742  # of the checksum: the largest prime below 65536
 
 LARGEST = 0x7FFF  # counts
-_UNSIGNED, _SIGNED = struct.Struct("6H"), struct.Struct("6h")
 
 ABSENT, RUNNING, EXPIRED, REJECTED = 0, 1, 2, 3  # what the robot's program says of itself
 
@@ -26,16 +25,17 @@ def next_number(number: int) -> int:
 
 def checksum(words: Sequence[int]) -> int:
     """Return the checksum of registers: a weighted sum, so that order and loss both show."""
-    return (SEED + sum((i + 1) * word for i, word in enumerate(words))) % MODULUS
+    total: int = sum(map(mul, words, range(1, len(words) + 1)))
+    return (SEED + total) % MODULUS
 
 
-def offset_counts(box: Mailbox, offset_in_base: Sequence[float]) -> list[int]:
-    """Return an offset (6,), m and rad, as signed counts.
+def offset_counts(units: Sequence[float], offset_in_base: Sequence[float]) -> list[int]:
+    """Return an offset (6,), m and rad, as signed counts of ``units_of`` the mailbox.
 
     Raises ValueError for one that is not finite or does not fit 16 bits.
     """
     found: list[int] = []
-    for i, (value, unit) in enumerate(zip(offset_in_base, _units(box), strict=True)):
+    for i, (value, unit) in enumerate(zip(offset_in_base, units, strict=True)):
         if not math.isfinite(value) or abs(count := round(value / unit)) > LARGEST:
             raise ValueError(
                 f"found an offset of {value:g} {'m' if i < 3 else 'rad'}, expected at most "
@@ -45,21 +45,21 @@ def offset_counts(box: Mailbox, offset_in_base: Sequence[float]) -> list[int]:
     return found
 
 
-def _units(box: Mailbox) -> list[float]:
+def units_of(box: Mailbox) -> tuple[float, ...]:
     """Return m or rad per count of an offset's six numbers."""
-    return [box.length_count] * 3 + [box.angle_count] * 3
+    return (box.length_count,) * 3 + (box.angle_count,) * 3
 
 
 def mailbox_words(sequence: int, counts: Sequence[int], heartbeat: int) -> list[int]:
     """Return the nine registers of a mailbox: sequence, offset, heartbeat, checksum."""
-    words = [sequence, *(count & 0xFFFF for count in counts), heartbeat]
+    words = [sequence, *[c & 0xFFFF for c in counts], heartbeat]
     return [*words, checksum(words)]
 
 
 def offset_of(box: Mailbox, words: Sequence[int]) -> list[float]:
     """Return the offset (6,), m and rad, in six registers."""
-    signed = _SIGNED.unpack(_UNSIGNED.pack(*words))
-    return [count * unit for count, unit in zip(signed, _units(box), strict=True)]
+    counts = Coding("i16").decode(words)
+    return [count * unit for count, unit in zip(counts, units_of(box), strict=True)]
 
 
 def vector_registers(entry: Vector, values: Sequence[float]) -> dict[int, int]:

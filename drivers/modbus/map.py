@@ -38,10 +38,23 @@ class RegisterMap:
     identity: tuple[Block, ...]
     writable: frozenset[tuple[Table, int]]
 
-    def block_of(self, table: Table, address: int, words: int) -> Block:
-        """Return the block that holds registers of the state."""
-        blocks = (*self.fast, *self.slow, *self.identity)
-        return next(b for b in blocks if b.holds(table, address, words))
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """Return what one sample is made of, in this order."""
+        return self.fast + self.slow
+
+    def place_of(self, table: Table, address: int, words: int) -> tuple[int, int]:
+        """Return which of ``blocks`` holds registers of a sample, and where they begin in it."""
+        return place_in(self.blocks, table, address, words)
+
+
+def place_in(blocks: Iterable[Block], table: Table, address: int, words: int) -> tuple[int, int]:
+    """Return which of the blocks holds registers, and where they begin in it."""
+    return next(
+        (i, address - block.first)
+        for i, block in enumerate(blocks)
+        if block.holds(table, address, words)
+    )
 
 
 def compile_map(profile: ProfileFile) -> RegisterMap:

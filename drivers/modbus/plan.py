@@ -7,7 +7,6 @@ Takes the vectors of one block apart, all at once. What registers mean is the sa
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Sequence
 
 import numpy as np
@@ -33,14 +32,17 @@ def _float_of(bits, words):  # type: ignore[no-untyped-def]
 def _taken(registers, places, found):  # type: ignore[no-untyped-def]
     """Write all numbers, SI; returns whether each is finite and within its bound.
 
-    ``places`` (m, 10): target, kind, words, adds to what is there, four registers, the high word
-    first, SI units per count, bound: one array, because each is unwrapped anew in every call.
+    ``registers``: bytes, the high one of each first. ``places`` (m, 10): target, kind, words, adds
+    to what is there, four registers, the high word first, SI units per count, bound: one array,
+    because each is unwrapped anew in every call.
     """
     for k in range(places.shape[0]):
         target, kind, words = int(places[k, 0]), int(places[k, 1]), int(places[k, 2])
         bits = np.uint64(0)
         for i in range(words):
-            bits = (bits << np.uint64(16)) | np.uint64(registers[int(places[k, 4 + i])])
+            at = 2 * int(places[k, 4 + i])
+            word = np.uint64(registers[at]) << np.uint64(8) | np.uint64(registers[at + 1])
+            bits = (bits << np.uint64(16)) | word
         top = np.uint64(1) << np.uint64(16 * words - 1)
         if kind == FLOAT:
             value = _float_of(bits, words)
@@ -70,33 +72,44 @@ class BlockPlan:
     """Vectors that lie in one block of registers."""
 
     def __init__(self, count: int) -> None:
-        self._pack = struct.Struct(f"{count}H")
-        self._memory = bytearray(2 * count)
-        self._registers = np.frombuffer(self._memory, np.uint16)
+        memory = bytearray(2 * count)
+        self._memory = memoryview(memory)
+        self._registers = np.frombuffer(memory, np.uint8)
         self._rows: list[tuple[float, ...]] = []
         self._limits: list[float] = []
-        self._slices: list[tuple[str, int, int]] = []
+        self._slices: list[tuple[str, slice]] = []
         self._compiled: Array = np.empty((0, 10))
 
     def add(
-        self, name: str, indices: Sequence[int], coding: Coding, size: float, bound: float
+        self,
+        name: str,
+        indices: Sequence[int],
+        coding: Coding,
+        sizes: Sequence[float],
+        bound: float,
     ) -> None:
-        """Add a vector: its registers, SI units per count, largest magnitude."""
+        """Add a vector: its registers, SI units per count of each number, largest magnitude."""
         start = len(self._limits)
-        end = start + len(indices) // coding.words
+        end = start + len(sizes)
         self._limits += [bound] * (end - start)
-        self._place(start, indices, coding, size, False)
-        self._slices.append((name, start, end))
+        self._place(start, indices, coding, sizes, False)
+        self._slices.append((name, slice(start, end)))
 
     def add_turns(self, indices: Sequence[int], coding: Coding) -> None:
         """Add the whole turns of the vector added last."""
-        self._place(self._slices[-1][1], indices, coding, TURN, True)
+        last = self._slices[-1][1]
+        self._place(last.start, indices, coding, [TURN] * (last.stop - last.start), True)
 
     def _place(
-        self, start: int, indices: Sequence[int], coding: Coding, size: float, adds: bool
+        self,
+        start: int,
+        indices: Sequence[int],
+        coding: Coding,
+        sizes: Sequence[float],
+        adds: bool,
     ) -> None:
         words = coding.words
-        for i in range(len(indices) // words):
+        for i, size in enumerate(sizes):
             own = list(indices[i * words : (i + 1) * words])
             if coding.order == "low_first":
                 own.reverse()
@@ -106,15 +119,15 @@ class BlockPlan:
     def compile(self) -> None:
         """Make ready, once everything has been added: a first sample waits for no compiler."""
         self._compiled = np.array(self._rows, float).reshape(-1, 10)
-        self.vectors([0] * (len(self._memory) // 2))
+        self.vectors(bytes(len(self._memory)))
 
-    def vectors(self, registers: Sequence[int]) -> dict[str, Array] | None:
+    def vectors(self, registers: bytes) -> dict[str, Array] | None:
         """Return the vectors by name, SI; None where a number is not finite or implausible.
 
-        Raises struct.error where there are more or fewer registers, or one of another size.
+        ``registers``: two bytes each, as on the wire. Raises ValueError for more or fewer.
         """
         found = np.empty(len(self._limits))
-        self._pack.pack_into(self._memory, 0, *registers)
+        self._memory[:] = registers
         if not _taken(self._registers, self._compiled, found):
             return None
-        return {name: found[start:end] for name, start, end in self._slices}
+        return {name: found[where] for name, where in self._slices}

@@ -41,6 +41,16 @@ UNITS: dict[str, tuple[str, float]] = {
 """Unit -> what it measures, and its size in SI units."""
 
 
+def words_in(data: bytes, first: int, count: int) -> tuple[int, ...]:
+    """Return registers out of bytes as they came over the wire."""
+    return struct.unpack_from(f">{count}H", data, 2 * first)
+
+
+def wire_of(words: Sequence[int]) -> bytes:
+    """Return registers (or bits, 0 and 1) as bytes; struct.error for one beyond 16 bits."""
+    return struct.pack(f">{len(words)}H", *words)
+
+
 @dataclass(frozen=True, slots=True)
 class Coding:
     """How numbers of one kind lie in registers."""

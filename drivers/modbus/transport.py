@@ -104,8 +104,8 @@ class Transport:
 
     # -- reading ----------------------------------------------------------------------------------
 
-    def read(self, block: Block) -> Sequence[int]:
-        """Return the registers (or bits, 0 and 1) of a block.
+    def read(self, block: Block) -> bytes:
+        """Return the registers (or bits, 0 and 1) of a block, two bytes each.
 
         Raises LinkError where the link broke, InvalidStateError for an answer that is none.
         """
@@ -120,7 +120,7 @@ class Transport:
         )
         return check_answer(found, function, block.count, f"{self.name}: {table}")
 
-    def exchange(self, block: Block, address: int, values: Sequence[int]) -> Sequence[int]:
+    def exchange(self, block: Block, address: int, values: Sequence[int]) -> bytes:
         """Write holding registers, then read a block of them, in one request (function 23)."""
         self._check_allowed("holding", address, values)
         if self._tcp is not None:
@@ -132,7 +132,7 @@ class Transport:
         )  # fmt: skip
         return check_answer(answer, 23, block.count, f"{self.name}: holding")
 
-    def _registers(self, answer: bytes, function: int, count: int, table: Table) -> tuple[int, ...]:
+    def _registers(self, answer: bytes, function: int, count: int, table: Table) -> bytes:
         try:
             return tcp_requests.read_registers(answer, function, count)
         except InvalidStateError as error:

@@ -89,6 +89,7 @@ class MailboxWriter:
 
     def __init__(self, box: Mailbox, transport: Transport, together: bool) -> None:
         self._box, self._transport, self._together = box, transport, together
+        self._units = encode.units_of(box)
         self._armed = False
         self._sequence = self._heartbeat = 0
         self._counts: list[int] = [0] * 6
@@ -99,24 +100,24 @@ class MailboxWriter:
 
     def arm(self, state: RobotState, look: Callable[[], Sample]) -> None:
         """Send offsets of zero until the robot's program answers them. Raises WriteError."""
-        echo = look().echo or (0,) * 8
-        if echo[1] == encode.ABSENT:
+        number, says = look().answer or (0, 0)
+        if says == encode.ABSENT:
             raise WriteError(
                 f"{self._transport.name}: {self._box.echo_table} {self._box.echo_address + 1}: "
-                f"found {echo[1]}, expected a running mailbox program on the robot "
+                f"found {says}, expected a running mailbox program on the robot "
                 "(docs/porting.md)"
             )
         # a number that the program cannot take for the one it has seen last
-        self._sequence = (echo[0] + encode.SEQUENCES // 4) % (encode.SEQUENCES - 1) + 1
+        self._sequence = (number + encode.SEQUENCES // 4) % (encode.SEQUENCES - 1) + 1
         self._counts = [0] * 6
         until = time.monotonic() + self._box.echo
         while True:
             self._send(self._words())
-            echo = look().echo or (0,) * 8
-            if echo[0] == self._sequence and echo[1] == encode.RUNNING:
+            answer = look().answer or (0, 0)
+            if answer == (self._sequence, encode.RUNNING):
                 break
             if time.monotonic() > until:
-                raise WriteError(self._silence(echo))
+                raise WriteError(self._silence(*answer))
             time.sleep(ANNOUNCE)
         self._awaited, self._sent, self._armed = 0, 0, True
 
@@ -125,7 +126,7 @@ class MailboxWriter:
         if not self._armed:
             raise WriteError(f"{self._transport.name}: found no mailbox, expected arm() first")
         try:
-            counts = encode.offset_counts(self._box, setpoint.offset_in_base.tolist())
+            counts = encode.offset_counts(self._units, setpoint.offset_in_base.tolist())
         except ValueError as error:
             raise WriteError(f"{self._transport.name}: {error}") from None
         self._check_echo(sample)
@@ -160,28 +161,28 @@ class MailboxWriter:
 
     def _check_echo(self, sample: Sample) -> None:
         """Raise WriteError where an offset has not come back in time, or nobody applies it."""
-        echo = sample.echo or (0,) * 8
+        number, says = sample.answer or (0, 0)
         if self._awaited:
-            ahead = (echo[0] - self._awaited) % (encode.SEQUENCES - 1)
+            ahead = (number - self._awaited) % (encode.SEQUENCES - 1)
             if ahead < encode.SEQUENCES // 2:
                 self._awaited = 0
         late = self._awaited and time.monotonic() - self._since > self._box.echo
-        if echo[1] != encode.RUNNING:
+        if says != encode.RUNNING:
             self._armed = False
-            raise WriteError(self._silence(echo))
-        if (self._sequence - echo[0]) % (encode.SEQUENCES - 1) > self._sent:
+            raise WriteError(self._silence(number, says))
+        if (self._sequence - number) % (encode.SEQUENCES - 1) > self._sent:
             raise ForeignCommandError(
-                f"{self._transport.name}: found number {echo[0]} in the mailbox's echo, which was "
+                f"{self._transport.name}: found number {number} in the mailbox's echo, which was "
                 "not sent from here: somebody else writes the mailbox"
             )
         if late:  # it was sent again in every cycle since
-            raise IneffectiveWriteError(self._silence(echo))
+            raise IneffectiveWriteError(self._silence(number, says))
 
-    def _silence(self, echo: tuple[int, ...]) -> str:
+    def _silence(self, number: int, says: int) -> str:
         said = {0: "absent", 1: "running", 2: "watchdog expired", 3: "checksum rejected"}
         return (
             f"{self._transport.name}: offsets do not arrive: number {self._sequence} was sent, "
-            f"{echo[0]} came back last, the robot's program says {said.get(echo[1], echo[1])}"
+            f"{number} came back last, the robot's program says {said.get(says, says)}"
         )
 
     def pending(self) -> tuple[int, list[int]] | None:

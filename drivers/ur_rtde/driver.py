@@ -76,7 +76,7 @@ class UrRtdeDriver(Driver):
             return
         wanted = wanted_pose(self._model, state.actual_q).position[0]
         apart = float(np.linalg.norm(said[:3] - wanted))
-        if apart > TCP_APART:
+        if not apart <= TCP_APART:  # NaN is not
             raise WriteError(
                 f"{self.settings.host}: the controller's TCP is {1e3 * apart:.1f} mm from the "
                 "cell's: set the same TCP in both (tool.tcp in the cell file)"

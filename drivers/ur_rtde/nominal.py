@@ -33,7 +33,8 @@ class Nominal:
         chain, shape = pack(model.without_terms().chain()), pack(kernel.new_shape(n))
         row = np.concatenate([np.zeros(n), np.ones(n), np.zeros(10)])
         self._block = np.concatenate([chain, row, shape, np.zeros(n + SCRATCH + 12)])
-        self._given = np.zeros(n + 6)  # target joints, offset
+        self._given = np.zeros(n + 6)
+        self._target, self._offset = self._given[:n], self._given[n:]
         # compiled here: the loop's first offset must not wait for a compiler
         self.without(np.zeros(n), np.zeros(6))
 
@@ -42,13 +43,12 @@ class Nominal:
 
         Raises InvalidStateError where there are none nearby (at a singularity).
         """
-        n, given = self._n, self._given
-        nominal: Vector = np.empty(n)
-        given[:n], given[n:] = target_q, offset_in_base
-        distance = float(take_out(self._block, given, nominal, LEVER, TOLERANCE, STEPS))
+        nominal: Vector = np.empty(self._n)
+        self._target[:], self._offset[:] = target_q, offset_in_base
+        distance = take_out(self._block, self._given, nominal, LEVER, TOLERANCE, STEPS)
         if not distance < TOLERANCE:
             raise InvalidStateError(
                 f"target_q: found no joints {distance:.1e} m nearer to the robot's own path "
-                f"without the offset {np.array2string(given[n:], precision=5)}"
+                f"without the offset {np.array2string(self._offset, precision=5)}"
             )
         return nominal

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 import time
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -39,10 +40,10 @@ _VECTORS: dict[str, tuple[str, int, float, bool]] = {
     "joint_temperatures": ("getJointTemperatures", N, 300.0, True),
     "actual_current": ("getActualCurrent", N, 1e3, True),
     "payload_cog": ("getPayloadCog", 3, 10.0, True),
-    "actual_TCP_pose": ("getActualTCPPose", 6, 100.0, True),
 }
+POSE = "actual_TCP_pose"  # read when it is asked for, not in every cycle
 _NAMES = (
-    "timestamp", *_VECTORS, "payload", "robot_mode", "safety_mode", "runtime_state",
+    "timestamp", *_VECTORS, POSE, "payload", "robot_mode", "safety_mode", "runtime_state",
     "safety_status_bits", "speed_scaling",
     f"output_int_register_{ECHO}", f"output_int_register_{PROGRAM}",
     *(f"output_double_register_{i}" for i in APPLIED),
@@ -66,7 +67,9 @@ class StateReader:
     def __init__(self, settings: UrRtdeSettings) -> None:
         self._settings = settings
         self._receive: Any = None
-        self._fields: list[tuple[str, int, int]] = []  # name, from, to
+        self._fields: list[tuple[str, slice]] = []  # in the numbers of a sample
+        self._sizes: list[int] = []  # numbers of each field
+        self._has_pose = False
         self._getters: list[Any] = []
         self._bounds = np.empty(0)
         self._payload = True
@@ -103,17 +106,18 @@ class StateReader:
         self._last, self._changed, self._q = -1.0, time.monotonic(), None
 
     def _lay_out(self, names: list[str]) -> None:
-        self._fields, self._getters, bounds, start = [], [], [], 0
+        self._fields, self._sizes, self._getters, bounds, start = [], [], [], [], 0
         for name, (getter, size, bound, _) in _VECTORS.items():
             if name in names:
-                self._fields.append((name, start, start + size))
+                self._fields.append((name, slice(start, start + size)))
+                self._sizes.append(size)
                 self._getters.append(getattr(self._receive, getter))
                 bounds += [bound] * size
                 start += size
         self._bounds = np.array(bounds)
         # compiled here: the first sample must not wait for a compiler
         _plausible(self._bounds, self._bounds, self._bounds[:N], 0.0)
-        self._payload = "payload" in names
+        self._payload, self._has_pose = "payload" in names, POSE in names
 
     def close(self) -> None:
         """Leave the link; may be repeated."""
@@ -197,26 +201,26 @@ class StateReader:
         payload: float | None,
     ) -> RobotState:
         """Return the sample. Raises InvalidStateError where it cannot be believed."""
-        for (name, start, end), row in zip(self._fields, rows, strict=True):
-            if len(row) != end - start:
-                raise self._invalid(f"{name}: found {len(row)} numbers, expected {end - start}")
-        values = np.array([v for row in rows for v in row])
+        if [*map(len, rows)] != self._sizes:
+            for (name, _), size, row in zip(self._fields, self._sizes, rows, strict=True):
+                if len(row) != size:
+                    raise self._invalid(f"{name}: found {len(row)} numbers, expected {size}")
+        values = np.array([*chain.from_iterable(rows)])
         before = values if self._q is None else self._q
         fine = _plausible(values, self._bounds, before, FASTEST * gap + JITTER)
         if not fine and not (np.abs(values) <= self._bounds).all():
             bad = int(np.argmax(~(np.abs(values) <= self._bounds)))
-            name, start, _ = next(f for f in self._fields if f[1] <= bad < f[2])
+            name, where = next(f for f in self._fields if bad < f[1].stop)
             raise self._invalid(
-                f"{name}_{bad - start}: found {values[bad]:g}, expected a finite number within "
-                f"+-{self._bounds[bad]:g}"
+                f"{name}_{bad - where.start}: found {values[bad]:g}, expected a finite number "
+                f"within +-{self._bounds[bad]:g}"
             )
         if payload is not None and not 0.0 <= payload <= 1e3:
             raise self._invalid(f"payload: found {payload:g} kg, expected 0 to 1000")
-        found: dict[str, Any] = {n: values[start:end] for n, start, end in self._fields}
+        found: dict[str, Any] = {name: values[where] for name, where in self._fields}
         if not fine:
             self._check_motion(found["actual_q"], gap)
         self._q = found["actual_q"]
-        found.pop("actual_TCP_pose", None)
         current, constants = found.pop("actual_current", None), self._settings.torque_constants
         if current is not None and constants is not None:
             found["actual_current_as_torque"] = current * constants
@@ -244,14 +248,11 @@ class StateReader:
 
     def tcp_pose(self) -> Vector | None:
         """Return the controller's own TCP pose (6,) in base, m and rotation vector, or None."""
-        names = [name for name, _, _ in self._fields]
-        if "actual_TCP_pose" not in names:
-            return None
-        return np.array(self._receive.getActualTCPPose())
+        return np.array(self._receive.getActualTCPPose()) if self._has_pose else None
 
 
 def _is_optional(name: str) -> bool:
-    return name in _VECTORS and _VECTORS[name][3]
+    return name == POSE or (name in _VECTORS and _VECTORS[name][3])
 
 
 def _first_line(error: Exception) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -207,7 +206,7 @@ class Scripted(Driver):
     def read_state(self) -> RobotState:
         if isinstance(self.next, Exception):
             raise self.next
-        self.next = replace(self.next, timestamp=self.next.timestamp + T)
+        self.next = self.next._replace(timestamp=self.next.timestamp + T)
         return self.next
 
     def write_setpoint(self, setpoint: object) -> None: ...

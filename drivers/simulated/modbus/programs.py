@@ -123,7 +123,7 @@ class MailboxProgram:
         box = self._box
         words = [0] * ECHO_WORDS
         if self.running:
-            applied = encode.offset_counts(box, self.applied)
+            applied = encode.offset_counts(encode.units_of(box), self.applied)
             words = [self._sequence, self._state, *(count & 0xFFFF for count in applied)]
         return [(box.echo_table, box.echo_address + i, word) for i, word in enumerate(words)]
 

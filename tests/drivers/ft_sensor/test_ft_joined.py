@@ -114,7 +114,7 @@ def test_the_controllers_declared_payload_stands_instead_of_the_models() -> None
     states = arm.read_state
 
     def declared() -> RobotState:
-        return replace(states(), payload=MASS, payload_cog=np.array(COG))
+        return states()._replace(payload=MASS, payload_cog=np.array(COG))
 
     arm.read_state = declared  # type: ignore[method-assign]
     wrong = model(payload_mass=1.0)

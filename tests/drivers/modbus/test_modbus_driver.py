@@ -67,7 +67,7 @@ def test_a_mailbox_whose_checksum_is_wrong_is_not_applied(ur: ModbusCase) -> Non
         driver.transport.write("holding", 236, [*words[:-1], words[-1] ^ 1])
         time.sleep(0.1)
         assert not any(program_of(ur).applied)
-        assert driver._look().echo[1] == encode.REJECTED
+        assert driver._look().answer[1] == encode.REJECTED
         driver.transport.write("holding", 236, words)
         time.sleep(0.1)
         assert any(program_of(ur).applied)
@@ -163,9 +163,6 @@ def test_a_map_with_the_wrong_word_order_is_told_when_connecting(tmp_path: Path)
 def test_a_register_that_is_not_there_is_told_when_connecting() -> None:
     with ModbusCase("xarm") as case:
         wide = ModbusDriver(case.settings, case.model)
-        wide.map = dataclasses.replace(
-            wide.map, fast=(dataclasses.replace(wide.map.fast[0], count=12),)
-        )
-        wide._decoder._map = wide.map
+        wide._first_block = dataclasses.replace(wide._first_block, count=12)
         with pytest.raises(LinkError, match="the controller refuses: illegal address"):
             wide.connect()

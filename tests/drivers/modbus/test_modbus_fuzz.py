@@ -17,6 +17,7 @@ from core.errors import InvalidStateError
 from drivers.modbus.decode import Decoder, check_step
 from drivers.modbus.map import compile_map
 from drivers.modbus.profile import read_profile
+from drivers.modbus.registers import wire_of
 from drivers.modbus.settings import SHIPPED
 from drivers.modbus.tcp_requests import TcpRequests, read_registers, read_request
 from drivers.simulated.modbus import image
@@ -52,7 +53,7 @@ def test_no_ruined_frame_is_taken_for_another_sample() -> None:
     good = [holding.get(a, 0) for a in range(block.first, block.first + block.count)]
     answer = ReadHoldingRegistersResponse(registers=good, dev_id=1, transaction_id=1)
     frame = FramerSocket(DecodePDU(False)).buildFrame(answer)
-    assert np.abs(decoder.decode({block: good}).vectors["position"] - Q).max() <= 5e-4
+    assert np.abs(decoder.decode([wire_of(good)]).vectors["position"] - Q).max() <= 5e-4
 
     random = np.random.default_rng(20)
     total, taken, refused, until = 300_000, 0, 0, time.monotonic() + 100.0
@@ -60,7 +61,7 @@ def test_no_ruined_frame_is_taken_for_another_sample() -> None:
         for data in mutations(frame, random, 5000):
             try:
                 words = read_registers(answered(data), 3, block.count)
-                sample = decoder.decode({block: words})
+                sample = decoder.decode([words])
                 check_step(sample.vectors["position"], np.array(Q), GAP, [FASTEST] * 6)
             except (InvalidStateError, OSError):  # of which the transport makes a LinkError
                 refused += 1
@@ -121,11 +122,11 @@ def test_random_registers_are_refused_or_plausible(path) -> None:
         pool = random.integers(0, 0x10000, (4000, sum(widths)))
         pool[random.random(pool.shape) < 0.5] = 0
         for k, row in enumerate(pool.tolist()):
-            parts, at = {}, 0
+            parts, at = [], 0
             for block, width in zip(blocks, widths, strict=True):
                 short = (start + k) % 97 == 0
                 top = 1 if block.table in ("coil", "discrete") else 0xFFFF
-                parts[block] = [min(v, top) for v in row[at : at + width - short]]
+                parts.append(wire_of([min(v, top) for v in row[at : at + width - short]]))
                 at += width
             try:
                 sample = decoder.decode(parts)

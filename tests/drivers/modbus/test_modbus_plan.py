@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.modbus.plan import TURN, BlockPlan
-from drivers.modbus.registers import CODES, Coding
+from drivers.modbus.registers import CODES, Coding, wire_of
 
 word = st.integers(0, 0xFFFF)
 
@@ -24,16 +24,16 @@ def test_a_block_says_to_the_plan_what_its_codings_say(
 ) -> None:
     coding = Coding(kind, order)  # type: ignore[arg-type]
     plan, indices = BlockPlan(32), places[: 4 * coding.words]
-    plan.add("position", indices, coding, size, np.inf)
+    plan.add("position", indices, coding, [size] * 4, np.inf)
     wanted = [count * size for count in coding.decode([registers[i] for i in indices])]
     if turns is not None:
         turning, at = Coding(turns), places[28:]  # type: ignore[arg-type]
         plan.add_turns(at, turning)
         counts = turning.decode([registers[i] for i in at])
         wanted = [v + TURN * t for v, t in zip(wanted, counts, strict=True)]
-    plan.add("velocity", [0], Coding("u16"), 1.0, np.inf)
+    plan.add("velocity", [0], Coding("u16"), [1.0], np.inf)
     plan.compile()
-    found = plan.vectors(tuple(registers))
+    found = plan.vectors(wire_of(registers))
     if any(np.isnan(wanted)):
         assert found is None
         return
@@ -47,6 +47,6 @@ def test_a_block_says_to_the_plan_what_its_codings_say(
 )
 def test_a_number_beyond_its_bound_is_told(count: int, fine: bool) -> None:
     plan = BlockPlan(2)
-    plan.add("position", [0, 1], Coding("i16"), 0.1, 1.0)
+    plan.add("position", [0, 1], Coding("i16"), [0.1, 0.1], 1.0)
     plan.compile()
-    assert (plan.vectors([0, count]) is not None) == fine
+    assert (plan.vectors(wire_of([0, count])) is not None) == fine

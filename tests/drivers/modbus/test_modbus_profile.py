@@ -7,9 +7,11 @@ from pathlib import Path
 import pytest
 from contract_modbus import INVENTED
 
-from core.errors import InputError
+from core.errors import InputError, InvalidStateError
+from drivers.modbus.decode import check_identity
 from drivers.modbus.map import Block, compile_map
 from drivers.modbus.profile import read_profile
+from drivers.modbus.registers import wire_of
 from drivers.modbus.settings import SHIPPED
 
 GOOD = """\
@@ -97,3 +99,13 @@ def test_a_map_without_gaps_is_read_run_by_run(tmp_path: Path) -> None:
     compiled = compile_map(read_profile(path, 6))
     assert compiled.fast == (Block("holding", 10, 12), Block("holding", 30, 6))
     assert compiled.slow == (Block("holding", 40, 1),)
+
+
+def test_a_controller_is_known_by_a_register_amid_its_state(tmp_path: Path) -> None:
+    mark = "identity:\n  - {name: version, table: holding, address: 25, good: [7]}\n"
+    profile = read_profile(written(tmp_path, GOOD + mark), 6)
+    compiled = compile_map(profile)
+    assert compiled.fast[0].holds("holding", 25, 1)
+    check_identity(profile, compiled, [wire_of([7])])
+    with pytest.raises(InvalidStateError, match="found 8, expected 7"):
+        check_identity(profile, compiled, [wire_of([8])])
