@@ -15,8 +15,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from core import kernel
-from core.kernel import JIT, Rows
+from core.kernel import JIT, Chain
 from core.kernels import single
+from core.kernels.single import LEVER, MAX_STEPS, SCRATCH, TOLERANCE
 from core.least_offset import LARGEST_OFFSET as LARGEST_OFFSET
 from core.least_offset import smallest_offset
 from core.loads import Loads
@@ -24,11 +25,7 @@ from core.model import Model, Poses
 from core.packed import chain_of, pack, row_of, shape_of, shape_size, sizes_of, view_row
 
 Array = NDArray[np.float64]
-TOLERANCE = 1e-9  # m, and rad times the tool's lever: where the pose counts as reached
-MAX_STEPS = 12
 NOTHING = Loads()
-SCRATCH = 42  # numbers that the compiled correction needs besides
-LEVER = 0.5  # m: weighs a rotation against a shift
 
 
 class Correction(NamedTuple):
@@ -144,6 +141,16 @@ def _step(chain_block, row_block, shape_block, pose, offset):  # type: ignore[no
     )  # fmt: skip
 
 
+def block_of(chain: Chain, rigid: Chain) -> Array:
+    """Return what the compiled correction of one setpoint keeps: ``kernels.single.correct``."""
+    n = chain.mass.shape[0]
+    row = np.concatenate([np.zeros(n), np.ones(n), np.zeros(10)])
+    shape = pack(kernel.new_shape(n))
+    return np.concatenate([
+        pack(chain), row, shape, np.zeros(n + SCRATCH), pack(rigid), row, shape, np.zeros(24 + n)
+    ])  # fmt: skip
+
+
 def _parts(block: Array, n: int) -> tuple[Array, Array, Array, Array]:
     """Return chain, row, shape, and what else is in a block, as views of it."""
     c, r = sizes_of(n)
@@ -160,24 +167,18 @@ class Compensator:
     def __init__(self, model: Model) -> None:
         self.model = model
         self._n = n = model.arm.n
-        plain = Rows(
-            np.zeros((1, n)), np.ones((1, n)), np.zeros(1), np.zeros((1, 3)), np.zeros((1, 6))
-        )
-        shape, row = pack(kernel.new_shape(n)), pack(plain)
-        # one block for all that is kept: each array handed to compiled code is unwrapped anew
         chain = model.chain()
-        self._block = np.concatenate([pack(chain), row, shape, np.zeros(n + SCRATCH)])
-        rigid = pack(model.without_terms().chain())
-        self._rigid_block = np.concatenate([rigid, row, shape, np.zeros(24)])
+        self._block = block_of(chain, model.without_terms().chain())
         self._chain, self._row, self._shape, rest = _parts(self._block, n)
         self._offset = rest[:n]
-        self._rigid, self._rigid_row, self._rigid_shape, rest = _parts(self._rigid_block, n)
-        self._wanted = rest[:12]
+        rest = rest[n + SCRATCH :]
+        self._rigid, self._rigid_row, self._rigid_shape, rest = _parts(rest, n)
+        self._wanted, self._nominal = rest[:12], rest[24:]
         self._view = view_row(self._row, n)
         self._loaded: Loads | None = None
         self._conditions = model.conditions()
         self._stiff_links = not chain.flexibility.any()
-        self._nominal, self._pose = np.zeros(n), np.zeros(12)
+        self._pose = np.zeros(12)
 
     def correct(self, nominal_q: Array, loads: Loads | None = None) -> Correction:
         """Return the corrected setpoint for ``nominal_q`` (n,); ``loads`` holds one row.
@@ -193,9 +194,7 @@ class Compensator:
             loads = loads or NOTHING
             self._load(loads)
         if self._stiff_links and not self._conditions:
-            best, steps = single.correct(
-                self._block, self._rigid_block, nominal, found, LEVER, TOLERANCE, MAX_STEPS
-            )
+            best, steps = single.correct(self._block, found)
         else:
             rigid = self._rigid
             _want(rigid, self._rigid_row, self._rigid_shape, nominal, self._wanted)

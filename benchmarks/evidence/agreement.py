@@ -13,7 +13,8 @@ import numpy as np
 
 from benchmarks.evidence.arms import dh_rows
 from core.arm import arm_from_dh
-from core.compensation import TOLERANCE, correct
+from core.compensation import correct
+from core.kernels.single import TOLERANCE
 from core.loads import Loads
 from core.model import Model
 from tests.oracle import equilibrium, rigid

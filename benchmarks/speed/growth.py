@@ -73,19 +73,17 @@ def _joints(n: int) -> dict[str, float]:
 
 def _setpoint(chain: Chain, n: int) -> float:
     """Return the time of one exact correction along a slow path."""
-    from core.compensation import LEVER, MAX_STEPS, SCRATCH, TOLERANCE
-    from core.packed import pack, shape_size
+    from core.compensation import block_of
+    from core.packed import sizes_of
 
-    row = np.concatenate([np.zeros(n), np.ones(n), [2.0], np.zeros(9)])
-    work = np.zeros(shape_size(n))
-    block = np.concatenate([pack(chain), row, work, np.zeros(n + SCRATCH)])
-    stiff = chain._replace(compliance=np.zeros((n, 3)))
-    rigid = np.concatenate([pack(stiff), row, work, np.zeros(24)])
+    block = block_of(chain, chain._replace(compliance=np.zeros((n, 3))))
+    block[sizes_of(n)[0] + 2 * n] = 2.0  # kg of payload
     there = 0.6 + 0.2 * np.sin(0.004 * np.arange(200)[:, None] + np.arange(n))
     found = np.empty(n + 6)
 
     def run() -> None:
         for q in there:
-            correct(block, rigid, q, found, LEVER, TOLERANCE, MAX_STEPS)
+            block[-n:] = q
+            correct(block, found)
 
     return _each(run) / len(there)

@@ -17,7 +17,7 @@ from benchmarks.speed.peers.cpp import Cpp, compiler
 from benchmarks.speed.peers.pinocchio_task import PinocchioTask
 from benchmarks.speed.sides import Call, Side, compared, interleaved
 from bridge.realtime import become_realtime
-from core.compensation import LEVER, MAX_STEPS, TOLERANCE, Compensator
+from core.compensation import Compensator
 from core.kernels import single
 from core.kernels.first_order import block_of, first_order
 from core.loads import Loads
@@ -74,12 +74,15 @@ def _exact(model: Any, loads: Loads) -> dict[str, Call]:
     both = cycle([*there, *there[::-1]])  # back and forth: no jump
     again = cycle([*there, *there[::-1]])
     other.correct(there[0], loads)
-    block, rigid = other._block, other._rigid_block
+    block, nominal = other._block, other._nominal
+
+    def bare() -> None:
+        nominal[:] = next(again)
+        single.correct(block, found)
+
     return {
         EXACT: lambda: one.correct(next(both), loads),
-        EXACT_CALL: lambda: single.correct(
-            block, rigid, next(again), found, LEVER, TOLERANCE, MAX_STEPS
-        ),
+        EXACT_CALL: bare,
     }
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.compensation import LEVER
+from core.kernels.single import LEVER
 from core.loads import Loads
 from core.model import Model
 

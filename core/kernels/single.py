@@ -21,9 +21,15 @@ from core.kernels.one_row import (
 from core.least_offset import LARGEST_OFFSET, REGULAR, smallest_offset
 from core.packed import sizes_of
 
+LEVER = 0.5  # m: weighs a rotation against a shift
+TOLERANCE = 1e-9  # m, and rad times the lever: where the pose counts as reached
+MAX_STEPS = 12
+NEARER, FEWER = 1e-10, 8  # the same of an offset that is taken out
+SCRATCH = 42  # numbers that a search needs besides
+
 
 @njit(**FAST)
-def next_offset(b, n, w, wanted, k0, lever):  # type: ignore[no-untyped-def]
+def next_offset(b, n, w, wanted, k0):  # type: ignore[no-untyped-def]
     """Write the next joint offset (after the workspace), as ``compensation.next_offset`` does.
 
     The wanted pose stands in the block ``wanted`` from ``k0`` on, twelve numbers.
@@ -42,7 +48,7 @@ def next_offset(b, n, w, wanted, k0, lever):  # type: ignore[no-untyped-def]
         e3 += r1 * v2 - r2 * v1
         e4 += r2 * v0 - r0 * v2
         e5 += r0 * v1 - r1 * v0
-    half = 0.5 * lever
+    half = 0.5 * LEVER
     e3, e4, e5 = half * e3, half * e4, half * e5
     distance = np.sqrt(e0 * e0 + e1 * e1 + e2 * e2 + e3 * e3 + e4 * e4 + e5 * e5)
     if not np.isfinite(distance):
@@ -54,7 +60,7 @@ def next_offset(b, n, w, wanted, k0, lever):  # type: ignore[no-untyped-def]
         y = py - b[U(j + ORIGIN + 1)]
         z = pz - b[U(j + ORIGIN + 2)]
         b[U(c)], b[U(c + 1)], b[U(c + 2)] = zy * z - zz * y, zz * x - zx * z, zx * y - zy * x
-        b[U(c + 3)], b[U(c + 4)], b[U(c + 5)] = lever * zx, lever * zy, lever * zz
+        b[U(c + 3)], b[U(c + 4)], b[U(c + 5)] = LEVER * zx, LEVER * zy, LEVER * zz
         # the whole offset is solved for anew, not a step on top
         o = b[U(at + i)]
         e0, e1, e2 = e0 + b[U(c)] * o, e1 + b[U(c + 1)] * o, e2 + b[U(c + 2)] * o
@@ -134,34 +140,37 @@ def rigid_pose(b, n, w, q, first, pose):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
-def correct(b, r, nominal, found, lever, tolerance, most):  # type: ignore[no-untyped-def]
+def correct(b, found):  # type: ignore[no-untyped-def]
     """Write the corrected setpoint and the rigid motion it makes (n + 6,) into ``found``.
 
-    ``b``: chain, row, workspace, offset (n,), scratch (42,); kept from call to call. ``r``: chain,
-    row and workspace of the rigid arm, then the wanted pose and the reached one (12 each). Returns
-    the distance (m) that is left, and the steps taken.
+    ``b``, kept from call to call: chain, row, workspace, offset (n,), scratch; chain, row and
+    workspace of the rigid arm, the wanted pose and the reached one (12 each); the nominal setpoint
+    (n,). One array, because each is unwrapped anew in every call. Returns the distance (m) that is
+    left, and the steps taken.
     """
-    n = nominal.shape[0]
+    n = found.shape[0] - 6
     c, size = sizes_of(n)
     w, row = c + size, c
     at = w + (RECORD + 6) * n + FLANGE
     wanted = at
+    end = b.shape[0] - n
+    r, nominal = b[at + n + SCRATCH : end], b[end:]
     rigid_pose(r, n, w, nominal, 0, wanted)
     best, steps = np.inf, 0
     for i in range(n):
         found[i] = nominal[i]
-    for _ in range(most):
+    for _ in range(MAX_STEPS):
         steps += 1
         for i in range(n):
             b[U(row + i)] = nominal[i] + b[U(at + i)]
-        distance = next_offset(b, n, w, r, wanted, lever)
+        distance = next_offset(b, n, w, r, wanted)
         if distance < 0:
             break
         if distance < best:
             best = distance
             for i in range(n):
                 found[i] = b[U(row + i)]
-        if distance < tolerance:
+        if distance < TOLERANCE:
             break
     moves = False
     for i in range(n):
@@ -193,18 +202,19 @@ def _motion(r, wanted, found, n, moves):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
-def take_out(b, given, found, lever, tolerance, most):  # type: ignore[no-untyped-def]
+def take_out(b, found):  # type: ignore[no-untyped-def]
     """Write the joints (n,) at which the rigid TCP is an offset short of where a target has it.
 
-    ``b``: chain, row, workspace of the rigid arm, joint offset (n,), scratch (42,), wanted pose
-    (12,); kept from call to call. ``given``: target (n,), offset (6,) in base. Returns the
-    distance (m) that is left.
+    ``b``, kept from call to call: chain, row, workspace of the rigid arm, joint offset (n,),
+    scratch, wanted pose (12,); target (n,) and offset (6,) in base. Returns the distance (m) that
+    is left.
     """
     n = found.shape[0]
     c, size = sizes_of(n)
     w, row = c + size, c
     at = w + (RECORD + 6) * n + FLANGE
-    wanted = at + n + 42
+    wanted = at + n + SCRATCH
+    given = b[wanted + 12 :]
     if not np.any(given[n:] != 0.0):  # no offset changes no bit
         for i in range(n):
             found[i], b[U(at + i)] = given[i], 0.0
@@ -212,16 +222,16 @@ def take_out(b, given, found, lever, tolerance, most):  # type: ignore[no-untype
     rigid_pose(b, n, w, given, 0, wanted)
     _move_back(b, wanted, given, n)
     distance = np.inf
-    for _ in range(most):
+    for _ in range(FEWER):
         for i in range(n):
             b[U(row + i)] = given[i] + b[U(at + i)]
-        distance = next_offset(b, n, w, b, wanted, lever)
-        if distance < tolerance:
+        distance = next_offset(b, n, w, b, wanted)
+        if distance < NEARER:
             break
     distance = distance if distance >= 0.0 else np.inf
     for i in range(n):
         found[i] = b[U(row + i)]
-        if not distance < tolerance:
+        if not distance < NEARER:
             b[U(at + i)] = 0.0  # the next search begins from nothing
     return distance
 

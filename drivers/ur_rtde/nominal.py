@@ -14,15 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core import kernel
-from core.compensation import LEVER, SCRATCH
 from core.errors import InvalidStateError
-from core.kernels.single import take_out
+from core.kernels.single import NEARER, SCRATCH, take_out
 from core.model import Model
 from core.packed import pack
 
 Vector = NDArray[np.float64]
-TOLERANCE = 1e-10  # m
-STEPS = 8
 
 
 class Nominal:
@@ -32,9 +29,8 @@ class Nominal:
         self._n = n = model.arm.n
         chain, shape = pack(model.without_terms().chain()), pack(kernel.new_shape(n))
         row = np.concatenate([np.zeros(n), np.ones(n), np.zeros(10)])
-        self._block = np.concatenate([chain, row, shape, np.zeros(n + SCRATCH + 12)])
-        self._given = np.zeros(n + 6)
-        self._target, self._offset = self._given[:n], self._given[n:]
+        self._block = np.concatenate([chain, row, shape, np.zeros(n + SCRATCH + 12 + n + 6)])
+        self._target, self._offset = self._block[-n - 6 : -6], self._block[-6:]
         # compiled here: the loop's first offset must not wait for a compiler
         self.without(np.zeros(n), np.zeros(6))
 
@@ -45,8 +41,8 @@ class Nominal:
         """
         nominal: Vector = np.empty(self._n)
         self._target[:], self._offset[:] = target_q, offset_in_base
-        distance = take_out(self._block, self._given, nominal, LEVER, TOLERANCE, STEPS)
-        if not distance < TOLERANCE:
+        distance = take_out(self._block, nominal)
+        if not distance < NEARER:
             raise InvalidStateError(
                 f"target_q: found no joints {distance:.1e} m nearer to the robot's own path "
                 f"without the offset {np.array2string(self._offset, precision=5)}"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from core.arm import builtin_arm
-from core.compensation import LEVER, MAX_STEPS, TOLERANCE, Compensator
+from core.compensation import Compensator
 from core.effects import Site, Term
 from core.kernels import single
 from core.loads import Loads
@@ -71,7 +71,8 @@ def test_a_correction_leaves_nothing_behind_in_memory():
 
     def run() -> None:
         for q in poses:
-            single.correct(live._block, live._rigid_block, q, found, LEVER, TOLERANCE, MAX_STEPS)
+            live._nominal[:] = q
+            single.correct(live._block, found)
 
     run()
     tracemalloc.start()
