@@ -79,7 +79,7 @@ def _run(order: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Exit:
     _compile(settings, model)
     if order["may_write"]:
         source.open()
-    tell({"kind": "granted", "detail": ", ".join(become_realtime())})
+    tell({"kind": "granted", "detail": ", ".join(become_realtime(1.0 / driver.rate))})
     return loop.run(order["arm"], order["may_write"], order["latched"])
 
 

@@ -11,18 +11,18 @@ from core.kernel import JIT
 Vector = NDArray[np.float64]
 DECELERATION = 8.0  # rad/s^2 of the fastest joint
 SMOOTHING = 0.02  # s: over which the velocity is averaged
-PLACE, RATE, LIMIT, GIVEN = range(4)  # rows of what is kept
+PLACE, RATE, LIMIT = range(3)  # rows of what is kept
 
 
 @njit(**JIT)
-def _followed(kept, gap):  # type: ignore[no-untyped-def]
-    """Take the given setpoint over: the velocity to it, averaged, and its place."""
+def _followed(kept, given, gap):  # type: ignore[no-untyped-def]
+    """Take a setpoint (n,) over: the velocity to it, averaged, and its place."""
     share = min(gap / SMOOTHING, 1.0)
     for i in range(kept.shape[1]):
         most = kept[LIMIT, i]
-        rate = min(max((kept[GIVEN, i] - kept[PLACE, i]) / gap, -most), most)
+        rate = min(max((given[i] - kept[PLACE, i]) / gap, -most), most)
         kept[RATE, i] += share * (rate - kept[RATE, i])
-        kept[PLACE, i] = kept[GIVEN, i]
+        kept[PLACE, i] = given[i]
 
 
 class NominalStream:
@@ -34,12 +34,11 @@ class NominalStream:
 
     def __init__(self, velocity_limit: Vector) -> None:
         # one array: each that is handed to compiled code is unwrapped anew in every call
-        self._kept = np.zeros((4, len(velocity_limit)))
+        self._kept = np.zeros((3, len(velocity_limit)))
         self._kept[LIMIT] = velocity_limit
         self.q: Vector = self._kept[PLACE]
         self._rate: Vector = self._kept[RATE]
-        self._given: Vector = self._kept[GIVEN]
-        _followed(self._kept, 1.0)  # compiled now: the loop waits for no compiler
+        _followed(self._kept, self.q.copy(), 1.0)  # compiled now: the loop waits for no compiler
 
     def start(self, q: Vector) -> None:
         """Begin at rest at ``q`` (n,) rad."""
@@ -48,8 +47,7 @@ class NominalStream:
 
     def follow(self, q: Vector, gap: float) -> None:
         """Take the source's setpoint (n,), ``gap`` s after the last one."""
-        self._given[:] = q
-        _followed(self._kept, gap)
+        _followed(self._kept, q, gap)
 
     def brake(self, gap: float) -> Vector:
         """Return the setpoint ``gap`` s later on the way to rest; it holds until the next call."""

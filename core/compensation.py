@@ -147,7 +147,7 @@ def block_of(chain: Chain, rigid: Chain) -> Array:
     row = np.concatenate([np.zeros(n), np.ones(n), np.zeros(10)])
     shape = pack(kernel.new_shape(n))
     return np.concatenate([
-        pack(chain), row, shape, np.zeros(n + SCRATCH), pack(rigid), row, shape, np.zeros(24 + n)
+        pack(chain), row, shape, np.zeros(n + SCRATCH), pack(rigid), row, shape, np.zeros(24)
     ])  # fmt: skip
 
 
@@ -173,12 +173,14 @@ class Compensator:
         self._offset = rest[:n]
         rest = rest[n + SCRATCH :]
         self._rigid, self._rigid_row, self._rigid_shape, rest = _parts(rest, n)
-        self._wanted, self._nominal = rest[:12], rest[24:]
+        self._wanted = rest[:12]
         self._view = view_row(self._row, n)
-        self._loaded: Loads | None = None
         self._conditions = model.conditions()
         self._stiff_links = not chain.flexibility.any()
         self._pose = np.zeros(12)
+        # what acts where nothing is given
+        self._mass, self._wrench = np.array([float(model.payload_mass)]), np.zeros((1, 6))
+        self._cog = np.array(model.payload_cog, dtype=float).reshape(1, 3)
 
     def correct(self, nominal_q: Array, loads: Loads | None = None) -> Correction:
         """Return the corrected setpoint for ``nominal_q`` (n,); ``loads`` holds one row.
@@ -186,19 +188,20 @@ class Compensator:
         The wanted pose is the rigid, effect-free arm's at ``nominal_q``. A row that cannot be
         solved comes back with the distance left in ``residual`` (inf: no equilibrium).
         """
-        n = self._n
-        found, nominal = np.empty(n + 6), self._nominal
-        nominal[:] = nominal_q
+        n, loads = self._n, loads or NOTHING
+        found, nominal = np.empty(n + 6), np.asarray(nominal_q, dtype=float)
         q, moved = found[:n], found[n:]
-        if loads is not None or self._loaded is not NOTHING:
-            loads = loads or NOTHING
-            self._load(loads)
         if self._stiff_links and not self._conditions:
-            best, steps = single.correct(self._block, found)
+            mass, cog, wrench = loads.payload_mass, loads.payload_cog, loads.wrench
+            best, steps = single.correct(
+                self._block, nominal, self._mass if mass is None else mass,
+                self._cog if cog is None else cog, self._wrench if wrench is None else wrench,
+                found,
+            )  # fmt: skip
         else:
             rigid = self._rigid
             _want(rigid, self._rigid_row, self._rigid_shape, nominal, self._wanted)
-            best, steps = self._solve_conditioned(nominal, loads or NOTHING, q)
+            best, steps = self._solve_conditioned(nominal, loads, q)
             self._offset[:] = q - nominal if best < np.inf else 0.0
             _want(rigid, self._rigid_row, self._rigid_shape, q, self._pose)
             _moved(self._wanted, self._pose, self._offset, moved)
@@ -229,13 +232,10 @@ class Compensator:
 
     def _load(self, loads: Loads) -> None:
         """Write what acts into the row's own buffers."""
-        self._loaded = loads
-        row, model = self._view, self.model
-        given = loads.payload_mass
-        row.payload_mass[0] = model.payload_mass if given is None else given[0]
-        cog = loads.payload_cog
-        row.payload_cog[0] = model.payload_cog if cog is None else cog[0]
-        row.wrench[0] = 0.0 if loads.wrench is None else loads.wrench[0]
+        row, mass, cog, wrench = self._view, loads.payload_mass, loads.payload_cog, loads.wrench
+        row.payload_mass[0] = (self._mass if mass is None else mass)[0]
+        row.payload_cog[0] = (self._cog if cog is None else cog)[0]
+        row.wrench[0] = (self._wrench if wrench is None else wrench)[0]
 
 
 def correct(model: Model, nominal_q: Array, loads: Loads | None = None) -> Correction:

@@ -74,16 +74,14 @@ def _joints(n: int) -> dict[str, float]:
 def _setpoint(chain: Chain, n: int) -> float:
     """Return the time of one exact correction along a slow path."""
     from core.compensation import block_of
-    from core.packed import sizes_of
 
     block = block_of(chain, chain._replace(compliance=np.zeros((n, 3))))
-    block[sizes_of(n)[0] + 2 * n] = 2.0  # kg of payload
+    mass, cog, wrench = np.array([2.0]), np.zeros((1, 3)), np.zeros((1, 6))
     there = 0.6 + 0.2 * np.sin(0.004 * np.arange(200)[:, None] + np.arange(n))
     found = np.empty(n + 6)
 
     def run() -> None:
         for q in there:
-            block[-n:] = q
-            correct(block, found)
+            correct(block, q, mass, cog, wrench, found)
 
     return _each(run) / len(there)

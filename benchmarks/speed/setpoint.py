@@ -74,15 +74,12 @@ def _exact(model: Any, loads: Loads) -> dict[str, Call]:
     both = cycle([*there, *there[::-1]])  # back and forth: no jump
     again = cycle([*there, *there[::-1]])
     other.correct(there[0], loads)
-    block, nominal = other._block, other._nominal
-
-    def bare() -> None:
-        nominal[:] = next(again)
-        single.correct(block, found)
-
+    block, cog = other._block, np.zeros((1, 3))
+    assert loads.wrench is not None
+    mass, wrench = np.array([model.payload_mass]), loads.wrench
     return {
         EXACT: lambda: one.correct(next(both), loads),
-        EXACT_CALL: bare,
+        EXACT_CALL: lambda: single.correct(block, next(again), mass, cog, wrench, found),
     }
 
 
@@ -142,7 +139,7 @@ def stream(rounds: int) -> dict[str, Any]:
 
     In a process that is made ready as the daemon's loop is: real-time priority, no collection.
     """
-    with ProcessPoolExecutor(1, get_context("spawn"), become_realtime) as alone:
+    with ProcessPoolExecutor(1, get_context("spawn"), become_realtime, (0.002,)) as alone:
         return alone.submit(_stream, rounds).result()
 
 

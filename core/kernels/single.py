@@ -140,21 +140,26 @@ def rigid_pose(b, n, w, q, first, pose):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
-def correct(b, found):  # type: ignore[no-untyped-def]
+def correct(b, nominal, mass, cog, wrench, found):  # type: ignore[no-untyped-def]
     """Write the corrected setpoint and the rigid motion it makes (n + 6,) into ``found``.
 
     ``b``, kept from call to call: chain, row, workspace, offset (n,), scratch; chain, row and
-    workspace of the rigid arm, the wanted pose and the reached one (12 each); the nominal setpoint
-    (n,). One array, because each is unwrapped anew in every call. Returns the distance (m) that is
-    left, and the steps taken.
+    workspace of the rigid arm, the wanted pose and the reached one (12 each). ``mass`` (1,),
+    ``cog`` (1, 3) and ``wrench`` (1, 6) as in Loads. Returns the distance (m) that is left, and the
+    steps taken.
     """
-    n = found.shape[0] - 6
+    n = nominal.shape[0]
     c, size = sizes_of(n)
     w, row = c + size, c
     at = w + (RECORD + 6) * n + FLANGE
     wanted = at
-    end = b.shape[0] - n
-    r, nominal = b[at + n + SCRATCH : end], b[end:]
+    r = b[at + n + SCRATCH :]
+    load = row + 2 * n
+    b[U(load)] = mass[0]
+    for k in range(3):
+        b[U(load + 1 + k)] = cog[0, k]
+    for k in range(6):
+        b[U(load + 4 + k)] = wrench[0, k]
     rigid_pose(r, n, w, nominal, 0, wanted)
     best, steps = np.inf, 0
     for i in range(n):

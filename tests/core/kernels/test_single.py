@@ -71,8 +71,7 @@ def test_a_correction_leaves_nothing_behind_in_memory():
 
     def run() -> None:
         for q in poses:
-            live._nominal[:] = q
-            single.correct(live._block, found)
+            single.correct(live._block, q, live._mass, live._cog, live._wrench, found)
 
     run()
     tracemalloc.start()
