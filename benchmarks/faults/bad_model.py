@@ -5,7 +5,6 @@ Named as ``model_source`` of a run; only the loop's process is changed by it.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +23,7 @@ def load_cell(path: Path) -> Cell:
 
     def ruined(self: Compensator, nominal_q: np.ndarray, loads: Loads | None = None) -> Correction:
         found = correct(self, nominal_q, loads)
-        return replace(found, q=found.q * np.nan) if flag.exists() else found
+        return found._replace(q=found.q * np.nan) if flag.exists() else found
 
     Compensator.correct = ruined  # type: ignore[method-assign]
     return load(path)
