@@ -154,7 +154,7 @@ class Checker:
         if not all(math.isfinite(v) and abs(v) < 1e3 for v in write.values):
             found.add(f"{write.where}: {write.values}")
             return
-        if write.kind == "offset" and not any(write.values) and write.state not in WRITING:
+        if write.kind == "offset" and not any(write.values) and self._lets_go(write):
             self._end_stream(write.early)
             return  # an offset of zero takes out what may be there; it may always leave
         if write.kind == "joints" and write.state not in WRITING and self._holds(write):
@@ -173,6 +173,11 @@ class Checker:
             ):
                 if not low - 1e-4 <= q <= high + 1e-4:
                     found.add(f"joint {i}: {q:.4f} rad is outside its limits")
+
+    def _lets_go(self, write: Write) -> bool:
+        """Return whether nothing is written any more: the page tells so after the letting go."""
+        late = self._fresh is not None and write.early - self._fresh.time > self.bounds.fresh
+        return late or write.state not in WRITING
 
     def _holds(self, write: Write) -> bool:
         """Return whether joints are those where the arm stands: it is being enabled or left."""
@@ -198,7 +203,8 @@ class Checker:
         self._unused -= 1.0
         self.found.oldest_state = max(self.found.oldest_state, age)
         if age > self.bounds.fresh:
-            self.found.add(f"write {age:.3f} s after the last fresh state")
+            told = f"write {age:.3f} s after the last fresh state"
+            self.found.add(f"{told}, {[round(v, 6) for v in write.values]}")
         elif self._unused < 0.0:
             self._unused = 0.0
             self.found.add("more writes than states")

@@ -110,6 +110,11 @@ def test_a_write_behind_an_old_state_is_found(checker: Checker) -> None:
     assert "after the last fresh state" in violations(checker)
 
 
+def test_an_offset_taken_out_behind_an_old_state_is_letting_go(checker: Checker) -> None:
+    write(checker, 20, 0.0, late=0.3)
+    assert not checker.found.violations
+
+
 def test_many_writes_behind_one_state_are_found(checker: Checker) -> None:
     for i in range(6):
         write(checker, 20, 20 * STEP, late=0.001 * i)
