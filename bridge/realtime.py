@@ -19,7 +19,7 @@ SLACK = 1000  # ns
 PRIORITY = 30  # SCHED_FIFO: below interrupt threads (50) and a simulated controller (40)
 LOCK_ALL = 3  # MCL_CURRENT | MCL_FUTURE
 LATENCY = "/dev/cpu_dma_latency"  # the kernel's PM QoS interface
-FAST = 0.005  # s: loops with a shorter cycle keep the processors awake
+FAST = 0.005  # s: loops with this cycle or a shorter one keep the processors awake
 _held: list[int] = []  # files whose closing would take a measure back
 
 
@@ -40,7 +40,7 @@ def become_realtime(cycle: float) -> list[str]:
         with contextlib.suppress(OSError, AttributeError):
             if ctypes.CDLL(None).mlockall(LOCK_ALL) == 0:
                 granted.append("locked memory")
-    if cycle < FAST and _keep_awake():
+    if cycle <= FAST and _keep_awake():
         granted.append("processors awake")
     gc.collect()
     gc.freeze()

@@ -22,7 +22,7 @@ from core.least_offset import LARGEST_OFFSET as LARGEST_OFFSET
 from core.least_offset import smallest_offset
 from core.loads import Loads
 from core.model import Model, Poses
-from core.packed import chain_of, pack, row_of, shape_of, shape_size, sizes_of, view_row
+from core.packed import arm_block, chain_of, row_of, shape_of, shape_size, sizes_of, view_row
 
 Array = NDArray[np.float64]
 NOTHING = Loads()
@@ -143,12 +143,8 @@ def _step(chain_block, row_block, shape_block, pose, offset):  # type: ignore[no
 
 def block_of(chain: Chain, rigid: Chain) -> Array:
     """Return what the compiled correction of one setpoint keeps: ``kernels.single.correct``."""
-    n = chain.mass.shape[0]
-    row = np.concatenate([np.zeros(n), np.ones(n), np.zeros(10)])
-    shape = pack(kernel.new_shape(n))
-    return np.concatenate([
-        pack(chain), row, shape, np.zeros(n + SCRATCH), pack(rigid), row, shape, np.zeros(24)
-    ])  # fmt: skip
+    own = np.zeros(chain.mass.shape[0] + SCRATCH)
+    return np.concatenate([arm_block(chain), own, arm_block(rigid), np.zeros(24)])
 
 
 def _parts(block: Array, n: int) -> tuple[Array, Array, Array, Array]:
@@ -189,7 +185,7 @@ class Compensator:
         solved comes back with the distance left in ``residual`` (inf: no equilibrium).
         """
         n, loads = self._n, loads or NOTHING
-        found, nominal = np.empty(n + 6), np.asarray(nominal_q, dtype=float)
+        found, nominal = np.empty(n + 6), np.ascontiguousarray(nominal_q, dtype=float)
         q, moved = found[:n], found[n:]
         if self._stiff_links and not self._conditions:
             mass, cog, wrench = loads.payload_mass, loads.payload_cog, loads.wrench

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.kernel import JIT, Chain, Rows, Shape
+from core.kernel import JIT, Chain, Rows, Shape, new_shape
 
 Array = NDArray[np.float64]
 
@@ -19,6 +19,14 @@ Array = NDArray[np.float64]
 def pack(record: Chain | Rows | Shape) -> Array:
     """Return a record's arrays one after the other in one block (k,)."""
     return np.concatenate([np.ravel(part) for part in record]).astype(float)
+
+
+def arm_block(chain: Chain) -> Array:
+    """Return an arm's chain, one row without loads, and buffers, one after the other (k,)."""
+    n = chain.mass.shape[0]
+    return np.concatenate([
+        pack(chain), np.zeros(n), np.ones(n), np.zeros(10), pack(new_shape(n))
+    ])  # fmt: skip
 
 
 @njit(**JIT)

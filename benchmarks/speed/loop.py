@@ -56,20 +56,20 @@ def loop(seconds: float) -> dict[str, Any]:
                     after, status = _counters(metrics), _status(web)
                 took, busy = time.monotonic() - begin, _busy(process) - busy
         own = stalls.not_among(_missed(Path(folder) / "recordings", begin, begin + took), 1 / RATE)
-        advance = np.fromfile(Path(folder) / TIMES)
+        advance = np.fromfile(Path(folder) / TIMES).reshape(-1, 2)  # wall and CPU time
     cycles, missed, late = (
         after[name] - before[name] for name in ("cycles", "missed_cycles", "late_cycles")
     )
     work = status["timing"]["duration"]
-    advance = advance[advance > 0.0][int(SETTLED * RATE) :]
-    middle, most, far = np.percentile(advance, [50, 99, 99.9]).tolist()
+    advance = advance[advance[:, 0] > 0.0][int(SETTLED * RATE) :]
+    middle, most, far = np.percentile(advance[:, 0], [50, 99, 99.9]).tolist()
     return {
         "row": f"the daemon at {RATE:g} Hz with page, recorder and scraper, {took:.0f} s",
         "goal": "under 0.2 % missed; SetpointStream.advance p99 under 50 us",
         "sides": {
             "SetpointStream.advance in that loop": {
                 "wall_s": {"median": middle, "p99": most, "p99_9": far},
-                "cpu_s": {"median": middle},
+                "cpu_s": {"median": float(np.median(advance[:, 1]))},
             },
             "loop, from seeing a state to having written": {
                 "wall_s": {"median": work["p50"], "p99": work["p99"]},
@@ -127,7 +127,7 @@ def _served(folder: Path) -> Iterator[tuple[str, str, Path]]:
         timing = Path(__file__).with_name("in_the_loop")
         path = os.pathsep.join([str(timing), *(p for p in sys.path if p)])
         times = folder / TIMES
-        np.zeros(TIMED).tofile(times)
+        np.zeros((TIMED, 2)).tofile(times)
         named = {"PYTHONPATH": path, "ADVANCE_TIMES": str(times)}
         daemon = subprocess.Popen(command, stdout=log, stderr=log, env={**os.environ, **named})
         try:

@@ -152,7 +152,7 @@ class Decoder:
                 for name, spot, condition in self._motion
                 if not condition.fine(count := int(_number(registers, spot)))
             ),
-            None if self._answer is None else self._answer_of(registers, *self._answer),
+            None if self._answer is None else _answer_of(registers, *self._answer),
         )
 
     def _vectors(self, registers: Registers) -> dict[str, Array]:
@@ -199,9 +199,10 @@ class Decoder:
             )
         return np.array(values)
 
-    def _answer_of(self, registers: Registers, block: int, first: int) -> tuple[int, int]:
-        number, says = words_in(registers[block], first, 2)
-        return number, says
+
+def _answer_of(registers: Registers, block: int, first: int) -> tuple[int, int]:
+    number, says = words_in(registers[block], first, 2)
+    return number, says
 
 
 def _picked(data: bytes, indices: Sequence[int]) -> list[int]:

@@ -13,11 +13,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from core import kernel
 from core.errors import InvalidStateError
 from core.kernels.single import NEARER, SCRATCH, take_out
 from core.model import Model
-from core.packed import pack
+from core.packed import arm_block
 
 Vector = NDArray[np.float64]
 
@@ -27,9 +26,8 @@ class Nominal:
 
     def __init__(self, model: Model) -> None:
         self._n = n = model.arm.n
-        chain, shape = pack(model.without_terms().chain()), pack(kernel.new_shape(n))
-        row = np.concatenate([np.zeros(n), np.ones(n), np.zeros(10)])
-        self._block = np.concatenate([chain, row, shape, np.zeros(n + SCRATCH + 12 + n + 6)])
+        rigid = arm_block(model.without_terms().chain())
+        self._block = np.concatenate([rigid, np.zeros(n + SCRATCH + 12 + n + 6)])
         self._target, self._offset = self._block[-n - 6 : -6], self._block[-6:]
         # compiled here: the loop's first offset must not wait for a compiler
         self.without(np.zeros(n), np.zeros(6))

@@ -25,7 +25,7 @@ def granted(file: Path, cycle: float) -> str:
     return subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
 
 
-@pytest.mark.parametrize(("cycle", "asks"), [(0.002, True), (0.008, False)])
+@pytest.mark.parametrize(("cycle", "asks"), [(0.002, True), (1.0 / 200.0, True), (0.008, False)])
 def test_a_fast_loop_keeps_the_processors_awake(tmp_path: Path, cycle: float, asks: bool) -> None:
     file = tmp_path / "cpu_dma_latency"
     file.write_bytes(b"")

@@ -14,17 +14,18 @@ if "bridge.loop_main" in sys.orig_argv and "ADVANCE_TIMES" in os.environ:
 
     from bridge.setpoint_stream import SetpointStream
 
-    taken = np.memmap(os.environ["ADVANCE_TIMES"], dtype=np.float64, mode="r+")
+    taken = np.memmap(os.environ["ADVANCE_TIMES"], dtype=np.float64, mode="r+").reshape(-1, 2)
     taken[:] = 0.0  # all pages are there before the loop begins
-    advance, now, size = SetpointStream.advance, time.perf_counter, len(taken)
+    advance, size = SetpointStream.advance, len(taken)
+    now, busy = time.perf_counter, time.thread_time
     count = 0
 
     def timed(self, *args, **named):  # type: ignore[no-untyped-def]
-        """Do what ``advance`` does, and write down how long it took, s."""
+        """Do what ``advance`` does, and write down how long it took: wall and CPU time, s."""
         global count
-        begin = now()
+        worked, begin = busy(), now()
         found = advance(self, *args, **named)
-        taken[count] = now() - begin
+        taken[count] = now() - begin, busy() - worked
         count = (count + 1) % size
         return found
 
