@@ -53,14 +53,18 @@ class Layout:
         return [data[at : at + width] for at in range(0, len(data), width)]
 
     def decode(self, messages: Bytes) -> dict[str, Array]:
-        """Return the fields of messages (k, length): (k,) or (k, count) each."""
+        """Return the fields of messages (k, length): (k,) or (k, count) each, in their own memory.
+
+        Never the messages' own: theirs is read-only and at odd addresses, for which the loop's
+        compiled functions would be compiled anew, amidst a cycle.
+        """
         found: dict[str, Array] = {}
         for place in self.places:
             if place.is_enum:
                 found[place.name] = messages[:, place.start].astype(np.float64)
                 continue
             raw = messages[:, place.start : place.start + 8 * place.count]
-            values = np.ascontiguousarray(raw).view("<f8").astype(np.float64, copy=False)
+            values = raw.copy().view("<f8").astype(np.float64, copy=False)
             found[place.name] = values[:, 0] if place.is_single else values
         return found
 

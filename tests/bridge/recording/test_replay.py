@@ -51,6 +51,19 @@ def test_states_come_back_as_they_were_and_then_there_is_an_end(desk: Desk) -> N
                 replay.read_state()
 
 
+def test_arrays_are_of_the_kind_that_the_loop_was_compiled_for(desk: Desk) -> None:
+    """Another kind is compiled amidst a cycle, for seconds, and a loop that hangs is ended."""
+    desk.record(1, 3)  # a chunk of one cycle was handed on as the file's own bytes
+    with driver(desk) as replay:
+        for _ in range(4):
+            state = replay.read_state()
+            arrays = [value for value in state if isinstance(value, np.ndarray)]
+            assert len(arrays) > 5
+            for array in (*arrays, replay.nominal_q(state), replay.cycle.nominal_q):  # type: ignore[union-attr]
+                assert array.dtype == np.float64
+                assert array.flags.carray  # in one piece, aligned, writable
+
+
 def test_it_takes_as_long_as_it_took_divided_by_the_speed(desk: Desk) -> None:
     desk.record(200)  # 0.398 s
     for speed, longest in ((1.0, 0.398), (4.0, 0.0995)):
