@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from core.compliance_fit import Linear, Mask, solve
 
@@ -57,6 +56,8 @@ def _spread(linear: Linear, kept: Mask, sigma: float) -> Array:
 
 def _root(linear: Linear, kept: Mask, sigma: float) -> Array:
     """Return a root (k, k) of the kept ones' covariance in units of the prior's variance."""
+    from scipy.linalg import solve_triangular  # a tenth of a second, only where something is fitted
+
     size = int(kept.sum())
     R = np.linalg.qr(np.vstack([linear.matrix[:, kept] * sigma, np.eye(size)]), mode="r")
     return np.asarray(solve_triangular(R, np.eye(size)))

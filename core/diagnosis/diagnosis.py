@@ -15,6 +15,7 @@ from core.diagnosis.held_out import HeldOut
 from core.diagnosis.judgement import Judgement, holding, judge, pure_error
 from core.diagnosis.location import Where, locate
 from core.diagnosis.observation import NotObservable, Observation, thinned
+from core.diagnosis.rigid_suspicion import softness_findings
 from core.diagnosis.selection import Selection, select, standing
 from core.diagnosis.separation import Measurement, next_measurements
 from core.diagnosis.simulation import joined, predicted_by
@@ -38,6 +39,7 @@ CHANNELS: Mapping[str, Observe] = {
 
 
 NEEDLESS = 0.05  # share by which more may be left without a cause that seemed needless
+SOFTNESS = ("axial_compliance", "radial_compliance")
 # samples that a diagnosis looks at: more cost time and tell hardly more
 MOST = {"position": 1200, "wrench": 300, "tracking": 300, "torque": 300}
 
@@ -143,6 +145,8 @@ def _diagnose(
         raise LogError(f"{log.path}: found no channel to diagnose, expected one of: {needs}{hint}")
     for channel in observed:
         told += _channel_findings(channel)
+        if simulated is None and not {*withhold} & {*SOFTNESS} and _lacks_much(channel):
+            told += softness_findings(model, log, metrology)
     terms = _for_the_model(observed)
     return Diagnosis(
         _overall(observed), tuple(observed), tuple(hidden),
@@ -180,6 +184,11 @@ def _for_the_model(channels: Sequence[ChannelDiagnosis]) -> list[Term]:
                 if key not in best or deviation < best[key][0]:
                     best[key] = (deviation, term)
     return [term for _, term in best.values()]
+
+
+def _lacks_much(channel: ChannelDiagnosis) -> bool:
+    """Return whether poses leave a gap that no cause accounts for."""
+    return channel.channel == "position" and channel.verdict in ("unexplained", "partly_explained")
 
 
 def _enough(seen: Observation) -> str | None:

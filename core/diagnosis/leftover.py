@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,15 +107,19 @@ def dependence(
     names = np.unique(groups)
     fold_of = np.random.default_rng(seed).permutation(len(names)) % FOLDS
     fold = fold_of[np.searchsorted(names, groups)]
-    best: dict[str, float] = {}
+    by_size: dict[int, list[int]] = {}
     for c, candidate in enumerate(space.candidates):
-        if candidate.named or not candidate.quantity:
-            continue
-        columns = space.X[:, space.start[c] : space.start[c + 1]]
-        clean = columns - fitted @ (fitted.T @ columns)
-        share = _held_out_share(clean, r, fold)
-        if share > best.get(candidate.quantity, -np.inf):
-            best[candidate.quantity] = share
+        if not candidate.named and candidate.quantity:
+            by_size.setdefault(int(space.start[c + 1] - space.start[c]), []).append(c)
+    best: dict[str, float] = {}
+    for size, members in by_size.items():
+        for few in np.array_split(members, 1 + len(members) * size // AT_ONCE):
+            columns = space.X[:, space.column_indices(few.tolist())]
+            clean = columns - fitted @ (fitted.T @ columns)
+            blocks = clean.reshape(len(r), len(few), size).transpose(1, 0, 2)
+            for c, share in zip(few, _held_out_shares(blocks, r, fold), strict=True):
+                quantity = space.candidates[c].quantity
+                best[quantity] = max(best.get(quantity, -np.inf), float(share))
     return _one_of_a_kind(sorted(best.items(), key=lambda item: -item[1]))
 
 
@@ -129,14 +134,17 @@ def _one_of_a_kind(ranked: list[tuple[str, float]]) -> list[tuple[str, float]]:
     return told
 
 
-def _held_out_share(columns: Array, r: Array, fold: NDArray[np.int64]) -> float:
-    unit = columns / (np.sqrt(np.einsum("ij,ij->j", columns, columns)) + 1e-300)
-    G, g = unit.T @ unit, unit.T @ r
-    ridge = 1e-6 * np.eye(len(g))
-    left = 0.0
-    for k in range(FOLDS):
-        out = fold == k
-        U, u = unit[out], r[out]
-        x = np.linalg.solve(G - U.T @ U + ridge, g - U.T @ u)
-        left += float(np.sum((u - U @ x) ** 2))
-    return 1 - left / float(r @ r)
+def _held_out_shares(columns: Array, r: Array, fold: NDArray[np.int64]) -> Array:
+    """Return the share of r (m,) that each block of columns (B, m, d) predicts held out (B,)."""
+    by_fold = np.argsort(fold, kind="stable")
+    ends = np.searchsorted(fold[by_fold], np.arange(FOLDS + 1))
+    unit, r = columns[:, by_fold], r[by_fold]
+    unit = unit / (np.sqrt(np.einsum("bij,bij->bj", unit, unit))[:, None] + 1e-300)
+    flipped = unit.transpose(0, 2, 1)
+    G, g = flipped @ unit + 1e-6 * np.eye(columns.shape[2]), flipped @ r
+    left = np.zeros(len(columns))
+    for begin, end in pairwise(ends):
+        U, V, u = unit[:, begin:end], flipped[:, :, begin:end], r[begin:end]
+        x = np.linalg.solve(G - V @ U, (g - V @ u)[..., None])
+        left += np.sum((u - (U @ x)[..., 0]) ** 2, axis=1)
+    return np.asarray(1 - left / float(r @ r))

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from core.diagnosis.observation import Observation
 
@@ -60,6 +59,8 @@ def estimate_noise(
         scale = np.array([max(float(np.mean(r[:, block == b] ** 2)), 1e-30) for b in range(count)])
         scale[0] = max(scale[0], known)
         return _noise(observation, block, scale, 0.0)
+    from scipy.optimize import minimize  # a quarter of a second, only where it is looked for
+
     lever = J[use] @ np.swapaxes(J[use], 1, 2)
     size = np.sqrt(np.mean(np.einsum("nii->ni", lever)[:, block == 0]))
     identity = np.stack([np.diag((block == b).astype(float)) for b in range(count)])

@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
 
 from core.dynamics import predict_torque, predict_wrench
 from core.errors import InputError
@@ -107,6 +106,8 @@ def _bending(model: Model, log: Log, q: Array, pull: Array) -> str:
 
 def _unbent(model: Model, q: Array, measured: Array, loads: Loads) -> Array:
     """Return what joints that give way, never less than nothing, leave of the positions (N, 3)."""
+    from scipy.optimize import lsq_linear  # a quarter of a second, only where pulls are judged
+
     predicted = model.predict(q, loads).position
     seen = register_robustly(measured, predicted).in_base(measured)
     form, n = model.linear_form(q, loads), model.arm.n

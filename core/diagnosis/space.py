@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,14 +151,17 @@ def fit(space: Space, chosen: Sequence[int]) -> Found:
         return Found((), float(space.misfit(np.array(rss))), rss)
     X = space.columns(chosen)
     unit = 1 / np.sqrt(np.einsum("ij,ij->j", X, X) + 1e-300)
-    solution, _, _rank, _ = np.linalg.lstsq(X * unit, space.y, rcond=1e-6)
+    U, s, V = np.linalg.svd(X * unit, full_matrices=False)
+    V = V[s > 1e-6 * s[0]] / s[s > 1e-6 * s[0], None]  # of nearly dependent columns the mean
+    solution = V.T @ (space.y @ U)[: len(V)]
     rss = float(np.sum((space.y - (X * unit) @ solution) ** 2))
     variance = max(rss / max(space.freedom - X.shape[1], 1.0), space.floor)
-    inverse = np.linalg.pinv((X * unit).T @ (X * unit), rcond=1e-12, hermitian=True)
-    values, deviation = solution * unit, np.sqrt(np.maximum(np.diag(inverse), 0) * variance) * unit
+    values = solution * unit
+    deviation = np.sqrt(np.einsum("ij,ij->j", V, V) * variance) * unit
     score = float(space.misfit(np.array(rss)) + space.price[list(chosen)].sum())
-    split = np.cumsum([len(space.candidates[c].parameters) for c in chosen])[:-1]
-    parts, spread = np.split(values, split), np.split(deviation, split)
+    ends = np.cumsum([0, *(len(space.candidates[c].parameters) for c in chosen)]).tolist()
+    own = [slice(begin, end) for begin, end in pairwise(ends)]
+    parts, spread = [values[o] for o in own], [deviation[o] for o in own]
     for c, x, s in zip(chosen, parts, spread, strict=True):
         if not _plausible(space.candidates[c], x, s):
             score = np.inf

@@ -116,6 +116,17 @@ def test_help_names_every_command_and_imports_none(desk: Desk) -> None:
         assert line in ran.stdout
 
 
+@pytest.mark.parametrize("name", ["predict", "diagnose", "fit", "run"])
+def test_a_command_waits_for_no_solver_before_it_has_work(desk: Desk, name: str) -> None:
+    code = (
+        f"import sys\nimport bridge.cli.{name}\n"
+        "found = {'scipy.optimize', 'scipy.linalg', 'scipy.stats'} & set(sys.modules)\n"
+        "assert not found, found\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_help_with_an_example(desk: Desk, name: str) -> None:
     ran = desk.run(name, "--help")

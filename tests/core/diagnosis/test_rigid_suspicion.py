@@ -1,0 +1,61 @@
+"""A rigid cell of a soft arm: the fit that should come first is named, with what it brings."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from benchmarks.fleet.simulating import TYPE, Habits, TrueArm, columns, write_type_cell
+from bridge.cell import load_cell
+from core.diagnosis.diagnosis import diagnose
+from core.diagnosis.rigid_suspicion import softness_findings
+from core.log import Log
+from core.metrology import Metrology
+from core.model import Model
+
+FREE = Metrology(sigma=2.0e-5)
+STIFF = TrueArm(np.zeros(6), np.zeros(6))
+
+
+@pytest.fixture(scope="module")
+def rigid(tmp_path_factory: pytest.TempPathFactory) -> Model:
+    return load_cell(write_type_cell(tmp_path_factory.mktemp("cell"))).model
+
+
+def log_of(arm: TrueArm, poses: int = 70, seed: int = 3) -> Log:
+    return Log("log.csv", columns(arm, poses, Habits(), np.random.default_rng(seed)), 6)
+
+
+def test_a_soft_arm_behind_a_rigid_cell_is_sent_to_the_fit(rigid: Model) -> None:
+    found = diagnose(rigid, log_of(TYPE), FREE)
+    assert found.verdict in ("unexplained", "partly_explained")  # too many causes for 70 poses
+    (word,) = [line for line in found.findings if "gapbridge fit" in line]
+    told = re.search(r"from ([\d.]+) to ([\d.]+) mm", word)
+    assert told is not None
+    before, after = map(float, told.groups())
+    assert before == pytest.approx(1e3 * found.channels[0].gap_rms, rel=0.2)
+    assert after < 0.05
+
+
+def test_nothing_is_said_where_the_cell_names_flexibilities(rigid: Model) -> None:
+    half = rigid.with_compliance(TYPE.axial / 2, TYPE.radial / 2)
+    assert softness_findings(half, log_of(TYPE), FREE) == []
+
+
+def test_nothing_is_said_where_softness_is_not_the_main_thing(rigid: Model) -> None:
+    log = log_of(STIFF)
+    log.columns["actual_q"][:, 1] += 2e-3 * np.sin(3 * log.columns["actual_q"][:, 0])
+    assert softness_findings(rigid, log, FREE) == []
+
+
+def test_nothing_is_said_where_no_fit_can_be_made(rigid: Model) -> None:
+    few = log_of(TYPE, poses=4)
+    assert softness_findings(rigid, few, FREE) == []
+
+
+def test_what_is_withheld_is_not_offered(rigid: Model) -> None:
+    found = diagnose(rigid, log_of(TYPE), FREE, withhold=("axial_compliance", "radial_compliance"))
+    assert found.verdict != "no_gap"
+    assert not any("gapbridge fit" in line for line in found.findings)
