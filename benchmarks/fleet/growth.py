@@ -88,6 +88,7 @@ def measure(folder: Path, sessions: int, chunk: int, seed: int, *, dask: bool) -
         },
         "processor_overhead": _ratios(spent, "loop", set(spent) - {"loop"}, over=True),
         "faster_than_loop": _ratios(times, "loop", {BARE, "processes", "dask"}),
+        "faster_than_one_process": _ratios(times, "one process", {"processes"}),
         "overhead": {
             name: _spread([t / b - 1 for t, b in zip(times[name], times["loop"], strict=True)])
             for name in times if name.startswith("one ")
