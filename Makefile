@@ -12,7 +12,7 @@ help:
 	@echo "make test      all tests"
 	@echo "make check     format, lint, types, import contracts, all tests"
 	@echo "make coverage  all tests, and which lines of core and drivers they reach"
-	@echo "make bench     speed beside peers, in one run; figures in out/speed.json"
+	@echo "make bench     speed beside peers, in one run; figures in out/speed.json, out/fleet.json"
 	@echo "make faults    every fault on the real wire, and random ones; fills docs/reliability.md"
 	@echo "make clean     remove .venv and everything that was made"
 
@@ -42,6 +42,7 @@ coverage: .venv/.test
 
 bench: .venv/.test
 	$(BIN)/python -m benchmarks.speed --out out/speed.json
+	$(BIN)/python -m benchmarks.fleet growth --no-dask --json out/fleet.json
 
 # REPEAT: times that each fault is made. SEQUENCES: random ones. MINUTES: no fault is begun after.
 REPEAT ?= 5

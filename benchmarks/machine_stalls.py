@@ -11,7 +11,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from types import TracebackType
 from typing import Self
 
@@ -25,17 +25,19 @@ Missed = tuple[float, int]  # when the next cycle was seen (s, monotonic), how m
 class MachineStalls:
     """Watches every core while the ``with`` block lasts; then ``spans`` has the stalls in order.
 
-    ``spans`` is None where real-time priority is not allowed: then nothing can be said.
+    ``cores``: where not those that this thread may use. ``spans`` is None where real-time priority
+    is not allowed: then nothing can be said.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, cores: Collection[int] | None = None) -> None:
+        self._cores = cores
         self.spans: list[Span] | None = None
         self._watchers: list[subprocess.Popen[str]] = []
 
     def __enter__(self) -> Self:
         path = os.pathsep.join(p for p in sys.path if p)
         environment = {**os.environ, "PYTHONPATH": path}
-        for core in sorted(os.sched_getaffinity(0)):
+        for core in sorted(self._cores or os.sched_getaffinity(0)):
             command = [sys.executable, "-m", "benchmarks.machine_stalls", str(core)]
             self._watchers.append(
                 subprocess.Popen(

@@ -1,4 +1,4 @@
-"""How cost grows: with rows, with joints, with parameters."""
+"""How cost grows: with rows, with joints, with effects and poses of a diagnosis."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.speed import task
+from benchmarks.speed import diagnosis_growth, task
 from core.kernel import Chain, Rows
 from core.kernels.many import predict
 from core.kernels.single import correct
@@ -35,8 +35,11 @@ def _each(call: Callable[[], object], least: float = 0.02) -> float:
 
 
 def growth() -> dict[str, Any]:
-    """Return CPU times by number of rows and of joints."""
-    return {"rows": [_rows(count) for count in ROWS], "joints": [_joints(n) for n in JOINTS]}
+    """Return CPU times by number of rows, of joints, and of a diagnosis' effects and poses."""
+    return {
+        "rows": [_rows(count) for count in ROWS], "joints": [_joints(n) for n in JOINTS],
+        "effects": diagnosis_growth.by_effects(), "poses": diagnosis_growth.by_poses(),
+    }  # fmt: skip
 
 
 def _rows(count: int) -> dict[str, float]:

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 import psutil
+from numpy.typing import NDArray
 
 from benchmarks.machine_stalls import MachineStalls, Missed
 from core.recording.reading import SUFFIX, read_columns
@@ -40,31 +41,30 @@ TIMED = 1 << 19  # setpoints at the most: 17 minutes
 
 
 def loop(seconds: float) -> dict[str, Any]:
-    """Return the row of the daemon's loop over ``seconds`` of compensating."""
+    """Return the row of the daemon's loop: ``seconds`` of compensating, and as many once more.
+
+    In the first a bare timer on each processor tells what the machine takes from everybody. Those
+    timers come between, a thousand times a second: single setpoints are timed in the second.
+    """
     with tempfile.TemporaryDirectory(prefix="loop-") as folder:
-        with MachineStalls() as stalls, _served(Path(folder)) as (web, metrics, cell):
+        times, cores = Path(folder) / TIMES, os.sched_getaffinity(0)
+        with _beside_the_loop(), _served(Path(folder)) as (web, metrics, cell):
             _compensating(web, cell)
             with _page(web):
+                with MachineStalls(cores) as stalls:
+                    counted = _counted(web, metrics, seconds)
+                _compensating(web, cell)
                 time.sleep(SETTLED)
-                before, status = _counters(metrics), _status(web)
-                process = psutil.Process(status["status"]["loop"]["pid"])
-                busy = _busy(process)
-                begin = until = time.monotonic()
-                until += seconds
-                while time.monotonic() < until:
-                    time.sleep(EVERY)
-                    after, status = _counters(metrics), _status(web)
-                took, busy = time.monotonic() - begin, _busy(process) - busy
-        own = stalls.not_among(_missed(Path(folder) / "recordings", begin, begin + took), 1 / RATE)
-        advance = np.fromfile(Path(folder) / TIMES).reshape(-1, 2)  # wall and CPU time
-    cycles, missed, late = (
-        after[name] - before[name] for name in ("cycles", "missed_cycles", "late_cycles")
-    )
-    work = status["timing"]["duration"]
-    advance = advance[advance[:, 0] > 0.0][int(SETTLED * RATE) :]
+                first = len(_timed(times))
+                time.sleep(seconds)
+                advance = _timed(times)[first:]
+        span = counted["begin"], counted["begin"] + counted["took"]
+        own = stalls.not_among(_missed(Path(folder) / "recordings", *span), 1 / RATE)
+    work, cycles, missed = counted["work"], counted["cycles"], counted["missed_cycles"]
     middle, most, far = np.percentile(advance[:, 0], [50, 99, 99.9]).tolist()
+    whole = max(cycles + missed, 1.0)
     return {
-        "row": f"the daemon at {RATE:g} Hz with page, recorder and scraper, {took:.0f} s",
+        "row": f"the daemon at {RATE:g} Hz with page, recorder and scraper, {seconds:.0f} s",
         "goal": "under 0.2 % missed; SetpointStream.advance p99 under 50 us",
         "sides": {
             "SetpointStream.advance in that loop": {
@@ -73,16 +73,39 @@ def loop(seconds: float) -> dict[str, Any]:
             },
             "loop, from seeing a state to having written": {
                 "wall_s": {"median": work["p50"], "p99": work["p99"]},
-                "cpu_s": {"median": busy / max(cycles, 1.0)},
+                "cpu_s": {"median": counted["busy"] / max(cycles, 1.0)},
             }
         },
-        "ratios": [], "state": status["now"]["state"], "cycles": int(cycles),
-        "missed_cycles": int(missed), "late_cycles": int(late),
-        "missed_percent": 100.0 * missed / max(cycles + missed, 1.0),
+        "ratios": [], "state": counted["state"], "setpoints_timed": len(advance),
+        "cycles": int(cycles), "missed_cycles": int(missed),
+        "late_cycles": int(counted["late_cycles"]), "missed_percent": 100.0 * missed / whole,
         "missed_percent_while_bare_timers_were_on_time": None if stalls.spans is None else
-        100.0 * sum(count for _, count in own) / max(cycles + missed, 1.0),
-        "age_p99_s": status["timing"]["age"]["p99"], "recorder_lost": after["recorder_lost_cycles"],
+        100.0 * sum(count for _, count in own) / whole,
+        "age_p99_s": counted["age_p99_s"], "recorder_lost": counted["recorder_lost"],
     }  # fmt: skip
+
+
+def _counted(web: str, metrics: str, seconds: float) -> dict[str, Any]:
+    """Return what the daemon counted over ``seconds``, scraped and looked at all the while."""
+    time.sleep(SETTLED)
+    before, status = _counters(metrics), _status(web)
+    process = psutil.Process(status["status"]["loop"]["pid"])
+    busy, begin = _busy(process), time.monotonic()
+    while time.monotonic() < begin + seconds:
+        time.sleep(EVERY)
+        after, status = _counters(metrics), _status(web)
+    return {
+        "begin": begin, "took": time.monotonic() - begin, "busy": _busy(process) - busy,
+        **{name: after[name] - before[name] for name in ("cycles", "missed_cycles", "late_cycles")},
+        "work": status["timing"]["duration"], "age_p99_s": status["timing"]["age"]["p99"],
+        "state": status["now"]["state"], "recorder_lost": after["recorder_lost_cycles"],
+    }  # fmt: skip
+
+
+def _timed(path: Path) -> NDArray[np.float64]:
+    """Return wall and CPU time (N, 2) of the setpoints so far, s."""
+    times = np.fromfile(path).reshape(-1, 2)
+    return times[times[:, 0] > 0.0]
 
 
 def _missed(folder: Path, begin: float, end: float) -> list[Missed]:
@@ -94,6 +117,21 @@ def _missed(folder: Path, begin: float, end: float) -> list[Missed]:
         chosen = (begin < seen) & (seen < end) & (missed > 0)
         found += zip(seen[chosen].tolist(), missed[chosen].astype(int).tolist(), strict=True)
     return found
+
+
+@contextmanager
+def _beside_the_loop() -> Iterator[None]:
+    """Keep this thread, and the robot that it starts, on part of the processors.
+
+    A cell's robot has a computer of its own, and nobody scrapes from the cell's.
+    """
+    whole = os.sched_getaffinity(0)
+    if len(whole) > 1:
+        os.sched_setaffinity(0, whole - {max(whole)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, whole)
 
 
 @contextmanager
@@ -129,7 +167,10 @@ def _served(folder: Path) -> Iterator[tuple[str, str, Path]]:
         times = folder / TIMES
         np.zeros((TIMED, 2)).tofile(times)
         named = {"PYTHONPATH": path, "ADVANCE_TIMES": str(times)}
-        daemon = subprocess.Popen(command, stdout=log, stderr=log, env={**os.environ, **named})
+        daemon = subprocess.Popen(
+            command, stdout=log, stderr=log, env={**os.environ, **named},
+            preexec_fn=lambda: os.sched_setaffinity(0, range(os.cpu_count() or 1)),
+        )  # fmt: skip
         try:
             web, metrics = (f"http://127.0.0.1:{port}/" for port in ports)
             yield web, metrics + "metrics", cell
