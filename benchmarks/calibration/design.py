@@ -40,7 +40,7 @@ from core.loads import Loads
 
 Array = NDArray[np.float64]
 SIGMA = 3e-5
-DRAWS = 15  # random choices of each number of poses
+DRAWS = 101  # random choices of each number of poses
 TIMES = (1.0, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0)  # of the planned number
 POOL = 2000  # poses over which the best possible choice is bounded
 SHOWN = 3.0  # a parameter counts as told where the weak prior is this many times as wide

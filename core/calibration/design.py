@@ -19,13 +19,12 @@ from core.calibration.plan import Payload, Plan
 from core.calibration.refinement import Refined, Refiner
 from core.calibration.space import Space
 from core.calibration.travel import joint_speed, leg_times
+from core.calibration.worst_places import evened, leaning
 from core.errors import PlanError
 from core.loads import Loads
 
 Array = NDArray[np.float64]
 REFERENCE = 200  # poses over which the predicted TCP is judged
-LEANING = 4  # power of a place's variance in its weight
-REFINED = 15  # rounds in which the chosen poses are moved
 BOUGHT_ROUNDS = 3
 BOUGHT = (0.5, 0.75, 1.0, 1.5, 2.0)  # of the poses asked for: what these would give
 SIGHT = "nobody said where the instrument stands: whether it sees the target was not looked at"
@@ -96,15 +95,15 @@ def _planned(
     cost = _cost(parameters, found, wish)
     choice = Choice.of(rows, reference.weight(rows.shape[2]), cost)
     chosen = _chosen(choice, wish, lambda share: tell("choosing poses", 0.2 + 0.3 * share))
-    weight = _leaning(reference, rows[chosen])
-    choice = Choice.of(rows, weight, cost)
-    chosen = exchanged(choice, chosen)
+    share = leaning(reference, rows[chosen])
+    weight = reference.weight(rows.shape[2], share)
+    chosen = exchanged(Choice.of(rows, weight, cost), chosen)
     refiner = Refiner(parameters, observable, space, found, weight, wish.sigma)
-    best = refiner.refined(
-        Refined(found.readings[np.array(chosen)], rows[chosen]), REFINED,
-        np.random.default_rng(wish.seed),
-        lambda share: tell("moving poses to where they tell more", 0.5 + 0.2 * share),
+    best, weight = evened(
+        refiner, reference, Refined(found.readings[np.array(chosen)], rows[chosen]), share,
+        wish.seed, lambda share: tell("moving poses to where they tell more", 0.5 + 0.2 * share),
     )  # fmt: skip
+    choice, refiner = Choice.of(rows, weight, cost), replace(refiner, weight=weight)
     tell("working out what more or fewer poses buy", 0.7)
     bought = _bought(choice, chosen, wish, refiner, reference)
     bought[wish.poses] = _rms(reference, best.rows)
@@ -196,17 +195,6 @@ def _cost(
         return unit * extra
 
     return cost
-
-
-def _leaning(reference: Reference, rows: Array) -> Array:
-    """Return the weight that minds the places most that a choice of ``rows`` knows worst.
-
-    The mean over the workspace alone would buy what is known well already with its worst places,
-    and it is the largest error that an integrator has to answer for.
-    """
-    variance = reference.std(inverse(gathered(rows))) ** 2
-    share = variance**LEANING
-    return reference.weight(rows.shape[2], share / share.mean())
 
 
 def _rms(reference: Reference, rows: Array) -> float:
