@@ -19,6 +19,7 @@ SLACK = 1000  # ns
 PRIORITY = 30  # SCHED_FIFO: below interrupt threads (50) and a simulated controller (40)
 LOCK_ALL = 3  # MCL_CURRENT | MCL_FUTURE
 LATENCY = "/dev/cpu_dma_latency"  # the kernel's PM QoS interface
+IDLE_DRIVER = "/sys/devices/system/cpu/cpuidle/current_driver"  # what the kernel sleeps by
 FAST = 0.005  # s: loops with this cycle or a shorter one keep the processors awake
 _held: list[int] = []  # files whose closing would take a measure back
 
@@ -52,9 +53,13 @@ def _keep_awake() -> bool:
     """Have idle processors wait without sleep until this process ends; returns whether they do.
 
     A processor that sleeps wakes late, and with cold caches; kept awake it takes more power. Only
-    root may ask for it, unless the system's owner lets others write to LATENCY.
+    root may ask for it, unless the system's owner lets others write to LATENCY. Without a driver
+    that knows kinds of sleep, as in many virtual machines, the request would change nothing.
     """
     with contextlib.suppress(OSError):
+        with open(IDLE_DRIVER, encoding="ascii") as told:
+            if told.read().strip() in ("", "none"):
+                return False
         file = os.open(LATENCY, os.O_WRONLY | os.O_CLOEXEC)
         _held.append(file)
         return os.write(file, struct.pack("@i", 0)) > 0  # us until a processor must be awake
