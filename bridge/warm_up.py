@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from bridge.nominal_stream import NominalStream
 from core.arm import builtin_arm
 from core.compensation import correct
 from core.kernels.factor import factor_blocks
@@ -15,10 +16,11 @@ from core.limits import Limiter, Limits
 from core.model import Model
 from core.pose_columns import pose_columns
 from drivers.ur_rtde.nominal import Nominal
+from drivers.ur_rtde.state import plausible
 
 
 def warm_up() -> None:
-    """Call each compiled function once."""
+    """Call each compiled function once; CAN and Modbus drivers compile theirs when made."""
     n = 6
     model = Model(builtin_arm("ur10e")).with_compliance([1e-6] * n, [1e-6] * n)
     q = np.array([[0.0, -1.5, 1.8, -1.87, -1.57, 0.0]])
@@ -30,6 +32,8 @@ def warm_up() -> None:
     factor_blocks(model.chain(), model.rows(q), gap, gap, 0, 0, 1, factor)
     corrected = correct(model, q)
     Nominal(model)
+    plausible(q[0], q[0], q[0], 0.0)
+    NominalStream(np.ones(n))
     limits = Limits(np.full(n, -7.0), np.full(n, 7.0), np.full(n, 3.0))
     limiter = Limiter(limits, n)
     limiter.start(q[0])

@@ -9,6 +9,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from core.kernel import JIT
+
 if TYPE_CHECKING:
     from core.motion import Motion
 
@@ -50,7 +52,7 @@ def lagged(time: Array, command: Array, constant: float, first: float) -> Array:
     return np.asarray(late[::fine])
 
 
-@njit(cache=True, nogil=True)  # type: ignore[misc,untyped-decorator,unused-ignore]
+@njit(**{**JIT, "error_model": "python"})  # type: ignore[misc,untyped-decorator,unused-ignore]
 def _follow(time: Array, command: Array, constant: float, first: float) -> Array:
     late = np.empty_like(command)
     late[0] = first

@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from core.errors import LimitError
+from core.kernel import JIT
 
 Array = NDArray[np.float64]
 LONGEST_GAP = 5.0  # cycles: after a longer one, no more than this many cycles' steps are allowed
@@ -190,10 +191,10 @@ def _kept(block: Array) -> tuple[Array, Array, Array, Array]:
     )  # fmt: skip
 
 
-_kept_of = njit(cache=True, nogil=True, error_model="numpy")(_kept)
+_kept_of = njit(**JIT)(_kept)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**JIT)
 def _share(vector, first, last, most):  # type: ignore[no-untyped-def]
     """Return the factor (<= 1) by which vector[first:last] must shrink to be `most` long."""
     square = 0.0
@@ -203,7 +204,7 @@ def _share(vector, first, last, most):  # type: ignore[no-untyped-def]
     return 1.0 if length <= most else most / length * SLACK
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**JIT)
 def _check(numbers, bounds, nominal, corrected, offset, ramp, actual, dt, q, before):  # type: ignore[no-untyped-def]
     """Return the reason why nothing may leave, or _FINE."""
     n = q.shape[0]
@@ -227,7 +228,7 @@ def _check(numbers, bounds, nominal, corrected, offset, ramp, actual, dt, q, bef
     return _FINE
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**JIT)
 def _whole(numbers, bounds, nominal, corrected, offset, ramp):  # type: ignore[no-untyped-def]
     """Return the factor on the whole correction that keeps it in bounds, and the clamped bits."""
     clamped = 0
@@ -248,7 +249,7 @@ def _whole(numbers, bounds, nominal, corrected, offset, ramp):  # type: ignore[n
     return share, clamped
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**JIT)
 def _limit(block, nominal, corrected, offset, ramp, actual, dt):  # type: ignore[no-untyped-def]
     """Advance what the block keeps by one setpoint; returns (reason, clamped bits)."""
     q, before, delta, applied = _kept_of(block)

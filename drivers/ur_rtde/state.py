@@ -51,7 +51,7 @@ _NAMES = (
 
 
 @njit(**JIT)
-def _plausible(values, bounds, before, step):  # type: ignore[no-untyped-def]
+def plausible(values, bounds, before, step):  # type: ignore[no-untyped-def]
     """Return whether values are within bounds, and the first six (joints) near ``before``."""
     fine = True
     for i in range(values.shape[0]):
@@ -116,7 +116,7 @@ class StateReader:
                 start += size
         self._bounds = np.array(bounds)
         # compiled here: the first sample must not wait for a compiler
-        _plausible(self._bounds, self._bounds, self._bounds[:N], 0.0)
+        plausible(self._bounds, self._bounds, self._bounds[:N], 0.0)
         self._payload, self._has_pose = "payload" in names, POSE in names
 
     def close(self) -> None:
@@ -207,7 +207,7 @@ class StateReader:
                     raise self._invalid(f"{name}: found {len(row)} numbers, expected {size}")
         values = np.array([*chain.from_iterable(rows)])
         before = values if self._q is None else self._q
-        fine = _plausible(values, self._bounds, before, FASTEST * gap + JITTER)
+        fine = plausible(values, self._bounds, before, FASTEST * gap + JITTER)
         if not fine and not (np.abs(values) <= self._bounds).all():
             bad = int(np.argmax(~(np.abs(values) <= self._bounds)))
             name, where = next(f for f in self._fields if bad < f[1].stop)
