@@ -108,6 +108,12 @@ def test_the_daemon_runs_on_a_recording_and_makes_the_same_offsets(robot: Robot)
     assert expected["written"].sum() > 300
 
 
+def is_told_to_be_over(session: Path) -> bool:
+    """Return whether the recorder has written that the daemon is gone."""
+    events = read_documents(session)
+    return bool(events) and "gone" in events[-1]["detail"]
+
+
 def kill_daemons(robot: Robot, times: int) -> None:
     random = np.random.default_rng(7)
     cell = robot.cell()
@@ -124,13 +130,12 @@ def kill_daemons(robot: Robot, times: int) -> None:
         run.wait()
         wait_for(lambda at=k: robot.controller.log().count("rtde_control ended") > at, 10.0,
                  "the end of the loop")  # type: ignore[misc]  # fmt: skip
-        time.sleep(4.0)  # the recorder finishes
         (session,) = {p.name.rsplit("-", 1)[0] for p in folder.glob("*.mcap")} - before
+        wait_for(lambda at=folder / session: is_told_to_be_over(at), 20.0, "the recording's end")  # type: ignore[misc]
         columns = read_columns(folder / session)
         numbers = columns["number"]
         assert np.array_equal(numbers, np.arange(len(numbers)))
         assert columns["received"][-1] > killed - 1.0
-        assert "gone" in read_documents(folder / session)[-1]["detail"]
 
 
 def test_a_daemon_that_is_killed_leaves_a_whole_recording(robot: Robot) -> None:
