@@ -24,7 +24,7 @@ from core.errors import LinkError, RunError
 from core.recording.reading import read_columns
 
 Array = NDArray[np.float64]
-ATTEMPTS = 4
+ATTEMPTS = 8  # a machine that others keep busy may end several runs in a row
 SLOWEST = 4  # a machine that cannot keep the cell's rate runs at half of it, or at a fourth
 MARGIN = 60.0  # s to connect, arm and end, on top of the trajectory
 

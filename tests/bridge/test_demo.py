@@ -34,7 +34,7 @@ def test_an_address_that_is_taken_is_passed_over() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(400)
+@pytest.mark.timeout(600)
 def test_the_demo_shows_what_it_promises(tmp_path: Path) -> None:
     out = tmp_path / "out" / "demo"
     command = [sys.executable, "-m", "bridge.cli", "demo", "--seed", "5", "--out", str(out)]

@@ -160,7 +160,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Shown]:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(700)
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize("name", PEERS)
 def test_the_demo_shows_on_every_link_what_it_promises(name: str, shown: dict[str, Shown]) -> None:
     out, code, told = shown[name]

@@ -127,7 +127,7 @@ def kill_daemons(robot: Robot, times: int) -> None:
         time.sleep(random.uniform(0.0, 2.0))
         killed = time.monotonic()
         run.kill()
-        run.wait()
+        said, _ = run.communicate()
         wait_for(lambda at=k: robot.controller.log().count("rtde_control ended") > at, 10.0,
                  "the end of the loop")  # type: ignore[misc]  # fmt: skip
         (session,) = {p.name.rsplit("-", 1)[0] for p in folder.glob("*.mcap")} - before
@@ -135,7 +135,8 @@ def kill_daemons(robot: Robot, times: int) -> None:
         columns = read_columns(folder / session)
         numbers = columns["number"]
         assert np.array_equal(numbers, np.arange(len(numbers)))
-        assert columns["received"][-1] > killed - 1.0
+        if "->" not in said:  # a busy machine may have ended the loop before
+            assert columns["received"][-1] > killed - 1.0
 
 
 def test_a_daemon_that_is_killed_leaves_a_whole_recording(robot: Robot) -> None:
