@@ -20,24 +20,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.effects import CATALOGUE, Term
+from core.effects import CATALOGUE, Term, acting
 from core.kernel import Chain
 from core.model import Model
 from core.motion import Motion, Pieces
 
 Array = NDArray[np.float64]
-
-# The way from load to reading: effects act in this order, whatever order they were found in.
-SENSING = ("payload", "ft_misalignment", "ft_gain", "ft_drift", "ft_bias")
-TRACKING = ("latency", "tracking_lag")
-DRIVING = (
-    "payload",
-    "link_inertia",
-    "rotor_inertia",
-    "viscous_friction",
-    "coulomb_friction",
-    "torque_constant",
-)
 
 
 @dataclass(frozen=True)
@@ -96,9 +84,12 @@ def pieces_of(model: Model, motion: Motion) -> Pieces:
     """Return what each part of the model's rigid arm contributes along a motion.
 
     The model's own effects count where they move the geometry or the gravity (joint offsets, say);
-    its payload effect does not count here, it enters by ``sense`` and ``drive``.
+    what loads the sensor or the motors does not count here, it enters by ``sense`` and ``drive``.
     """
-    geometry = replace(model, terms=tuple(t for t in model.terms if t.effect != "payload"))
+    own = {"wrench", "torque"}
+    geometry = replace(
+        model, terms=tuple(t for t in model.terms if not own & {*CATALOGUE[t.effect].channels})
+    )
     chain, rows = geometry.chain(), geometry.rows(motion.q, motion.loads)
     frames = frames_of(chain, rows.q, motion.qd, motion.qdd)
     n, count = model.arm.n, len(motion)
@@ -172,7 +163,7 @@ def predict_torque(model: Model, motion: Motion, terms: Sequence[Term] = ()) -> 
     pieces = _pieces(model, motion)
     torque: Array = pieces.link_torque.sum(axis=1) + pieces.external_torque
     torque = torque + pieces.payload_mass[:, None] * pieces.payload_torque
-    for term in _in_order(model, terms, DRIVING):
+    for term in acting((*model.terms, *terms), "torque"):
         torque = CATALOGUE[term.effect].drive(term, model.arm, torque, motion)
     return torque
 
@@ -184,7 +175,7 @@ def predict_wrench(model: Model, motion: Motion, terms: Sequence[Term] = ()) -> 
     """
     pieces = _pieces(model, motion)
     wrench = pieces.payload_mass[:, None] * pieces.payload_wrench + pieces.external_wrench
-    for term in _in_order(model, terms, SENSING):
+    for term in acting((*model.terms, *terms), "wrench"):
         wrench = CATALOGUE[term.effect].sense(term, model.arm, wrench, motion)
     return wrench
 
@@ -194,15 +185,10 @@ def predict_tracking(model: Model, motion: Motion, terms: Sequence[Term] = ()) -
     if motion.target_q is None:
         raise ValueError("the motion has no target_q")
     q = motion.target_q
-    for term in _in_order(model, terms, TRACKING):
+    for term in acting((*model.terms, *terms), "tracking"):
         q = CATALOGUE[term.effect].track(term, model.arm, q, motion)
     return q
 
 
 def _pieces(model: Model, motion: Motion) -> Pieces:
     return pieces_of(model, motion) if motion.pieces is None else motion.pieces
-
-
-def _in_order(model: Model, terms: Sequence[Term], order: tuple[str, ...]) -> list[Term]:
-    acting = [t for t in (*model.terms, *terms) if t.effect in order]
-    return sorted(acting, key=lambda term: order.index(term.effect))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arm import Arm
-from core.effects import CATALOGUE, Site, Term
+from core.effects import CATALOGUE, Site, Term, flexibility_effects
 from core.effects.effect import Effect
 from core.errors import InputError
 from core.kernel import Chain, Rows
@@ -67,8 +67,9 @@ class Model:
         self, axial: Sequence[float] | Array, radial: Sequence[float] | Array
     ) -> Model:
         """Return the model with these joint flexibilities (n each, rad/Nm) instead of its own."""
-        kept = [t for t in self.terms if t.effect not in ("axial_compliance", "radial_compliance")]
-        for effect, values in (("axial_compliance", axial), ("radial_compliance", radial)):
+        kept = [t for t in self.terms if not CATALOGUE[t.effect].flexibility]
+        named = flexibility_effects()
+        for effect, values in ((named["axial"], axial), (named["radial"], radial)):
             if len(values) != self.arm.n:
                 raise InputError(f"{effect}: found {len(values)} values, expected {self.arm.n}")
             kept += [Term(effect, Site(i + 1), (float(v),)) for i, v in enumerate(values) if v]

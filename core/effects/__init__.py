@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Iterable
 
 from core.effects.axial_compliance import AxialCompliance
 from core.effects.backlash import Backlash
@@ -62,6 +63,25 @@ CATALOGUE: dict[str, Effect] = {
 }
 
 
+def flexibility_effects() -> dict[str, str]:
+    """Return the effect behind each key of a cell's compliance section: axial, radial."""
+    return {e.flexibility: name for name, e in CATALOGUE.items() if e.flexibility}
+
+
+def correcting(what: str) -> tuple[str, ...]:
+    """Return the effects that correct one thing a cell declares: "payload", "tool", ..."""
+    return tuple(name for name, effect in CATALOGUE.items() if effect.corrects == what)
+
+
+def acting(terms: Iterable[Term], channel: str) -> list[Term]:
+    """Return the terms that show in a channel, in the order in which they act there.
+
+    On the way from load to reading: whatever order they were found in.
+    """
+    own = [t for t in terms if channel in CATALOGUE[t.effect].channels]
+    return sorted(own, key=lambda term: CATALOGUE[term.effect].order)
+
+
 def effect_named(identifier: str) -> Effect:
     """Return a member of the catalogue; raises InputError naming the nearest known one."""
     if identifier in CATALOGUE:
@@ -79,5 +99,8 @@ __all__ = [
     "Reported",
     "Site",
     "Term",
+    "acting",
+    "correcting",
     "effect_named",
+    "flexibility_effects",
 ]

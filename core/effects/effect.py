@@ -37,6 +37,7 @@ class Parameter:
     scale: float  # a usual size, for steps, priors and scaling
     lower: float = -np.inf
     upper: float = np.inf
+    of_rotation: bool = False  # True: shows only where the instrument measures rotations too
 
 
 @dataclass(frozen=True)
@@ -71,12 +72,39 @@ class Reported:
 
 
 class Effect(ABC):
-    """One member of the catalogue; its docstring is what ``gapbridge explain`` prints."""
+    """One member of the catalogue; its docstring is what ``gapbridge explain`` prints.
+
+    What the program needs to know of an effect is asked of its attributes, never of its name.
+    """
 
     identifier: ClassVar[str]
     channels: ClassVar[tuple[str, ...]]
     needs: ClassVar[tuple[str, ...]] = ()  # log columns beyond those of its channel
     motion: ClassVar[str] = ""  # what a log must contain so that the effect shows
+
+    # how people read it
+    title: ClassVar[str] = ""  # in plain words; left out: the identifier without underscores
+    label_words: ClassVar[str] = ""  # of one parameter, with {joint} and {part}
+    moved: ClassVar[str] = ""  # report of a verification that found it alone; '': not looked for
+
+    # how it acts
+    order: ClassVar[int] = 50  # place on the way from load to reading, in its channel
+    periodic: ClassVar[bool] = False  # True: sites have an order, and values are sine and cosine
+    delays: ClassVar[bool] = False  # True: its only value is a time that the joint comes late
+    by_approach: ClassVar[bool] = False  # True: acts by the joint's last motion
+    softens: ClassVar[bool] = False  # True: a flexibility, never below zero with the model's own
+    flexibility: ClassVar[str] = ""  # which of a joint's linear flexibilities: axial, radial
+    needs_softness: ClassVar[bool] = False  # True: positions show it by what bends alone
+    adds_mass: ClassVar[bool] = False  # True: kg beyond the declared payload
+    scales_reading: ClassVar[bool] = False  # True: the sensor reads zero where nothing acts
+    felt_by_all: ClassVar[bool] = False  # True: one cause moves coordinates of many joints
+
+    # how it is found
+    curved: ClassVar[bool] = False  # True: first value a slope, second what bends the line
+    contains: ClassVar[str] = ""  # the effect of the same joint that it stands instead of
+    sum_of: ClassVar[str] = ""  # the effect whose parameters together can be the same as this
+    calibrated: ClassVar[int] = 0  # turn in a calibration that names no effects; 0: none
+    corrects: ClassVar[str] = ""  # what of the cell a session measures anew instead
 
     def sites(self, arm: Arm) -> tuple[Site, ...]:
         """Return where the effect can sit on this arm."""
@@ -85,6 +113,13 @@ class Effect(ABC):
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the parameters of one occurrence."""
         raise NotImplementedError
+
+    def angle_columns(self, site: Site, q: Array) -> Array | None:
+        """Return d joint angle / d parameter (N, d) at encoder angles ``q`` (N,) of its joint.
+
+        For effects that turn the joint by its own angle alone; None for all others.
+        """
+        return None
 
     def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
         """Change the chain in place: what holds for all rows (position channel)."""
