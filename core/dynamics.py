@@ -153,6 +153,11 @@ def _at_flange(frames: Frames, point: Array, force: Array, moment: Array) -> Arr
     return np.concatenate([_times(hand, force), _times(hand, whole)], axis=1)
 
 
+def with_held(model: Model, motion: Motion) -> Motion:
+    """Return the motion with the torques that the joints hold in it at rest."""
+    return replace(motion, held=model.held_torque(motion.q, motion.loads))
+
+
 def with_pieces(model: Model, motion: Motion) -> Motion:
     """Return the motion with the model's contributions, which effects and predictions need."""
     return replace(motion, pieces=pieces_of(model, motion))
@@ -185,6 +190,8 @@ def predict_tracking(model: Model, motion: Motion, terms: Sequence[Term] = ()) -
     if motion.target_q is None:
         raise ValueError("the motion has no target_q")
     q = motion.target_q
+    if motion.held is None:
+        motion = with_held(model, motion)
     for term in acting((*model.terms, *terms), "tracking"):
         q = CATALOGUE[term.effect].track(term, model.arm, q, motion)
     return q

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arm import Arm
-from core.effects import CATALOGUE, Site, Term, flexibility_effects
+from core.effects import CATALOGUE, Site, Term, flexibility_effects, settling
 from core.effects.effect import Effect
 from core.errors import InputError
 from core.kernel import Chain, Rows
@@ -146,6 +146,25 @@ class Model:
         position, rotation = np.empty((count, 3)), np.empty((count, 3, 3))
         _require_equilibrium(many.predict(chain, rows, position, rotation))
         return Poses(position, rotation)
+
+    def held_torque(self, q: Array, loads: Loads | None = None) -> Array:
+        """Return the torques (N, n), Nm, that the joints hold at rest at encoder angles ``q``.
+
+        Gravity, payload and pull, about the joints' axes where the bent arm has them; positive
+        where the motor pushes towards positive q. Raises InputError where a row has no equilibrium.
+        """
+        form = self.linear_form(q, loads)
+        return -np.asarray(np.einsum("nij,nji->ni", form.moment, form.jacobian[:, 3:]))
+
+    def settled(self, commands: Array, loads: Loads | None = None) -> Array:
+        """Return where the encoders (N, n) come to rest for ``commands`` (N, n), rad."""
+        terms, q = settling(self.terms), np.atleast_2d(commands)
+        if terms:
+            loads = loads or Loads()
+            held = self.held_torque(q, loads)
+            for term in terms:
+                q = CATALOGUE[term.effect].settle(term, self.arm, q, held, loads.approach)
+        return q
 
     def rigid_pose(self, q: Array) -> Poses:
         """Return the TCP poses of the rigid, effect-free arm at ``q`` (N, n)."""

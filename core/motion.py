@@ -62,6 +62,7 @@ class Motion:
     moving: bool  # False: poses at rest
     still: Array  # (n,) rad/s below which the direction of motion is unsure
     pieces: Pieces | None = None
+    held: Array | None = None  # (N, n) Nm that each joint holds at rest: gravity, payload, pull
 
     def __len__(self) -> int:
         return len(self.t)
@@ -74,6 +75,7 @@ class Motion:
             target_q=None if self.target_q is None else self.target_q[rows],
             loads=self.loads[index], rows=self.rows[rows], valid=self.valid[rows],
             stretch=self.stretch[rows], pieces=None,
+            held=None if self.held is None else self.held[rows],
         )  # fmt: skip
 
     @property

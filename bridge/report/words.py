@@ -39,6 +39,7 @@ _COLUMNS = {
     "actual_qd": "speed of joint",
     "joint_temperatures": "temperature of joint",
     "approach": "last motion of joint",
+    "held_torque": "torque held by joint",
 }
 _VECTORS = {
     "payload_cog": "centre of gravity of the load",
@@ -75,7 +76,7 @@ def quantity_unit(name: str) -> tuple[str, float]:
         return "deg", 180 / math.pi
     units = {
         "actual_qd": "rad/s", "joint_temperatures": "°C", "actual_TCP_force": "N",
-        "timestamp": "s", "approach": "",
+        "timestamp": "s", "approach": "", "held_torque": "Nm",
     }  # fmt: skip
     for start, unit in units.items():
         if name.startswith(start):

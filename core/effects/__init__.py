@@ -9,6 +9,7 @@ from core.effects.axial_compliance import AxialCompliance
 from core.effects.backlash import Backlash
 from core.effects.base_compliance import BaseCompliance
 from core.effects.coulomb_friction import CoulombFriction
+from core.effects.dead_band import DeadBand
 from core.effects.effect import CHANNELS, Effect, Parameter, Reported, Site, Term
 from core.effects.ft_bias import FtBias
 from core.effects.ft_drift import FtDrift
@@ -23,6 +24,7 @@ from core.effects.link_inertia import LinkInertia
 from core.effects.payload import Payload
 from core.effects.radial_compliance import RadialCompliance
 from core.effects.rotor_inertia import RotorInertia
+from core.effects.servo_droop import ServoDroop
 from core.effects.stiffness_nonlinearity import StiffnessNonlinearity
 from core.effects.thermal_drift import ThermalDrift
 from core.effects.tool_frame import ToolFrame
@@ -54,6 +56,8 @@ CATALOGUE: dict[str, Effect] = {
         FtMisalignment(),
         Latency(),
         TrackingLag(),
+        ServoDroop(),
+        DeadBand(),
         CoulombFriction(),
         ViscousFriction(),
         RotorInertia(),
@@ -82,6 +86,12 @@ def acting(terms: Iterable[Term], channel: str) -> list[Term]:
     return sorted(own, key=lambda term: CATALOGUE[term.effect].order)
 
 
+def settling(terms: Iterable[Term]) -> list[Term]:
+    """Return the terms by which encoders rest elsewhere than commanded, in order of action."""
+    own = Effect.settle
+    return [t for t in acting(terms, "tracking") if type(CATALOGUE[t.effect]).settle is not own]
+
+
 def effect_named(identifier: str) -> Effect:
     """Return a member of the catalogue; raises InputError naming the nearest known one."""
     if identifier in CATALOGUE:
@@ -103,4 +113,5 @@ __all__ = [
     "correcting",
     "effect_named",
     "flexibility_effects",
+    "settling",
 ]

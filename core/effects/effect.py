@@ -140,6 +140,18 @@ class Effect(ABC):
 
     def track(self, term: Term, arm: Arm, q: Array, motion: Motion) -> Array:
         """Return where the encoders would stand instead of ``q`` (N, n)."""
+        assert motion.held is not None
+        return self.settle(term, arm, q, motion.held, motion.loads.approach)
+
+    def settle(
+        self, term: Term, arm: Arm, q: Array, held: Array, approach: Array | None
+    ) -> Array:
+        """Return where the encoders come to rest for commands ``q`` (N, n), rad.
+
+        ``held`` (N, n) is the torque that each joint holds there, Nm about its axis, positive where
+        the motor pushes towards positive q; ``approach`` (N, n) the sign of its last motion. What
+        differs from ``q`` is made up for in live setpoints.
+        """
         return q
 
     def drive(self, term: Term, arm: Arm, torque: Array, motion: Motion) -> Array:
