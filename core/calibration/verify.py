@@ -182,7 +182,7 @@ def _suspects(
 def _stories(model: Model, readings: Readings) -> list[tuple[str, tuple[str, ...]]]:
     mass = readings.loads.payload_mass
     loaded = model.payload_mass > 0 if mass is None else bool((mass > 0).any())
-    stories = []
+    stories: list[tuple[str, tuple[str, ...]]] = []
     for identifier, effect in CATALOGUE.items():
         if not effect.moved or (effect.adds_mass and not loaded):
             continue

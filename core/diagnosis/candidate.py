@@ -19,6 +19,7 @@ from core.effects import CATALOGUE, Effect, Parameter, Site, Term
 from core.errors import InputError
 
 Array = NDArray[np.float64]
+HELD = "held_torque"  # Nm that a joint holds at rest, by joint: a quantity beside the log's columns
 STEP = 1e-2  # of a parameter's usual scale, for central differences
 WHOLE_ORDERS = 128  # cycles a turn that are looked through one by one
 CYCLES = 1.5  # of a periodic line over the joint's range, at least
@@ -90,6 +91,12 @@ def own_target(quantity: str) -> str:
     """Return the joint whose angle the quantity is, as smooth targets are named ('' if none)."""
     stem, _, index = quantity.rpartition("_")
     return f"joint_{int(index) + 1}" if stem in ("actual_q", "target_q") else ""
+
+
+def carrying(quantity: str) -> str:
+    """Return the joint that holds the torque of a quantity, as own_target ('' if none)."""
+    stem, _, index = quantity.rpartition("_")
+    return f"joint_{int(index) + 1}" if stem == HELD else ""
 
 
 def named_candidates(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from core.diagnosis.candidate import HELD
 from core.identification import pose_groups
 from core.log import Log
 from core.motion import Motion
@@ -76,7 +77,7 @@ def held_torques(motion: Motion) -> dict[str, Array]:
         return {}
     largest = max(float(np.abs(motion.held).max(initial=0.0)), SMALLEST_TORQUE)
     return {
-        f"held_torque_{i}": motion.held[:, i]
+        f"{HELD}_{i}": motion.held[:, i]
         for i in np.flatnonzero(np.ptp(motion.held, axis=0) > HARDLY * largest)
     }
 
