@@ -14,16 +14,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core import kernel
 from core.effects import CATALOGUE, settling
-from core.kernel import JIT, Chain
+from core.kernels import reference as kernel
 from core.kernels import single
-from core.kernels.single import LEVER, MAX_STEPS, SCRATCH, TOLERANCE
-from core.least_offset import LARGEST_OFFSET as LARGEST_OFFSET
-from core.least_offset import smallest_offset
-from core.loads import Loads
-from core.model import Model, Poses
-from core.packed import (
+from core.kernels.least_offset import LARGEST_OFFSET as LARGEST_OFFSET
+from core.kernels.least_offset import smallest_offset
+from core.kernels.packed import (
     arm_block,
     chain_of,
     row_of,
@@ -33,6 +29,10 @@ from core.packed import (
     view_row,
     view_shape,
 )
+from core.kernels.reference import JIT, Chain
+from core.kernels.single import LEVER, MAX_STEPS, SCRATCH, TOLERANCE
+from core.loads import Loads
+from core.model import Model, Poses
 
 Array = NDArray[np.float64]
 NOTHING = Loads()

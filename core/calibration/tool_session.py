@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.calibration.result import Estimate
-from core.calibration.robust import Weighed, weighed
 from core.effects import correcting
 from core.errors import ExcitationError, InputError
+from core.estimation.robust import Weighed, weighed
 from core.loads import Loads
 from core.model import Model
 

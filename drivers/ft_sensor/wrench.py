@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core import kernel
 from core.effects import CATALOGUE, acting
+from core.kernels import reference as kernel
 from core.loads import Loads
 from core.model import Model
 from core.motion import Motion
