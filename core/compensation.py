@@ -8,6 +8,7 @@ one.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -266,7 +267,8 @@ class Compensator:
 def correct(model: Model, nominal_q: Array, loads: Loads | None = None) -> Correction:
     """Return the corrected setpoints of many rows (N, n): ``Compensator.correct`` row by row."""
     q = np.atleast_2d(np.asarray(nominal_q, dtype=float))
-    loads, live = loads or Loads(), Compensator(model)
+    # what slipped once has slipped: setpoints are for what comes
+    loads, live = replace(loads or Loads(), time=None), Compensator(model)
     results = [live.correct(q[r], loads[r : r + 1]) for r in range(len(q))]
     return Correction(
         np.array([c.q for c in results]).reshape(q.shape),

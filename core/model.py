@@ -145,6 +145,9 @@ class Model:
         count = len(rows.q)
         position, rotation = np.empty((count, 3)), np.empty((count, 3, 3))
         _require_equilibrium(many.predict(chain, rows, position, rotation))
+        if loads is not None and loads.time is not None:
+            for term in self.terms:
+                CATALOGUE[term.effect].before(term, chain, position, rotation, loads)
         return Poses(position, rotation)
 
     def held_torque(self, q: Array, loads: Loads | None = None) -> Array:

@@ -164,10 +164,10 @@ def _sites(model: Model, named: str) -> list[tuple[str, Site]]:
     stem, _, number = named.rpartition("_")
     joint = int(number) if number.isdigit() and stem in CATALOGUE else None
     effect = effect_named(named if joint is None else stem)
-    if "position" not in effect.channels:
+    if not effect.calibratable:
         raise InputError(
             f"effect: found {named!r}, expected one that measured positions show: "
-            + ", ".join(e for e, member in CATALOGUE.items() if "position" in member.channels)
+            + ", ".join(e for e, member in CATALOGUE.items() if member.calibratable)
         )
     sites = [s for s in effect.sites(model.arm) if joint is None or s.joint == joint]
     if not sites:

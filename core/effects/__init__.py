@@ -17,18 +17,25 @@ from core.effects.ft_gain import FtGain
 from core.effects.ft_misalignment import FtMisalignment
 from core.effects.gravity_direction import GravityDirection
 from core.effects.joint_offset import JointOffset
+from core.effects.joint_slip import JointSlip
 from core.effects.latency import Latency
+from core.effects.link_cog import LinkCog
 from core.effects.link_flexibility import LinkFlexibility
 from core.effects.link_geometry import LinkGeometry
 from core.effects.link_inertia import LinkInertia
+from core.effects.load_friction import LoadFriction
 from core.effects.payload import Payload
+from core.effects.payload_cog import PayloadCog
 from core.effects.radial_compliance import RadialCompliance
 from core.effects.rotor_inertia import RotorInertia
 from core.effects.servo_droop import ServoDroop
 from core.effects.stiffness_nonlinearity import StiffnessNonlinearity
+from core.effects.stribeck_friction import StribeckFriction
+from core.effects.target_slip import TargetSlip
 from core.effects.thermal_drift import ThermalDrift
 from core.effects.tool_frame import ToolFrame
 from core.effects.torque_constant import TorqueConstant
+from core.effects.torque_offset import TorqueOffset
 from core.effects.tracking_lag import TrackingLag
 from core.effects.transmission_error import TransmissionError
 from core.effects.viscous_friction import ViscousFriction
@@ -38,8 +45,10 @@ CATALOGUE: dict[str, Effect] = {
     effect.identifier: effect
     for effect in (
         JointOffset(),
+        JointSlip(),
         LinkGeometry(),
         ToolFrame(),
+        TargetSlip(),
         TransmissionError(),
         AxialCompliance(),
         RadialCompliance(),
@@ -48,6 +57,7 @@ CATALOGUE: dict[str, Effect] = {
         BaseCompliance(),
         GravityDirection(),
         Payload(),
+        PayloadCog(),
         Backlash(),
         ThermalDrift(),
         FtBias(),
@@ -60,8 +70,12 @@ CATALOGUE: dict[str, Effect] = {
         DeadBand(),
         CoulombFriction(),
         ViscousFriction(),
+        StribeckFriction(),
+        LoadFriction(),
+        TorqueOffset(),
         RotorInertia(),
         LinkInertia(),
+        LinkCog(),
         TorqueConstant(),
     )
 }

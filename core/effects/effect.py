@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from abc import ABC
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,20 +91,28 @@ class Effect(ABC):
     order: ClassVar[int] = 50  # place on the way from load to reading, in its channel
     periodic: ClassVar[bool] = False  # True: sites have an order, and values are sine and cosine
     delays: ClassVar[bool] = False  # True: its only value is a time that the joint comes late
+    at_moment: ClassVar[bool] = False  # True: steps once; the last value is when
     by_approach: ClassVar[bool] = False  # True: acts by the joint's last motion
     softens: ClassVar[bool] = False  # True: a flexibility, never below zero with the model's own
     flexibility: ClassVar[str] = ""  # which of a joint's linear flexibilities: axial, radial
     needs_softness: ClassVar[bool] = False  # True: positions show it by what bends alone
+    carried: ClassVar[bool] = False  # True: a load on the joints, which friction may grow with
     adds_mass: ClassVar[bool] = False  # True: kg beyond the declared payload
     scales_reading: ClassVar[bool] = False  # True: the sensor reads zero where nothing acts
     felt_by_all: ClassVar[bool] = False  # True: one cause moves coordinates of many joints
 
     # how it is found
+    shapes: ClassVar[tuple[float, ...]] = ()  # last values that a search begins with
     curved: ClassVar[bool] = False  # True: first value a slope, second what bends the line
     contains: ClassVar[str] = ""  # the effect of the same joint that it stands instead of
     sum_of: ClassVar[str] = ""  # the effect whose parameters together can be the same as this
     calibrated: ClassVar[int] = 0  # turn in a calibration that names no effects; 0: none
     corrects: ClassVar[str] = ""  # what of the cell a session measures anew instead
+
+    @property
+    def calibratable(self) -> bool:
+        """Return whether a calibration can look for it: measured positions show it all the time."""
+        return "position" in self.channels and not self.at_moment
 
     def sites(self, arm: Arm) -> tuple[Site, ...]:
         """Return where the effect can sit on this arm."""
@@ -134,6 +142,14 @@ class Effect(ABC):
     def condition(self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: Array) -> None:
         """Change the rows in place; ``q`` (N, n) are the encoder angles (position channel)."""
 
+    def before(
+        self, term: Term, chain: Chain, position: Array, rotation: Array, loads: Loads
+    ) -> None:
+        """Put predicted TCP poses (N, 3), (N, 3, 3) back in rows before the term's moment.
+
+        For effects whose ``shape`` holds from a moment on.
+        """
+
     def sense(self, term: Term, arm: Arm, wrench: Array, motion: Motion) -> Array:
         """Return what the flange sensor would read instead of ``wrench`` (N, 6)."""
         return wrench
@@ -143,9 +159,7 @@ class Effect(ABC):
         assert motion.held is not None
         return self.settle(term, arm, q, motion.held, motion.loads.approach)
 
-    def settle(
-        self, term: Term, arm: Arm, q: Array, held: Array, approach: Array | None
-    ) -> Array:
+    def settle(self, term: Term, arm: Arm, q: Array, held: Array, approach: Array | None) -> Array:
         """Return where the encoders come to rest for commands ``q`` (N, n), rad.
 
         ``held`` (N, n) is the torque that each joint holds there, Nm about its axis, positive where
@@ -182,6 +196,14 @@ class JointEffect(Effect):
     def sites(self, arm: Arm) -> tuple[Site, ...]:
         """Return one site a joint."""
         return tuple(Site(joint=i + 1) for i in range(arm.n))
+
+
+def rows_after(term: Term, loads: Loads) -> Any:
+    """Return an index of the rows that are later than a term's moment; all where time is unknown.
+
+    The moment is the term's last value.
+    """
+    return slice(None) if loads.time is None else loads.time > term.values[-1]
 
 
 def typical_moment(arm: Arm) -> float:

@@ -28,6 +28,7 @@ class LinkInertia(JointEffect):
     title = "link weighs more or less"
     order = 20
     felt_by_all = True
+    carried = True
     channels = ("torque",)
     motion = "many poses, and accelerations of all joints up to the link"
 

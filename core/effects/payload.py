@@ -29,6 +29,7 @@ class Payload(Effect):
     order = 10
     needs_softness = True
     adds_mass = True
+    carried = True
     felt_by_all = True
     corrects = "payload"
     moved = "the load differs from what was declared by {size}"

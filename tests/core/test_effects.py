@@ -12,12 +12,12 @@ from core.dynamics import predict_torque, predict_tracking, predict_wrench, with
 from core.effects import CATALOGUE, CHANNELS, Site, Term, effect_named
 from core.errors import InputError
 from core.loads import Loads
-from core.log import Log
+from core.log.log import Log
 from core.model import Model
 from core.motion import motion_of
 
 DH = {"ur10e": builtin_rows("ur10e")["dh"], "seven": SEVEN}
-WITHOUT_UNIT = ("ft_gain", "link_inertia", "torque_constant")  # shares of what is there
+WITHOUT_UNIT = ("ft_gain", "link_inertia", "load_friction", "torque_constant")  # shares of what is there
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
@@ -114,7 +114,9 @@ def test_every_member_changes_every_channel_that_it_declares(name, channel):
     member, arm = CATALOGUE[name], arm_from_dh(DH["ur10e"])
     tool = np.eye(4)
     tool[:3, 3] = [0.05, 0.02, 0.15]
-    model = Model(arm, tool, payload_mass=3.0, payload_cog=np.array([0.02, 0.0, 0.1]))
+    tilted = np.array([2.0, 1.0, -9.5])  # joint 1 holds something too
+    cog = np.array([0.02, 0.0, 0.1])
+    model = Model(arm, tool, payload_mass=3.0, payload_cog=cog, gravity=tilted)
     model = model.with_compliance([1e-5] * 6, [5e-6] * 6)
     plain = _predicted(channel, model, ())
     for site in member.sites(arm):

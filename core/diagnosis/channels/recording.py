@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.selection.candidate import HELD
+from core.diagnosis.channels.observation import HELD
 from core.estimation.identification import pose_groups
 from core.log.log import Log
 from core.motion import Motion

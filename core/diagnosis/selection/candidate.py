@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arm import Arm
-from core.diagnosis.channels.observation import Observation
+from core.diagnosis.channels.observation import HELD, Observation
 from core.effects import CATALOGUE, Effect, Parameter, Site, Term
 from core.errors import InputError
 
 Array = NDArray[np.float64]
-HELD = "held_torque"  # Nm that a joint holds at rest, by joint: a quantity beside the log's columns
 STEP = 1e-2  # of a parameter's usual scale, for central differences
 WHOLE_ORDERS = 128  # cycles a turn that are looked through one by one
 CYCLES = 1.5  # of a periodic line over the joint's range, at least
@@ -39,6 +38,7 @@ class Candidate:
     parameters: tuple[Parameter, ...]
     fixed: tuple[float | None, ...]  # per parameter of the effect: None = fitted
     curve: float | None = None  # softening of a bent stiffness curve: columns straight, and bent
+    tried: int = 1  # hypotheses that this one was picked from
     quantity: str = ""  # what a smooth candidate depends on
     target: str = ""  # and what it moves
 
@@ -114,7 +114,7 @@ def named_candidates(
     """
     found = []
     for identifier, effect in CATALOGUE.items():
-        if channel not in effect.channels or identifier in set(withheld):
+        if channel not in effect.channels or identifier in set(withheld) or effect.at_moment:
             continue
         for site in effect.sites(arm):
             inside = [t for t in base if t.effect == identifier and t.site.joint == site.joint]
@@ -156,6 +156,13 @@ def _at(
                 curve=s * parameters[1].scale,
             )
             for s in SOFTENING
+        ]
+    if effect.shapes:
+        had = {t.values[-1] for t in inside}
+        held = (None,) * (len(parameters) - 1)
+        return [
+            Candidate(effect.identifier, site, parameters[:-1], (*held, shape))
+            for shape in (*effect.shapes, *(had - {*effect.shapes}))
         ]
     if any(p.of_rotation for p in parameters) and not with_rotation:
         shown = tuple(p for p in parameters if not p.of_rotation)

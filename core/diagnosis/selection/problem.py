@@ -98,7 +98,7 @@ def prices(candidates: Sequence[Candidate], freedom: float) -> Array:
     families = {c.family for c in candidates if c.named} or {""}
     count: dict[str, int] = {}
     for c in candidates:
-        count[_kind(c)] = count.get(_kind(c), 0) + 1
+        count[_kind(c)] = count.get(_kind(c), 0) + c.tried
     paid = []
     for c in candidates:
         tried = count[_kind(c)] * (len(families) if c.named else 1)

@@ -152,7 +152,7 @@ def _share(
 
 def _freed(arm: Arm, candidate: Candidate) -> Candidate:
     """Return the candidate with what its columns held fixed (a softening) fitted too."""
-    if not candidate.effect.curved:
+    if not (candidate.effect.curved or candidate.effect.shapes):
         return candidate
     parameters = candidate.effect.parameters(arm, candidate.site)
     return replace(candidate, parameters=parameters, fixed=(None,) * len(parameters), curve=None)

@@ -22,6 +22,7 @@ from core.diagnosis.selection.candidate import (
 )
 from core.diagnosis.selection.following import exact_columns
 from core.diagnosis.selection.local_search import pruned
+from core.diagnosis.selection.moments import step_candidates
 from core.diagnosis.selection.noise import Noise, estimate_noise
 from core.diagnosis.selection.outliers import look_again, look_for_wild, with_wild_explained
 from core.diagnosis.selection.problem import Found, Space, fit
@@ -105,6 +106,9 @@ def select(
         columns = [exact_columns(work.observation, c, base) for c in work.candidates]
         if turn == 0:
             look_for_wild(work, columns)
+        stepping = step_candidates(work, columns, base, withheld)
+        work.candidates += [candidate for candidate, _ in stepping]
+        columns += [own for _, own in stepping]
         space, raw = sample_space(work, columns, base, smooth)
         inside = [locate(work.candidates, t)[0] for t in base]
         best = screened_search(space, base=inside)

@@ -18,7 +18,7 @@ from core.arm import builtin_arm
 from core.compensation import Compensator
 from core.dynamics import predict_torque, predict_tracking, predict_wrench, with_pieces
 from core.effects import CATALOGUE, Site, Term
-from core.log import Log
+from core.log.log import Log
 from core.model import Model
 from core.motion import motion_of
 
