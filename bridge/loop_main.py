@@ -87,7 +87,7 @@ def _make_source(settings: DaemonSettings, model: Model, driver: Driver) -> Sour
     """Return where setpoints come from; on a recording they are in the recording."""
     is_replay = isinstance(driver, ReplayDriver)
     setpoints = SetpointSettings() if is_replay else settings.setpoints
-    return make_source(setpoints, model.arm.n, driver.moves_arm, settings.cell.parent)
+    return make_source(setpoints, model.arm.n, driver.moves_arm, settings.cell.parent, driver.rate)
 
 
 def _make_loop(

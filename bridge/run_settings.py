@@ -10,7 +10,9 @@ from pydantic import ValidationError
 
 from bridge.cell import Cell, load_cell
 from bridge.daemon_settings import DaemonSettings
-from bridge.served.credentials import check_credentials
+from bridge.runtime_folder import cell_key, runtime_folder
+from bridge.served.credentials import check_credentials, read_token
+from bridge.settings import SetpointSettings
 from core.errors import CellError, InputError
 
 
@@ -54,15 +56,31 @@ def settings_of(cell: Cell) -> DaemonSettings:
                 check_credentials(served, section)
             except InputError as error:
                 raise CellError(f"{cell.path}: {error}") from None
+    setpoints = _setpoints_of(cell)
     try:
         return DaemonSettings(
-            cell=cell.path.resolve(), link=cell.link, limits=cell.limits,
-            setpoints=cell.setpoints.model_copy(
-                update={"file": cell.setpoints.file and cell.setpoints.file.resolve()}
-            ),
+            cell=cell.path.resolve(), link=cell.link, limits=cell.limits, setpoints=setpoints,
             recording=cell.recording, ft_sensor=cell.ft_sensor,
             web=cell.web, metrics=cell.metrics,
         )  # fmt: skip
     except ValidationError as error:
         words = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
         raise CellError(f"{cell.path}: {words}") from None
+
+
+def _setpoints_of(cell: Cell) -> SetpointSettings:
+    """Return section ``setpoints`` with whole paths, its token checked. Raises CellError."""
+    given = cell.setpoints
+    update = {
+        name: path.resolve()
+        for name in ("file", "socket", "token_file")
+        if (path := getattr(given, name)) is not None
+    }
+    if given.source == "planner" and given.socket is None:
+        update["socket"] = runtime_folder() / f"{cell_key(cell.path)}.planner.sock"
+    if given.source == "tcp" and given.token_file is not None:
+        try:
+            read_token(given.token_file, "setpoints.token_file")
+        except InputError as error:
+            raise CellError(f"{cell.path}: {error}") from None
+    return given.model_copy(update=update)

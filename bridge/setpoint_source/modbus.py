@@ -27,8 +27,10 @@ class ModbusSource(Source):
     Raises InputError for an arm with more joints than the registers hold.
     """
 
-    def __init__(self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path) -> None:
-        super().__init__(settings, n, moves_arm, folder)
+    def __init__(
+        self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
+    ) -> None:
+        super().__init__(settings, n, moves_arm, folder, rate)
         if n > MOST_JOINTS:
             raise InputError(f"setpoints.source modbus: found {n} joints, expected {MOST_JOINTS}")
         self._glide = Glide(settings.timeout, "new sequence number")

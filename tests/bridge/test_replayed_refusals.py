@@ -89,7 +89,7 @@ def test_refused_and_half_sent_setpoints_gaps_and_lost_sensors_are_replayed(tmp_
     model = load_cell(cell).model
     settings = DaemonSettings(cell=cell)
     page, told = Page(N), []
-    source = TargetSource(SetpointSettings(), N, False, tmp_path)
+    source = TargetSource(SetpointSettings(), N, False, tmp_path, 20.0)
     loop = Loop(settings, model, Scripted(1800, page), source, page, told.append)
     _compile(settings, model)  # else the first cycles are late
     then = run(loop, page, tmp_path, "then")
