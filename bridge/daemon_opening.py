@@ -21,7 +21,7 @@ def open_all(daemon: Daemon, stack: ExitStack, arm: bool, by: str) -> bool:
     Raises InputError where the controller has an owner already, or a folder cannot be used.
     """
     settings = daemon.settings
-    stack.callback(daemon.page.close)
+    stack.callback(daemon.close_memory)
     lock = OwnerLock(address_of(settings.link), settings.cell)
     stack.enter_context(lock)
     folder = settings.recording.folder
@@ -53,8 +53,6 @@ def open_all(daemon: Daemon, stack: ExitStack, arm: bool, by: str) -> bool:
             }
         )
         return False
-    if arm:
-        daemon.told_to_arm(by)
     return arm
 
 

@@ -1,9 +1,9 @@
 """The loop's process: ``python -m bridge.loop_main``, started by the daemon and by nobody else.
 
 It holds the loop and one driver, and is expendable: the robot's library can abort it, crash it or
-hang it. Settings come as one line of JSON on stdin; cycles go out through shared memory, events as
-lines of JSON through a pipe. It always ends by ``os._exit``, because destroying the library's
-objects is not safe.
+hang it. Settings come as one line of JSON on stdin, requests through memory that only the daemon
+writes to; cycles go out through shared memory, events as JSON through a socket. It always ends by
+``os._exit``, because destroying the library's objects is not safe.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from bridge.command_page import Commands
 from bridge.daemon_settings import DaemonSettings
 from bridge.loop import Exit, Loop
 from bridge.realtime import become_realtime
@@ -41,7 +42,7 @@ from drivers.ft_sensor.joined import DriverWithSensor
 from drivers.replay import ReplayDriver
 
 _PR_SET_PDEATHSIG = 1
-LONGEST_WORDS = 1000  # of an event: a line that a pipe takes whole or not at all
+LONGEST_WORDS = 1000  # of an event
 
 
 def main() -> None:
@@ -80,7 +81,8 @@ def _run(order: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Exit:
     if order["may_write"]:
         source.open()
     tell({"kind": "granted", "detail": ", ".join(become_realtime(1.0 / driver.rate))})
-    return loop.run(order["arm"], order["may_write"], order["latched"])
+    commands = Commands(order["commands"], order["after"])
+    return loop.run(commands, order["may_write"], order["latched"])
 
 
 def _make_source(settings: DaemonSettings, model: Model, driver: Driver) -> Source:
@@ -108,9 +110,8 @@ def _teller(events: int) -> Callable[[dict[str, Any]], None]:
         if len(event.get("detail", "")) > LONGEST_WORDS:
             event = {**event, "detail": event["detail"][:LONGEST_WORDS]}
         now = {"time": time.time(), "monotonic": time.monotonic()}
-        line = json.dumps({**now, **event}) + "\n"
-        with contextlib.suppress(OSError):
-            os.write(events, line.encode())
+        with contextlib.suppress(OSError):  # a message each: taken whole, or not at all
+            os.write(events, json.dumps({**now, **event}).encode())
 
     return tell
 

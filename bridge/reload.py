@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from bridge.cell.cell import complaints
 from bridge.owner_lock import address_of
 from bridge.run_settings import Configuration, read_configuration
-from bridge.shared_page import Command, Phase
+from bridge.shared_page import Phase
 from bridge.supervisor import State
 from core.errors import GapbridgeError
 
@@ -47,7 +47,7 @@ class Reload:
         if self._next is None or self.wants_end or phase == Phase.ARMING:
             return
         if state in (State.ARMED, State.COMPENSATING):
-            self._daemon.page.ask(Command.DISARM)
+            self._daemon.ramp_out()
         elif state != State.HOLDING:
             self.wants_end = True
 

@@ -125,7 +125,7 @@ Promise.all(ways).then(found => {{ document.title = found.join(); }});
         self.end_headers()
         self.wfile.write(text)
 
-    def log_message(self, format: str, *args: object) -> None:
+    def log_message(self, *_: object) -> None:
         pass
 
 
