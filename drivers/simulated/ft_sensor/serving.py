@@ -9,7 +9,7 @@ from pathlib import Path
 
 from core.addresses import is_loopback
 from core.errors import InputError, LinkError
-from drivers.can.bus import BusSettings
+from drivers.can_bus.bus import BusSettings
 from drivers.ft_sensor.settings import (
     AtiSettings,
     FtSensorSettings,
