@@ -17,6 +17,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "bridge.cli.export:export_recording",
         "Turn a recording of the daemon into a log.",
     ),
+    "convert": (
+        "bridge.cli.convert:convert",
+        "Turn a ROS bag, an MCAP file or a LeRobot dataset into a log.",
+    ),
     "fit": ("bridge.cli.fit:fit", "Identify the compliance of a cell from a log."),
     "predict": ("bridge.cli.predict:predict", "Predict the TCP pose of every row of a log."),
     "compensate": (
