@@ -28,6 +28,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Correct the setpoint of every row of a log.",
     ),
     "diagnose": ("bridge.cli.diagnose:diagnose", "Diagnose the sim-to-real gap of a log."),
+    "patch": (
+        "bridge.cli.patch:patch",
+        "Write a cell's effects into a simulator's model.",
+    ),
     "fleet": ("bridge.cli.fleet:fleet", "Diagnose or fit many arms over many sessions."),
     "blind": ("bridge.cli.blind:blind", "Run the blind benchmark of the diagnosis."),
     "explain": ("bridge.cli.explain:explain", "Explain an effect of the catalogue."),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from core.effects.effect import JointEffect, Parameter, Site, Term
+from core.effects.simulator import Kind, SimulatorChange
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,10 +27,15 @@ class Backlash(JointEffect):
     identifier = "backlash"
     channels = ("position",)
     motion = "poses reached from both sides of the joint"
+    instead = "add a joint about the same axis, limited to half the clearance on each side"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the whole clearance."""
         return (Parameter("", "rad", 3e-4, 0.0, 0.1),)
+
+    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
+        """Return it in a simulator's terms."""
+        return (SimulatorChange(Kind.PLAY, term.site.joint, term.values[0]),)
 
     def condition(
         self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]

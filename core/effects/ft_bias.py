@@ -31,6 +31,7 @@ class FtBias(Effect):
     identifier = "ft_bias"
     channels = ("wrench",)
     motion = "poses that turn the flange by tens of degrees against gravity"
+    instead = "subtract the bias from the sensor's readings"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return force (N) and torque (Nm) along the flange axes."""

@@ -31,6 +31,7 @@ class FtGain(Effect):
     identifier = "ft_gain"
     channels = ("wrench",)
     motion = "a load on every axis: the flange turned every way, with pulls or several payloads"
+    instead = "divide the sensor's readings by 1 + gain"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the relative errors along the flange axes."""

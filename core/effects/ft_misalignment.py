@@ -29,6 +29,7 @@ class FtMisalignment(Effect):
     identifier = "ft_misalignment"
     channels = ("wrench",)
     motion = "loads along at least two directions of the flange"
+    instead = "turn the sensor's frame, or its readings"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the rotation vector of the sensor in the flange."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from core.effects.effect import JointEffect, Parameter, Site, Term
+from core.effects.simulator import Kind, SimulatorChange
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,6 +33,10 @@ class JointOffset(JointEffect):
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the offset."""
         return (Parameter("", "rad", 1e-3, -0.5, 0.5),)
+
+    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
+        """Return it in a simulator's terms."""
+        return (SimulatorChange(Kind.JOINT_ZERO, term.site.joint, term.values[0]),)
 
     def condition(
         self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]

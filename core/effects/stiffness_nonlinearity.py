@@ -28,6 +28,7 @@ class StiffnessNonlinearity(JointEffect):
     identifier = "stiffness_nonlinearity"
     channels = ("position",)
     motion = "at least three well separated torques about the joint's axis"
+    instead = "add a joint with the spring 1/c + theta^2 / (2 c^3 M0^2)"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return c and the softening 1/M0^2, in which the curve starts linear."""

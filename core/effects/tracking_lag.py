@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from core.effects.effect import JointEffect, Parameter, Site, Term
+from core.effects.simulator import Kind, SimulatorChange
 from core.interpolation import lagged, stretches
 
 if TYPE_CHECKING:
@@ -29,10 +30,15 @@ class TrackingLag(JointEffect):
     channels = ("tracking",)
     needs = ("timestamp",)
     motion = "a recording of the joint with accelerations, the sharper the better"
+    instead = "filter the command in the control loop"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the time constant."""
         return (Parameter("", "s", 5e-3, 0.0, 2.0),)
+
+    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
+        """Return it in a simulator's terms."""
+        return (SimulatorChange(Kind.LAG, term.site.joint, term.values[0]),)
 
     def track(
         self, term: Term, arm: Arm, q: NDArray[np.float64], motion: Motion

@@ -30,6 +30,7 @@ class TransmissionError(JointEffect):
     identifier = "transmission_error"
     channels = ("position",)
     motion = "many different angles of the joint"
+    instead = "add amplitude sin(order q + phase) to the commanded angle in the control loop"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the coefficients of sine and cosine, in which the effect is linear."""
