@@ -8,10 +8,10 @@ from typing import Any
 import click
 
 from bridge.cli.options import joint_names, open_cell
-from bridge.output_file import PARQUET, require_writable, write_table
+from bridge.document.output_file import PARQUET, require_writable, write_table
 from core.errors import InputError, LogError
-from core.sources import SOURCES, SourceOptions, source_of
-from core.sources.ros_bag import TYPES, WRENCHES
+from core.log.sources import SOURCES, SourceOptions, source_of
+from core.log.sources.ros_bag import TYPES, WRENCHES
 
 ROLES = tuple(TYPES)
 

@@ -9,11 +9,11 @@ from pathlib import Path
 from bridge.cell import Cell
 from bridge.cli.options import check_log
 from core.errors import LogError
-from core.log import Log
-from core.log_pieces import PARQUET, LogPieces
-from core.recording.reading import files_of
-from core.sources import source_of
-from core.sources.recording import Recording
+from core.log.log import Log
+from core.log.mcap_reading import files_of
+from core.log.pieces import PARQUET, LogPieces
+from core.log.sources import source_of
+from core.log.sources.recording import Recording
 
 LARGE = 20_000  # rows from which a log is read in pieces
 BYTES = 8_000_000  # of a text file that holds about as many

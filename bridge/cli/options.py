@@ -9,10 +9,10 @@ import numpy as np
 
 from bridge.cell import Cell, load_cell
 from bridge.cell.cell import HEAVIEST
-from core.diagnosis.suspicion import check_units
+from core.diagnosis.log_checks.units_and_clocks import check_units
 from core.errors import LogError
-from core.log import Log, read_log
-from core.sources import SourceOptions, source_of
+from core.log.log import Log, read_log
+from core.log.sources import SourceOptions, source_of
 
 log_argument = click.argument("log", type=click.Path(path_type=Path))
 cell_argument = click.argument("cell", type=click.Path(path_type=Path))
@@ -33,7 +33,7 @@ def open_cell(path: Path) -> Cell:
 
 
 def open_log(path: Path, cell: Cell) -> Log:
-    """Return a log for a cell's arm: a CSV or Parquet file, or another source (core.sources).
+    """Return a log for a cell's arm: a CSV or Parquet file, or another source (core.log.sources).
 
     Raises LogError where a payload is out of range, angles look like degrees or positions like
     millimetres.

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from bridge.cli.options import cell_option, open_cell
-from bridge.output_file import require_writable, write_text
+from bridge.document.output_file import require_writable, write_text
 from core.errors import InputError
 
 

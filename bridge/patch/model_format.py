@@ -11,7 +11,7 @@ from typing import ClassVar
 
 from bridge.patch.changes import ModelChanges
 from core.errors import InputError
-from core.sources.joint_order import order_joints
+from core.log.sources.joint_order import order_joints
 
 
 @dataclass(frozen=True)

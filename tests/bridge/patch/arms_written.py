@@ -37,7 +37,7 @@ def mjcf(arm: Arm, names: tuple[str, ...], kp: float = 0.0, tcp: float = 0.1,
             f'<body name="link_{i + 1}" pos="{numbers(at)}" quat="{numbers(quat)}">'
             f'<inertial pos="{numbers(cog)}" mass="{max(arm.mass[i], 1e-3):.17g}" '
             f'diaginertia="1e-3 1e-3 1e-3"/>'
-            f'<joint name="{name}" axis="{numbers(axis)}"/>'
+            f'<joint name="{name}" axis="{numbers(axis)}" armature="{0.5 if kp else 0}"/>'
         )
         opened += "</body>"
         nxt = arm.link_in_link[i + 1]

@@ -178,8 +178,8 @@ def test_a_delayed_actuator_moves_later(tmp_path: Path) -> None:
 
 
 def test_what_no_format_holds_is_listed_with_what_people_do(tmp_path: Path) -> None:
-    model = NOMINAL.with_terms([Term("transmission_error", Site(1, 2.0), (1e-4, 2e-4)),
-                                Term("tool_frame", Site(), (1e-3, 0.0, 0.0, 0.0, 0.0, 0.0))])  # fmt: skip
+    wave = Term("transmission_error", Site(1, 2.0), (1e-4, 2e-4))
+    model = NOMINAL.with_terms([wave, Term("tool_frame", Site(), (1e-3, 0.0, 0.0, 0.0, 0.0, 0.0))])
     text, _, missing = patched(tmp_path / "a.urdf", urdf(ARM, UR_JOINTS), model, "")
     assert any("transmission_error" in line and "sin" in line for line in missing)
     assert any("- -tcp" in line or "--tcp" in line for line in missing)
