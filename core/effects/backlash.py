@@ -21,7 +21,7 @@ class Backlash(JointEffect):
 
     Comes from worn gears and belts. Needs poses that are reached from both sides; without reversals
     nothing can be said.
-    Source: CONTRACT; He et al. 2024 on joint hysteresis (SMART5 NJ220).
+    Source: He et al. 2024 on joint hysteresis (SMART5 NJ220).
     """
 
     identifier = "backlash"

@@ -63,7 +63,7 @@ class Term:
 
 @dataclass(frozen=True)
 class Reported:
-    """A parameter as it is told: in the unit and form of CONTRACT's signs."""
+    """A parameter as it is reported: in the unit and sign of docs/conventions.md."""
 
     name: str
     value: float

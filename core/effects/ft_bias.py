@@ -24,7 +24,7 @@ class FtBias(Effect):
     Comes from mounting strain, temperature, an old zero. Shows the same at every pose, while the
     weight of a payload turns with the flange: poses that turn the flange separate it from a
     payload; sessions of some length from a drift.
-    Source: CONTRACT; Hollerbach, Khalil, Gautier, "Model Identification", Springer Handbook of
+    Source: Hollerbach, Khalil, Gautier, "Model Identification", Springer Handbook of
     Robotics (2016), ch. 6.
     """
 

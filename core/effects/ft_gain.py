@@ -24,7 +24,7 @@ class FtGain(Effect):
     Comes from a wrong calibration matrix, an amplifier, an overload. An axis whose wrench stays
     zero tells nothing of its gain. With one payload for the whole log, six equal gains are the
     same as another payload; other payloads or pulls separate them.
-    Source: CONTRACT; Hollerbach, Khalil, Gautier, "Model Identification", Springer Handbook of
+    Source: Hollerbach, Khalil, Gautier, "Model Identification", Springer Handbook of
     Robotics (2016), ch. 6.
     """
 

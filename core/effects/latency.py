@@ -25,7 +25,7 @@ class Latency(JointEffect):
     fast changes of the command separate the two, slow motion gives their sum.
     Exact: the command is interpolated by a cubic spline at t - latency. Rows
     right after the start of a recording, or after a gap, hold the first command.
-    Source: CONTRACT; Astrom, Wittenmark, "Computer-Controlled Systems" (1997), ch. 2.
+    Source: Astrom, Wittenmark, "Computer-Controlled Systems" (1997), ch. 2.
     """
 
     identifier = "latency"

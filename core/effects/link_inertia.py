@@ -22,7 +22,7 @@ class LinkInertia(JointEffect):
     as in accelerations, on its own joint and on those before. Links beyond joint 1 need poses
     that change how they pull; link 1 turns about the vertical and shows in accelerations only.
     Links that keep their direction to each other (the last ones, with a payload) look alike.
-    Source: CONTRACT; Swevers, Verdonck, De Schutter, IEEE Control Systems 27 (2007) 58.
+    Source: Swevers, Verdonck, De Schutter, IEEE Control Systems 27 (2007) 58.
     """
 
     identifier = "link_inertia"

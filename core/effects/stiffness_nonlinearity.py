@@ -22,7 +22,7 @@ class StiffnessNonlinearity(JointEffect):
     Comes from strain-wave gears, whose teeth engage further under torque. It holds the linear part
     too, so it stands instead of the joint's ``axial_compliance``. Needs several loads: with one, it
     looks like a linear compliance.
-    Source: CONTRACT; stiffening curves of harmonic drives in makers' catalogues (K1 < K2 < K3).
+    Source: stiffening curves of harmonic drives in makers' catalogues (K1 < K2 < K3).
     """
 
     identifier = "stiffness_nonlinearity"

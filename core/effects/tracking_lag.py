@@ -23,7 +23,7 @@ class TrackingLag(JointEffect):
     which is what separates it from pure latency. Exact: the lag's response to the command, which
     runs from row to row as a ramp (finer than the log where that is coarse), from where the
     encoder stood at first. A negative T, which only steps of a solver ask for, is continued oddly.
-    Source: CONTRACT; Astrom, Wittenmark, "Computer-Controlled Systems" (1997), ch. 2.
+    Source: Astrom, Wittenmark, "Computer-Controlled Systems" (1997), ch. 2.
     """
 
     identifier = "tracking_lag"

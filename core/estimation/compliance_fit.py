@@ -1,8 +1,8 @@
 """The least squares behind the identification: flexibilities, and what is unknown beside them.
 
-Gauss-Newton on the paper's linear form (eq. 35), taken again at the deflected shape, wild readings
-weighed down. Where the instrument is not registered, its frame and the tool point are estimated
-along: nuisances, projected out before anything is said of a flexibility.
+Gauss-Newton on the linear form (eq. 4 of docs/conventions.md), taken again at the deflected shape,
+outliers down-weighted. Where the instrument is not registered, its frame and the tool point are
+estimated along: nuisances, projected out before anything is said of a flexibility.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Logs: what was measured, in RTDE's column names (CONTRACT, "The log").
+"""Logs: what was measured, in RTDE's column names.
 
 Reading checks shape and numbers and names row and column of what is wrong; what a channel needs is
 asked for when it is used. CSV goes through numpy, Parquet through pyarrow.
@@ -23,14 +23,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Log:
-    """One log: ``columns`` holds (N,) or (N, k) arrays by contract name; NaN: an empty cell."""
+    """One log: ``columns`` holds (N,) or (N, k) arrays by column name; NaN: an empty cell."""
 
     path: str
     columns: Mapping[str, Array]
     n: int  # joints
     first_row: int = 2  # line of the first data row in the file, for messages
     lines: NDArray[np.int64] | None = None  # (N,) line of each row; None: one after the other
-    unknown: tuple[str, ...] = ()  # names of the file's columns that the contract does not name
+    unknown: tuple[str, ...] = ()  # names of the file's columns that no channel reads
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
@@ -140,7 +140,7 @@ def read_log(path: Path | str, n: int) -> Log:
         raise LogError(f"{path}: found no data rows, expected at least one")
     columns = table_columns(path, [name for name in names if is_known(name)], table, n)
     if not columns:
-        raise LogError(f"{path}: columns: found none that the contract names{nearest(names)}")
+        raise LogError(f"{path}: columns: found none that a log may hold{nearest(names)}")
     unknown = tuple(name for name in names if not is_known(name))
     return Log(str(path), columns, n, unknown=unknown)
 
@@ -227,7 +227,7 @@ def _read_parquet(path: Path) -> tuple[list[str], Array]:
 
 
 def table_columns(path: Path, names: Sequence[str], table: Array, n: int) -> dict[str, Array]:
-    """Return columns (N,) or (N, k) of a table (N, names), grouped by contract name.
+    """Return columns (N,) or (N, k) of a table (N, names), grouped by name.
 
     Raises LogError where a vector has a gap in its indices, or not its length.
     """
