@@ -47,6 +47,9 @@ class DriverSettings(BaseModel):
         """
         return self
 
+    def read_files(self) -> None:
+        """Read, through core.files, all files that the driver will read. Raises InputError."""
+
 
 class Driver(ABC):
     """One link to one controller, for one thread.

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.cell.daemon_settings import DaemonSettings
+from bridge.ipc.command_page import Command, Commands
 from bridge.ipc.counts import Count
 from bridge.ipc.cycle_row import fill_row
-from bridge.ipc.shared_memory import Command, Page, Phase
+from bridge.ipc.shared_memory import Page, Phase
 from bridge.loop.checks import RAMPING_OUT, LoopChecks
 from bridge.loop.controller_clock import ControllerClock
 from bridge.loop.link_monitor import StateWatch, hold_time
@@ -90,11 +91,11 @@ class Loop:
 
     # -- the frame --------------------------------------------------------------------------------
 
-    def run(self, arm: bool, may_write: bool, latched: str = "") -> Exit:
+    def run(self, commands: Commands, may_write: bool, latched: str = "") -> Exit:
         """Connect and loop until told to stop, or until the link is lost.
 
-        ``arm``: arm as soon as a state is there. ``may_write`` False: nothing can arm. ``latched``:
-        the fault of a loop before this one that nobody has acknowledged.
+        ``commands``: the daemon's, and the only way to arm. ``may_write`` False: nothing can arm.
+        ``latched``: the fault of a loop before this one that nobody has acknowledged.
         """
         self._page.enter(Phase.CONNECTING)
         try:
@@ -107,17 +108,18 @@ class Loop:
         if latched:
             self._supervisor.take(Cause.LATCHED, latched)
         self._page.enter(Phase.RUNNING)
-        wanted = arm
+        wanted = False
         while self._exit is None:
             self._page.beat()
-            command = self._page.take_command()
-            if self.stop_requested or command == Command.STOP:
+            asked = commands.take()
+            for command in asked:
+                wanted = command == Command.ARM
+                if command in (Command.DISARM, Command.RAMP_OUT):
+                    self._disarm(command == Command.DISARM)
+            if asked:
+                self._page.tell_taken(commands.taken)
+            if self.stop_requested or commands.stop:
                 self._stop()
-            elif command == Command.DISARM:
-                wanted = False
-                self._disarm()
-            elif command == Command.ARM:
-                wanted = True
             if wanted and may_write and self._page.seen and self._stop_by is None:
                 wanted = False
                 self._arm()
@@ -138,9 +140,9 @@ class Loop:
             return
         self._tell({"kind": "refused", "what": "arm", "detail": words})
 
-    def _disarm(self) -> None:
+    def _disarm(self, by_a_person: bool) -> None:
         if self._supervisor.state == State.FAULT:
-            self._acknowledged = True
+            self._acknowledged |= by_a_person
         else:
             self._supervisor.take(Cause.DISARM)
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import LogError
+from core.files import is_file, is_given, read_bytes, read_text
 from core.loads import Loads
 from core.log.columns import COLUMNS, INDEXED, is_known, misspelt, nearest, written
 
@@ -130,7 +131,7 @@ def read_log(path: Path | str, n: int) -> Log:
     ragged, a cell is no number, a vector has a gap in its indices or is not of its length.
     """
     path = Path(path)
-    if not path.is_file():
+    if not is_file(path):
         raise LogError(f"{path}: file not found, expected a CSV or Parquet log")
     if path.suffix.lower() in (".parquet", ".pq"):
         names, table = _read_parquet(path)
@@ -152,7 +153,7 @@ def _wanted(names: Sequence[str]) -> list[int]:
 def _read_csv(path: Path) -> tuple[list[str], Array]:
     """Return the names of all columns, and those that are known (rows, known columns)."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path, "utf-8-sig")
     except UnicodeDecodeError:
         raise LogError(f"{path}: found bytes that are no text, expected CSV (UTF-8)") from None
     lines = text.splitlines()
@@ -208,9 +209,10 @@ def _read_parquet(path: Path) -> tuple[list[str], Array]:
     from pyarrow import parquet
 
     try:
-        names = list(parquet.read_schema(path).names)
+        data = pyarrow.BufferReader(read_bytes(path)) if is_given() else path
+        names = list(parquet.read_schema(data).names)
         wanted = [names[i] for i in _wanted(names)]
-        frame = parquet.read_table(path, columns=wanted)
+        frame = parquet.read_table(data, columns=wanted)
         for name in wanted:
             kind = frame.schema.field(name).type
             types = pyarrow.types
