@@ -28,6 +28,7 @@ from bridge.loop_process import LoopProcess
 from bridge.reload import Reload
 from bridge.run_settings import configuration_for, settings_of
 from bridge.service_manager import ServiceManager
+from bridge.setpoint_stream import longest_withdrawal
 from bridge.shared_page import Command, Page, Phase
 from bridge.summary import RunSummary, Tally
 from bridge.supervisor import State
@@ -222,7 +223,8 @@ class Daemon:
                     self._stopping.set()
                 self._reload.step(self.state, self.phase)
                 if (self._stopping.is_set() or self._reload.wants_end) and stop_by is None:
-                    stop_by = time.monotonic() + LONGEST_STOP + STOP_MARGIN
+                    needed = LONGEST_STOP + longest_withdrawal(self.settings.limits)
+                    stop_by = time.monotonic() + needed + STOP_MARGIN
                     if self._stopping.is_set():
                         self.manager.stopping()
                     loop.ask_to_stop()

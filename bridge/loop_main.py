@@ -29,7 +29,7 @@ from bridge.realtime import become_realtime
 from bridge.replayed_loop import ReplayedLoop
 from bridge.setpoint_source import make_source
 from bridge.setpoint_source.source import Source
-from bridge.setpoint_stream import SetpointStream
+from bridge.setpoint_stream import SetpointStream, gate_bounds
 from bridge.settings import SetpointSettings
 from bridge.shared_page import Page, Phase
 from core.errors import GapbridgeError, InputError
@@ -70,7 +70,7 @@ def _run(order: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Exit:
     page = Page(order["n"], order["page"])
     page.enter(Phase.STARTING)
     model = _read_model(settings)
-    driver = make_driver(settings.link, model)
+    driver = make_driver(settings.link, model, gate_bounds(settings.limits))
     source = _make_source(settings, model, driver)
     loop = _make_loop(settings, model, driver, source, page, tell, order["number"])
     for number in (signal.SIGTERM, signal.SIGINT):

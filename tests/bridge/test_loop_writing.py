@@ -41,7 +41,7 @@ class Failing(Driver):
     """A driver whose writes fail as they are told to; no wire fails so exactly."""
 
     def __init__(self) -> None:
-        super().__init__(500.0, 6)
+        super().__init__(500.0, MODEL)
         self.error: LinkError | None = None
         self.sent: list[np.ndarray] = []
         self.released = 0
@@ -51,12 +51,12 @@ class Failing(Driver):
     def read_state(self) -> RobotState:
         raise NotImplementedError
 
-    def write_setpoint(self, setpoint: Setpoint) -> None:
+    def _send(self, setpoint: Setpoint) -> None:
         if self.error is not None:
             raise self.error
         self.sent.append(setpoint.q.copy())
 
-    def release(self) -> None:
+    def _let_go(self) -> None:
         self.released += 1
 
     def close(self) -> None: ...
@@ -177,7 +177,7 @@ def test_a_process_that_was_stopped_after_the_judgement_sends_nothing_old(bench:
 def test_a_process_that_was_stopped_while_it_sent_says_so_and_ends_the_motion(
     bench: Bench,
 ) -> None:
-    bench.driver.write_setpoint = lambda _: time.sleep(0.03)  # type: ignore[method-assign]
+    bench.driver._send = lambda _: time.sleep(0.03)  # type: ignore[method-assign]
     state = bench.state()
     expiry = time.monotonic() + 0.02
     assert bench.writing.write(state, Q, bench.loads.update(state), expiry) is not None
