@@ -196,6 +196,8 @@ class Checker:
         of the cell: whoever writes next goes on from there.
         """
         b = self.bounds
+        if not any(self._written) or math.isinf(b.withdraws):
+            return self._written
         silent = max(time - self._written_at - b.withdraws, 0.0)
         offset = self._written
         parts: list[float] = []

@@ -21,6 +21,7 @@ from drivers.gate import GateBounds
 from drivers.modbus import encode
 from drivers.modbus.driver import ModbusDriver
 from drivers.modbus.settings import SHIPPED
+from drivers.simulated.bench import BenchError
 from drivers.simulated.modbus.programs import MailboxProgram
 from drivers.simulated.modbus.server import ModbusServer
 
@@ -181,10 +182,16 @@ def test_registers_too_coarse_for_the_offset_are_told_before_arming(tmp_path: Pa
             driver.arm(next_state(driver))
 
 
-def test_a_target_that_the_robot_refuses_is_told() -> None:
+def test_a_target_that_the_robot_refuses_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     with ModbusCase("niryo") as case, case.driver() as driver:
-        driver.arm(next_state(driver))
-        q = np.array([30.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        state = next_state(driver)
+        driver.arm(state)
+        q = state.actual_q + 0.02
+
+        def refuse(_: object) -> None:
+            raise BenchError("move: outside what this controller allows")
+
+        monkeypatch.setattr(case.peer, "move_own", refuse)
         with pytest.raises(WriteError, match=r"last command .*found 2, expected 0 or 1"):
             stream(driver, lambda state, _: setpoint_of(state, q, q, (0.0,) * 6), 2.0)
 
