@@ -87,7 +87,7 @@ class ReplayedLoop(Loop):
             self._changed(before, state, cast("Cause", _Followed.RECORDED), "")
 
     def _began_with(self, cycle: Cycle) -> InForce | None:
-        """Return the offset in force that a stream began with: its nominal joints are without it."""
+        """Return the offset in force that a stream began with: nominal joints are without it."""
         found = self._in_force.at(cycle.own_q)
         if found is None:
             return None

@@ -22,9 +22,7 @@ DRIVERS: dict[str, str] = {
 """Driver name in a cell file -> ``module:Class``, imported when it is used."""
 
 
-def make_driver(
-    settings: DriverSettings, model: Model, bounds: GateBounds | None = None
-) -> Driver:
+def make_driver(settings: DriverSettings, model: Model, bounds: GateBounds | None = None) -> Driver:
     """Return the driver that the settings name, not yet connected.
 
     ``model`` tells it the arm and the tool, ``bounds`` what its gate lets pass (left out: the

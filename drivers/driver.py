@@ -1,6 +1,6 @@
 """What a driver is: four methods between a controller's wire and the loop.
 
-``connect``, ``read_state``, ``write_setpoint`` and ``close`` are what the loop asks for, ``arm`` and
+``connect``, ``read_state``, ``write_setpoint`` and ``close`` are what every driver has; ``arm`` and
 ``release`` stand around the writing. Whatever is written passes the gate (drivers/gate.py) here, in
 the base: a driver implements ``_send``, ``_make_ready`` and ``_let_go``, and cannot go around it.
 """

@@ -142,7 +142,9 @@ def _judge(links, joints, offsets, numbers, budget, moves):  # type: ignore[no-u
         for k in range(3):
             shift += (offsets[0, k] - offsets[1, k]) ** 2
             angle += (offsets[0, 3 + k] - offsets[1, 3 + k]) ** 2
-        travel = max((math.sqrt(shift) - GRAIN) / numbers[2], (math.sqrt(angle) - GRAIN) / numbers[3])
+        travel = max(
+            (math.sqrt(shift) - GRAIN) / numbers[2], (math.sqrt(angle) - GRAIN) / numbers[3]
+        )
     if travel > numbers[5] * (1.0 + GRAIN):
         return STEP, -1, travel, 0.0
     if travel > budget:
@@ -244,8 +246,8 @@ class Gate:
     def _reason(self, code: int, joint: int, found: float) -> str:
         where = f"gate: joint {joint + 1}: " if joint >= 0 else "gate: "
         lower, upper = self._joints[3, joint], self._joints[4, joint]
-        bounds, longest = self.bounds, 1e3 * self._longest
-        return where + {
+        bounds, takes = self.bounds, f"found a step that takes {1e3 * found:.1f} ms at the rates"
+        words = {
             NOT_FINITE: f"found {found}, expected a finite number",
             OUTSIDE: f"found {found:.4f} rad, expected {lower:.4f} to {upper:.4f}",
             FAR_OFFSET: f"found an offset of {found:.6f} m, expected at most {bounds.offset:g}",
@@ -253,9 +255,8 @@ class Gate:
             f"{bounds.offset_rotation:g}",
             JOINT_OFFSET: f"found {found:.4f} rad from its nominal setpoint, expected at most "
             f"{bounds.joint_offset:g}",
-            STEP: f"found a step that takes {1e3 * found:.1f} ms at the cell's rates, expected at "
-            f"most {longest:.1f} ms",
-            RATE: f"found a step that takes {1e3 * found:.1f} ms at the cell's rates, more than has "
-            "passed",
-            AWAY: f"found a first setpoint {found:.4f} rad from the arm, expected at most {START:g}",
-        }[code]
+            STEP: f"{takes}, expected at most {1e3 * self._longest:.1f} ms",
+            RATE: f"{takes}, more than has passed",
+            AWAY: f"found a first setpoint {found:.4f} rad from the arm, expected at most {START}",
+        }
+        return where + words[code]

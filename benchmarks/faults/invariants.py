@@ -49,7 +49,9 @@ class Bounds:
     fresh: float = 0.04
     burst: float = 0.0  # s for which the transport may hold small packets back
     lag: float = 0.04
-    withdraws: float = math.inf  # s of silence after which the robot's own program withdraws offsets
+    withdraws: float = (
+        math.inf
+    )  # s of silence after which the robot's own program withdraws offsets
 
 
 @dataclass
@@ -262,8 +264,9 @@ class Checker:
         Where the last one has left the arm, its offset is still in it: what was wanted is older.
         """
         last, b = self._ended, self.bounds
-        if last.nominal is not None and last.joints[0]:
-            if max(abs(x - y) for x, y in zip(q, last.joints[0], strict=True)) < STAYED:
+        if last.nominal is not None and len(last.joints[0]) == len(q):
+            away = max(abs(x - y) for x, y in zip(q, last.joints[0], strict=True))
+            if away < STAYED:
                 return last.nominal
         return tcp_in_base(b.arm, q, b.tool)
 

@@ -190,9 +190,7 @@ class MailboxWriter:
 
     def _words(self) -> list[int]:
         self._heartbeat = encode.next_number(self._heartbeat)
-        return encode.mailbox_words(
-            self._sequence, self._counts, self._heartbeat, self._rates
-        )
+        return encode.mailbox_words(self._sequence, self._counts, self._heartbeat, self._rates)
 
     def _send(self, words: list[int]) -> None:
         """Write a mailbox of zeros; a lost one once more."""

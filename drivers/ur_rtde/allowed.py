@@ -19,9 +19,12 @@ CONTROL = (
 DOUBLES = frozenset(registers.OFFSET_DOUBLES)
 INTEGERS = frozenset(
     (
-        registers.OFFSET_RZ, registers.SEQUENCE, registers.CHECKSUM, registers.HEARTBEAT,
+        registers.OFFSET_RZ,
+        registers.SEQUENCE,
+        registers.CHECKSUM,
+        registers.HEARTBEAT,
         registers.RATES,
-    )  # fmt: skip
+    )
 )
 
 

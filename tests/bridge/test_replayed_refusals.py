@@ -21,8 +21,8 @@ from bridge.setpoint_source.target import TargetSource
 from bridge.settings import SetpointSettings
 from bridge.shared_page import Command, Page
 from core.errors import LinkError, PartialWriteError
-from core.recording.reading import read_columns
 from core.model import Model
+from core.recording.reading import read_columns
 from core.setpoint import Setpoint
 from core.state import RobotState
 from drivers.driver import Driver

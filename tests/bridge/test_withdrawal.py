@@ -15,7 +15,9 @@ from daemon_cell import Robot, Run, offsets, wait_for
 from bridge.supervisor import State
 
 RATE = 0.0005  # m/s: a hundredth of what the robot's program would allow
-LIMITS = f"{{offset: 0.002, offset_rate: {RATE}, offset_rotation: 0.005, offset_rotation_rate: 0.05}}"
+LIMITS = (
+    f"{{offset: 0.002, offset_rate: {RATE}, offset_rotation: 0.005, offset_rotation_rate: 0.05}}"
+)
 CYCLE = 0.008
 
 

@@ -58,7 +58,8 @@ class MailboxProgram:
     A checksum that does not fit leaves the offset as it was; a heartbeat that stands still takes
     it out, at the rates that came with the last offset. What stands in the registers when the
     program starts, or after a silence, counts only once the heartbeat has changed: it may be of a
-    client that is dead. ``running`` False is a program that was stopped: nothing is applied or answered.
+    client that is dead. ``running`` False is a program that was stopped: nothing is applied or
+    answered.
     """
 
     def __init__(self, box: Mailbox) -> None:
@@ -108,7 +109,9 @@ class MailboxProgram:
                 self._sequence = body[0]
                 x, y, z, rx, ry, rz = encode.offset_of(self._box, body[1:7])
                 self._wanted = (x, y, z, rx, ry, rz)
-                shift, turn = (n * unit for n, unit in zip(body[8:], encode.RATE_COUNTS, strict=True))
+                shift, turn = (
+                    n * unit for n, unit in zip(body[8:], encode.RATE_COUNTS, strict=True)
+                )
                 self._rates = (shift, turn)
         if self._silent > self._box.watchdog:
             self._state, self._wanted, self._sequence = encode.EXPIRED, NOTHING, 0

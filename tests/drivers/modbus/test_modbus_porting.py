@@ -47,7 +47,10 @@ def test_the_checksum_is_the_one_on_the_page() -> None:
     seed, modulus = map(int, said.groups())
     total = seed + sum((i + 1) * word for i, word in enumerate(words))
     assert encode.checksum(words) == total % modulus
-    assert encode.mailbox_words(7, [100, -100, 3, 4, -5, 6], 9, [2500, 1000]) == [*words, total % modulus]
+    assert encode.mailbox_words(7, [100, -100, 3, 4, -5, 6], 9, [2500, 1000]) == [
+        *words,
+        total % modulus,
+    ]
     assert encode.rate_counts((0.05, 0.1)) == [2500, 1000]
 
 
