@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from test_drivers import WIRED, link
 
-from bridge.setpoint_stream import gate_bounds, limits_of
-from bridge.settings import LimitSettings
+from bridge.cell.sections import LimitSettings
+from bridge.loop.setpoint_stream import gate_bounds, limits_of
 from core.arm import builtin_arm
 from core.errors import GateError, WriteError
 from core.limits import Limiter

@@ -21,9 +21,9 @@ from drivers.gate import GateBounds
 from drivers.modbus import encode
 from drivers.modbus.driver import ModbusDriver
 from drivers.modbus.settings import SHIPPED
-from drivers.simulated.bench import BenchError
 from drivers.simulated.modbus.programs import MailboxProgram
 from drivers.simulated.modbus.server import ModbusServer
+from drivers.simulated.peer.bench import BenchError
 
 
 @pytest.fixture
