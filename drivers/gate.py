@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from core.kernel import JIT
+from core.kernels.reference import JIT
 from numba import njit
 from numpy.typing import NDArray
 
