@@ -236,7 +236,10 @@ class MailboxWriter:
 
         At the rates it was told; a zero from here would be a step.
         """
-        self._armed, self._pending = False, None
+        self._armed, pending, self._pending = False, self._pending, None
+        if pending is not None and not any(self._counts):
+            # the last setpoint of a ramp, which would have left with the next reading
+            self._transport.write("holding", self._box.address, pending)
 
     def target(self) -> Array | None:
         """Return None: the joints are the robot's own."""
