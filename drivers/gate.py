@@ -12,11 +12,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from core.kernels.reference import JIT
 from numba import njit
 from numpy.typing import NDArray
 
 from core.errors import GateError
+from core.kernels.reference import JIT
 from core.model import Model
 from core.setpoint import Setpoint
 
