@@ -19,7 +19,7 @@ from benchmarks.blind.measuring import (
     without,
 )
 from benchmarks.blind.mechanics import Array, RealArm, Session, Shape, stand, turn
-from benchmarks.blind.session import Plan, draw_session
+from benchmarks.blind.session import Plan, draw_session, parted
 
 CLEAR = 150.0  # what each cause must add to chi-square that nothing else in the case can take up
 
@@ -35,6 +35,7 @@ class Bench:
     instrument: Instrument
     model: Shape  # what the nominal model predicts
     floor: float  # m rms per coordinate
+    fresh: Session | None = None  # poses of regions that the log does not show
 
     @property
     def weights(self) -> Array:
@@ -86,7 +87,12 @@ def draw_bench(
         gravity=np.array([0.0, 0.0, up * 9.80665]),
         reference_temperature=plan.reference_temperature,
     )
-    session = draw_session(kind, plan, rng)
+    fresh = None
+    if plan.beyond:
+        whole = draw_session(kind, replace(plan, poses=plan.poses + plan.beyond), rng)
+        session, fresh = parted(whole, plan, rng)
+    else:
+        session = draw_session(kind, plan, rng)
     model = stand(nominal, session)
     rotated = rng.random() < 0.35 if with_rotation is None else with_rotation
     floor = rng.uniform(*target_floor)
@@ -101,7 +107,8 @@ def draw_bench(
     )
     if instrument.registered:
         instrument = replace(instrument, rotation=np.eye(3), position=np.zeros(3))
-    return Bench(kind, nominal, session, plan, instrument, model, floor_of(model, instrument))
+    return Bench(kind, nominal, session, plan, instrument, model, floor_of(model, instrument),
+                 fresh)  # fmt: skip
 
 
 def _short(values: Array) -> Array:

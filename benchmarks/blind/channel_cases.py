@@ -58,6 +58,11 @@ class ChannelCase:
         return gap if self.error is None else gap + (self.error / self.truth.sigma).ravel()
 
     @property
+    def known_gap(self) -> Array:
+        """Return the gap to explain: of a mixed case that of its known effects alone."""
+        return self.truth.gap(self.values) if self.values else self.gap
+
+    @property
     def floor_rms(self) -> float:
         """Return the noise per coordinate in the channel's unit; of a wrench, its forces."""
         sigma = self.truth.sigma[:3] if self.channel == "wrench" else self.truth.sigma

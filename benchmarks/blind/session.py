@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.random import Generator
+from scipy.cluster.vq import kmeans2
 
 from benchmarks.blind.arms import ArmKind
 from benchmarks.blind.mechanics import Array, Session
+
+REGIONS = 24  # of joint space, of which whole ones are kept back
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,28 @@ class Plan:
     span: float = 1.0  # share of each joint's range that is used
     warming: float = 20.0  # K
     reference_temperature: float = 25.0
+    beyond: int = 0  # poses kept back: whole regions of joint space that the log does not show
+
+
+def parted(session: Session, plan: Plan, rng: Generator) -> tuple[Session, Session]:
+    """Return the session without whole regions of joint space, and the poses of those."""
+    scale = np.maximum(np.std(session.q, axis=0), 1e-9)
+    _, region = kmeans2(session.q / scale, REGIONS, minit="++", rng=rng)
+    away = np.zeros(len(session.q), dtype=bool)
+    for own in rng.permutation(REGIONS):
+        if away.sum() >= plan.beyond:
+            break
+        away |= region == own
+    kept, fresh = (_rows(session, rows) for rows in (~away, away))
+    if plan.both_sides and not plan.approach_written:  # it is read from the rows that are there
+        approach = np.sign(np.diff(kept.q, axis=0, prepend=kept.q[:1]))
+        overshoot = np.where(approach == 0, 0.0, 0.05)
+        kept = replace(kept, approach=approach, from_where=kept.q - overshoot * approach)
+    return kept, fresh
+
+
+def _rows(session: Session, rows: Array) -> Session:
+    return Session(**{f.name: getattr(session, f.name)[rows] for f in fields(session)})
 
 
 def draw_session(kind: ArmKind, plan: Plan, rng: Generator) -> Session:

@@ -18,6 +18,8 @@ from benchmarks.blind.mechanics import Array, RealArm, stand
 from benchmarks.blind.session import Plan
 from benchmarks.blind.writing import write_cell, write_log
 
+MANY = 3  # effects; with more, each sits at one joint
+
 
 @dataclass(frozen=True)
 class Drawn:
@@ -67,7 +69,7 @@ def draw_static(wish: Wish, rng: Generator) -> Drawn:
             target_floor=wish.floor,
         )  # fmt: skip
         try:
-            bench, parts = _draw_parts(bench, wish, rng)
+            bench, parts = draw_parts(bench, wish, rng)
         except Redraw:
             continue
         if parts and wish.clear and not all_clear(bench, parts):
@@ -82,11 +84,12 @@ def _places(effect: str, wish: Wish, bench: Bench, rng: Generator) -> list[int] 
         return [None]
     count = int(rng.choice([1, 2, 3], p=[0.55, 0.3, 0.15]))
     most = 1 if wish.ratio is not None else 3 if len(wish.effects) == 1 else 2
+    most = 1 if len(wish.effects) > MANY else most
     chosen = [int(j) for j in rng.permutation(draws.sites(effect, bench.kind))]
     return sorted((wish.joints or {}).get(effect, chosen[: min(count, most)]))
 
 
-def _draw_parts(bench: Bench, wish: Wish, rng: Generator) -> tuple[Bench, list[Ingredient]]:
+def draw_parts(bench: Bench, wish: Wish, rng: Generator) -> tuple[Bench, list[Ingredient]]:
     """Return the parts, sized. The nominal axial compliance of a stiffening joint is taken out."""
     parts: list[Ingredient] = []
     for effect in wish.effects:
