@@ -166,6 +166,7 @@ def _channel_label(kind: str, seed: int, case: ChannelCase) -> Label:
         gap_rms=float(np.sqrt(np.mean(case.gap**2))) * case.floor_rms,
         depends_on=case.depends_on,
         outside=case.outside,
+        akin=case.akin,
         withhold=tuple(c.effect for c in causes) if kind.startswith("withheld:") else (),
         facts=facts,
     )

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.blind.cases import group_of
 from benchmarks.blind.beyond import true_beyond
+from benchmarks.blind.cases import group_of
 from benchmarks.blind.hidden import SAME, Claim, Hidden, Place, claims_of
 from benchmarks.blind.label import Label
 
