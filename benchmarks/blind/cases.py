@@ -2,10 +2,11 @@
 
 Kinds of the position channel: ``none``; an effect (``backlash``); several (``backlash+payload``);
 ``pair``, ``triple``, ``four``, ``five`` (at random); ``mixed:COUNT`` or ``mixed:REMAINDER`` (known
-effects and an unknown remainder); ``withheld:EFFECT``; ``outside:NAME``; ``hard:EFFECT`` and
-``hard:none``; ``bad:NAME``; ``size:EFFECT@RATIO`` (at one place, gap over floor). Other channels:
-``wrench:``, ``tracking:``, ``torque:`` with an effect, several, ``none``, or one outside the
-catalogue.
+effects and an unknown remainder); ``arm:one``, ``arm:two`` (an arm drawn at random);
+``sessions:one``, ``sessions:two``; ``laid_out:clustered``, ``student``, ``doubled``;
+``withheld:EFFECT``; ``outside:NAME``; ``hard:EFFECT`` and ``hard:none``; ``bad:NAME``;
+``size:EFFECT@RATIO`` (at one place, gap over floor). Other channels: ``wrench:``, ``tracking:``,
+``torque:`` with an effect, several, ``pair``, ``mixed``, ``none``, or one outside the catalogue.
 """
 
 from __future__ import annotations
@@ -30,7 +31,6 @@ from benchmarks.blind.channel_cases import (
 from benchmarks.blind.label import Label
 from benchmarks.blind.measuring import read_arm
 from benchmarks.blind.mechanics import Array
-from benchmarks.blind.mixed_cases import ONE_OF, some_effects
 from benchmarks.blind.outside import OUTSIDE
 from benchmarks.blind.remainders import ALONE, REMAINDERS
 from benchmarks.blind.special_cases import Strange
@@ -40,6 +40,11 @@ from benchmarks.blind.wrench_cases import WrenchCell
 CHANNELS = tuple(EFFECTS)
 COUNTS = {"pair": 2, "triple": 3, "four": 4, "five": 5}
 MIXED = ("1", "2", "3")
+LAYOUTS = {
+    "laid_out": special_cases.draw_laid_out,
+    "arm": special_cases.draw_arms,
+    "sessions": special_cases.draw_sessions,
+}
 
 
 @dataclass(frozen=True)
@@ -69,13 +74,15 @@ def effects_of(kind: str, rng: Generator) -> tuple[str, ...]:
     if kind == "none":
         return ()
     if kind in COUNTS:
-        return some_effects(COUNTS[kind], rng)
+        return draws.some_effects(COUNTS[kind], rng)
     effects = tuple(kind.split("+"))
     for effect in effects:
         if effect not in draws.POSITION_EFFECTS:
             raise ValueError(f"kind: found {effect!r}, expected an effect of the position channel")
-    if set(effects) >= ONE_OF:
-        raise ValueError(f"kind: found {kind!r}, expected one of {' and '.join(sorted(ONE_OF))}")
+    if set(effects) >= draws.ONE_OF:
+        raise ValueError(
+            f"kind: found {kind!r}, expected one of {' and '.join(sorted(draws.ONE_OF))}"
+        )
     return effects
 
 
@@ -92,6 +99,8 @@ def draw_case(kind: str, rng: Generator) -> Static | ChannelCase:
         return Static(strange.drawn, strange, strange.gap, wild=False)
     if group == "bad":
         drawn = special_cases.draw_bad(rest, rng)
+    elif group in LAYOUTS:
+        drawn = LAYOUTS[group](rest, rng)
     elif group == "hard":
         drawn = special_cases.draw_hard(effects_of(rest, rng), rng)
     elif group == "":
@@ -184,7 +193,7 @@ def group_of(kind: str) -> str:
         if kind in own:
             return group
     head = kind.partition(":")[0]
-    if head in ("withheld", "outside", "hard", "bad", "size", "mixed"):
+    if head in ("withheld", "outside", "hard", "bad", "size", "mixed", *LAYOUTS):
         return head
     return "several" if "+" in kind else "known"
 
@@ -198,6 +207,9 @@ def position_kinds() -> dict[str, tuple[str, ...]]:
         "several": ("pair", "triple"),
         "many": ("four", "five"),
         "mixed": tuple(f"mixed:{c}" for c in MIXED),
+        "arm": tuple(f"arm:{c}" for c in special_cases.ONE_OR_TWO),
+        "sessions": tuple(f"sessions:{c}" for c in special_cases.ONE_OR_TWO),
+        "laid_out": tuple(f"laid_out:{n}" for n in special_cases.LAID_OUT),
         "withheld": tuple(f"withheld:{e}" for e in known),
         "outside": tuple(f"outside:{n}" for n in (*OUTSIDE, *ALONE)),
         "hard": tuple(f"hard:{e}" for e in (*known, "none")),

@@ -65,7 +65,8 @@ class Hidden:
     def left_over(self, claims: Iterable[Claim]) -> float:
         """Return the chi-square that the best version of the claims leaves of the true gap.
 
-        Of a mixed case it is the gap of its known effects alone. Claims that the truth cannot make sense of (unknown effect or joint) explain nothing.
+        Of a mixed case it is the gap of its known effects alone. Claims that the truth cannot
+        make sense of (unknown effect or joint) explain nothing.
         """
         claims = list(claims)
         if isinstance(self.case, ChannelCase):

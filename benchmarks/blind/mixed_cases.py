@@ -23,7 +23,6 @@ from benchmarks.blind.remainders import REMAINDERS
 from benchmarks.blind.special_cases import Strange, outside_gap, unlike_known
 from benchmarks.blind.static_cases import Drawn, Wish, draw_parts, draw_plan
 
-ONE_OF = {"axial_compliance", "stiffness_nonlinearity"}
 SIZE = (0.5, 1.5)  # the remainder over the known effects together
 FLOORS = (3.0, 20.0)  # the remainder over the noise
 BEYOND = 12  # poses kept back
@@ -33,7 +32,7 @@ DRAWS = 150
 def draw_mixed(count: int, name: str | None, rng: Generator) -> Strange:
     """Return a cell with ``count`` known effects and a remainder, by name or any."""
     for _ in range(DRAWS):
-        effects = some_effects(count, rng)
+        effects = draws.some_effects(count, rng)
         soft = True if set(effects) & set(draws.NEEDS_COMPLIANCE) else None
         bench = draw_bench(rng, replace(draw_plan(rng), beyond=BEYOND), compliant=soft)
         try:
@@ -47,14 +46,6 @@ def draw_mixed(count: int, name: str | None, rng: Generator) -> Strange:
             return strange
     raise RuntimeError(f"no clear draw of {count} effects beside {name or 'a remainder'} "
                        f"in {DRAWS}")  # fmt: skip
-
-
-def some_effects(count: int, rng: Generator) -> tuple[str, ...]:
-    """Return that many different effects at random, never a joint's softness twice."""
-    while True:
-        chosen = tuple(str(e) for e in rng.choice(draws.POSITION_EFFECTS, count, replace=False))
-        if not set(chosen) >= ONE_OF:
-            return chosen
 
 
 def _with_remainder(

@@ -15,7 +15,7 @@ from benchmarks.blind.hidden import SAME, Claim, Hidden, Place, claims_of
 from benchmarks.blind.label import Label
 
 NOWHERE = "not in the catalogue"
-EXPLAINED = ("clean", "known", "several", "many", "laid_out")
+EXPLAINED = ("clean", "known", "several", "many", "arm", "sessions", "laid_out")
 UNLIKE = 100.0  # chi-square from which on a tie told is no tie
 
 

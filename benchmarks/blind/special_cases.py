@@ -9,6 +9,7 @@ import numpy as np
 from numpy.random import Generator
 
 from benchmarks.blind.bench import Bench, draw_bench
+from benchmarks.blind.draws import some_effects
 from benchmarks.blind.measuring import read_arm, without
 from benchmarks.blind.mechanics import Array, RealArm, Session
 from benchmarks.blind.outside import NEED_COMPLIANCE, OUTSIDE, Outside
@@ -93,6 +94,41 @@ def draw_hard(effects: tuple[str, ...], rng: Generator) -> Drawn:
     """Return a cell seen in 30 poses with 50 um of noise."""
     plan = replace(draw_plan(rng, poses=30), blocks=3)
     return draw_static(Wish(effects, plan, HARD_SIGMA, (5.5e-5, 7e-5)), rng)
+
+
+LAID_OUT = ("clustered", "student", "doubled")
+ONE_OR_TWO = {"one": 1, "two": 2}
+
+
+def draw_laid_out(name: str, rng: Generator) -> Drawn:
+    """Return one known effect in poses in heaps, in long-tailed noise, or in doubled rows."""
+    plan = draw_plan(rng)
+    if name == "clustered":
+        plan = replace(plan, clusters=int(rng.integers(7, 11)))
+    elif name == "doubled":
+        plan = replace(plan, poses=35, doubled=True, approach_written=True)
+    elif name != "student":
+        raise ValueError(f"kind: found laid_out:{name}, expected one of {', '.join(LAID_OUT)}")
+    freedom = 3.0 if name == "student" else None
+    return draw_static(Wish(some_effects(1, rng), plan, freedom=freedom), rng)
+
+
+def draw_arms(name: str, rng: Generator) -> Drawn:
+    """Return one or two known effects of an arm that is drawn at random too."""
+    wish = Wish(some_effects(_count(name), rng), any_arm=True)
+    return draw_static(wish, rng)
+
+
+def draw_sessions(name: str, rng: Generator) -> Drawn:
+    """Return one or two known effects in two sessions, the tracker elsewhere in each."""
+    plan = replace(draw_plan(rng, poses=90), sessions=2)
+    return draw_static(Wish(some_effects(_count(name), rng), plan), rng)
+
+
+def _count(name: str) -> int:
+    if name not in ONE_OR_TWO:
+        raise ValueError(f"kind: found {name!r}, expected one of {', '.join(ONE_OR_TWO)}")
+    return ONE_OR_TWO[name]
 
 
 def wild_readings(drawn: Drawn, rng: Generator, share: float = 0.03) -> tuple[Array, Array | None]:

@@ -69,6 +69,10 @@ def criteria(scores: Sequence[CaseScore]) -> list[Criterion]:
     many, mixed = _of(scores, "many"), _of(scores, "mixed")
     out += [
         _criterion("four and more at once: exactly those", 0.90, many),
+        _criterion("arms drawn at random", 0.95, _of(scores, "arm")),
+        _criterion("two sessions, one frame each", 0.95, _of(scores, "sessions")),
+        _criterion("poses in heaps, long-tailed noise, doubled rows", 0.95,
+                   _of(scores, "laid_out")),
         Criterion("beside a remainder: known effects named", *_at(0.90, _share(
             k < s.known_named for s in mixed for k in range(s.known)))),
         Criterion("beside a remainder: it is admitted", *_at(0.95, _share(

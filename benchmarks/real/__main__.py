@@ -19,7 +19,7 @@ SCALE = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "N": (1.0, "N"), "Nm": (1.0, "N
 @click.command()
 @click.option("--data", "folders", multiple=True, type=click.Path(path_type=Path),
               default=(OWN,), show_default=True,
-              help="Folder of logs, one folder each (log.csv, cell.yaml); several times.")  # fmt: skip
+              help="Folder of logs, one folder each; may be given several times.")  # fmt: skip
 @click.option("--only", "names", default=None, help="Logs by name, by commas.")
 @click.option("--split", type=click.Choice(["tune", "held back"]), default=None,
               help="Only this half.")  # fmt: skip
