@@ -25,6 +25,9 @@ class Backlash(JointEffect):
     """
 
     identifier = "backlash"
+    title = "play in the joint"
+    label_words = "play of joint {joint}"
+    by_approach = True
     channels = ("position",)
     motion = "poses reached from both sides of the joint"
     instead = "add a joint about the same axis, limited to half the clearance on each side"

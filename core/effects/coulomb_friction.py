@@ -27,6 +27,8 @@ class CoulombFriction(JointEffect):
     """
 
     identifier = "coulomb_friction"
+    title = "constant friction"
+    order = 52
     channels = ("torque",)
     motion = "the joint moved both ways"
 

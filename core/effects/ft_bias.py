@@ -29,6 +29,10 @@ class FtBias(Effect):
     """
 
     identifier = "ft_bias"
+    title = "force sensor zero is off"
+    label_words = "sensor zero of {part}"
+    order = 80
+    corrects = "sensor zero"
     channels = ("wrench",)
     motion = "poses that turn the flange by tens of degrees against gravity"
     instead = "subtract the bias from the sensor's readings"

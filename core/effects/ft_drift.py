@@ -28,6 +28,8 @@ class FtDrift(Effect):
     """
 
     identifier = "ft_drift"
+    title = "force sensor zero drifts"
+    order = 70
     channels = ("wrench",)
     needs = ("timestamp",)
     motion = "a session long enough for the zero to move, with poses that come back"

@@ -29,6 +29,9 @@ class FtGain(Effect):
     """
 
     identifier = "ft_gain"
+    title = "force sensor scale is off"
+    order = 60
+    scales_reading = True
     channels = ("wrench",)
     motion = "a load on every axis: the flange turned every way, with pulls or several payloads"
     instead = "divide the sensor's readings by 1 + gain"

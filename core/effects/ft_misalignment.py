@@ -27,6 +27,9 @@ class FtMisalignment(Effect):
     """
 
     identifier = "ft_misalignment"
+    title = "force sensor is turned"
+    order = 55
+    scales_reading = True
     channels = ("wrench",)
     motion = "loads along at least two directions of the flange"
     instead = "turn the sensor's frame, or its readings"

@@ -23,6 +23,9 @@ class GravityDirection(Effect):
     """
 
     identifier = "gravity_direction"
+    title = "base is not level"
+    label_words = "tilt of the base about {part}"
+    needs_softness = True
     channels = ("position",)
     motion = "a compliant model and poses all around the base"
     instead = "turn the base, or gravity in the world"

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from core.effects.effect import JointEffect, Parameter, Site, Term
 from core.effects.simulator import Kind, SimulatorChange
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from core.arm import Arm
@@ -27,6 +28,10 @@ class JointOffset(JointEffect):
     """
 
     identifier = "joint_offset"
+    title = "joint zero is off"
+    label_words = "zero of joint {joint}"
+    calibrated = 2
+    moved = "the zero of joint {joint} moved by {size}"
     channels = ("position",)
     motion = "poses that differ in the other joints"
 
@@ -37,6 +42,10 @@ class JointOffset(JointEffect):
     def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
         """Return it in a simulator's terms."""
         return (SimulatorChange(Kind.JOINT_ZERO, term.site.joint, term.values[0]),)
+
+    def angle_columns(self, site: Site, q: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return ones: the same turn at every angle."""
+        return np.ones((len(q), 1))
 
     def condition(
         self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]

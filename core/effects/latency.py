@@ -29,6 +29,9 @@ class Latency(JointEffect):
     """
 
     identifier = "latency"
+    title = "joint reacts late"
+    order = 20
+    delays = True
     channels = ("tracking",)
     needs = ("timestamp",)
     motion = "a recording of changing speeds of the joint"

@@ -23,6 +23,9 @@ class LinkFlexibility(Effect):
     """
 
     identifier = "link_flexibility"
+    title = "link bends under load"
+    label_words = "bending of link {joint}"
+    softens = True
     channels = ("position",)
     motion = "payloads or pulls in several directions, so that force and moment on the link differ"
     instead = "add a pair of springs across the link at a third of its length, 4 EI / 3 L each"

@@ -26,6 +26,10 @@ class LinkInertia(JointEffect):
     """
 
     identifier = "link_inertia"
+    title = "link weighs more or less"
+    order = 20
+    felt_by_all = True
+    carried = True
     channels = ("torque",)
     motion = "many poses, and accelerations of all joints up to the link"
 

@@ -25,6 +25,15 @@ class Payload(Effect):
     """
 
     identifier = "payload"
+    title = "load weighs more or less than declared"
+    label_words = "mass of the load beyond the declared one"
+    order = 10
+    needs_softness = True
+    adds_mass = True
+    carried = True
+    felt_by_all = True
+    corrects = "payload"
+    moved = "the load differs from what was declared by {size}"
     channels = ("position", "wrench", "torque")
     motion = "poses that change how the load pulls"
     instead = "change the load's mass where it is modelled"

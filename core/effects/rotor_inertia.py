@@ -27,6 +27,8 @@ class RotorInertia(JointEffect):
     """
 
     identifier = "rotor_inertia"
+    title = "motor inertia is missing"
+    order = 30
     channels = ("torque",)
     motion = "accelerations of the joint, at several poses of those beyond"
     instead = "set the joint's armature where the simulator has it"

@@ -26,6 +26,11 @@ class StiffnessNonlinearity(JointEffect):
     """
 
     identifier = "stiffness_nonlinearity"
+    title = "joint stiffens under load"
+    label_words = "stiffening of joint {joint} ({part})"
+    softens = True
+    curved = True
+    contains = "axial_compliance"
     channels = ("position",)
     motion = "at least three well separated torques about the joint's axis"
     instead = "add a joint with the spring 1/c + theta^2 / (2 c^3 M0^2)"

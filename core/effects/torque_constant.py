@@ -23,6 +23,9 @@ class TorqueConstant(JointEffect):
     """
 
     identifier = "torque_constant"
+    title = "torque reading is scaled"
+    order = 90
+    felt_by_all = True
     channels = ("torque",)
     motion = "a joint that carries torque, the more changing the better"
     instead = "scale the measured torque by 1 / (1 + value) before it is compared"

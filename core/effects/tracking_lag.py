@@ -27,6 +27,9 @@ class TrackingLag(JointEffect):
     """
 
     identifier = "tracking_lag"
+    title = "joint lags behind"
+    order = 30
+    delays = True
     channels = ("tracking",)
     needs = ("timestamp",)
     motion = "a recording of the joint with accelerations, the sharper the better"

@@ -26,6 +26,8 @@ class ViscousFriction(JointEffect):
     """
 
     identifier = "viscous_friction"
+    title = "friction grows with speed"
+    order = 51
     channels = ("torque",)
     motion = "the joint moved at several speeds"
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from core.effects import CATALOGUE
 from core.estimation.registration import IDENTITY, Registration, frame_columns, register_robustly
 from core.loads import Loads
 from core.model import Model, Poses
@@ -77,12 +78,13 @@ class Fit:
 def flexibilities(model: Model) -> Array:
     """Return the model's linear flexibilities (2n,) rad/Nm: axial, then radial.
 
-    Those that ``with_compliance`` replaces; what ``stiffness_nonlinearity`` holds stays beside.
+    Those that ``with_compliance`` replaces; what a bent stiffness curve holds stays beside.
     """
     found = np.zeros(2 * model.arm.n)
     for term in model.terms:
-        if term.effect in ("axial_compliance", "radial_compliance") and term.site.joint:
-            first = 0 if term.effect == "axial_compliance" else model.arm.n
+        kind = CATALOGUE[term.effect].flexibility
+        if kind and term.site.joint:
+            first = 0 if kind == "axial" else model.arm.n
             found[first + term.site.joint - 1] += term.values[0]
     return found
 

@@ -92,7 +92,14 @@ class Log:
                 f"{self.path}: row {self.line(row)}, column payload: found {mass[row]:g}, "
                 "expected 0 or more kg"
             )
-        return Loads(**found, approach=self.approach())
+        return Loads(**found, approach=self.approach(), time=self.times())
+
+    def times(self) -> Array:
+        """Return when each row was taken (N,): s of ``timestamp``, else the row's number from 1."""
+        if self.has("timestamp"):
+            return self.require("timestamp")
+        lines = np.arange(len(self)) + self.first_row if self.lines is None else self.lines
+        return np.asarray(lines - self.first_row + 1, dtype=float)
 
     def approach(self) -> Array | None:
         """Return the sign (N, n) of each joint's last motion before the pose, 0 where unknown.

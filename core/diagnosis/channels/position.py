@@ -82,6 +82,7 @@ def observe(
         axial_moment=np.einsum("nij,nji->ni", form.moment, form.jacobian[:, 3:]),
         unnamed=lambda: unnamed_rivals(model, q, loads, k),
         tool_axes=poses.rotation,
+        times=loads.time,
         rebase=None if metrology.registered else rebase,
     )
 
