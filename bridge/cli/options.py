@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
@@ -12,8 +13,18 @@ from bridge.cell.cell import HEAVIEST
 from core.diagnosis.suspicion import check_units
 from core.errors import LogError
 from core.log import Log, read_log
+from core.range import outside
+from core.sessions import join_sessions
 
 log_argument = click.argument("log", type=click.Path(path_type=Path))
+logs_argument = click.argument(
+    "logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path)
+)
+remounted_option = click.option(
+    "--remounted",
+    is_flag=True,
+    help="The target was taken off between sessions: each has a tool point of its own.",
+)
 cell_argument = click.argument("cell", type=click.Path(path_type=Path))
 cell_option = click.option(
     "--cell", required=True, type=click.Path(path_type=Path), help="The cell file (YAML)."
@@ -40,6 +51,23 @@ def open_log(path: Path, cell: Cell) -> Log:
     log = read_log(path, cell.arm.n)
     check_log(log, cell)
     return log
+
+
+def open_logs(paths: Sequence[Path], cell: Cell) -> Log:
+    """Return one log, or several as the sessions of one; so is one with a column ``session``.
+
+    Raises LogError as ``open_log`` does, and where the sessions do not belong together.
+    """
+    return join_sessions([open_log(path, cell) for path in paths], cell.model)
+
+
+def warn_outside(log: Log, cell: Cell) -> None:
+    """Print a warning where a log's poses, loads or temperatures lie outside what was fitted.
+
+    What was fitted stands in the cell's ``provenance``; cells without one give no warning.
+    """
+    for text in outside(log, cell.fitted_range):
+        click.echo(f"warning: {log.path}: {text}", err=True)
 
 
 def check_log(log: Log, cell: Cell) -> None:

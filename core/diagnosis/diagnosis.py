@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from core.diagnosis import position, torque, tracking, wrench
+from core.diagnosis.carrying import Carried, carried
 from core.diagnosis.cause import Cause, Considered, causes_of, considered_of
+from core.diagnosis.generalisation import NOWHERE, Generalisation, generalisation
 from core.diagnosis.held_out import HeldOut
 from core.diagnosis.judgement import Judgement, holding, judge, pure_error
 from core.diagnosis.location import Where, locate
@@ -26,6 +28,8 @@ from core.log import Log
 from core.log_columns import COLUMNS, misspelt
 from core.metrology import Metrology
 from core.model import Model
+from core.range import outside_findings
+from core.sessions import sessions_in, with_sessions
 
 Array = NDArray[np.float64]
 Observe = Callable[[Model, Log, Metrology], Observation | NotObservable]
@@ -69,6 +73,8 @@ class ChannelDiagnosis:
     gap: Array = field(repr=False)  # (N, k) measured - predicted, frame fitted
     remaining: Array = field(repr=False)  # (N, k) with the causes in the model
     held_out: Array | None = field(repr=False)  # (kept,) rms of each held-out sample
+    elsewhere: Generalisation = NOWHERE  # new region, new session
+    carried: tuple[Carried, ...] = ()  # of causes, where several sessions show them
 
 
 @dataclass(frozen=True)
@@ -81,6 +87,8 @@ class Diagnosis:
     next_measurements: tuple[Measurement, ...]
     findings: tuple[str, ...]
     model: Model = field(repr=False)  # with the causes in it
+    sessions: tuple[str, ...] = ()  # names, where there are several
+    one_clock: bool = True  # False: the sessions' timestamps overlap
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -107,6 +115,7 @@ def diagnose(
     # matrices of this size gain nothing from threads, which wait for each other on a busy machine
     with threadpool_limits(1, "blas"):
         metrology = metrology or Metrology()
+        log = with_sessions(log, model)
         return _diagnose(model, log, metrology, tuple(withhold), progress, observers, simulated)
 
 
@@ -116,7 +125,7 @@ def _diagnose(
     simulated: Log | None,
 ) -> Diagnosis:  # fmt: skip
     check_units(model, log)
-    told = findings(log, model, metrology)
+    told = _log_findings(model, log, metrology)
     observed: list[ChannelDiagnosis] = []
     hidden: list[NotObservable] = []
     if simulated is not None:
@@ -151,7 +160,25 @@ def _diagnose(
     return Diagnosis(
         _overall(observed), tuple(observed), tuple(hidden),
         next_measurements(model, log, observed), tuple(told), with_found(model, terms),
+        log.session_names, log.one_clock,
     )  # fmt: skip
+
+
+def _log_findings(model: Model, log: Log, metrology: Metrology) -> list[str]:
+    """Return what is suspicious about the log; of several sessions each by itself."""
+    if len(log.session_names) < 2:
+        return findings(log, model, metrology)
+    found: dict[str, list[str]] = {}
+    for name, part in zip(log.session_names, sessions_in(log), strict=True):
+        for text in findings(part, model, metrology):
+            found.setdefault(text, []).append(name)
+    told = [f"session {', '.join(names)}: {text}" for text, names in found.items()]
+    if not log.one_clock:
+        told.append(
+            "the sessions' timestamps overlap: each has a clock of its own, so nothing is said of "
+            "the time between them"
+        )
+    return told + outside_findings(log)
 
 
 def _thinned(
@@ -213,6 +240,8 @@ def _channel(
     causes = causes_of(selection, verdict, held, model.arm)
     left = float(np.sqrt(np.mean(remaining[kept][:, :k] ** 2)))
     held_rms = held.rms(chosen) if held.possible else None
+    if not causes:  # nothing was fitted but the frame, before as well as after
+        held_rms = float(np.sqrt(np.mean(gap[kept][:, :k] ** 2)))
     structured = verdict.structured
     floor = noise_floor(selection, structured)
     some_gap = bool(causes) or structured
@@ -230,6 +259,7 @@ def _channel(
         p_value=verdict.p_value, depends_on=verdict.depends_on, verdict=word,
         selection=selection, judgement=verdict, gap=gap, remaining=remaining,
         held_out=np.sqrt(held.squares(chosen)) if held.possible else None,
+        elsewhere=generalisation(selection, chosen), carried=carried(selection, chosen, model.arm),
     )  # fmt: skip
 
 

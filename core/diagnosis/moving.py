@@ -31,8 +31,8 @@ def conditions(motion: Motion) -> Index:
     Where the log holds fewer than five poses, another load counts as another condition.
     """
     if motion.moving:
-        span = max(float(motion.t[-1] - motion.t[0]), 1e-9)
-        number = (motion.t - motion.t[0]) / span * STRETCHES
+        t = motion.recorded_time
+        number = t / max(float(t[-1]), 1e-9) * STRETCHES
         return np.asarray(np.minimum(number.astype(np.int64), STRETCHES - 1))
     loads = motion.loads
     groups = pose_groups(motion.q)
@@ -55,7 +55,7 @@ def quantities(log: Log, motion: Motion) -> dict[str, Array]:
         "actual_q" if log.has("actual_q") else "target_q": motion.q,
         "actual_qd": motion.qd,
     }
-    for name in ("payload", "payload_cog", "joint_temperatures", "actual_TCP_force"):
+    for name in ("session", "payload", "payload_cog", "joint_temperatures", "actual_TCP_force"):
         column = log.get(name)
         columns[name] = None if column is None else column[motion.rows]
     for name, values in columns.items():
