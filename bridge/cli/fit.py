@@ -71,7 +71,11 @@ def _identified(
     paths: Sequence[Path], cell: Cell, metrology: Metrology
 ) -> tuple[Identification, dict[str, list[float]]]:
     """Return what the logs show, and the ranges fitted on; one of many rows passes in pieces."""
-    if len(paths) == 1 and is_large(paths[0]) and not has_sessions(paths[0]):
+    if (
+        len(paths) == 1
+        and is_large(paths[0])
+        and not (has_sessions(paths[0]) or metrology.remounted)
+    ):
         log = LargeLog(paths[0], cell)
         with status("fitting") as tell_step:
             found = identify_streamed(cell.model, log, metrology, progress=tell_step)
@@ -106,6 +110,12 @@ def tell(found: Identification) -> None:
     if np.isfinite(found.remaining_rms_held_out):
         change = _change(found.gap_rms_held_out, found.remaining_rms_held_out)
         click.echo(f"on poses left out of the fit: {change}")
+    for where, left in (
+        ("a new region of joint space", found.remaining_rms_new_region),
+        ("a new session", found.remaining_rms_new_session),
+    ):
+        if np.isfinite(left):
+            click.echo(f"to expect in {where}, rms in mm: {left * 1e3:.4f}")
     for line in (*found.notes, *found.combinations):
         click.echo(f"note: {line}")
 

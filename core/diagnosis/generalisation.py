@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from core.diagnosis.observation import Observation
 from core.diagnosis.selection import Selection
+from core.regions import joint_regions
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -135,12 +136,8 @@ def regions(
     names = [q for q in observation.quantities if q.startswith(("actual_q_", "target_q_"))]
     if not names or n < REGIONS:
         return np.zeros(n, dtype=np.int64), np.zeros((1, n), dtype=bool)
-    from scipy.cluster.vq import kmeans2
-
     poses = np.stack([observation.quantities[name][kept] for name in names], axis=1)
-    count = min(REGIONS, len(np.unique(observation.groups[kept])))
-    found = kmeans2(poses, count, minit="++", seed=seed, iter=50)[1]
-    fold = np.unique(found, return_inverse=True)[1].reshape(-1)
+    fold = joint_regions(poses, REGIONS, seed)
     return fold, np.zeros((int(fold.max()) + 1, n), dtype=bool)
 
 
