@@ -16,7 +16,7 @@ from bridge.cli.options import (
     warn_outside,
 )
 from bridge.cli.progress import progress
-from bridge.output_file import require_writable, write_table
+from bridge.document.output_file import require_writable, write_table
 from core.compensation import correct
 from core.errors import InputError
 from core.model import Array

@@ -21,14 +21,14 @@ from bridge.cli.options import (
     warn_outside,
 )
 from bridge.cli.progress import status
-from bridge.output_file import require_writable, write_text
-from bridge.provenance import fitted, provenance
+from bridge.document.output_file import require_writable, write_text
+from bridge.document.provenance import fitted, provenance
 from core.diagnosis.diagnosis import Diagnosis
 from core.diagnosis.diagnosis import diagnose as diagnose_log
 from core.diagnosis.document import document
 from core.effects import effect_named
 from core.errors import InputError, LogError
-from core.log import Log
+from core.log.log import Log
 from core.metrology import Metrology
 
 if TYPE_CHECKING:

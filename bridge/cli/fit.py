@@ -21,13 +21,13 @@ from bridge.cli.options import (
     remounted_option,
 )
 from bridge.cli.progress import progress, status
-from bridge.output_file import require_writable
-from bridge.provenance import provenance
+from bridge.document.output_file import require_writable
+from bridge.document.provenance import provenance
 from core.errors import ExcitationError
-from core.identification import Identification, identify_compliance
+from core.estimation.identification import Identification, identify_compliance
+from core.estimation.streamed import identify_streamed
+from core.log.ranges import merged, range_of
 from core.metrology import Metrology
-from core.range import merged, range_of
-from core.streamed_identification import identify_streamed
 
 
 @click.command()

@@ -10,11 +10,11 @@ import numpy as np
 
 from bridge.cell import Cell, load_cell
 from bridge.cell.cell import HEAVIEST
-from core.diagnosis.suspicion import check_units
+from core.diagnosis.log_checks.units_and_clocks import check_units
 from core.errors import LogError
-from core.log import Log, read_log
-from core.range import outside
-from core.sessions import join_sessions
+from core.log.log import Log, read_log
+from core.log.ranges import outside
+from core.log.sessions import join_sessions
 
 log_argument = click.argument("log", type=click.Path(path_type=Path))
 logs_argument = click.argument(

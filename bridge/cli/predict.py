@@ -15,7 +15,7 @@ from bridge.cli.options import (
     open_log,
     warn_outside,
 )
-from bridge.output_file import require_writable, write_table
+from bridge.document.output_file import require_writable, write_table
 from core.errors import InputError, LogError
 
 

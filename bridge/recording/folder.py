@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from core.errors import InputError
-from core.recording.reading import SUFFIX, last_batch
+from core.log.mcap_reading import SUFFIX, last_batch
 
 NAME = re.compile(r"(?P<session>.+)-(?P<number>\d{3,})\.mcap$")
 LOOP_LOG = ".loop.log"

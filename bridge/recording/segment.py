@@ -19,8 +19,8 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
-from core.recording.layout import layout_of
-from core.recording.schema import (
+from core.log.mcap_layout import layout_of
+from core.log.mcap_schema import (
     CYCLE_CHANNELS,
     JSON_CHANNELS,
     PACKAGE,

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arm import Arm
-from core.diagnosis.candidate import Candidate
-from core.diagnosis.selection import Selection
+from core.diagnosis.selection.candidate import Candidate
+from core.diagnosis.selection.selection import Selection
 from core.effects import CATALOGUE, Reported
 
 Array = NDArray[np.float64]

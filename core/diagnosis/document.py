@@ -6,8 +6,8 @@ import math
 from typing import Any
 
 from core.diagnosis.carrying import Carried
-from core.diagnosis.cause import Cause
 from core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
+from core.diagnosis.result import Cause
 
 SCHEMA = "gapbridge.diagnosis/1"
 

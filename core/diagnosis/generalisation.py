@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.observation import Observation
-from core.diagnosis.selection import Selection
-from core.regions import joint_regions
+from core.diagnosis.channels.observation import Observation
+from core.diagnosis.selection.selection import Selection
+from core.estimation.regions import joint_regions
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -13,8 +13,8 @@ from core.model import Model
 from core.setpoint import Setpoint
 from core.state import RobotState
 from drivers.driver import Driver
+from drivers.offset_inverse import Nominal
 from drivers.ur_rtde.command import OffsetWriter, ServoWriter, Writer
-from drivers.ur_rtde.nominal import Nominal
 from drivers.ur_rtde.settings import UrRtdeSettings
 from drivers.ur_rtde.state import StateReader
 
