@@ -50,6 +50,7 @@ def _channel(c: ChannelDiagnosis, diagnosis: Diagnosis) -> dict[str, Any]:
         "gap_rms": c.gap_rms,
         "gap_max": c.gap_max,
         "noise_floor_rms": c.noise_floor_rms,
+        "noise_floor_source": c.noise_floor_source,
         "remaining_rms": c.remaining_rms,
         "remaining_rms_held_out": c.remaining_rms_held_out,
         "remaining_rms_new_region": c.elsewhere.new_region,

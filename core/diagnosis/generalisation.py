@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.diagnosis.channels.observation import Observation
+from core.diagnosis.held_out import MANY_ROWS, TINY
 from core.diagnosis.selection.selection import Selection
 from core.estimation.regions import joint_regions
 
@@ -146,6 +147,10 @@ def _solved(A: Array, b: Array) -> Array:
     if not A.shape[1]:
         return np.zeros(0)
     unit = 1 / np.sqrt(np.einsum("ij,ij->j", A, A) + 1e-300)
+    if len(A) > MANY_ROWS:
+        size, V = np.linalg.eigh((A.T @ A) * np.outer(unit, unit))
+        inverse = np.where(size > TINY * size[-1], 1 / np.maximum(size, 1e-300), 0.0)
+        return np.asarray(unit * (V @ (inverse * (V.T @ (unit * (A.T @ b))))))
     return np.asarray(np.linalg.lstsq(A * unit, b, rcond=RANK)[0] * unit)
 
 

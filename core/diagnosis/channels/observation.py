@@ -51,6 +51,8 @@ class Observation:
     axial_moment: Array | None = None  # (N, n) Nm about each joint's axis, where it is known
     order_in_time: bool = False  # True: neighbours in time are correlated (a moving log)
     rebase: Callable[[Array], Observation] | None = None  # the same with the nuisance moved (p,)
+    instrument: Array | None = None  # (k,) 1 sigma measured by neighbouring samples of a recording
+    fewer: Callable[[NDArray[np.int64]], Observation] | None = None  # of some samples only
     session: NDArray[np.int64] | None = None  # (N,) session of each sample; None: there is one
     nuisance_session: tuple[int, ...] = ()  # (p,) session of each nuisance column, where several
 
@@ -69,6 +71,8 @@ def thinned(observation: Observation, most: int) -> Observation:
     if count <= most:
         return observation
     take = np.unique(np.linspace(0, count - 1, most).astype(int))
+    if observation.fewer is not None:
+        return observation.fewer(take)
     whole, unnamed = observation.predict, observation.unnamed
 
     def some(columns: Array | None) -> Array | None:

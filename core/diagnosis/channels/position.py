@@ -147,7 +147,7 @@ def _observe_session(
         sigma=float(np.hypot(metrology.sigma, metrology.repeatability or 0.0)),
         sigma_is_whole=metrology.repeatability is not None,
         quantities=quantities(log, rows) | approaches(loads.approach),
-        groups=pose_groups(q) if len(q) <= 3000 else np.arange(len(q)),
+        groups=pose_groups(q) if len(q) <= 3000 else rounded_groups(q),
         rows=rows,
         axes=("x", "y", "z", "rx", "ry", "rz")[:k],
         joint_columns=form.jacobian[:, :k],
@@ -156,6 +156,15 @@ def _observe_session(
         tool_axes=poses.rotation,
         rebase=rebase if nuisance.shape[2] else None,
     )
+
+
+def rounded_groups(q: Array, tolerance: float = 1e-3) -> NDArray[np.int64]:
+    """Return a number per row (N,): rows alike when rounded to ``tolerance`` (rad) share one.
+
+    Of many rows; a pair on either side of a rounding border counts as two poses.
+    """
+    rounded = np.round(q / tolerance)
+    return np.asarray(np.unique(rounded, axis=0, return_inverse=True)[1].reshape(-1))
 
 
 def _placed(model: Model, data: Data, metrology: Metrology) -> Placement:
