@@ -50,3 +50,16 @@ def is_large(path: Path) -> bool:
         return LogPieces(path, 0).count() > LARGE
     except (pyarrow.ArrowException, OSError) as error:
         raise LogError(f"{path}: found no readable Parquet file ({error})") from None
+
+
+def has_sessions(path: Path) -> bool:
+    """Return whether a log's rows belong to several sessions (a column ``session``)."""
+    if path.suffix.lower() == RECORDING or not path.is_file():
+        return False
+    if path.suffix.lower() in PARQUET:
+        from pyarrow import parquet
+
+        return "session" in parquet.read_schema(path).names
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        header = file.readline().replace(";", ",").strip().split(",")
+    return "session" in [name.strip().strip('"') for name in header]

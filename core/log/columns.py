@@ -12,6 +12,7 @@ from collections.abc import Sequence
 # name -> number of columns: 0 = one column without index, None = one per joint
 COLUMNS: dict[str, int | None] = {
     "timestamp": 0,
+    "session": 0,
     "target_q": None,
     "actual_q": None,
     "actual_qd": None,

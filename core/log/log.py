@@ -32,6 +32,8 @@ class Log:
     first_row: int = 2  # line of the first data row in the file, for messages
     lines: NDArray[np.int64] | None = None  # (N,) line of each row; None: one after the other
     unknown: tuple[str, ...] = ()  # names of the file's columns that no channel reads
+    session_names: tuple[str, ...] = ()  # of several sessions; column session holds their index
+    one_clock: bool = True  # False: timestamps of later sessions were shifted behind the first's
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
