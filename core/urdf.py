@@ -151,7 +151,8 @@ def _arm(
             columns[key].append(value if value > 0 else np.inf)
     limits = JointLimits(**{key: np.array(values) for key, values in columns.items()})
     names = tuple(str(j.get("name")) for j in moving)
-    return Arm(name, fixed, mass, cog, inertia, limits, joint_names=names)
+    axes = np.array([_align_z(_axis(joint, f"{path}: joint")).T[:3, :3] for joint in moving])
+    return Arm(name, fixed, mass, cog, inertia, limits, joint_names=names, body_axes=axes)
 
 
 def _limit(text: str, key: str, label: str) -> float:

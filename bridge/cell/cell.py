@@ -112,6 +112,12 @@ class Cell:
         )  # fmt: skip
 
     @property
+    def fitted_range(self) -> dict[str, tuple[float, float]]:
+        """Return the least and largest value of each log column that the model was fitted on."""
+        origin = self.file.provenance
+        return {} if origin is None else dict(origin.fitted)
+
+    @property
     def simulation(self) -> Simulation:
         """Return section ``simulation``."""
         return self.file.simulation

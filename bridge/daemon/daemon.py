@@ -32,6 +32,7 @@ from bridge.ipc.control_socket import ControlSocket
 from bridge.ipc.events import Event, EventBook
 from bridge.ipc.shared_memory import Phase, RunPage
 from bridge.loop.loop import LONGEST_STOP, Exit
+from bridge.loop.setpoint_stream import longest_withdrawal
 from bridge.loop.supervisor import State
 from core.errors import InputError, LinkError
 
@@ -264,7 +265,8 @@ class Daemon:
                     self._stopping.set()
                 self._reload.step(self.state, self.phase)
                 if (self._stopping.is_set() or self._reload.wants_end) and stop_by is None:
-                    stop_by = time.monotonic() + LONGEST_STOP + STOP_MARGIN
+                    needed = LONGEST_STOP + longest_withdrawal(self.settings.limits)
+                    stop_by = time.monotonic() + needed + STOP_MARGIN
                     if self._stopping.is_set():
                         self.manager.stopping()
                     loop.ask_to_stop()

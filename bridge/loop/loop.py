@@ -23,7 +23,8 @@ from bridge.loop.checks import RAMPING_OUT, LoopChecks
 from bridge.loop.controller_clock import ControllerClock
 from bridge.loop.link_monitor import StateWatch, hold_time
 from bridge.loop.live_loads import LiveLoads
-from bridge.loop.setpoint_stream import SetpointStream
+from bridge.loop.offset_in_force import OffsetInForce
+from bridge.loop.setpoint_stream import SetpointStream, longest_withdrawal
 from bridge.loop.supervisor import Cause, State, Supervisor
 from bridge.loop.writing import Writing
 from bridge.setpoint_source.source import Source, Told
@@ -36,7 +37,7 @@ from drivers.driver import Driver
 
 Vector = NDArray[np.float64]
 
-LONGEST_STOP = 1.0  # s from a request to stop to letting go, at rest or not
+LONGEST_STOP = 1.0  # s from a request to stop to letting go, beside what the cell's rates take
 HASTY_RAMP = 0.5  # s: what a stop takes for the ramp at most
 
 UNSENT = 2  # "attempted" of a cycle whose setpoint was computed and did not (wholly) leave
@@ -80,14 +81,21 @@ class Loop:
             driver, model.arm, self._supervisor, page, tell, self._lose, patience
         )
         self._checks = LoopChecks(driver.rate, self._supervisor, page, tell, patience)
+        self._in_force = self._kept_offset()
         self._writing = Writing(
             settings.setpoints, driver, source, self._stream, self._supervisor, page, tell,
-            self._skip, self._lose,
+            self._skip, self._lose, self._in_force,
         )  # fmt: skip
         self._acknowledged = False  # a person has seen the fault; it ends when the robot is fine
         self._stop_by: float | None = None  # s, monotonic
         self._exit: Exit | None = None
         self.stop_requested = False  # set by signal handlers
+
+    def _kept_offset(self) -> OffsetInForce:
+        """Return where the offset that an arm is left with is kept."""
+        if not self._driver.moves_arm:  # the robot's own program takes it out
+            return OffsetInForce(self._driver.n, None)
+        return OffsetInForce.of_link(self._driver.n, self._settings.link)
 
     # -- the frame --------------------------------------------------------------------------------
 
@@ -166,7 +174,8 @@ class Loop:
     def _stop(self) -> None:
         """Ramp out, then end; a deadline makes sure of the end."""
         if self._stop_by is None:
-            self._stop_by = time.monotonic() + LONGEST_STOP
+            needed = LONGEST_STOP + longest_withdrawal(self._settings.limits)
+            self._stop_by = time.monotonic() + needed
             self._stream.hasten(HASTY_RAMP)
             self._supervisor.take(Cause.STOP)
         if not self._supervisor.state.writes or time.monotonic() > self._stop_by:

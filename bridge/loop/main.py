@@ -32,7 +32,7 @@ from bridge.ipc.shared_memory import Page, Phase
 from bridge.loop.loop import Exit, Loop
 from bridge.loop.realtime import become_realtime
 from bridge.loop.replay import ReplayedLoop
-from bridge.loop.setpoint_stream import SetpointStream
+from bridge.loop.setpoint_stream import SetpointStream, gate_bounds
 from bridge.setpoint_source import make_source
 from bridge.setpoint_source.source import Source
 from core.errors import GapbridgeError, InputError
@@ -76,7 +76,7 @@ def _run(order: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Exit:
     read_only_from(files)  # the disk is the daemon's to read, at start and reload
     settings = DaemonSettings.model_validate(order["settings"])
     model = _read_model(settings)
-    driver = make_driver(settings.link, model)
+    driver = make_driver(settings.link, model, gate_bounds(settings.limits))
     source = _make_source(settings, model, driver)
     loop = _make_loop(settings, model, driver, source, page, tell, order["number"])
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -1,4 +1,4 @@
-"""A cell that is edited while the daemon runs changes nothing, whatever becomes of the loop."""
+"""A cell edited while the daemon runs changes nothing, whatever becomes of the loop."""
 
 from __future__ import annotations
 

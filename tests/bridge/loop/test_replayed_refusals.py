@@ -23,6 +23,7 @@ from bridge.recording.settings import RecordingSettings
 from bridge.setpoint_source.target import TargetSource
 from core.errors import LinkError, PartialWriteError
 from core.log.mcap_reading import read_columns
+from core.model import Model
 from core.setpoint import Setpoint
 from core.state import RobotState
 from drivers.driver import Driver
@@ -39,8 +40,10 @@ HOME = np.array([0.3, -1.2, 1.4, -0.6, 0.4, 0.2])
 class Scripted(Driver):
     """A controller whose own program swings the arm, with mishaps at known cycles."""
 
-    def __init__(self, cycles: int, commands: CommandPage) -> None:
-        super().__init__(20.0, N, moves_arm=False)  # no deadline that a busy machine misses
+    def __init__(self, cycles: int, commands: CommandPage, model: Model) -> None:
+        super().__init__(20.0, model, moves_arm=False)  # no deadline that a busy machine misses
+        self._now = 0.0  # s, of the script
+        self.gate.clock = lambda: self._now
         self._count = iter(range(cycles))
         self._commands = commands
         self._writes = itertools.count(1)
@@ -60,7 +63,7 @@ class Scripted(Driver):
             self._commands.ask(Command.DISARM)
         if k in (20, 900):
             self._commands.ask(Command.ARM)
-        t = 0.002 * k + (3.0 if k > 1300 else 0.0)  # a gap
+        t = self._now = 0.002 * k + (3.0 if k > 1300 else 0.0)  # a gap
         q = HOME + 0.2 * np.sin(t + np.arange(N))
         target = q + (0.1 if 400 <= k < 402 else 0.0)  # a jump
         force = self._random.normal(0.0, 8.0, 6)
@@ -71,7 +74,7 @@ class Scripted(Driver):
             payload_cog=np.array([0.0, 0.0, 0.06]), sensor_lost=lost,
         )  # fmt: skip
 
-    def write_setpoint(self, setpoint: Setpoint) -> None:
+    def _send(self, setpoint: Setpoint) -> None:
         if next(self._writes) % 53 == 0:
             raise PartialWriteError("half of it")
 
@@ -91,7 +94,7 @@ def test_refused_and_half_sent_setpoints_gaps_and_lost_sensors_are_replayed(tmp_
     settings = DaemonSettings(cell=cell)
     page, commands, told = Page(N), CommandPage(), []
     source = TargetSource(SetpointSettings(), N, False, tmp_path, 20.0)
-    loop = Loop(settings, model, Scripted(1800, commands), source, page, told.append)
+    loop = Loop(settings, model, Scripted(1800, commands, model), source, page, told.append)
     _compile(settings, model)  # else the first cycles are late
     then = run(loop, page, commands, tmp_path, "then")
     flags = then["flags"].astype(int)
