@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from core.load_bounds import LoadBounds
 from core.loads import Loads
 from core.state import RobotState
 
@@ -18,10 +19,16 @@ class LiveLoads:
     """Keeps one row of loads up to date: filtered force, payload, temperature, last motion.
 
     The controller's declared payload stands instead of the model's own, because its TCP force has
-    that payload taken off.
+    that payload taken off. A load beyond ``bounds`` is not taken: the last one that can be stays,
+    and ``doubt`` says why.
     """
 
-    def __init__(self, n: int, use_force: bool, time_constant: float) -> None:
+    def __init__(
+        self, n: int, use_force: bool, time_constant: float, bounds: LoadBounds | None = None
+    ) -> None:
+        self._bounds = bounds or LoadBounds(math.inf)
+        self._has_payload = False  # a payload has been taken
+        self.doubt: str | None = None  # why a load of the last state cannot be
         self._use_force = use_force
         self._constant = time_constant
         self._wrench = np.zeros((1, 6))
@@ -34,12 +41,10 @@ class LiveLoads:
 
     def update(self, state: RobotState) -> Loads:
         """Return the loads (one row) of this state; the arrays are this object's own."""
+        self.doubt = None
         self._filter_force(state)
         self._follow_motion(state.actual_q)
-        has_payload = state.payload is not None and state.payload_cog is not None
-        if has_payload:
-            self._mass[0] = state.payload
-            self._cog[0] = state.payload_cog
+        has_payload = self._take_payload(state)
         if state.joint_temperatures is not None:
             self._temperature[0] = state.joint_temperatures
         return Loads(
@@ -49,6 +54,19 @@ class LiveLoads:
             temperature=None if state.joint_temperatures is None else self._temperature,
             approach=self._approach,
         )
+
+    def _take_payload(self, state: RobotState) -> bool:
+        """Take the declared payload over; returns whether there is one to go by."""
+        mass, cog = state.payload, state.payload_cog
+        if mass is None or cog is None:
+            return False
+        doubt = self._bounds.doubt_payload(mass, cog)
+        if doubt is not None:
+            self.doubt = doubt
+            return self._has_payload
+        self._has_payload = True
+        self._mass[0], self._cog[0] = mass, cog
+        return True
 
     def forget(self) -> None:
         """Begin anew after a gap: an old force means nothing."""
@@ -62,6 +80,10 @@ class LiveLoads:
         if state.sensor_lost and not np.isfinite(state.actual_TCP_force).all():
             self._wrench[0], self._last = 0.0, -math.inf
             return
+        if self._use_force:
+            self.doubt = self._bounds.doubt_wrench(state.actual_TCP_force)
+            if self.doubt is not None:
+                return
         gap = state.timestamp - self._last
         self._last = state.timestamp
         if self._constant <= 0.0 or not 0.0 < gap < 10.0 * self._constant:

@@ -148,12 +148,19 @@ class Writing:
             else:
                 self._driver.write_setpoint(setpoint)
                 self._failed = 0
+                self._judge_correction()
                 self._judge_sending(expiry)
                 return setpoint
         except WriteError as error:
             self.unsent = _copied(setpoint)
             self._fail(error)
         return None
+
+    def _judge_correction(self) -> None:
+        """End the motion where the model has no correction; the offset is on its way out."""
+        words = self._stream.unsolved
+        if words and self._supervisor.take(Cause.UNSOLVED, words):
+            self._page.count(Count.UNSOLVED)
 
     def _judge_sending(self, expiry: float) -> None:
         """End the motion where the system stopped this process between judging and sending."""

@@ -25,7 +25,7 @@ def address_of(link: DriverSettings) -> str:
     """Return what tells one controller from another: the same for whatever driver reaches it.
 
     A host is what its name resolves to, once for the whole run. A port is left out where it is the
-    protocol's own: RTDE and Modbus of one robot are one controller, a gateway's other ports are not.
+    protocol's own: RTDE and Modbus of one robot are one controller, ports of a gateway are not.
     """
     given = link.model_dump(mode="json")
     if "interface" in given:  # a bus, with a whole arm by each profile

@@ -15,6 +15,7 @@ from bridge.loop_checks import RAMPING_OUT, RESYNC
 from bridge.setpoint_stream import SetpointStream
 from bridge.supervisor import Cause, State
 from core.errors import LimitError
+from core.load_bounds import LoadBounds
 from core.loads import Loads
 from core.model import Model
 from core.setpoint import Setpoint
@@ -68,8 +69,9 @@ class ReplayedLoop(Loop):
         settings = self._settings
         self._stream = SetpointStream(self._model, settings.limits, self._recording.rate)
         self._loads = LiveLoads(
-            self._model.arm.n, settings.setpoints.use_force, settings.setpoints.force_filter
-        )
+            self._model.arm.n, settings.setpoints.use_force, settings.setpoints.force_filter,
+            LoadBounds.of(self._model),
+        )  # fmt: skip
         self._clock.skip()
         self._streaming = False
 

@@ -98,6 +98,13 @@ class Driver(ABC):
         May take a while. Raises WriteError where the link is gone.
         """
 
+    def mismatch(self) -> str | None:
+        """Return in words how the controller is set otherwise than the cell says; None: it is not.
+
+        Asked about once a second while the arm is armed; where the link does not show it: None.
+        """
+        return None
+
     def nominal_q(self, state: RobotState) -> Vector:
         """Return the joints (n,) that the robot itself wants, without our correction, rad."""
         return state.target_q

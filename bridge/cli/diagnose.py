@@ -12,7 +12,7 @@ from bridge.cell import Cell, save_cell
 from bridge.cli.answer import answer
 from bridge.cli.options import cell_option, log_argument, open_cell, open_log
 from bridge.cli.progress import status
-from bridge.output_file import require_writable, write_text
+from bridge.output_file import FOLDER_MODE, require_writable, write_text
 from core.diagnosis.diagnosis import Diagnosis
 from core.diagnosis.diagnosis import diagnose as diagnose_log
 from core.diagnosis.document import document
@@ -139,7 +139,7 @@ def _folder(path: Path) -> None:
     if not path.parent.is_dir():
         raise InputError(f"{path}: found no folder {path.parent}, expected an existing one")
     try:
-        path.mkdir(exist_ok=True)
+        path.mkdir(FOLDER_MODE, exist_ok=True)
     except OSError as error:
         raise InputError(f"{path}: folder cannot be made: {error.strerror}") from None
 

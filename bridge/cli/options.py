@@ -8,9 +8,9 @@ import click
 import numpy as np
 
 from bridge.cell import Cell, load_cell
-from bridge.cell.cell import HEAVIEST
 from core.diagnosis.suspicion import check_units
 from core.errors import LogError
+from core.load_bounds import HEAVIEST
 from core.log import Log, read_log
 
 log_argument = click.argument("log", type=click.Path(path_type=Path))

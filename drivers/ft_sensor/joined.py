@@ -72,6 +72,10 @@ class DriverWithSensor(Driver):
         """See Driver.keep_alive."""
         self._arm.keep_alive()
 
+    def mismatch(self) -> str | None:
+        """See Driver.mismatch."""
+        return self._arm.mismatch()
+
     def write_setpoint(self, setpoint: Setpoint) -> None:
         """Send one setpoint to the arm."""
         self._arm.write_setpoint(setpoint)

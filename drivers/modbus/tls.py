@@ -1,4 +1,4 @@
-"""TLS to one controller: whoever answers must be the one that the cell names, before any request."""
+"""TLS to one controller: who answers must be the one that the cell names, before any request."""
 
 from __future__ import annotations
 

@@ -235,7 +235,7 @@ def test_a_fingerprint_is_taken_as_tools_print_it() -> None:
     given = {"profile": "ur", "transport": "tls"}
     assert ModbusSettings(**given, fingerprint=spelled).fingerprint == "ab" * 32
     for wrong in (None, "ab" * 31, "zz" * 32):
-        with pytest.raises(ValueError, match="fingerprint|expected 64"):
+        with pytest.raises(ValueError, match=r"fingerprint|expected 64"):
             ModbusSettings(**given, fingerprint=wrong)
 
 
