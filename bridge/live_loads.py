@@ -19,8 +19,8 @@ class LiveLoads:
     """Keeps one row of loads up to date: filtered force, payload, temperature, last motion.
 
     The controller's declared payload stands instead of the model's own, because its TCP force has
-    that payload taken off. A load beyond ``bounds`` is not taken: the last one that can be stays,
-    and ``doubt`` says why.
+    that payload taken off. Where a load is beyond ``bounds``, none of the state's is taken: the
+    last ones stay, and ``doubt`` says why.
     """
 
     def __init__(
@@ -41,10 +41,12 @@ class LiveLoads:
 
     def update(self, state: RobotState) -> Loads:
         """Return the loads (one row) of this state; the arrays are this object's own."""
-        self.doubt = None
-        self._filter_force(state)
+        self.doubt = self._doubt(state)
+        if self.doubt is None:
+            self._filter_force(state)
+            self._take_payload(state)
         self._follow_motion(state.actual_q)
-        has_payload = self._take_payload(state)
+        has_payload = self._has_payload
         if state.joint_temperatures is not None:
             self._temperature[0] = state.joint_temperatures
         return Loads(
@@ -55,18 +57,24 @@ class LiveLoads:
             approach=self._approach,
         )
 
-    def _take_payload(self, state: RobotState) -> bool:
-        """Take the declared payload over; returns whether there is one to go by."""
-        mass, cog = state.payload, state.payload_cog
-        if mass is None or cog is None:
-            return False
-        doubt = self._bounds.doubt_payload(mass, cog)
-        if doubt is not None:
-            self.doubt = doubt
-            return self._has_payload
-        self._has_payload = True
-        self._mass[0], self._cog[0] = mass, cog
-        return True
+    def _doubt(self, state: RobotState) -> str | None:
+        """Return in words which load of a state cannot be; None: all can.
+
+        Together: the controller takes the declared payload off its force.
+        """
+        found = None
+        if state.payload is not None and state.payload_cog is not None:
+            found = self._bounds.doubt_payload(state.payload, state.payload_cog)
+        if found is None and self._use_force and not state.sensor_lost:
+            found = self._bounds.doubt_wrench(state.actual_TCP_force)
+        return found
+
+    def _take_payload(self, state: RobotState) -> None:
+        """Take the declared payload over, where there is one."""
+        self._has_payload = state.payload is not None and state.payload_cog is not None
+        if self._has_payload:
+            self._mass[0] = state.payload
+            self._cog[0] = state.payload_cog
 
     def forget(self) -> None:
         """Begin anew after a gap: an old force means nothing."""
@@ -80,10 +88,6 @@ class LiveLoads:
         if state.sensor_lost and not np.isfinite(state.actual_TCP_force).all():
             self._wrench[0], self._last = 0.0, -math.inf
             return
-        if self._use_force:
-            self.doubt = self._bounds.doubt_wrench(state.actual_TCP_force)
-            if self.doubt is not None:
-                return
         gap = state.timestamp - self._last
         self._last = state.timestamp
         if self._constant <= 0.0 or not 0.0 < gap < 10.0 * self._constant:

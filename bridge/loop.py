@@ -220,7 +220,7 @@ class Loop:
         except InvalidStateError as error:
             self._watch.doubt(str(error))
             return
-        missed = self._clock.take(state)
+        missed = self._clock.take(state, self._supervisor.state.writes)
         expiry = self._clock.expiry(state)
         is_fresh = self._watch.believe(expiry)
         self._page.tell_seen()

@@ -14,6 +14,7 @@ from bridge.setpoint_source.source import Source, SourceDryError
 from bridge.setpoint_stream import SetpointStream
 from bridge.settings import SetpointSettings
 from bridge.shared_page import Page, Phase
+from bridge.state_watch import hold_time
 from bridge.supervisor import Cause, State, Supervisor
 from core.errors import (
     ForeignCommandError,
@@ -97,11 +98,21 @@ class Writing:
         self._page.enter(Phase.ARMING)
         self.has_armed = True
         try:
+            self._check_way()
             self._driver.arm(state)
             self.ready = True
         finally:
             self._page.enter(Phase.RUNNING)
             self._skip()
+
+    def _check_way(self) -> None:
+        """Refuse a link on which no state can be fresh. Raises WriteError."""
+        taken, most = self._driver.round_trip(), hold_time(self._driver.rate)
+        if taken is not None and taken > most:
+            raise WriteError(
+                f"link: a question and its answer take {1e3 * taken:.0f} ms, expected at most "
+                f"{1e3 * most:.0f} ms: no state behind a setpoint may be older"
+            )
 
     def _refuse_start(self, detail: str) -> None:
         self.release()

@@ -98,6 +98,14 @@ class Driver(ABC):
         May take a while. Raises WriteError where the link is gone.
         """
 
+    def round_trip(self) -> float | None:
+        """Return how long a question and its answer take now, s; None where nothing can be asked.
+
+        No state is younger than that way lets it be: asked before arming. Raises WriteError where
+        no answer comes.
+        """
+        return None
+
     def mismatch(self) -> str | None:
         """Return in words how the controller is set otherwise than the cell says; None: it is not.
 

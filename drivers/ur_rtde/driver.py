@@ -16,6 +16,7 @@ from core.state import RobotState
 from drivers.driver import Driver
 from drivers.ur_rtde.command import OffsetWriter, ServoWriter, Writer
 from drivers.ur_rtde.nominal import Nominal
+from drivers.ur_rtde.round_trip import round_trip
 from drivers.ur_rtde.settings import UrRtdeSettings
 from drivers.ur_rtde.state import StateReader
 
@@ -70,6 +71,10 @@ class UrRtdeDriver(Driver):
         if words is not None:
             raise WriteError(f"{self.settings.host}: {words}")
         self._writer.arm(state)
+
+    def round_trip(self) -> float | None:
+        """Return how long a question to the RTDE server takes, s; see Driver.round_trip."""
+        return round_trip(self.settings.host)
 
     def mismatch(self) -> str | None:
         """Return in words how the controller's TCP differs from the cell's; see Driver.mismatch.

@@ -140,6 +140,20 @@ def test_a_clock_that_stood_still_is_tied_anew_once_nothing_younger_comes() -> N
             assert (clock.expiry(late) < late.received) == (k < 20)
 
 
+def test_while_writing_samples_that_come_later_for_good_stay_old() -> None:
+    clock = ControllerClock(500.0, hold=0.04)
+    now = time.monotonic()
+    clock.take(state(1.0, now - 3.0), writes=True)
+    for k in range(1, 1000):  # from then on 0.21 s later than before
+        late = state(1.0 + 0.002 * k, now - 3.0 + 0.21 + 0.002 * k)
+        clock.take(late, writes=True)
+        assert clock.expiry(late) < late.received
+    clock.take(state(3.0, now - 0.79), writes=False)  # nothing is written any more
+    late = state(3.002, now - 0.788)
+    clock.take(late)
+    assert clock.expiry(late) > late.received
+
+
 def test_what_a_stalled_link_hands_on_at_once_is_old_until_the_newest_has_come() -> None:
     clock = ControllerClock(500.0, hold=0.04)
     now = time.monotonic()
