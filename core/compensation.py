@@ -14,15 +14,23 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core import kernel
-from core.kernel import JIT, Chain
+from core.kernels import reference as kernel
 from core.kernels import single
+from core.kernels.least_offset import LARGEST_OFFSET as LARGEST_OFFSET
+from core.kernels.least_offset import smallest_offset
+from core.kernels.packed import (
+    arm_block,
+    chain_of,
+    row_of,
+    shape_of,
+    shape_size,
+    sizes_of,
+    view_row,
+)
+from core.kernels.reference import JIT, Chain
 from core.kernels.single import LEVER, MAX_STEPS, SCRATCH, TOLERANCE
-from core.least_offset import LARGEST_OFFSET as LARGEST_OFFSET
-from core.least_offset import smallest_offset
 from core.loads import Loads
 from core.model import Model, Poses
-from core.packed import arm_block, chain_of, row_of, shape_of, shape_size, sizes_of, view_row
 
 Array = NDArray[np.float64]
 NOTHING = Loads()

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.effects import CATALOGUE, Term
-from core.kernel import Chain
+from core.kernels.reference import Chain
 from core.model import Model
 from core.motion import Motion, Pieces
 

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.kernel import JIT
+from core.kernels.reference import JIT
 
 if TYPE_CHECKING:
     from core.motion import Motion

@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from core.errors import LimitError
-from core.kernel import JIT
+from core.kernels.reference import JIT
 
 Array = NDArray[np.float64]
 LONGEST_GAP = 5.0  # cycles: after a longer one, no more than this many cycles' steps are allowed

@@ -12,8 +12,8 @@ from core.arm import Arm
 from core.effects import CATALOGUE, Site, Term
 from core.effects.effect import Effect
 from core.errors import InputError
-from core.kernel import Chain, Rows
 from core.kernels import many
+from core.kernels.reference import Chain, Rows
 from core.loads import Loads
 from core.rotation import rotation_vector
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from core.derivatives import differentiate
 from core.errors import LogError
 from core.loads import Loads
-from core.log import Log
+from core.log.log import Log
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -51,7 +51,7 @@ class ReplaySettings(DriverSettings):
 
         Raises InputError where there is none.
         """
-        from core.recording.reading import files_of
+        from core.log.mcap_reading import files_of
 
         path = (folder / self.file).resolve()
         try:
@@ -136,7 +136,7 @@ class ReplayDriver(Driver):
         self._left = iter(())
 
     def _rows(self) -> Iterator[Mapping[str, Vector]]:
-        from core.recording.reading import read_batches  # only who replays loads MCAP
+        from core.log.mcap_reading import read_batches  # only who replays loads MCAP
 
         for batch in read_batches(self.settings.file):
             for k in range(len(batch)):

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from benchmarks.faults.wire.seen import Fresh, Numbers, Write
-from drivers.simulated.kinematics import gap, tcp_in_base
-from drivers.simulated.plant_arm import Frame, PlantArm
+from drivers.simulated.plant.kinematics import gap, tcp_in_base
+from drivers.simulated.plant.plant_arm import Frame, PlantArm
 
 WRITING = (3, 4)  # compensating, holding
 GRACE = 0.03  # s: a write seen so long after the state has changed was on its way

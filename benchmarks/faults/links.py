@@ -19,9 +19,9 @@ from benchmarks.faults.wire.rtde import RtdeDecoder
 from benchmarks.faults.wire.seen import Decoder
 from benchmarks.faults.wire.socketcand import PiperDecoder
 from bridge.cell import load_cell
-from drivers.simulated.kinematics import frame_of
-from drivers.simulated.plant_arm import plant_arm
-from drivers.simulated.settings import START_Q
+from drivers.simulated.plant.kinematics import frame_of
+from drivers.simulated.plant.plant_arm import plant_arm
+from drivers.simulated.ur.settings import START_Q
 from drivers.ur_rtde.driver import OFFSET_SCRIPT
 
 CONFIG = Path(__file__).parents[2] / "config"

@@ -17,14 +17,14 @@ import psutil
 from benchmarks.faults.punctual import go_first
 from benchmarks.faults.running import Event, Told
 from bridge.cell import load_cell
-from bridge.shared_page import Page
-from bridge.supervisor import State
+from bridge.ipc.shared_memory import Page
+from bridge.loop.supervisor import State
 
 CODE = """
 import ctypes, json, signal, sys
 from pathlib import Path
 from bridge.cli import main
-from bridge.daemon_run import run_cell
+from bridge.daemon.run import run_cell
 def tell(event):
     print(json.dumps(event, default=str), file=sys.stderr, flush=True)
 sys.exit(run_cell(Path(sys.argv[1]), arm=True, log=tell))

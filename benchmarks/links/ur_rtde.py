@@ -15,7 +15,7 @@ from typing import Any
 from benchmarks.links.case import Cycles, LinkCase, OurCycle, Pause
 from benchmarks.links.serving import served_cell
 from bridge.cell.cell import Cell
-from drivers.simulated.settings import SCRIPT_PORT
+from drivers.simulated.ur.settings import SCRIPT_PORT
 from drivers.ur_rtde import registers
 from drivers.ur_rtde.driver import OFFSET_SCRIPT, UrRtdeDriver
 from drivers.ur_rtde.settings import UrRtdeSettings

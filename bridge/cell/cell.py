@@ -14,8 +14,8 @@ from bridge.cell.effects import compliance_terms, term_of
 from bridge.cell.message import message, messages
 from bridge.cell.robot import build_arm
 from bridge.cell.schema import CellFile, Frame, Simulation
+from bridge.cell.sections import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
 from bridge.metrics.settings import MetricsSettings
-from bridge.settings import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
 from bridge.web.settings import WebSettings
 from core.arm import Arm
 from core.errors import ArmError, CellError, InputError

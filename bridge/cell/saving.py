@@ -12,7 +12,7 @@ import yaml
 from bridge.cell.cell import Cell
 from bridge.cell.document import Document, number_text, parse
 from bridge.cell.effects import compliance_entry, effect_entries
-from bridge.output_file import write_text
+from bridge.document.output_file import write_text
 from core.errors import CellError
 from core.model import Model
 

@@ -7,8 +7,8 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 from bridge.calibration.settings import CalibrationSettings
+from bridge.cell.sections import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
 from bridge.metrics.settings import MetricsSettings
-from bridge.settings import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
 from bridge.web.settings import WebSettings
 from drivers.ft_sensor.settings import AnyFtSensor
 

@@ -17,10 +17,10 @@ from core.errors import CellError
 from core.rotation import rotation_vector
 from drivers.driver import DriverSettings
 from drivers.simulated.ft_sensor.serving import served_sensor
-from drivers.simulated.peer import Peer, make_peer
-from drivers.simulated.peer_server import PeerServer, serve_peer
-from drivers.simulated.server import serve
-from drivers.simulated.settings import (
+from drivers.simulated.peer.peer import Peer, make_peer
+from drivers.simulated.peer.peer_server import PeerServer, serve_peer
+from drivers.simulated.ur.server import serve
+from drivers.simulated.ur.settings import (
     BENCH_PORT,
     ServerSettings,
     simulated_arm,

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from core.diagnosis.cause import Cause
 from core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
+from core.diagnosis.result import Cause
 from core.diagnosis.separation import Measurement
 from core.effects import Reported
 

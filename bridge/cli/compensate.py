@@ -9,7 +9,7 @@ import numpy as np
 
 from bridge.cli.options import cell_option, csv_option, log_argument, open_cell, open_log
 from bridge.cli.progress import progress
-from bridge.output_file import require_writable, write_table
+from bridge.document.output_file import require_writable, write_table
 from core.compensation import correct
 from core.errors import InputError
 from core.model import Array

@@ -12,13 +12,13 @@ from bridge.cell import Cell, save_cell
 from bridge.cli.answer import answer
 from bridge.cli.options import cell_option, log_argument, open_cell, open_log
 from bridge.cli.progress import status
-from bridge.output_file import FOLDER_MODE, require_writable, write_text
+from bridge.document.output_file import FOLDER_MODE, require_writable, write_text
 from core.diagnosis.diagnosis import Diagnosis
 from core.diagnosis.diagnosis import diagnose as diagnose_log
 from core.diagnosis.document import document
 from core.effects import effect_named
 from core.errors import InputError, LogError
-from core.log import Log
+from core.log.log import Log
 
 if TYPE_CHECKING:
     from collections.abc import Callable

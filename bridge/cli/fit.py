@@ -13,10 +13,10 @@ from bridge.cell import Cell, save_cell
 from bridge.cli.large_log import LargeLog, is_large
 from bridge.cli.options import cell_option, log_argument, open_cell, open_log
 from bridge.cli.progress import progress, status
-from bridge.output_file import require_writable
+from bridge.document.output_file import require_writable
 from core.errors import ExcitationError
-from core.identification import Identification, identify_compliance
-from core.streamed_identification import identify_streamed
+from core.estimation.identification import Identification, identify_compliance
+from core.estimation.streamed import identify_streamed
 
 
 @click.command()

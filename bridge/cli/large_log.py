@@ -9,9 +9,9 @@ from pathlib import Path
 from bridge.cell import Cell
 from bridge.cli.options import check_log
 from core.errors import LogError
-from core.log import Log
-from core.log_pieces import PARQUET, RECORDING, LogPieces
-from core.recording.reading import files_of
+from core.log.log import Log
+from core.log.mcap_reading import files_of
+from core.log.pieces import PARQUET, RECORDING, LogPieces
 
 LARGE = 20_000  # rows from which a log is read in pieces
 BYTES = 8_000_000  # of a text file that holds about as many

@@ -8,10 +8,10 @@ import click
 import numpy as np
 
 from bridge.cell import Cell, load_cell
-from core.diagnosis.suspicion import check_units
+from core.diagnosis.log_checks.units_and_clocks import check_units
 from core.errors import LogError
 from core.load_bounds import HEAVIEST
-from core.log import Log, read_log
+from core.log.log import Log, read_log
 
 log_argument = click.argument("log", type=click.Path(path_type=Path))
 cell_argument = click.argument("cell", type=click.Path(path_type=Path))

@@ -8,7 +8,7 @@ import click
 import numpy as np
 
 from bridge.cli.options import cell_option, csv_option, log_argument, open_cell, open_log
-from bridge.output_file import require_writable, write_table
+from bridge.document.output_file import require_writable, write_table
 from core.errors import InputError, LogError
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.demo.poses import Load
-from bridge.output_file import write_table
+from bridge.document.output_file import write_table
 from core.errors import RunError
 from core.rotation import rotation_matrix, rotation_vector
 

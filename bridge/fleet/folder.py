@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from bridge.output_file import FOLDER_MODE
+from bridge.document.output_file import FOLDER_MODE
 from core.errors import InputError
 
 

@@ -33,8 +33,8 @@ from mcap.writer import MCAP0_MAGIC
 
 from bridge.recording.folder import NAME
 from core.errors import LogError
-from core.recording import records
-from core.recording.reading import files_of
+from core.log import mcap_records as records
+from core.log.mcap_reading import files_of
 
 _FOOTER = struct.Struct("<BQQQ")
 FOOTER_SIZE = 20

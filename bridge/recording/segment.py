@@ -20,9 +20,9 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
-from bridge.output_file import MODE
-from core.recording.layout import layout_of
-from core.recording.schema import (
+from bridge.document.output_file import MODE
+from core.log.mcap_layout import layout_of
+from core.log.mcap_schema import (
     CYCLE_CHANNELS,
     JSON_CHANNELS,
     PACKAGE,

@@ -16,8 +16,8 @@ from bridge.report.words import (
     quantity_words,
     told,
 )  # fmt: skip
-from core.diagnosis.cause import Cause
 from core.diagnosis.diagnosis import ChannelDiagnosis
+from core.diagnosis.result import Cause
 
 KINDS = {"no_gap": "good", "explained": "good", "partly_explained": "doubtful",
          "unexplained": "bad"}  # fmt: skip

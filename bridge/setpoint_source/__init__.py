@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
+    from bridge.cell.sections import SetpointSettings
     from bridge.setpoint_source.source import Source
-    from bridge.settings import SetpointSettings
 
 SOURCES: dict[str, str] = {
     "target": "bridge.setpoint_source.target:TargetSource",

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bridge.cell.sections import SetpointSettings
 from bridge.setpoint_source.glide import Glide
 from bridge.setpoint_source.modbus_page import MOST_JOINTS, PlcPage
 from bridge.setpoint_source.source import Source, Told
-from bridge.settings import SetpointSettings
 from core.errors import InputError, RunError
 
 Vector = NDArray[np.float64]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.settings import SetpointSettings
+from bridge.cell.sections import SetpointSettings
 from core.errors import RunError
 
 Vector = NDArray[np.float64]

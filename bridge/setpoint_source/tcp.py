@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bridge.cell.sections import SetpointSettings
 from bridge.setpoint_source.glide import Glide
 from bridge.setpoint_source.source import Source
-from bridge.settings import SetpointSettings
 from core.errors import RunError
 
 Vector = NDArray[np.float64]

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.calibration.result import Estimate
-from core.calibration.robust import weighed
 from core.effects import CATALOGUE, Site, Term
 from core.errors import ExcitationError, InputError
-from core.log import Log
+from core.estimation.robust import weighed
+from core.log.log import Log
 from core.model import Model
 from core.motion import Motion, motion_of
 

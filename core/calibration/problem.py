@@ -12,10 +12,10 @@ from core.calibration.observables.nuisance import Nuisance
 from core.calibration.observables.observable import Observable
 from core.calibration.parameters import Parameters
 from core.calibration.readings import Readings
-from core.calibration.robust import scaled_length, weights_of
 from core.calibration.staging import Stages
-from core.calibration.system import Bounds, System
 from core.errors import ExcitationError, InputError
+from core.estimation.linear_system import Bounds, System
+from core.estimation.robust import scaled_length, weights_of
 
 Array = NDArray[np.float64]
 HELD = 10.0  # usual sizes within which a parameter is weakly held at its beginning

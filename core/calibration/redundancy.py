@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.foreseen import foreseen, somewhere
+from core.calibration.observables.foreseen import foreseen, somewhere
 from core.calibration.observables.nuisance import Nuisance
 from core.calibration.observables.observable import Observable
 from core.calibration.readings import Readings

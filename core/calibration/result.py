@@ -10,8 +10,8 @@ from scipy.special import stdtrit
 
 from core.calibration.readings import Readings
 from core.diagnosis.diagnosis import Diagnosis
+from core.estimation.registration import Registration
 from core.model import Model
-from core.registration import Registration
 
 Array = NDArray[np.float64]
 

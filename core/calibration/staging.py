@@ -15,8 +15,8 @@ from scipy.stats import chi2
 
 from core.calibration.parameters import Parameters
 from core.calibration.readings import Readings
-from core.calibration.system import Bounds, Mask, System, posterior, solve
-from core.identification import pose_groups
+from core.estimation.identification import pose_groups
+from core.estimation.linear_system import Bounds, Mask, System, posterior, solve
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.calibration.result import Estimate
-from core.calibration.robust import Weighed, weighed
 from core.errors import ExcitationError, InputError
+from core.estimation.robust import Weighed, weighed
 from core.loads import Loads
 from core.model import Model
 

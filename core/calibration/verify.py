@@ -26,9 +26,9 @@ from core.calibration.readings import Readings
 from core.calibration.result import Errors, Estimate
 from core.calibration.telling_moved import moved_words, verdict_words
 from core.errors import ExcitationError
+from core.estimation.registration import Registration
 from core.metrology import Metrology
 from core.model import Model
-from core.registration import Registration
 
 Array = NDArray[np.float64]
 BROKEN = 1e-3  # chance below which a promise counts as broken

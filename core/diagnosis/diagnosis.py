@@ -9,21 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from core.diagnosis import position, torque, tracking, wrench
-from core.diagnosis.cause import Cause, Considered, causes_of, considered_of
+from core.diagnosis.channels import position, torque, tracking, wrench
+from core.diagnosis.channels.observation import NotObservable, Observation, thinned
+from core.diagnosis.channels.simulation import joined, predicted_by
 from core.diagnosis.held_out import HeldOut
 from core.diagnosis.judgement import Judgement, holding, judge, pure_error
 from core.diagnosis.location import Where, locate
-from core.diagnosis.observation import NotObservable, Observation, thinned
+from core.diagnosis.log_checks.units_and_clocks import check_units, findings
+from core.diagnosis.result import Cause, Considered, causes_of, considered_of
 from core.diagnosis.rigid_suspicion import softness_findings
-from core.diagnosis.selection import Selection, select, standing
+from core.diagnosis.selection.selection import Selection, select, standing
 from core.diagnosis.separation import Measurement, next_measurements
-from core.diagnosis.simulation import joined, predicted_by
-from core.diagnosis.suspicion import check_units, findings
 from core.effects import Term
 from core.errors import LogError
-from core.log import Log
-from core.log_columns import COLUMNS, misspelt
+from core.log.columns import COLUMNS, misspelt
+from core.log.log import Log
 from core.metrology import Metrology
 from core.model import Model
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from core.diagnosis.cause import Cause
 from core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
+from core.diagnosis.result import Cause
 
 SCHEMA = "gapbridge.diagnosis/1"
 

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.bent import not_bent
 from core.diagnosis.held_out import HeldOut
-from core.diagnosis.leftover import dependence, structure_p_value
-from core.diagnosis.neighbours import rivals
-from core.diagnosis.selection import Selection
-from core.diagnosis.space import Found, Space, fit
+from core.diagnosis.residual_structure import dependence, structure_p_value
+from core.diagnosis.selection.bent import not_bent
+from core.diagnosis.selection.local_search import rivals
+from core.diagnosis.selection.problem import Found, Space, fit
+from core.diagnosis.selection.selection import Selection
 
 Array = NDArray[np.float64]
 SURE = 0.002  # probability below which a leftover counts as structured

@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.neighbours import rivals
-from core.diagnosis.space import Found, Space, fit
-from core.diagnosis.trials import PREDICTED, Predict, Trials, draw_trials
+from core.diagnosis.next_measurements import PREDICTED, Predict, Trials, draw_trials
+from core.diagnosis.selection.local_search import rivals
+from core.diagnosis.selection.problem import Found, Space, fit
 from core.effects import CATALOGUE, Site, Term
 from core.errors import InputError
-from core.log import Log
+from core.estimation.registration import frame_columns
+from core.log.log import Log
 from core.model import Model
-from core.registration import frame_columns
 
 if TYPE_CHECKING:
     from core.diagnosis.diagnosis import ChannelDiagnosis

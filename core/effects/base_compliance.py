@@ -8,8 +8,8 @@ from core.effects.effect import Effect, Parameter, Site, Term, typical_moment
 
 if TYPE_CHECKING:
     from core.arm import Arm
-    from core.kernel import Chain
     from core.kernels.rates import ChainRate
+    from core.kernels.reference import Chain
 
 
 class BaseCompliance(Effect):

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from core.arm import Arm
-    from core.kernel import Chain, Rows
     from core.kernels.rates import ChainRate
+    from core.kernels.reference import Chain, Rows
     from core.loads import Loads
     from core.motion import Motion
 

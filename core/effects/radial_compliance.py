@@ -8,8 +8,8 @@ from core.effects.effect import JointEffect, Parameter, Site, Term, typical_mome
 
 if TYPE_CHECKING:
     from core.arm import Arm
-    from core.kernel import Chain
     from core.kernels.rates import ChainRate
+    from core.kernels.reference import Chain
 
 
 class RadialCompliance(JointEffect):

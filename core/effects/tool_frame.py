@@ -11,8 +11,8 @@ from core.rotation import left_jacobian, one_rotation_matrix
 
 if TYPE_CHECKING:
     from core.arm import Arm
-    from core.kernel import Chain
     from core.kernels.rates import ChainRate
+    from core.kernels.reference import Chain
 
 
 class ToolFrame(Effect):

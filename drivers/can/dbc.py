@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drivers.can.document import ProfileError
+from drivers.profile_file import ProfileError
 
 _MESSAGE = re.compile(r"^\s*BO_\s+\d+\s+(\w+)\s*:")
 _SIGNAL = re.compile(r"^\s+SG_\s+(\w+)\b")

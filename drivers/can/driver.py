@@ -18,9 +18,9 @@ from core.errors import (
 from core.model import Model
 from core.setpoint import Setpoint
 from core.state import RobotState
+from drivers.can.assembler import Sample
 from drivers.can.loading import read_profile
 from drivers.can.reader import FrameReader
-from drivers.can.sample import Sample
 from drivers.can.settings import CanSettings
 from drivers.can.state import StateBuilder
 from drivers.can.writer import FrameWriter

@@ -8,7 +8,7 @@ from typing import Literal, Self
 from pydantic import Field
 
 from core.errors import InputError
-from drivers.can.bus import BusSettings
+from drivers.can_bus.bus import BusSettings
 from drivers.driver import DriverSettings
 
 SHIPPED = Path(__file__).with_name("profiles")

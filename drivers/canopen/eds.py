@@ -7,9 +7,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from drivers.can.bus import first_line
-from drivers.can.document import ProfileError
+from drivers.can_bus.bus import first_line
 from drivers.canopen.objects import Address
+from drivers.profile_file import ProfileError
 
 SUFFIXES = (".eds", ".dcf")
 

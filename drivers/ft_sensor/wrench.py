@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core import kernel
 from core.dynamics import SENSING
 from core.effects import CATALOGUE
+from core.kernels import reference as kernel
 from core.loads import Loads
 from core.model import Model
 from core.motion import Motion

@@ -21,7 +21,7 @@ from drivers.modbus.registers import UNITS
 from drivers.modbus.settings import ModbusSettings
 from drivers.modbus.transport import Transport
 from drivers.modbus.write import make_writer
-from drivers.ur_rtde.nominal import Nominal
+from drivers.offset_inverse import Nominal
 
 Vector = NDArray[np.float64]
 SLOW_EVERY = 0.2  # s between two readings of conditions that lie apart

@@ -14,8 +14,8 @@ from core.rotation import one_rotation_matrix
 from core.setpoint import Setpoint
 from core.state import RobotState
 from drivers.driver import Driver
+from drivers.offset_inverse import Nominal
 from drivers.ur_rtde.command import OffsetWriter, ServoWriter, Writer
-from drivers.ur_rtde.nominal import Nominal
 from drivers.ur_rtde.round_trip import round_trip
 from drivers.ur_rtde.settings import UrRtdeSettings
 from drivers.ur_rtde.state import StateReader

@@ -18,7 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from core.errors import InvalidStateError, LinkError, StaleStateError
-from core.kernel import JIT
+from core.kernels.reference import JIT
 from core.state import RobotState
 from drivers.ur_rtde.registers import APPLIED, ECHO, PROGRAM
 from drivers.ur_rtde.settings import UrRtdeSettings

@@ -9,16 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from bridge.calibration.journal import Journal as SessionJournal
+from bridge.calibration.session.journal import Journal as SessionJournal
 from bridge.cell import load_cell
 from bridge.cell.saving import save_cell
+from bridge.document.output_file import write_text
 from bridge.fleet.folder import require_folder as require_fleet_folder
 from bridge.fleet.journal import Journal as FleetJournal
-from bridge.output_file import write_text
+from bridge.ipc.shared_memory import slices_of
+from bridge.loop.supervisor import State
 from bridge.recording.folder import require_folder
 from bridge.recording.segment import Segment
-from bridge.shared_page import slices_of
-from bridge.supervisor import State
 
 CELL = "robot: {model: ur10e}\npayload: {mass: 5.0}\n"
 

@@ -8,9 +8,9 @@ import pytest
 from pyarrow import parquet
 
 from core.arm import builtin_arm
-from core.diagnosis.suspicion import check_units
+from core.diagnosis.log_checks.units_and_clocks import check_units
 from core.errors import LogError
-from core.log import last_motion, read_log
+from core.log.log import last_motion, read_log
 from core.model import Model
 
 RECORDING = Path(__file__).parents[2] / ".." / "shared" / "data" / "rad_ur3e_rtde" / "log.csv"

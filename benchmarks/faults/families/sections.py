@@ -19,7 +19,7 @@ from benchmarks.faults.links import LIMITS, Link, own_address
 from benchmarks.faults.rig import Rig
 from benchmarks.faults.row import Row, cycles, seconds
 from bridge.cell import load_cell
-from drivers.can.bus import BusSettings
+from drivers.can_bus.bus import BusSettings
 from drivers.simulated.can.hub import Hub
 from drivers.simulated.ft_sensor.robotous_node import RobotousNode
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from core.errors import InputError, LinkError
-from drivers.can.bus import BusSettings
+from drivers.can_bus.bus import BusSettings
 from drivers.ft_sensor.settings import (
     AtiSettings,
     FtSensorSettings,

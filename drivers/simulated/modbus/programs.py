@@ -10,13 +10,13 @@ from drivers.modbus import encode
 from drivers.modbus.profile import ECHO_WORDS, MAILBOX_WORDS, addresses
 from drivers.modbus.registers import UNITS, Table
 from drivers.modbus.schema import Condition, Mailbox, ProfileFile, TargetTrigger
-from drivers.simulated.bench import BenchError
-from drivers.simulated.kinematics import Joints, offset_frame, solve, tcp_in_base
 from drivers.simulated.modbus.image import bad
-from drivers.simulated.motion import Hold, Stop
-from drivers.simulated.offset_program import NOTHING, approach
-from drivers.simulated.peer import BRAKING, HOLD, Peer
-from drivers.simulated.plant_settings import Vector6
+from drivers.simulated.peer.bench import BenchError
+from drivers.simulated.peer.peer import BRAKING, HOLD, Peer
+from drivers.simulated.plant.kinematics import Joints, offset_frame, solve, tcp_in_base
+from drivers.simulated.plant.motion import Hold, Stop
+from drivers.simulated.plant.plant_settings import Vector6
+from drivers.simulated.ur.offset_program import NOTHING, approach
 
 log = logging.getLogger("drivers.simulated")
 

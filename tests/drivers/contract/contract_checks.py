@@ -16,7 +16,7 @@ from core.model import Model
 from core.setpoint import Setpoint
 from core.state import RobotState
 from drivers.driver import Driver
-from drivers.simulated.kinematics import gap, tcp_in_base
+from drivers.simulated.plant.kinematics import gap, tcp_in_base
 
 OFFSET = (4e-4, -3e-4, 5e-4, 1e-3, 0.0, -1e-3)  # m, rad: what a write of offsets moves the TCP by
 STEP = 0.02  # rad: what a write of joints moves each joint by

@@ -32,7 +32,7 @@ from core.setpoint import Setpoint
 from core.state import RobotState
 from drivers.driver import Driver
 from drivers.ft_sensor.joined import DriverWithSensor
-from drivers.simulated.peer import Peer
+from drivers.simulated.peer.peer import Peer
 
 TURNED = (0.3, -1.2, 1.4, -1.1, -1.3, 0.8)  # rad
 MOUNTED = {"sensor_in_flange": {"xyz": XYZ, "rpy": RPY}}

@@ -23,7 +23,7 @@ from core.errors import InvalidStateError, LinkError, StaleStateError
 from drivers.modbus.driver import ModbusDriver
 from drivers.modbus.settings import ModbusSettings
 from drivers.simulated.modbus.server import ModbusServer
-from drivers.simulated.peer_server import PeerThread
+from drivers.simulated.peer.peer_server import PeerThread
 
 QUICK = {"timeout": 0.05, "state_timeout": 0.4}
 

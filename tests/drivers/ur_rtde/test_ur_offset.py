@@ -7,7 +7,7 @@ from textwrap import dedent
 import pytest
 from driver_runs import Bench, offset_program, run_driver
 
-from drivers.simulated.process import SimulatedController
+from drivers.simulated.ur.process import SimulatedController
 from drivers.ur_rtde import registers
 
 OFFSET = [1.0e-3, -5.0e-4, 2.0e-3, 1.0e-3, -4.0e-4, -2.0e-3]
@@ -175,7 +175,7 @@ def test_another_tcp_in_the_controller_is_refused(offset_robot: SimulatedControl
 
 
 def test_the_checksum_is_what_both_sides_compute() -> None:
-    from drivers.simulated.offset_program import checksum
+    from drivers.simulated.ur.offset_program import checksum
 
     for sequence in (1, 77, registers.LAST_SEQUENCE):
         units = registers.counts(OFFSET)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from driver_runs import Bench, run_driver
 
-from drivers.simulated.process import SimulatedController
+from drivers.simulated.ur.process import SimulatedController
 
 ARMED = """
 driver.connect()

@@ -1,0 +1,261 @@
+"""The least squares behind the identification: flexibilities, and what is unknown beside them.
+
+Gauss-Newton on the paper's linear form (eq. 35), taken again at the deflected shape, wild readings
+weighed down. Where the instrument is not registered, its frame and the tool point are estimated
+along: nuisances, projected out before anything is said of a flexibility.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.estimation.registration import IDENTITY, Registration, frame_columns, register_robustly
+from core.loads import Loads
+from core.model import Model, Poses
+from core.rotation import rotation_vector
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+ROUNDS = 12
+NUISANCE_ROUNDS = 20
+SETTLED = 1e-8  # relative step at which a fit has come to rest
+RANK = 1e-10  # singular values of the nuisances below this share are rounding
+WILD = 5.0  # standard deviations beyond which a reading counts as wild
+
+
+@dataclass(frozen=True)
+class Data:
+    """Measured poses of N rows and what acted on the arm."""
+
+    q: Array  # (N, n) rad
+    loads: Loads
+    position: Array  # (N, 3) m, measured, instrument's frame
+    rotation: Array | None  # (N, 3, 3)
+    registered: bool  # the instrument measures the cell's TCP in base: nothing beside is unknown
+
+    def part(self, rows: NDArray[Any]) -> Data:
+        """Return some of the rows."""
+        rotation = None if self.rotation is None else self.rotation[rows]
+        return Data(self.q[rows], self.loads[rows], self.position[rows], rotation, self.registered)
+
+    @property
+    def nuisances(self) -> int:
+        """Return how many numbers are estimated beside the flexibilities: frame and tool point."""
+        return 0 if self.registered else 9
+
+
+@dataclass(frozen=True)
+class Linear:
+    """The problem at one shape, weighed by the noise, nuisances projected out.
+
+    matrix @ flexibilities = right for the flexibilities (2n,) themselves, not for a step.
+    """
+
+    matrix: Array  # (2n+1, 2n) per rad/Nm
+    right: Array  # (2n+1,)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Where a fit came to rest."""
+
+    model: Model  # with the flexibilities and the tool point found
+    frame: Registration
+    weights: Array  # (N,)
+    linear: Linear | None = None  # None: only the nuisances were fitted
+
+    @property
+    def flexibility(self) -> Array:
+        """Return the flexibilities (2n,) rad/Nm: axial, then radial."""
+        return flexibilities(self.model)
+
+
+def flexibilities(model: Model) -> Array:
+    """Return the model's linear flexibilities (2n,) rad/Nm: axial, then radial.
+
+    Those that ``with_compliance`` replaces; what ``stiffness_nonlinearity`` holds stays beside.
+    """
+    found = np.zeros(2 * model.arm.n)
+    for term in model.terms:
+        if term.effect in ("axial_compliance", "radial_compliance") and term.site.joint:
+            first = 0 if term.effect == "axial_compliance" else model.arm.n
+            found[first + term.site.joint - 1] += term.values[0]
+    return found
+
+
+def residual(model: Model, data: Data, frame: Registration) -> tuple[Array, Poses]:
+    """Return measured minus predicted (N, 3 or 6) in base axes, and the predicted poses."""
+    poses = model.predict(data.q, data.loads)
+    gap = frame.in_base(data.position) - poses.position
+    if data.rotation is None:
+        return gap, poses
+    turn = frame.rotation_in_base(data.rotation) @ np.swapaxes(poses.rotation, 1, 2)
+    return np.hstack([gap, rotation_vector(turn)]), poses
+
+
+def nuisance_columns(model: Model, poses: Poses, width: int) -> Array:
+    """Return d(measured minus predicted) / d(frame step, tool point) as (N, width, 9), negated."""
+    columns = np.zeros((len(poses.position), width, 9))
+    columns[:, :, :6] = -frame_columns(poses.position)[:, :width]
+    columns[:, :3, 6:] = poses.rotation @ model.tool_in_flange[:3, :3].T  # flange axes in base
+    return columns
+
+
+def orthonormal(columns: Array) -> Array:
+    """Return an orthonormal base of the columns (M, k); what is only rounding is left out."""
+    U, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(U[:, s > RANK * max(float(s.max(initial=0.0)), 1e-300)])
+
+
+def fit_nuisances(model: Model, data: Data) -> Fit:
+    """Return the frame and tool point that fit best, the model's flexibilities left alone."""
+    if data.registered:
+        gap, _ = residual(model, data, IDENTITY)
+        return Fit(model, IDENTITY, _robust_weights(gap)[0])
+    frame = register_robustly(data.position, model.predict(data.q, data.loads).position)
+    for _ in range(NUISANCE_ROUNDS):
+        gap, poses = residual(model, data, frame)
+        weights, scale = _robust_weights(gap)
+        per_cell = per_cell_of(weights, scale, gap.shape[1])
+        columns = nuisance_columns(model, poses, gap.shape[1]) * per_cell[..., None]
+        step = np.linalg.lstsq(columns.reshape(-1, 9), (gap * per_cell).ravel(), rcond=RANK)[0]
+        model, frame = moved(model, frame, step)
+        if np.abs(step).max() < SETTLED:
+            break
+    return Fit(model, frame, weights)
+
+
+def fit_flexibilities(
+    begin: Fit,
+    data: Data,
+    kept: Mask,
+    prior: tuple[Array, float],
+    *,
+    nonnegative: bool,
+    rounds: int = ROUNDS,
+) -> Fit:
+    """Return the fit of the ``kept`` flexibilities (2n,), the others as they are in ``begin``.
+
+    ``prior`` is the value (2n,) and the 1 sigma (rad/Nm) that weakly hold every flexibility.
+    """
+    now = begin
+    for _ in range(rounds):
+        before = now.flexibility
+        now = _round(now, data, kept, prior, nonnegative)
+        if np.abs(now.flexibility - before).max() < SETTLED * max(np.abs(before).max(), 1e-12):
+            break
+    return now
+
+
+def _round(now: Fit, data: Data, kept: Mask, prior: tuple[Array, float], nonnegative: bool) -> Fit:
+    """Take one step of Gauss and Newton."""
+    model, n = now.model, now.model.arm.n
+    gap, poses = residual(model, data, now.frame)
+    weights, scale = _robust_weights(gap)
+    width = gap.shape[1]
+    per_cell = per_cell_of(weights, scale, width)
+    form = model.linear_form(data.q, data.loads).regressor[:, :width]
+    A = (form * per_cell[..., None]).reshape(-1, 2 * n)
+    b = (gap * per_cell).ravel()
+    F = np.zeros((len(b), 0))
+    if data.nuisances:
+        F = (nuisance_columns(model, poses, width) * per_cell[..., None]).reshape(len(b), -1)
+    return stepped(now, (F, A, b), weights, kept, prior, nonnegative=nonnegative)
+
+
+def stepped(
+    now: Fit, problem: tuple[Array, Array, Array], weights: Array, kept: Mask,
+    prior: tuple[Array, float], *, nonnegative: bool,
+) -> Fit:  # fmt: skip
+    """Return the fit after one step of Gauss and Newton.
+
+    ``problem``: columns of the nuisances (M, 0 or 9), of the flexibilities (M, 2n), and the gap
+    (M,), all weighed; or their R factor's, which says the same in fewer rows.
+    """
+    F, A, b = problem
+    model, frame, flexibility = now.model, now.frame, now.flexibility
+    base = orthonormal(F) if F.shape[1] else F
+    linear = _projected(A, b + A @ flexibility, base)
+    found = solve(linear, kept, flexibility, prior, nonnegative)
+    if F.shape[1]:
+        left = b - A @ (found - flexibility)
+        model, frame = moved(model, frame, np.linalg.lstsq(F, left, rcond=RANK)[0])
+    n = model.arm.n
+    return Fit(model.with_compliance(found[:n], found[n:]), frame, weights, linear)
+
+
+def _projected(A: Array, b: Array, Q: Array) -> Linear:
+    """Return the problem off the nuisances ``Q``, brought to as few rows as it has unknowns."""
+    whole = np.column_stack([A, b])
+    R = np.asarray(np.linalg.qr(whole - Q @ (Q.T @ whole), mode="r"))
+    return Linear(R[:, :-1], R[:, -1])
+
+
+def solve(
+    linear: Linear, kept: Mask, now: Array, prior: tuple[Array, float], nonnegative: bool
+) -> Array:
+    """Return the flexibilities (2n,) that solve the problem; those not kept stay as they are.
+
+    One at its bound of zero is exactly zero.
+    """
+    centre, sigma = prior
+    found = now.copy()
+    if not kept.any():
+        return found
+    A = linear.matrix[:, kept]
+    # scaled by what data and prior say together: a column of rounding errors stays harmless
+    norm = np.linalg.norm(A, axis=0)
+    unit = 1 / np.sqrt(norm**2 + sigma**-2 + (1e-9 * norm.max()) ** 2)
+    rows = np.vstack([A * unit, np.diag(unit / sigma)])
+    right = np.concatenate(
+        [linear.right - linear.matrix[:, ~kept] @ now[~kept], centre[kept] / sigma]
+    )
+    if nonnegative:
+        from scipy.optimize import nnls  # a quarter of a second, only where something is fitted
+
+        found[kept] = nnls(rows, right, maxiter=100 * len(unit))[0] * unit
+    else:
+        found[kept] = np.linalg.lstsq(rows, right, rcond=1e-12)[0] * unit
+    return found
+
+
+def moved(model: Model, frame: Registration, step: NDArray[Any]) -> tuple[Model, Registration]:
+    """Return model and frame after a step of the nuisances: frame (6,), tool point (3,)."""
+    tool = model.tool_in_flange.copy()
+    tool[:3, 3] += step[6:]
+    return replace(model, tool_in_flange=tool), frame.moved(step[:6])
+
+
+def per_cell_of(weights: Array, scale: Array, width: int) -> Array:
+    """Return the factor (N, width) that makes every cell's noise 1 and weighs its row."""
+    return np.asarray(np.sqrt(weights)[:, None] / np.repeat(scale, 3)[:width])
+
+
+def _robust_weights(gap: Array) -> tuple[Array, Array]:
+    """Return weights (N,) (Tukey's biweight on wild rows) and the noise scale of each unit."""
+
+    def middle(part: Array) -> float:
+        return float(np.median(np.abs(part)))
+
+    scale = noise_scale(middle(gap[:, :3]), middle(gap[:, 3:]) if gap.shape[1] > 3 else None)
+    return weights_at(gap, scale), scale
+
+
+def noise_scale(middle: float, turned: float | None) -> Array:
+    """Return the noise (2,), m and rad, from the medians of a gap's absolute values."""
+    spread = [max(1.4826 * value, 1e-12) for value in (middle, turned or 0.0)]
+    return np.array([spread[0], 1.0 if turned is None else spread[1]])
+
+
+def weights_at(gap: Array, scale: Array) -> Array:
+    """Return the weights (N,) of gaps (N, 3 or 6) where the noise is ``scale`` (2,)."""
+    distance = np.linalg.norm(gap / np.repeat(scale, 3)[: gap.shape[1]], axis=1)
+    limit = WILD * np.sqrt(gap.shape[1])
+    weights = np.clip(1 - (distance / limit) ** 2, 0, 1) ** 2
+    # below two deviations nothing is weighed down: clean data keep their full information
+    weights = np.where(distance < 2 * np.sqrt(gap.shape[1]), 1.0, weights)
+    return np.asarray(np.maximum(weights, 1e-12))

@@ -1,0 +1,268 @@
+"""What the loop does with setpoints that must not, cannot or did not leave."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bridge.cell.sections import LimitSettings, SetpointSettings
+from bridge.ipc.shared_memory import Page
+from bridge.loop.live_loads import LiveLoads
+from bridge.loop.setpoint_stream import SetpointStream
+from bridge.loop.supervisor import State, Supervisor
+from bridge.loop.writing import PARTS_IN_A_ROW, Writing
+from bridge.setpoint_source import make_source
+from core.arm import builtin_arm
+from core.compensation import Correction
+from core.errors import (
+    ForeignCommandError,
+    IneffectiveWriteError,
+    LinkError,
+    PartialWriteError,
+    WriteError,
+)
+from core.loads import Loads
+from core.model import Model
+from core.setpoint import Setpoint
+from core.state import RobotState
+from drivers.driver import Driver
+
+Q = np.array([0.0, -1.5, 1.8, -1.87, -1.57, 0.0])
+T = 0.002
+MODEL = Model(builtin_arm("ur10e")).with_compliance([1e-6] * 6, [1e-6] * 6)
+
+
+class Failing(Driver):
+    """A driver whose writes fail as they are told to; no wire fails so exactly."""
+
+    def __init__(self) -> None:
+        super().__init__(500.0, 6)
+        self.error: LinkError | None = None
+        self.sent: list[np.ndarray] = []
+        self.released = 0
+
+    def connect(self) -> None: ...
+
+    def read_state(self) -> RobotState:
+        raise NotImplementedError
+
+    def write_setpoint(self, setpoint: Setpoint) -> None:
+        if self.error is not None:
+            raise self.error
+        self.sent.append(setpoint.q.copy())
+
+    def release(self) -> None:
+        self.released += 1
+
+    def close(self) -> None: ...
+
+
+class Stream(SetpointStream):
+    """A stream whose model can be made to give no numbers."""
+
+    broken = False
+    unsolvable = 0.0  # m: the residual instead
+
+    def correct(self, nominal_q: np.ndarray, loads: Loads) -> Correction:
+        found = super().correct(nominal_q, loads)
+        if self.broken:
+            self.residual, self.finite = np.nan, False
+        self.residual = self.unsolvable or self.residual
+        return found
+
+
+class Bench:
+    """A loop's writing half, compensating."""
+
+    def __init__(self, page: Page) -> None:
+        self.page, self.driver, self.lost = page, Failing(), list[str]()
+        self.changes: list[tuple[str, str]] = []  # cause and detail
+        self.supervisor = Supervisor(lambda *change: self.changes.append(change[2:]))
+        self.supervisor.state = State.ARMED
+        self.stream = Stream(MODEL, LimitSettings(), 500.0)
+        self.loads = LiveLoads(6, True, 0.0)
+        settings = SetpointSettings()
+        source = make_source(settings, 6, True, Path())
+        told: list[dict[str, Any]] = []
+        self.writing = Writing(
+            settings, self.driver, source, self.stream, self.supervisor, page, told.append,
+            lambda: None, self.lost.append,
+        )  # fmt: skip
+        self.at = 1.0
+        self.writing.start(self.state(), Q)
+        self.writing.start(self.state(), Q)
+        assert self.supervisor.state == State.COMPENSATING
+
+    def state(self) -> RobotState:
+        self.at += T
+        return RobotState(self.at, 0.0, Q, np.zeros(6), Q, np.zeros(6))
+
+    def cycles(self, count: int) -> None:
+        for _ in range(count):
+            state = self.state()
+            if self.supervisor.state.writes:
+                self.writing.write(state, Q, self.loads.update(state))
+
+    def count(self, name: str) -> int:
+        return self.page.counts()[name]
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    page = Page(6)
+    yield Bench(page)
+    page.close()
+
+
+def test_a_correction_that_is_no_number_never_leaves_and_is_a_fault(bench: Bench) -> None:
+    bench.cycles(50)
+    sent = len(bench.driver.sent)
+    assert sent == 50
+    bench.stream.broken = True
+    bench.cycles(50)
+    assert bench.supervisor.state == State.FAULT
+    assert len(bench.driver.sent) == sent
+    assert bench.driver.released == 1
+    assert bench.count("bad_output") == 1
+
+
+@pytest.mark.parametrize("residual", [np.inf, 1e-3])
+def test_an_unsolved_correction_ends_the_motion_and_its_offset_is_ramped_out(
+    bench: Bench, residual: float
+) -> None:
+    bench.cycles(400)
+    before = len(bench.driver.sent)
+    assert np.abs(bench.stream.limiter.offset_in_base[:3]).max() > 5e-5
+    bench.stream.unsolvable = residual
+    bench.cycles(1)
+    assert bench.supervisor.state == State.HOLDING
+    assert "correction unsolved" in bench.changes[-1][0]
+    assert ("no equilibrium" if np.isinf(residual) else "1 mm from") in bench.changes[-1][1]
+    assert bench.count("unsolved") == 1
+    offsets = []
+    for _ in range(400):
+        bench.cycles(1)
+        offsets.append(bench.stream.limiter.offset_in_base.copy())
+    assert bench.stream.is_bare
+    assert len(bench.driver.sent) == before + 401  # ramped out, not dropped
+    assert np.abs(bench.driver.sent[-1] - Q).max() < 1e-12
+    lengths = np.linalg.norm(offsets, axis=1)
+    assert lengths[200] > 0.1 * lengths[0]  # over the ramp's time
+    assert np.abs(np.diff(lengths)).max() < 1.1 * lengths[0] / 250
+
+
+def test_nothing_leaves_that_is_made_of_an_old_state_and_the_next_step_is_no_larger(
+    bench: Bench,
+) -> None:
+    bench.cycles(50)
+    sent, offset = len(bench.driver.sent), bench.stream.limiter.offset_in_base
+    state = bench.state()
+    for expiry in (-np.inf, time.monotonic() - 1e-6):
+        assert bench.writing.write(state, Q, bench.loads.update(state), expiry) is None
+    assert len(bench.driver.sent) == sent
+    assert (bench.stream.limiter.offset_in_base == offset).all()
+    bench.cycles(1)
+    assert len(bench.driver.sent) == sent + 1
+    assert bench.supervisor.state == State.COMPENSATING
+
+
+def test_what_takes_the_watchdog_too_long_to_hear_lets_nothing_old_leave(bench: Bench) -> None:
+    bench.driver.keep_alive = lambda: time.sleep(0.03)  # type: ignore[method-assign]
+    state = bench.state()
+    expiry = time.monotonic() + 0.02
+    assert bench.writing.write(state, Q, bench.loads.update(state), expiry) is None
+    assert not bench.driver.sent
+    assert bench.count("late") == 1
+
+
+def test_a_process_that_was_stopped_after_the_judgement_sends_nothing_old(bench: Bench) -> None:
+    bench.cycles(50)
+    sent, limit = len(bench.driver.sent), bench.stream.limiter.limit
+
+    def stopped_after(*given: Any) -> Any:
+        found = limit(*given)
+        time.sleep(0.03)
+        return found
+
+    bench.stream.limiter.limit = stopped_after  # type: ignore[method-assign]
+    state = bench.state()
+    expiry = time.monotonic() + 0.02
+    assert bench.writing.write(state, Q, bench.loads.update(state), expiry) is None
+    assert bench.writing.unsent is not None
+    assert len(bench.driver.sent) == sent
+    assert bench.count("late") == 1
+    assert bench.supervisor.state == State.COMPENSATING
+    bench.stream.limiter.limit = limit  # type: ignore[method-assign]
+    bench.cycles(1)
+    assert len(bench.driver.sent) == sent + 1
+
+
+def test_a_process_that_was_stopped_while_it_sent_says_so_and_ends_the_motion(
+    bench: Bench,
+) -> None:
+    bench.driver.write_setpoint = lambda _: time.sleep(0.03)  # type: ignore[method-assign]
+    state = bench.state()
+    expiry = time.monotonic() + 0.02
+    assert bench.writing.write(state, Q, bench.loads.update(state), expiry) is not None
+    assert bench.supervisor.state == State.HOLDING
+    assert bench.count("overrun") == 1
+
+
+def test_a_setpoint_that_left_in_part_is_followed_by_a_whole_one(bench: Bench) -> None:
+    bench.cycles(10)
+    bench.driver.error = PartialWriteError("1 of 3 frames")
+    bench.cycles(PARTS_IN_A_ROW - 1)
+    bench.driver.error = None
+    bench.cycles(10)
+    assert bench.supervisor.state == State.COMPENSATING
+    assert len(bench.driver.sent) == 20
+    assert bench.count("write_partial") == PARTS_IN_A_ROW - 1
+    assert bench.count("write_ineffective") == 0
+
+
+@pytest.mark.parametrize(
+    ("error", "cycles", "counter"),
+    [
+        (PartialWriteError("1 of 3"), PARTS_IN_A_ROW, "write_ineffective"),
+        (IneffectiveWriteError("no echo"), 1, "write_ineffective"),
+        (ForeignCommandError("two masters"), 1, "foreign"),
+    ],
+)
+def test_what_a_live_link_does_not_take_holds_and_then_is_a_fault(
+    bench: Bench, error: LinkError, cycles: int, counter: str
+) -> None:
+    bench.driver.error = error
+    bench.cycles(cycles)
+    assert bench.supervisor.state == State.HOLDING
+    assert bench.count(counter) == 1
+    bench.cycles(cycles)
+    assert bench.supervisor.state == State.FAULT
+    assert bench.driver.released == 1
+    assert bench.lost == []
+    bench.cycles(10)
+    assert bench.driver.sent == []
+
+
+def test_a_write_that_fails_gives_the_link_up(bench: Bench) -> None:
+    bench.driver.error = WriteError("the script has ended")
+    bench.cycles(3)
+    assert bench.supervisor.state == State.FAULT
+    assert bench.lost == ["the script has ended"]
+    assert bench.count("write_failed") == 1
+
+
+def test_holding_brings_the_offset_to_nothing_and_no_step_is_too_large(bench: Bench) -> None:
+    bench.cycles(500)
+    last = bench.stream.limiter.offset_in_base
+    assert np.abs(last).max() > 0.0
+    bench.driver.error = IneffectiveWriteError("no echo")
+    bench.cycles(1)
+    bench.driver.error = None
+    bench.cycles(600)
+    assert bench.supervisor.state == State.HOLDING
+    assert not bench.stream.limiter.offset_in_base.any()
