@@ -181,7 +181,7 @@ def _tail(whole: _Whole) -> bytes:
             index.write(data)
         last.message_index_length = data.count
     DataEnd(0).write(data)
-    begin = data.end()
+    begin: bytes = data.end()  # type: ignore[no-untyped-call]
     start = whole.end + len(begin)
     summary = RecordBuilder()
     groups = (
@@ -199,11 +199,12 @@ def _tail(whole: _Whole) -> bytes:
     offsets_at = start + summary.count
     for offset in offsets:
         offset.write(summary)
-    text = summary.end()
+    text: bytes = summary.end()  # type: ignore[no-untyped-call]
     crc = zlib.crc32(_FOOTER.pack(Opcode.FOOTER, FOOTER_SIZE, start, offsets_at), zlib.crc32(text))
     footer = RecordBuilder()
     Footer(start, offsets_at, crc).write(footer)
-    return bytes(begin + text + footer.end() + MCAP0_MAGIC)
+    end: bytes = footer.end()  # type: ignore[no-untyped-call]
+    return begin + text + end + MCAP0_MAGIC
 
 
 def _statistics(whole: _Whole) -> Statistics:

@@ -45,6 +45,10 @@ class Failing(Driver):
         self.error: LinkError | None = None
         self.sent: list[np.ndarray] = []
         self.released = 0
+        self.taken: float | None = None  # s, of a question and its answer
+
+    def round_trip(self) -> float | None:
+        return self.taken
 
     def connect(self) -> None: ...
 
@@ -266,3 +270,17 @@ def test_holding_brings_the_offset_to_nothing_and_no_step_is_too_large(bench: Be
     bench.cycles(600)
     assert bench.supervisor.state == State.HOLDING
     assert not bench.stream.limiter.offset_in_base.any()
+
+
+@pytest.mark.parametrize(("taken", "armed"), [(None, True), (0.03, True), (0.21, False)])
+def test_a_long_way_to_the_controller_is_refused_at_arming(
+    bench: Bench, taken: float | None, armed: bool
+) -> None:
+    bench.writing.release()
+    bench.supervisor.state = State.ARMED
+    bench.driver.taken = taken
+    bench.writing.start(bench.state(), Q)
+    assert bench.writing.ready == armed
+    assert (bench.supervisor.state == State.ARMED) == armed
+    if not armed:
+        assert bench.changes[-1][1].startswith("link: a question and its answer take 210 ms")
