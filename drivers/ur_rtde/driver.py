@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.compensation import wanted_pose
-from core.errors import LinkError, WriteError
+from core.errors import InvalidStateError, LinkError, WriteError
 from core.model import Model
 from core.rotation import one_rotation_matrix
 from core.setpoint import Setpoint
@@ -33,14 +33,16 @@ class UrRtdeDriver(Driver):
     """
 
     def __init__(self, settings: UrRtdeSettings, model: Model) -> None:
-        super().__init__(settings.rate, 6, moves_arm=settings.mode == "servoj")
+        super().__init__(settings.rate, model, moves_arm=settings.mode == "servoj")
         if model.arm.n != 6:
             raise LinkError(f"link: found an arm of {model.arm.n} joints, a UR has 6")
         self.settings = settings
         self.reader = StateReader(settings)
         self._model, self._nominal = model, Nominal(model)
         self._writer: Writer = (
-            ServoWriter(settings) if settings.mode == "servoj" else OffsetWriter(settings)
+            ServoWriter(settings)
+            if settings.mode == "servoj"
+            else OffsetWriter(settings, self._rates)
         )
         self._state: RobotState | None = None
 
@@ -53,7 +55,21 @@ class UrRtdeDriver(Driver):
         self._state = self.reader.read()
         if isinstance(self._writer, OffsetWriter):
             self._writer.echo, self._writer.program = self.reader.echo, self.reader.program
+            self._writer.applied = self.reader.applied
         return self._state
+
+    def _rates(self) -> tuple[float, float]:
+        """Return the cell's rates of the offset, m/s and rad/s."""
+        return self.gate.bounds.offset_rate, self.gate.bounds.offset_rotation_rate
+
+    def _look(self) -> None:
+        """Read a sample while arming. Raises WriteError."""
+        try:
+            self.read_state()
+        except InvalidStateError:
+            pass
+        except LinkError as error:
+            raise WriteError(str(error)) from None
 
     def nominal_q(self, state: RobotState) -> Vector:
         """Return what the robot itself wants (6,), rad.
@@ -65,12 +81,12 @@ class UrRtdeDriver(Driver):
             return state.target_q
         return self._nominal.without(state.target_q, self.reader.applied)
 
-    def arm(self, state: RobotState) -> None:
+    def _make_ready(self, state: RobotState) -> None:
         """Make ready for writing: upload the control script, or claim the registers."""
         words = self.mismatch()
         if words is not None:
             raise WriteError(f"{self.settings.host}: {words}")
-        self._writer.arm(state)
+        self._writer.arm(state, self._look)
 
     def round_trip(self) -> float | None:
         """Return how long a question to the RTDE server takes, s; see Driver.round_trip."""
@@ -102,15 +118,15 @@ class UrRtdeDriver(Driver):
         """Feed the watchdog of the control script; see Driver.keep_alive."""
         self._writer.keep_alive()
 
-    def write_setpoint(self, setpoint: Setpoint) -> None:
+    def _send(self, setpoint: Setpoint) -> None:
         """Send one setpoint; needs ``arm`` before."""
         state = self._state
         if state is None:
             raise WriteError(f"{self.settings.host}: found no state, expected read_state() first")
         self._writer.write(setpoint, state)
 
-    def release(self) -> None:
-        """Stop writing: servoStop and end of the script, or an offset of zero."""
+    def _let_go(self) -> None:
+        """Stop writing: servoStop and end of the script, or no heartbeat any more."""
         if self.reader.age > self.settings.state_timeout:
             raise WriteError(f"{self.settings.host}: the link is silent; the robot's watchdog acts")
         self._writer.release()
