@@ -9,9 +9,9 @@ import click
 import numpy as np
 
 from bridge.cell import Cell, load_cell
-from bridge.cell.cell import HEAVIEST
 from core.diagnosis.log_checks.units_and_clocks import check_units
 from core.errors import LogError
+from core.load_bounds import HEAVIEST
 from core.log.log import Log, read_log
 from core.log.ranges import outside
 from core.log.sessions import join_sessions
