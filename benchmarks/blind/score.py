@@ -1,4 +1,4 @@
-"""Scores one diagnosis (the contract's JSON) against the truth of its case."""
+"""Scores one diagnosis (its JSON) against the truth of its case."""
 
 from __future__ import annotations
 

@@ -71,11 +71,15 @@ class Cell:
 
     @property
     def setpoints(self) -> SetpointSettings:
-        """Return section ``setpoints``, its file seen from here instead of the cell's folder."""
-        given = self.file.setpoints
-        if given.file is None:
-            return given
-        return given.model_copy(update={"file": self.path.parent / given.file})
+        """Return section ``setpoints``, its paths seen from here instead of the cell's folder."""
+        given, folder = self.file.setpoints, self.path.parent
+        return given.model_copy(
+            update={
+                name: folder / path
+                for name in ("file", "socket", "token_file")
+                if (path := getattr(given, name)) is not None
+            }
+        )
 
     @property
     def recording(self) -> RecordingSettings:
@@ -106,6 +110,12 @@ class Cell:
                 "folder": folder / given.folder, "instrument": given.instrument.located(folder),
             }
         )  # fmt: skip
+
+    @property
+    def fitted_range(self) -> dict[str, tuple[float, float]]:
+        """Return the least and largest value of each log column that the model was fitted on."""
+        origin = self.file.provenance
+        return {} if origin is None else dict(origin.fitted)
 
     @property
     def simulation(self) -> Simulation:

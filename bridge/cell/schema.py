@@ -1,8 +1,8 @@
-"""The cell file's keys (CONTRACT, "The cell file"), and what may stand there."""
+"""The cell file's keys, and what may stand there."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -119,6 +119,27 @@ class Simulation(Section):
     bench_port: int | None = Field(default=None, gt=0, lt=65536, strict=True)
 
 
+class SourceFile(Section):
+    """A file that a result was made from."""
+
+    role: str = Field(description="log, cell or sim")
+    name: str = Field(description="without its folder")
+    sha256: str | None = Field(default=None, description="of its bytes")
+
+
+class Provenance(Section):
+    """Where the model in this cell comes from, as fit, calibrate and --apply write it."""
+
+    version: str = Field(default="", description="of Gapbridge")
+    time: str = Field(default="", description="when it was written, UTC")
+    command: str = Field(default="", description="that wrote it")
+    arguments: dict[str, Any] = Field(default={}, description="of the command")
+    files: list[SourceFile] = []
+    fitted: dict[str, tuple[Number, Number]] = Field(
+        default={}, description="least and largest value of each column that was fitted on"
+    )
+
+
 class CellFile(Section):
     """The whole file."""
 
@@ -143,3 +164,6 @@ class CellFile(Section):
         default=CalibrationSettings(), description="instrument, loads, ...: of calibration sessions"
     )
     simulation: Simulation = Simulation()
+    provenance: Provenance | None = Field(
+        default=None, description="where the model comes from; written by the commands"
+    )

@@ -125,7 +125,7 @@ def _usual(model: Model, effect: str) -> Iterator[Term]:
     """Yield an effect of usual size at each of its sites."""
     member = CATALOGUE[effect]
     for site in member.sites(model.arm):
-        place = Site(site.joint, 1.0 if effect == "transmission_error" else None)
+        place = Site(site.joint, 1.0 if member.periodic else None)
         yield Term(effect, place, tuple(p.scale for p in member.parameters(model.arm, place)))
 
 
@@ -136,7 +136,7 @@ def _difference(
     observation = channel.selection.observation
     try:
         apart = predict(question.one) - predict(question.other)
-        if observation.nuisance.shape[2]:
+        if observation.nuisance.shape[2] >= 6:
             seen = observation.predict(question.one) - observation.predict(question.other)
             apart = apart - _framed(observation.nuisance, seen, predict(question.other))
     except InputError:  # the arm would buckle under one of them
@@ -149,7 +149,8 @@ def _difference(
 def _framed(nuisance: Array, seen: Array, position: Array) -> Array:
     """Return how the frame that takes up the log's difference moves the readings of trials."""
     A = nuisance[:, :3].reshape(-1, nuisance.shape[2])
-    x = np.linalg.lstsq(A, seen[:, :3].ravel(), rcond=1e-9)[0]
+    # of several sessions the trials go on with the first one's frame
+    x = np.linalg.lstsq(A, seen[:, :3].ravel(), rcond=1e-9)[0][:6]
     return np.asarray(-frame_columns(position)[:, :3] @ x)
 
 
@@ -161,7 +162,8 @@ def _best(moving: bool, trials: Trials, names: tuple[str, ...], gain: Array) -> 
         if gain[r] < VISIBLE or len(told) == EACH:
             break
         if all(np.abs(q[r] - np.array(m.q)).max() > APART for m in told):
-            approach = tuple(int(v) for v in loads.approach[r]) if "backlash" in names else None
+            sided = any(CATALOGUE[name].by_approach for name in names)
+            approach = tuple(int(v) for v in loads.approach[r]) if sided else None
             told.append(Measurement(
                 _floats(q[r]), float(loads.payload_mass[r]), names, float(gain[r]), approach,
                 velocity=_floats(trials.qd[r]) if moving else None,

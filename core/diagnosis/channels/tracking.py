@@ -12,14 +12,17 @@ from core.diagnosis.channels.observation import NotObservable, Observation, Pred
 from core.diagnosis.channels.recording import (
     Index,
     conditions,
+    held_torques,
+    instrument_noise,
     joint_axes,
     own_joints,
     picked,
     quantities,
 )
-from core.dynamics import predict_tracking
+from core.dynamics import predict_tracking, with_held
 from core.effects import Term
 from core.log.log import Log
+from core.log.sessions import session_of
 from core.metrology import Metrology
 from core.model import Model
 from core.motion import Motion, motion_of
@@ -34,17 +37,22 @@ LEADS = 4.0  # times the delay: what is left out where it is longer
 def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotObservable:
     """Return the tracking channel of a log (rad, one coordinate a joint), or what it lacks.
 
-    Delays are predicted on every row; of long logs at most 3000 rows are compared, evenly. The
+    Delays are predicted on every row; of long logs at most 30,000 rows are compared, evenly. The
     start of each stretch is left out, because the commands before it are unknown. ``sigma`` is the
     encoder's step over the root of 12. Raises LogError where the log holds something unusable.
     """
     needs = tuple(name for name in ("target_q", "actual_q") if not log.has(name))
     if needs:
         return NotObservable("tracking", needs)
-    motion = motion_of(log)
-    rows = picked(_known_past(motion))
+    motion = with_held(model, motion_of(log))
+    return _observed(model, log, motion, picked(_known_past(motion)))
+
+
+def _observed(model: Model, log: Log, motion: Motion, rows: Index) -> Observation:
+    """Return the channel at some rows of the motion."""
     part = motion.pick(rows)
-    n = model.arm.n
+    n, target = model.arm.n, motion.target_q
+    assert target is not None
     return Observation(
         channel="tracking",
         unit="rad",
@@ -54,12 +62,15 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
         weight=np.ones(n),
         sigma=encoder_step(log.require("actual_q")) / np.sqrt(12),
         sigma_is_whole=False,
-        quantities=quantities(log, part),
+        quantities=held_torques(part) | quantities(log, part),
         groups=conditions(part),
         rows=part.rows,
         axes=joint_axes(n),
         joint_columns=own_joints(len(part), n),
         order_in_time=motion.moving,
+        instrument=instrument_noise(motion.q - target, motion),
+        fewer=lambda take: _observed(model, log, motion, rows[take]),
+        session=session_of(log)[part.rows] if log.session_names else None,
     )
 
 
@@ -75,6 +86,8 @@ def _following(model: Model, motion: Motion, rows: Index) -> Predict:
         return np.asarray(predict_tracking(model, motion, own)[rows, joint - 1])
 
     def predict(terms: Sequence[Term]) -> Array:
+        if any(term.site.joint is None for term in terms):
+            return np.asarray(predict_tracking(model, motion, terms)[rows])
         told = plain.copy()
         for joint in {term.site.joint for term in terms if term.site.joint is not None}:
             own = tuple(term for term in terms if term.site.joint == joint)

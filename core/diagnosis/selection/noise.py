@@ -79,6 +79,11 @@ def estimate_noise(
     return _noise(observation, block, _floored(variance[:count], known), float(variance[-1]))
 
 
+def carried_to(observation: Observation, noise: Noise) -> Noise:
+    """Return the same noise, as estimated on other samples, for the samples of an observation."""
+    return _noise(observation, blocks(observation), noise.block_sigma**2, noise.joint_sigma**2)
+
+
 def _floored(variance: Array, known: float) -> Array:
     floored = variance.copy()
     floored[0] = variance[0] + known

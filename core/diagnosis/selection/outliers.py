@@ -26,7 +26,7 @@ def look_for_wild(work: Work, columns: list[Array]) -> None:
     N, k = gap.shape
     usual, parts = [], []
     for c, block in zip(work.candidates, columns, strict=True):
-        if c.family == "transmission_error" and (c.site.order or 0) > 3:
+        if c.periodic and (c.site.order or 0) > 3:
             continue
         parts.append(block)
         usual += [p.scale for p in c.parameters]
@@ -49,6 +49,19 @@ def look_for_wild(work: Work, columns: list[Array]) -> None:
         distance = _distance(work, r)
         weight = 1 / (1 + (distance / 2) ** 2)
     work.kept = _keep(work, r)
+
+
+def inliers(work: Work, residual: Array) -> NDArray[np.bool_]:
+    """Return the samples (N,) that are no outliers of a residual (N, k), the nuisance refitted."""
+    nuisance = work.observation.nuisance
+    if nuisance.shape[2]:
+        W = work.noise.whitener
+        A, b = (W @ nuisance).reshape(-1, nuisance.shape[2]), (W @ residual[..., None]).ravel()
+        white = (W @ residual[..., None])[..., 0]
+        size = np.sqrt(np.mean(white**2, axis=1))
+        row = np.repeat(size < WILD_SIGMA * np.median(size), residual.shape[1])
+        residual = residual - nuisance @ np.linalg.lstsq(A[row], b[row], rcond=1e-12)[0]
+    return _keep(work, residual)
 
 
 def _distance(work: Work, residual: Array) -> Array:
