@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Metrology:
-    """The instrument: its frame and its noise (CONTRACT, "metrology")."""
+    """The instrument: its frame and its noise."""
 
     registered: bool = False  # True: measured_* are in base; False: their frame is estimated along
     sigma: float = 2.0e-5  # m, 1 sigma of one coordinate, the instrument alone

@@ -6,6 +6,7 @@ first has derivatives. Which one it is follows from its timestamps and steps.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -43,6 +44,11 @@ class Pieces:
     payload_wrench: Array  # (N, 6) N, Nm per kg of payload at its declared centre of gravity
     external_wrench: Array  # (N, 6) N, Nm of the surroundings
     payload_mass: Array  # (N,) kg, declared
+    carried_mass: Array  # (N,) kg, with what the effects at hand add to it
+    # torques (N, n) and wrench (N, 6) per kg of payload, its centre shifted by (3,) m, flange axes
+    payload_from: Callable[[Array], tuple[Array, Array]]
+    # torques (N, n) that a first moment (3,) kg m of a link (from 0) takes more, link axes
+    link_from: Callable[[int, Array], Array]
 
 
 @dataclass(frozen=True)
@@ -62,6 +68,8 @@ class Motion:
     moving: bool  # False: poses at rest
     still: Array  # (n,) rad/s below which the direction of motion is unsure
     pieces: Pieces | None = None
+    load: Array | None = None  # (N, n) Nm of the rigid arm with payload and pull, no friction
+    held: Array | None = None  # (N, n) Nm that each joint holds at rest: gravity, payload, pull
 
     def __len__(self) -> int:
         return len(self.t)
@@ -74,6 +82,7 @@ class Motion:
             target_q=None if self.target_q is None else self.target_q[rows],
             loads=self.loads[index], rows=self.rows[rows], valid=self.valid[rows],
             stretch=self.stretch[rows], pieces=None,
+            held=None if self.held is None else self.held[rows],
         )  # fmt: skip
 
     @property

@@ -9,13 +9,15 @@ from numpy.random import Generator
 
 from benchmarks.blind.arms import ARMS, ArmKind
 from benchmarks.blind.bench import Bench, draw_bench
-from benchmarks.blind.mechanics import Array
+from benchmarks.blind.mechanics import Array, Session, loads_of, stand
 from benchmarks.blind.moving import Motion, draw_motion, torque_shares
 from benchmarks.blind.parametric import Candidate, Parametric, Place, Values
 from benchmarks.blind.session import Plan
 
-TRACKING = ("latency", "tracking_lag")
+TRACKING = ("latency", "tracking_lag", "servo_droop", "dead_band")
 TRACKING_OUTSIDE = ("droop", "track_step", "speed_loss")
+TRACKING_REMAINDERS = ("coupled",)
+TORQUE_REMAINDERS = ("torque_field",)
 TORQUE = (
     "coulomb_friction", "viscous_friction", "rotor_inertia", "link_inertia", "torque_constant",
     "payload",
@@ -59,19 +61,59 @@ def draw_tracking_cell(rng: Generator, seconds: float = 30.0) -> MovingCell:
     shake = float(rng.uniform(5e-6, 3e-5))
     candidates: dict[Place, Candidate] = {
         (effect, j): Candidate((f"{effect}_{j}",), np.array([usual]), 8)
-        for effect, usual in (("latency", 8e-3), ("tracking_lag", 1e-2))
+        for effect, usual in (("latency", 8e-3), ("tracking_lag", 1e-2), ("dead_band", 2e-3))
         for j in range(1, kind.n + 1)
     }
+    held = _held(bench, motion.at(time))
+    largest = max(float(np.abs(held).max()), 1e-9)
+    for j in range(1, kind.n + 1):
+        usual = 5e-3 / max(float(np.abs(held[:, j - 1]).max()), 0.03 * largest)
+        candidates[("servo_droop", j)] = Candidate((f"servo_droop_{j}",), np.array([usual]), 8)
 
     def read(values: Values) -> Array:
-        delay, lag = (
+        delay, lag, droop, band = (
             np.array([values.get((effect, j), np.zeros(1))[0] for j in range(1, kind.n + 1)])
-            for effect in ("latency", "tracking_lag")
+            for effect in TRACKING
         )
-        return motion.lagged(time, delay, lag)
+        wanted = stood = motion.lagged(time, delay, lag)
+        for _ in range(3 if droop.any() else 0):  # the weight is felt where the arm stands
+            stood = wanted - droop * _held(bench, stood)
+        return resting(stood, np.abs(band))
 
     sigma = np.full(kind.n, np.hypot(shake, encoder / np.sqrt(12)))
     return MovingCell(bench, motion, time, Parametric(read, sigma, candidates), encoder, shake)
+
+
+def _held(bench: Bench, q: Array) -> Array:
+    """Return the torques (N, n) that the motors hold at rest: weights of links and payload."""
+    one, count = bench.session, len(q)
+    session = Session(
+        np.zeros(count), q, np.full(count, one.payload_mass[0]),
+        np.tile(one.payload_cog[0], (count, 1)), np.zeros((count, 6)), np.full(q.shape, 25.0),
+        np.zeros_like(q), q,
+    )  # fmt: skip
+    shape = stand(bench.nominal, session)
+    loads = loads_of(bench.nominal, session, shape)
+    about = [
+        np.sum(loads.about(shape.origin[i], i) * shape.axes[i][:, :, 2], axis=1)
+        for i in range(q.shape[1])
+    ]
+    return -np.column_stack(about)
+
+
+def resting(target: Array, band: Array) -> Array:
+    """Return where servos stand (N, n) that move only once the target is further off than a band.
+
+    They begin on target.
+    """
+    if not band.any():
+        return target
+    stand, at = np.empty_like(target), target[0]
+    for k, wanted in enumerate(target):
+        off = wanted - at
+        at = np.where(np.abs(off) > band, wanted - np.sign(off) * band, at)
+        stand[k] = at
+    return stand
 
 
 def draw_torque_cell(rng: Generator, seconds: float = 30.0) -> MovingCell:
@@ -133,6 +175,11 @@ def tracking_error(cell: MovingCell, name: str, rng: Generator) -> tuple[Array, 
     elif name == "track_step":
         when = cell.time[-1] * rng.uniform(0.3, 0.7)
         shape, columns = (cell.time > when).astype(float), ("timestamp",)
+    elif name == "coupled":  # a structure that swings as another joint accelerates
+        other = int(rng.choice([i for i in range(cell.kind.n) if i != j]))
+        shape = cell.motion.at(cell.time, 2)[:, other] * np.cos(q[:, j])
+        columns = (f"actual_q_{j}", f"actual_q_{other}", f"actual_qd_{other}",
+                   f"target_q_{j}", f"target_q_{other}")  # fmt: skip
     else:
         shape, columns = -(np.maximum(qd[:, j] - 0.3 * qd[:, j].max(), 0) ** 2), (f"actual_qd_{j}",)
     return _on_joint(cell, j, shape, rng), columns
@@ -140,18 +187,24 @@ def tracking_error(cell: MovingCell, name: str, rng: Generator) -> tuple[Array, 
 
 def torque_error(cell: MovingCell, name: str, rng: Generator) -> tuple[Array, tuple[str, ...]]:
     """Return a torque (N, n) outside the catalogue, and the columns it depends on."""
+    columns: tuple[str, ...]
     j = int(rng.integers(0, cell.kind.n))
     q, qd = cell.motion.at(cell.time), cell.motion.at(cell.time, 1)
     if name == "cogging":
         shape = np.sin(int(rng.integers(6, 40)) * q[:, j] + rng.uniform(-3, 3))
-        columns: tuple[str, ...] = (f"actual_q_{j}",)
+        columns = (f"actual_q_{j}",)
+    elif name == "torque_field":
+        other = int(rng.choice([i for i in range(cell.kind.n) if i != j]))
+        rate, phase = rng.normal(size=(5, 2)) * 1.5, rng.uniform(-np.pi, np.pi, 5)
+        shape = np.cos(q[:, [j, other]] @ rate.T + phase) @ rng.normal(size=5)
+        columns = (f"actual_q_{j}", f"actual_q_{other}")
     elif name == "stribeck":
         shape = np.sign(qd[:, j]) * np.exp(-((qd[:, j] / 0.1) ** 2))
         columns = (f"actual_qd_{j}",)
     else:
         # the amount decays in time, so both the speed and the time are true answers
         shape = qd[:, j] * (np.exp(-cell.time / 10.0) - 0.35)
-        columns = ("timestamp", f"actual_qd_{j}")
+        columns = (f"actual_qd_{j}", "timestamp")
     return _on_joint(cell, j, shape, rng), columns
 
 

@@ -30,6 +30,8 @@ class Outside:
     read: Reading | None = None
     ratio: tuple[float, float] = (3.0, 10.0)
     first: float = 1e-4  # a strength to start sizing from
+    akin: tuple[tuple[str, int | None], ...] = ()  # what may be accused with the rest admitted
+    near: tuple[tuple[str, int | None], ...] = ()  # where no known effect is told from it
 
 
 def angle_of(joint: int, shape: Callable[[Session], Array]) -> Callable[[RealArm, float], RealArm]:

@@ -71,11 +71,15 @@ class Cell:
 
     @property
     def setpoints(self) -> SetpointSettings:
-        """Return section ``setpoints``, its file seen from here instead of the cell's folder."""
-        given = self.file.setpoints
-        if given.file is None:
-            return given
-        return given.model_copy(update={"file": self.path.parent / given.file})
+        """Return section ``setpoints``, its paths seen from here instead of the cell's folder."""
+        given, folder = self.file.setpoints, self.path.parent
+        return given.model_copy(
+            update={
+                name: folder / path
+                for name in ("file", "socket", "token_file")
+                if (path := getattr(given, name)) is not None
+            }
+        )
 
     @property
     def recording(self) -> RecordingSettings:

@@ -10,11 +10,10 @@ import numpy as np
 from bridge.cell.message import nearest
 from bridge.cell.schema import Compliance, EffectEntry
 from core.arm import Arm
-from core.effects import Parameter, Site, Term, effect_named
+from core.effects import CATALOGUE, Parameter, Site, Term, effect_named, flexibility_effects
 from core.errors import CellError, InputError
 
 VALUE = "value"  # the name in the file of a parameter that has none of its own
-FLEXIBILITIES = {"axial_compliance": "axial", "radial_compliance": "radial"}
 
 
 def term_of(entry: EffectEntry, arm: Arm, where: str) -> Term:
@@ -29,7 +28,7 @@ def term_of(entry: EffectEntry, arm: Arm, where: str) -> Term:
         allowed = "no joint" if joints == [None] else f"a joint of {joints[0]} to {joints[-1]}"
         found = "none" if entry.joint is None else entry.joint
         raise CellError(f"{where}.joint: found {found}, expected {allowed} for {entry.effect}")
-    if (entry.order is not None) != (entry.effect == "transmission_error"):
+    if (entry.order is not None) != effect.periodic:
         raise CellError(
             f"{where}.order: found {'none' if entry.order is None else entry.order}, expected "
             f"{'cycles per turn' if entry.order is None else 'none'} for {entry.effect}"
@@ -67,7 +66,7 @@ def name_of(parameter: Parameter) -> str:
 def compliance_terms(compliance: Compliance, arm: Arm) -> tuple[Term, ...]:
     """Return the terms of the compliance section; zeros are left out."""
     terms = []
-    for effect, key in FLEXIBILITIES.items():
+    for key, effect in flexibility_effects().items():
         values = getattr(compliance, key)
         if values is None:
             continue
@@ -82,10 +81,11 @@ def compliance_terms(compliance: Compliance, arm: Arm) -> tuple[Term, ...]:
 
 def compliance_entry(terms: Sequence[Term], n: int) -> dict[str, list[float]]:
     """Return the compliance section of a model's terms: n values per key."""
-    entry = {key: np.zeros(n) for key in FLEXIBILITIES.values()}
+    entry = {key: np.zeros(n) for key in flexibility_effects()}
     for term in terms:
-        if term.effect in FLEXIBILITIES and term.site.joint is not None:
-            entry[FLEXIBILITIES[term.effect]][term.site.joint - 1] += term.values[0]
+        key = CATALOGUE[term.effect].flexibility
+        if key and term.site.joint is not None:
+            entry[key][term.site.joint - 1] += term.values[0]
     # what is below zero is no flexibility: it stands among the effects
     return {key: np.maximum(values, 0.0).tolist() for key, values in entry.items()}
 
@@ -94,7 +94,7 @@ def _negative_terms(terms: Sequence[Term]) -> list[Term]:
     """Return what a joint's flexibilities of one kind add up to, where that is below zero."""
     totals: dict[tuple[str, Site], float] = {}
     for term in terms:
-        if term.effect in FLEXIBILITIES:
+        if CATALOGUE[term.effect].flexibility:
             key = (term.effect, term.site)
             totals[key] = totals.get(key, 0.0) + term.values[0]
     return [Term(effect, site, (v,)) for (effect, site), v in totals.items() if v < 0]
@@ -103,7 +103,7 @@ def _negative_terms(terms: Sequence[Term]) -> list[Term]:
 def effect_entries(terms: Sequence[Term], arm: Arm) -> list[dict[str, Any]]:
     """Return the ``effects`` list of a model's terms; flexibilities stand in their own section."""
     entries = []
-    further = [term for term in terms if term.effect not in FLEXIBILITIES]
+    further = [term for term in terms if not CATALOGUE[term.effect].flexibility]
     for term in (*_negative_terms(terms), *further):
         entry: dict[str, Any] = {"effect": term.effect}
         if term.site.joint is not None:

@@ -1,4 +1,4 @@
-"""The cell file's keys (CONTRACT, "The cell file"), and what may stand there."""
+"""The cell file's keys, and what may stand there."""
 
 from __future__ import annotations
 

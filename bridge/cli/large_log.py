@@ -11,7 +11,9 @@ from bridge.cli.options import check_log
 from core.errors import LogError
 from core.log.log import Log
 from core.log.mcap_reading import files_of
-from core.log.pieces import PARQUET, RECORDING, LogPieces
+from core.log.pieces import PARQUET, LogPieces
+from core.log.sources import source_of
+from core.log.sources.recording import Recording
 
 LARGE = 20_000  # rows from which a log is read in pieces
 BYTES = 8_000_000  # of a text file that holds about as many
@@ -35,8 +37,9 @@ class LargeLog:
 
 def is_large(path: Path) -> bool:
     """Return whether a log is to be read in pieces. Raises LogError where it cannot be read."""
-    if path.suffix.lower() == RECORDING:
-        return True
+    source = source_of(path)
+    if source is not None:
+        return source.identifier == Recording.identifier
     if not path.is_file():
         return False
     if path.suffix.lower() not in PARQUET:

@@ -15,6 +15,7 @@ from core.errors import LogError
 from core.log.log import Log, read_log
 from core.log.ranges import outside
 from core.log.sessions import join_sessions
+from core.log.sources import SourceOptions, source_of
 
 log_argument = click.argument("log", type=click.Path(path_type=Path))
 logs_argument = click.argument(
@@ -43,14 +44,26 @@ def open_cell(path: Path) -> Cell:
 
 
 def open_log(path: Path, cell: Cell) -> Log:
-    """Return a log for a cell's arm.
+    """Return a log for a cell's arm: a CSV or Parquet file, or another source (core.log.sources).
 
     Raises LogError where a payload is out of range, angles look like degrees or positions like
     millimetres.
     """
-    log = read_log(path, cell.arm.n)
+    source = source_of(path)
+    if source is None:
+        log = read_log(path, cell.arm.n)
+    else:
+        converted = source.read(path, joint_names(cell), SourceOptions())
+        for note in converted.notes:
+            click.echo(f"note: {path}: {note}", err=True)
+        log = converted.log(path, cell.arm.n)
     check_log(log, cell)
     return log
+
+
+def joint_names(cell: Cell) -> tuple[str, ...]:
+    """Return the names of the cell's joints: those of its URDF, or joint_1, joint_2, ..."""
+    return cell.arm.joint_names or tuple(f"joint_{i + 1}" for i in range(cell.arm.n))
 
 
 def open_logs(paths: Sequence[Path], cell: Cell) -> Log:

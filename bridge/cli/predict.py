@@ -26,7 +26,8 @@ from core.errors import InputError, LogError
 def predict(log: Path, cell: Path, out: Path) -> None:
     """Predict the TCP pose of every row of a log.
 
-    Joints come from actual_q (where there is none, from target_q), loads from the payload,
+    Joints come from actual_q (where there is none, from target_q, less what the servos are known to
+    give way), loads from the payload,
     payload_cog, actual_TCP_force, joint_temperatures and approach columns. Writes
     predicted_position_0..2 (m) and predicted_rotation_0..2 (rotation vector, rad), in base.
 
@@ -36,9 +37,11 @@ def predict(log: Path, cell: Path, out: Path) -> None:
     rows = open_log(log, given)
     warn_outside(rows, given)
     require_writable(out, log, cell)
-    q = rows.require("actual_q", "target_q")
+    q, loads = rows.require("actual_q", "target_q"), rows.loads()
     try:
-        poses = given.model.predict(q, rows.loads())
+        if not rows.has("actual_q"):
+            q = given.model.settled(q, loads)
+        poses = given.model.predict(q, loads)
     except LogError:
         raise
     except InputError as error:

@@ -21,7 +21,7 @@ def open_all(daemon: Daemon, stack: ExitStack, arm: bool, by: str) -> bool:
     Raises InputError where the controller has an owner already, or a folder cannot be used.
     """
     settings = daemon.settings
-    stack.callback(daemon.page.close)
+    stack.callback(daemon.close_memory)
     lock = OwnerLock(address_of(settings.link), settings.cell)
     stack.enter_context(lock)
     folder = settings.recording.folder
@@ -40,6 +40,9 @@ def open_all(daemon: Daemon, stack: ExitStack, arm: bool, by: str) -> bool:
     _open_socket(daemon, stack)
     if settings.web is not None:
         daemon.book.add({"kind": "note", "detail": f"status page: {settings.web.url}"})
+    if settings.setpoints.source == "planner":
+        where = f"setpoints: a planner writes to {settings.setpoints.socket}"
+        daemon.book.add({"kind": "note", "detail": where})
     # a person at the terminal may arm after a crash; a service that was started anew may not
     if arm and lock.before and (by != "--arm" or daemon.manager.present):
         daemon.book.add(
@@ -50,8 +53,6 @@ def open_all(daemon: Daemon, stack: ExitStack, arm: bool, by: str) -> bool:
             }
         )
         return False
-    if arm:
-        daemon.told_to_arm(by)
     return arm
 
 

@@ -28,6 +28,7 @@ class DaemonStatus:
         self._started = self._since = time.time()
         self._why = ""
         self.armed_by = ""
+        self._asked_by = ""  # of the last request to arm
         self.latched = ""  # the fault that waits for being acknowledged
         self._heals = False  # it ends with the link
         self._batches: deque[tuple[float, int]] = deque()  # s, cycles
@@ -48,6 +49,8 @@ class DaemonStatus:
         """Take note of an event."""
         if event["kind"] == "configuration":
             self.configured = event
+        if event["kind"] == "request" and event["command"] == "arm":
+            self._asked_by = event["by"]
         if event["kind"] != "transition":
             return
         to, cause, detail = event["to"], event["cause"], event["detail"]
@@ -60,6 +63,8 @@ class DaemonStatus:
             self.latched = ""
         if to == State.DISCONNECTED.name:
             self.lost_loop()
+        if to == State.ARMED.name:
+            self.armed_by = self._asked_by
         if to not in (State.ARMED.name, State.COMPENSATING.name, State.HOLDING.name):
             self.armed_by = ""
 

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from core.errors import InputError, RunError
 
+PARQUET = (".parquet", ".pq")
+
 
 def require_writable(path: Path, *inputs: Path) -> Path:
     """Return the path if a file can be written there; asked before the work is done.
@@ -70,7 +72,18 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_table(path: Path, columns: Sequence[str], table: NDArray[np.float64]) -> None:
-    """Write rows (N, k) under k column names as CSV; every number reads back exactly."""
+    """Write rows (N, k) under k column names, as Parquet where the path's suffix says so, or CSV.
+
+    Every number reads back exactly.
+    """
+    if path.suffix.lower() in PARQUET:
+        import pyarrow
+        from pyarrow import parquet
+
+        frame = pyarrow.table({name: table[:, k] for k, name in enumerate(columns)})
+        with replacing_bytes(path) as raw:
+            parquet.write_table(frame, raw)
+        return
     with replacing(path) as file:
         file.write(",".join(columns) + "\n")
         np.savetxt(file, table, fmt="%.17g", delimiter=",")

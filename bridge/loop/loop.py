@@ -15,14 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.cell.daemon_settings import DaemonSettings
+from bridge.ipc.command_page import Command, Commands
 from bridge.ipc.counts import Count
 from bridge.ipc.cycle_row import fill_row
-from bridge.ipc.shared_memory import Command, Page, Phase
+from bridge.ipc.shared_memory import Page, Phase
 from bridge.loop.checks import RAMPING_OUT, LoopChecks
 from bridge.loop.controller_clock import ControllerClock
 from bridge.loop.link_monitor import StateWatch, hold_time
 from bridge.loop.live_loads import LiveLoads
-from bridge.loop.setpoint_stream import SetpointStream
+from bridge.loop.offset_in_force import OffsetInForce
+from bridge.loop.setpoint_stream import SetpointStream, longest_withdrawal
 from bridge.loop.supervisor import Cause, State, Supervisor
 from bridge.loop.writing import Writing
 from bridge.setpoint_source.source import Source, Told
@@ -35,7 +37,7 @@ from drivers.driver import Driver
 
 Vector = NDArray[np.float64]
 
-LONGEST_STOP = 1.0  # s from a request to stop to letting go, at rest or not
+LONGEST_STOP = 1.0  # s from a request to stop to letting go, beside what the cell's rates take
 HASTY_RAMP = 0.5  # s: what a stop takes for the ramp at most
 
 UNSENT = 2  # "attempted" of a cycle whose setpoint was computed and did not (wholly) leave
@@ -79,22 +81,29 @@ class Loop:
             driver, model.arm, self._supervisor, page, tell, self._lose, patience
         )
         self._checks = LoopChecks(driver.rate, self._supervisor, page, tell, patience)
+        self._in_force = self._kept_offset()
         self._writing = Writing(
             settings.setpoints, driver, source, self._stream, self._supervisor, page, tell,
-            self._skip, self._lose,
+            self._skip, self._lose, self._in_force,
         )  # fmt: skip
         self._acknowledged = False  # a person has seen the fault; it ends when the robot is fine
         self._stop_by: float | None = None  # s, monotonic
         self._exit: Exit | None = None
         self.stop_requested = False  # set by signal handlers
 
+    def _kept_offset(self) -> OffsetInForce:
+        """Return where the offset that an arm is left with is kept."""
+        if not self._driver.moves_arm:  # the robot's own program takes it out
+            return OffsetInForce(self._driver.n, None)
+        return OffsetInForce.of_link(self._driver.n, self._settings.link)
+
     # -- the frame --------------------------------------------------------------------------------
 
-    def run(self, arm: bool, may_write: bool, latched: str = "") -> Exit:
+    def run(self, commands: Commands, may_write: bool, latched: str = "") -> Exit:
         """Connect and loop until told to stop, or until the link is lost.
 
-        ``arm``: arm as soon as a state is there. ``may_write`` False: nothing can arm. ``latched``:
-        the fault of a loop before this one that nobody has acknowledged.
+        ``commands``: the daemon's, and the only way to arm. ``may_write`` False: nothing can arm.
+        ``latched``: the fault of a loop before this one that nobody has acknowledged.
         """
         self._page.enter(Phase.CONNECTING)
         try:
@@ -107,17 +116,18 @@ class Loop:
         if latched:
             self._supervisor.take(Cause.LATCHED, latched)
         self._page.enter(Phase.RUNNING)
-        wanted = arm
+        wanted = False
         while self._exit is None:
             self._page.beat()
-            command = self._page.take_command()
-            if self.stop_requested or command == Command.STOP:
+            asked = commands.take()
+            for command in asked:
+                wanted = command == Command.ARM
+                if command in (Command.DISARM, Command.RAMP_OUT):
+                    self._disarm(command == Command.DISARM)
+            if asked:
+                self._page.tell_taken(commands.taken)
+            if self.stop_requested or commands.stop:
                 self._stop()
-            elif command == Command.DISARM:
-                wanted = False
-                self._disarm()
-            elif command == Command.ARM:
-                wanted = True
             if wanted and may_write and self._page.seen and self._stop_by is None:
                 wanted = False
                 self._arm()
@@ -138,9 +148,9 @@ class Loop:
             return
         self._tell({"kind": "refused", "what": "arm", "detail": words})
 
-    def _disarm(self) -> None:
+    def _disarm(self, by_a_person: bool) -> None:
         if self._supervisor.state == State.FAULT:
-            self._acknowledged = True
+            self._acknowledged |= by_a_person
         else:
             self._supervisor.take(Cause.DISARM)
 
@@ -164,7 +174,8 @@ class Loop:
     def _stop(self) -> None:
         """Ramp out, then end; a deadline makes sure of the end."""
         if self._stop_by is None:
-            self._stop_by = time.monotonic() + LONGEST_STOP
+            needed = LONGEST_STOP + longest_withdrawal(self._settings.limits)
+            self._stop_by = time.monotonic() + needed
             self._stream.hasten(HASTY_RAMP)
             self._supervisor.take(Cause.STOP)
         if not self._supervisor.state.writes or time.monotonic() > self._stop_by:

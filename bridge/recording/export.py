@@ -1,4 +1,4 @@
-"""From a recording to a log: the contract's columns, and what the daemon made of them beside."""
+"""From a recording to a log: a log's columns, and what the daemon made of them beside."""
 
 from __future__ import annotations
 

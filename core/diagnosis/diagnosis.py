@@ -25,7 +25,7 @@ from core.diagnosis.result import Cause, Considered, causes_of, considered_of
 from core.diagnosis.rigid_suspicion import softness_findings
 from core.diagnosis.selection.selection import Selection, select, standing
 from core.diagnosis.separation import Measurement, next_measurements
-from core.effects import Term
+from core.effects import Term, flexibility_effects
 from core.errors import LogError
 from core.log.columns import COLUMNS, misspelt
 from core.log.log import Log
@@ -46,7 +46,6 @@ CHANNELS: Mapping[str, Observe] = {
 
 
 NEEDLESS = 0.05  # share by which more may be left without a cause that seemed needless
-SOFTNESS = ("axial_compliance", "radial_compliance")
 # samples that a diagnosis looks at: more cost time and tell hardly more
 MOST = {"position": 1200, "wrench": 300, "tracking": 300, "torque": 300}
 
@@ -160,7 +159,8 @@ def _diagnose(
         raise LogError(f"{log.path}: found no channel to diagnose, expected one of: {needs}{hint}")
     for channel in observed:
         told += _channel_findings(channel, log)
-        if simulated is None and not {*withhold} & {*SOFTNESS} and _lacks_much(channel):
+        soft = {*flexibility_effects().values()} - {*withhold}
+        if simulated is None and len(soft) == 2 and _lacks_much(channel):
             told += softness_findings(model, log, metrology)
     terms = _for_the_model(observed)
     return Diagnosis(

@@ -1,4 +1,4 @@
-"""The diagnosis as the contract's JSON (schema ``gapbridge.diagnosis/1``)."""
+"""The diagnosis as JSON (schema ``gapbridge.diagnosis/1``)."""
 
 from __future__ import annotations
 

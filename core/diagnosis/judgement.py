@@ -32,8 +32,6 @@ INSTRUMENTS = 5.0  # times the instrument's sigma, for coarse instruments
 HINT = 0.05  # probability from which a coordinate is suspect once structure is sure
 TRACE = 0.01  # share of an unnamed function from which a coordinate has it
 TOUCH = 0.1  # share of a cause that acts on a coordinate: more than that touches it
-NESTED = ("axial_compliance", "stiffness_nonlinearity")
-HELD_BY_ALL = ("payload", "link_inertia", "torque_constant")  # one weight, felt by many joints
 LEAST = 0.002  # share of the held-out gap that a cause has to take beside a leftover
 
 
@@ -129,7 +127,7 @@ def _weak(selection: Selection, believed: list[int], smooth: list[int]) -> list[
         return believed
     return [
         c for c in believed
-        if touched[c][bad].sum() > TOUCH or space.candidates[c].family in HELD_BY_ALL
+        if touched[c][bad].sum() > TOUCH or space.candidates[c].effect.felt_by_all
     ]  # fmt: skip
 
 
@@ -179,8 +177,9 @@ def _ties(
         names: list[str] = []
         for _, other in rivals(space, found, c, TIE):
             family = space.candidates[other].family
-            nested = (own, family) == NESTED  # the curve holds the line: no rival
-            if space.candidates[other].named and family not in (own, *names) and not nested:
+            if not space.candidates[other].named or family in (own, *names):
+                continue
+            if space.candidates[other].effect.contains != own:  # a curve holds its line: no rival
                 names.append(family)
         told[position] = tuple(names)
     return told

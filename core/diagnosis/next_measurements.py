@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.dynamics import predict_torque, predict_tracking, predict_wrench, with_pieces
+from core.dynamics import predict_torque, predict_tracking, predict_wrench, with_held, with_pieces
 from core.effects import Term
 from core.loads import Loads
 from core.log.log import Log
@@ -129,11 +129,13 @@ def _followings(model: Model, trials: Trials) -> Predict:
     hours = np.arange(count)[:, None] * 10.0 * LEAD  # one after the other
     motion = Motion(
         t=(trials.time + hours + before[None]).ravel(), q=q, qd=speed,
-        qdd=np.repeat(trials.qdd, k, axis=0), target_q=q, loads=Loads(),
+        qdd=np.repeat(trials.qdd, k, axis=0), target_q=q,
+        loads=trials.loads[np.repeat(np.arange(count), k)],
         rows=np.arange(count * k), valid=np.ones(count * k, dtype=bool),
         stretch=np.repeat(np.arange(count), k), start=trials.start, moving=True,
         still=STILL * fastest_of(model),
     )  # fmt: skip
+    motion = with_held(model, motion)
     return lambda terms: predict_tracking(model, motion, terms)[k - 1 :: k]
 
 

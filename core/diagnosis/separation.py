@@ -125,7 +125,7 @@ def _usual(model: Model, effect: str) -> Iterator[Term]:
     """Yield an effect of usual size at each of its sites."""
     member = CATALOGUE[effect]
     for site in member.sites(model.arm):
-        place = Site(site.joint, 1.0 if effect == "transmission_error" else None)
+        place = Site(site.joint, 1.0 if member.periodic else None)
         yield Term(effect, place, tuple(p.scale for p in member.parameters(model.arm, place)))
 
 
@@ -162,7 +162,8 @@ def _best(moving: bool, trials: Trials, names: tuple[str, ...], gain: Array) -> 
         if gain[r] < VISIBLE or len(told) == EACH:
             break
         if all(np.abs(q[r] - np.array(m.q)).max() > APART for m in told):
-            approach = tuple(int(v) for v in loads.approach[r]) if "backlash" in names else None
+            sided = any(CATALOGUE[name].by_approach for name in names)
+            approach = tuple(int(v) for v in loads.approach[r]) if sided else None
             told.append(Measurement(
                 _floats(q[r]), float(loads.payload_mass[r]), names, float(gain[r]), approach,
                 velocity=_floats(trials.qd[r]) if moving else None,

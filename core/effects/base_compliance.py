@@ -22,8 +22,12 @@ class BaseCompliance(Effect):
     """
 
     identifier = "base_compliance"
+    title = "foundation gives way"
+    label_words = "yielding of the foundation about {part}"
+    softens = True
     channels = ("position",)
     motion = "poses and payloads that change the moment on the base, in all directions around it"
+    instead = "put the base on springs about x and y"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the flexibilities about x and y of base."""

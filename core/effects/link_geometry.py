@@ -68,6 +68,9 @@ class LinkGeometry(Effect):
     """
 
     identifier = "link_geometry"
+    title = "link measures differ"
+    label_words = "{part} of link {joint}"
+    calibrated = 3
     channels = ("position",)
     motion = "poses that differ in the joint before the link"
 

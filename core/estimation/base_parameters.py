@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from core.effects import flexibility_effects
 from core.estimation.compliance_fit import Linear, Mask, solve
 
 Array = NDArray[np.float64]
@@ -89,7 +90,8 @@ def what_is_shown(linear: Linear, kept: Mask, sigma: float) -> Shown:
 def name(i: int | np.integer[Any], count: int) -> str:
     """Return the public name of flexibility ``i`` of ``count`` = 2n: axial first, then radial."""
     n = count // 2
-    return f"axial_compliance_{i + 1}" if i < n else f"radial_compliance_{i - n + 1}"
+    named = flexibility_effects()
+    return f"{named['axial']}_{i + 1}" if i < n else f"{named['radial']}_{i - n + 1}"
 
 
 def _held(i: int, columns: Array, kept: Mask) -> str:

@@ -1,8 +1,8 @@
 """The least squares behind the identification: flexibilities, and what is unknown beside them.
 
-Gauss-Newton on the paper's linear form (eq. 35), taken again at the deflected shape, wild readings
-weighed down. Where the instrument is not registered, its frame and the tool point are estimated
-along: nuisances, projected out before anything is said of a flexibility.
+Gauss-Newton on the linear form (eq. 4 of docs/conventions.md), taken again at the deflected shape,
+outliers down-weighted. Where the instrument is not registered, its frame and the tool point are
+estimated along: nuisances, projected out before anything is said of a flexibility.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from core.effects import CATALOGUE
 from core.estimation.registration import IDENTITY, Registration, frame_columns, register_robustly
 from core.loads import Loads
 from core.model import Model, Poses
@@ -104,12 +105,13 @@ class Fit:
 def flexibilities(model: Model) -> Array:
     """Return the model's linear flexibilities (2n,) rad/Nm: axial, then radial.
 
-    Those that ``with_compliance`` replaces; what ``stiffness_nonlinearity`` holds stays beside.
+    Those that ``with_compliance`` replaces; what a bent stiffness curve holds stays beside.
     """
     found = np.zeros(2 * model.arm.n)
     for term in model.terms:
-        if term.effect in ("axial_compliance", "radial_compliance") and term.site.joint:
-            first = 0 if term.effect == "axial_compliance" else model.arm.n
+        kind = CATALOGUE[term.effect].flexibility
+        if kind and term.site.joint:
+            first = 0 if kind == "axial" else model.arm.n
             found[first + term.site.joint - 1] += term.values[0]
     return found
 

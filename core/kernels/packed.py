@@ -79,8 +79,7 @@ def view_row(block: Array, n: int) -> Rows:
 row_of = njit(**JIT)(view_row)
 
 
-@njit(**JIT)
-def shape_of(block, n):  # type: ignore[no-untyped-def]
+def view_shape(block: Array, n: int) -> Shape:
     """Return the buffers for n joints whose arrays are views of ``block``."""
     a = 3 * (n + 1)
     b = a + 9 * (n + 1)
@@ -98,3 +97,6 @@ def shape_of(block, n):  # type: ignore[no-untyped-def]
         block[f : f + 3],
         block[f + 3 : f + 12].reshape((3, 3)),
     )
+
+
+shape_of = njit(**JIT)(view_shape)

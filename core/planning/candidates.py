@@ -184,7 +184,7 @@ def _under_loads(
     """Return each pose under every load, from both sides where joints have play."""
     q, station, target = seen
     count = len(q)
-    played = [j - 1 for j in parameters.joints("backlash")]
+    played = [j - 1 for j in parameters.sided()]
     sides: list[Array] = [np.zeros(q.shape)]
     if played:
         side = np.zeros(q.shape)

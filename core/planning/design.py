@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_limits
 from core.calibration.observables.observable import Observable
 from core.calibration.parameters import Parameters
 from core.calibration.plan import Payload, Plan
+from core.effects import flexibility_effects
 from core.errors import PlanError
 from core.loads import Loads
 from core.planning.candidates import STOPS, Candidates, candidates_of, joined
@@ -169,7 +170,7 @@ def reference_of(
     clear = drawn[space.clear(drawn)]
     q = clear[:REFERENCE] if len(clear) else drawn[:REFERENCE]
     turn = np.arange(len(q)) % len(loads)
-    approach = random.choice([-1.0, 1.0], q.shape) if parameters.joints("backlash") else None
+    approach = random.choice([-1.0, 1.0], q.shape) if parameters.sided() else None
     mass, cog = np.array([load.mass for load in loads]), np.array([load.cog for load in loads])
     return Reference.of(parameters, q, Loads(mass[turn], cog[turn], approach=approach))
 
@@ -253,7 +254,7 @@ def _notes(
     idle = [f"{load.mass:g} kg" for i, load in enumerate(loads) if i not in hung]
     if idle:
         notes.append(f"loads that tell nothing more and need not be hung: {', '.join(idle)}")
-    soft = [e for e in ("axial_compliance", "radial_compliance") if parameters.joints(e)]
+    soft = [e for e in flexibility_effects().values() if parameters.joints(e)]
     if soft and len(loads) == 1:
         notes.append(
             "one load alone: compliance is told from what the arm itself weighs; a second load "

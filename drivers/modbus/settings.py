@@ -90,6 +90,12 @@ class ModbusSettings(DriverSettings):
         """Return what messages call the controller."""
         return self.serial or self.host if self.transport == "rtu" else self.host
 
+    def read_files(self) -> None:
+        """Read the profile; see DriverSettings."""
+        from drivers.modbus.profile import read_profile
+
+        read_profile(self.profile_path)
+
     def located(self, folder: Path) -> Self:
         """Return the settings with paths seen from ``folder`` made whole; see DriverSettings."""
         update: dict[str, object] = {

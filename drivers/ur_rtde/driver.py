@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.compensation import wanted_pose
-from core.errors import LinkError, WriteError
+from core.errors import InvalidStateError, LinkError, WriteError
 from core.model import Model
 from core.setpoint import Setpoint
 from core.state import RobotState
@@ -31,14 +31,16 @@ class UrRtdeDriver(Driver):
     """
 
     def __init__(self, settings: UrRtdeSettings, model: Model) -> None:
-        super().__init__(settings.rate, 6, moves_arm=settings.mode == "servoj")
+        super().__init__(settings.rate, model, moves_arm=settings.mode == "servoj")
         if model.arm.n != 6:
             raise LinkError(f"link: found an arm of {model.arm.n} joints, a UR has 6")
         self.settings = settings
         self.reader = StateReader(settings)
         self._model, self._nominal = model, Nominal(model)
         self._writer: Writer = (
-            ServoWriter(settings) if settings.mode == "servoj" else OffsetWriter(settings)
+            ServoWriter(settings)
+            if settings.mode == "servoj"
+            else OffsetWriter(settings, self._rates)
         )
         self._state: RobotState | None = None
 
@@ -51,7 +53,21 @@ class UrRtdeDriver(Driver):
         self._state = self.reader.read()
         if isinstance(self._writer, OffsetWriter):
             self._writer.echo, self._writer.program = self.reader.echo, self.reader.program
+            self._writer.applied = self.reader.applied
         return self._state
+
+    def _rates(self) -> tuple[float, float]:
+        """Return the cell's rates of the offset, m/s and rad/s."""
+        return self.gate.bounds.offset_rate, self.gate.bounds.offset_rotation_rate
+
+    def _look(self) -> None:
+        """Read a sample while arming. Raises WriteError."""
+        try:
+            self.read_state()
+        except InvalidStateError:
+            pass
+        except LinkError as error:
+            raise WriteError(str(error)) from None
 
     def nominal_q(self, state: RobotState) -> Vector:
         """Return what the robot itself wants (6,), rad.
@@ -63,11 +79,11 @@ class UrRtdeDriver(Driver):
             return state.target_q
         return self._nominal.without(state.target_q, self.reader.applied)
 
-    def arm(self, state: RobotState) -> None:
+    def _make_ready(self, state: RobotState) -> None:
         """Make ready for writing: upload the control script, or claim the registers."""
         if not self.moves_arm:
             self._check_tcp(state)
-        self._writer.arm(state)
+        self._writer.arm(state, self._look)
 
     def _check_tcp(self, state: RobotState) -> None:
         """Refuse where the controller's TCP is another than the cell's: offsets act there."""
@@ -86,15 +102,15 @@ class UrRtdeDriver(Driver):
         """Feed the watchdog of the control script; see Driver.keep_alive."""
         self._writer.keep_alive()
 
-    def write_setpoint(self, setpoint: Setpoint) -> None:
+    def _send(self, setpoint: Setpoint) -> None:
         """Send one setpoint; needs ``arm`` before."""
         state = self._state
         if state is None:
             raise WriteError(f"{self.settings.host}: found no state, expected read_state() first")
         self._writer.write(setpoint, state)
 
-    def release(self) -> None:
-        """Stop writing: servoStop and end of the script, or an offset of zero."""
+    def _let_go(self) -> None:
+        """Stop writing: servoStop and end of the script, or no heartbeat any more."""
         if self.reader.age > self.settings.state_timeout:
             raise WriteError(f"{self.settings.host}: the link is silent; the robot's watchdog acts")
         self._writer.release()

@@ -28,9 +28,10 @@ from bridge.document.blocks import (
 )
 from bridge.document.drawing import AFTER, EDGE, Drawing
 from bridge.document.section import Section
-from bridge.report.words import likelihood
+from bridge.report.words import effect_words, likelihood
 from core.calibration.readings import Readings
 from core.calibration.verify import Suspect, Verification
+from core.effects import CATALOGUE
 
 TWICE = 2.0  # promised deviations that an error hardly exceeds
 
@@ -150,9 +151,11 @@ def suspect_words(suspect: Suspect) -> str:
     kind, _, number = suspect.name.rpartition("_")
     if kind == "reading":
         return f"reading {number} alone is wrong"
-    words = {"tool_frame": "the tool sits elsewhere", "payload": "the load is another",
-             "instrument": "the instrument stands elsewhere"}  # fmt: skip
-    return words.get(suspect.name, f"another {parameter_words(suspect.name)}")
+    if suspect.name in CATALOGUE:
+        return effect_words(suspect.name)
+    if suspect.name == "instrument":
+        return "the instrument stands elsewhere"
+    return f"another {parameter_words(suspect.name)}"
 
 
 VERIFICATION: tuple[Section[VerificationMaterial], ...] = (Holds(), Facts(), Poses(), Moved())

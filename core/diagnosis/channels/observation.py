@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from core.effects import Term
 
 Array = NDArray[np.float64]
+HELD = "held_torque"  # Nm that a joint holds at rest: a quantity beside the columns of the log
 Rivals = tuple[tuple[str, Array], ...]
 Predict = Callable[[Sequence[Term]], Array]
 
@@ -49,6 +50,7 @@ class Observation:
     friction: Array | None = None  # (N, k) sign of each joint's motion, where friction shows
     tool_axes: Array | None = None  # (N, 3, 3) axes of the TCP in base, as columns
     axial_moment: Array | None = None  # (N, n) Nm about each joint's axis, where it is known
+    times: Array | None = None  # (N,) s or numbers of rows, where something may have stepped
     order_in_time: bool = False  # True: neighbours in time are correlated (a moving log)
     rebase: Callable[[Array], Observation] | None = None  # the same with the nuisance moved (p,)
     instrument: Array | None = None  # (k,) 1 sigma measured by neighbouring samples of a recording
@@ -89,6 +91,7 @@ def thinned(observation: Observation, most: int) -> Observation:
         joint_columns=some(observation.joint_columns),
         unnamed=lambda: tuple((target, columns[take]) for target, columns in unnamed()),
         friction=some(observation.friction),
+        times=some(observation.times),
         tool_axes=some(observation.tool_axes),
         axial_moment=some(observation.axial_moment),
         session=None if observation.session is None else observation.session[take],

@@ -154,6 +154,7 @@ def _observe_session(
         axial_moment=np.einsum("nij,nji->ni", form.moment, form.jacobian[:, 3:]),
         unnamed=lambda: unnamed_rivals(model, q, loads, k),
         tool_axes=poses.rotation,
+        times=loads.time,
         rebase=rebase if nuisance.shape[2] else None,
     )
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.derivatives import signal_noise
+from core.diagnosis.channels.observation import HELD
 from core.estimation.identification import pose_groups
 from core.log.log import Log
 from core.motion import Motion
@@ -15,6 +16,8 @@ Index = NDArray[np.int64]
 MOST_SAMPLES = 30_000  # rows judged of a long log, evenly picked: what memory holds
 STRETCHES = 24  # conditions of a recording: even stretches of time
 FEWEST_CONDITIONS = 5
+SMALLEST_TORQUE = 1e-3  # Nm
+HARDLY = 1e-3  # share of the largest held torque by which one has to change to count
 REPEATED = 0.5  # distinct values over samples below which a signal comes in steps
 VARIES = 1e-9  # spread below which a quantity counts as constant
 
@@ -68,6 +71,17 @@ def quantities(log: Log, motion: Motion) -> dict[str, Array]:
             if np.isfinite(table[:, i]).all() and np.ptp(table[:, i]) > VARIES:
                 found[name if values.ndim == 1 else f"{name}_{i}"] = table[:, i]
     return found
+
+
+def held_torques(motion: Motion) -> dict[str, Array]:
+    """Return the torques that the joints hold, where they vary, as quantities."""
+    if motion.held is None:
+        return {}
+    largest = max(float(np.abs(motion.held).max(initial=0.0)), SMALLEST_TORQUE)
+    return {
+        f"{HELD}_{i}": motion.held[:, i]
+        for i in np.flatnonzero(np.ptp(motion.held, axis=0) > HARDLY * largest)
+    }
 
 
 def instrument_noise(signal: Array, motion: Motion) -> Array | None:

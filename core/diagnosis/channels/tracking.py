@@ -12,13 +12,14 @@ from core.diagnosis.channels.observation import NotObservable, Observation, Pred
 from core.diagnosis.channels.recording import (
     Index,
     conditions,
+    held_torques,
     instrument_noise,
     joint_axes,
     own_joints,
     picked,
     quantities,
 )
-from core.dynamics import predict_tracking
+from core.dynamics import predict_tracking, with_held
 from core.effects import Term
 from core.log.log import Log
 from core.log.sessions import session_of
@@ -43,7 +44,7 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     needs = tuple(name for name in ("target_q", "actual_q") if not log.has(name))
     if needs:
         return NotObservable("tracking", needs)
-    motion = motion_of(log)
+    motion = with_held(model, motion_of(log))
     return _observed(model, log, motion, picked(_known_past(motion)))
 
 
@@ -61,7 +62,7 @@ def _observed(model: Model, log: Log, motion: Motion, rows: Index) -> Observatio
         weight=np.ones(n),
         sigma=encoder_step(log.require("actual_q")) / np.sqrt(12),
         sigma_is_whole=False,
-        quantities=quantities(log, part),
+        quantities=held_torques(part) | quantities(log, part),
         groups=conditions(part),
         rows=part.rows,
         axes=joint_axes(n),
@@ -85,6 +86,8 @@ def _following(model: Model, motion: Motion, rows: Index) -> Predict:
         return np.asarray(predict_tracking(model, motion, own)[rows, joint - 1])
 
     def predict(terms: Sequence[Term]) -> Array:
+        if any(term.site.joint is None for term in terms):
+            return np.asarray(predict_tracking(model, motion, terms)[rows])
         told = plain.copy()
         for joint in {term.site.joint for term in terms if term.site.joint is not None}:
             own = tuple(term for term in terms if term.site.joint == joint)

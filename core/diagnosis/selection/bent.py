@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.diagnosis.selection.problem import Space
-from core.effects import Term
+from core.effects import CATALOGUE, Term
 
 Array = NDArray[np.float64]
 BENT = 10.8  # gain of a bent stiffness curve over a straight one that makes it one
@@ -18,7 +18,7 @@ def not_bent(terms: Sequence[Term], covariance: Sequence[Array]) -> list[int]:
     """Return positions of stiffness curves that a straight line would fit as well."""
     straight = []
     for position, (term, spread) in enumerate(zip(terms, covariance, strict=True)):
-        if term.effect != "stiffness_nonlinearity":
+        if not CATALOGUE[term.effect].curved:
             continue
         softening, deviation = term.values[1], float(np.sqrt(max(spread[1, 1], 0)))
         if softening <= 0 or softening < np.sqrt(BENT) * deviation:
@@ -40,8 +40,8 @@ def straightened(
     """
     instead: dict[int, int] = {}
     for position in not_bent(terms, covariance):
-        joint = terms[position].site.joint
+        joint, straight = terms[position].site.joint, CATALOGUE[terms[position].effect].contains
         for c, candidate in enumerate(space.candidates):
-            if candidate.family == "axial_compliance" and candidate.site.joint == joint:
+            if candidate.family == straight and candidate.site.joint == joint:
                 instead[index[position]] = c
     return tuple(instead.get(c, c) for c in chosen) if instead else None

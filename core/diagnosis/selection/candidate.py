@@ -1,7 +1,7 @@
 """Candidates: everything that may stand behind a gap, each with its columns.
 
 A *named* candidate is an effect of the catalogue at one site; a *smooth* one is an unnamed function
-of one quantity (CONTRACT: what wins there is ``unexplained``). Columns are derivatives of the
+of one quantity (what wins there is ``unexplained``). Columns are derivatives of the
 channel's whole prediction, by central differences, at the model found so far.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arm import Arm
-from core.diagnosis.channels.observation import Observation
+from core.diagnosis.channels.observation import HELD, Observation
 from core.effects import CATALOGUE, Effect, Parameter, Site, Term
 from core.errors import InputError
 
@@ -26,6 +26,8 @@ HALF_ORDERS = 40  # up to here also the halves
 # (typical moment / M0)^2 that a bent stiffness curve starts from
 SOFTENING = tuple(float(v) for v in np.geomspace(0.1, 3000, 13))
 
+UNNAMED = Effect()
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -36,6 +38,7 @@ class Candidate:
     parameters: tuple[Parameter, ...]
     fixed: tuple[float | None, ...]  # per parameter of the effect: None = fitted
     curve: float | None = None  # softening of a bent stiffness curve: columns straight, and bent
+    tried: int = 1  # hypotheses that this one was picked from
     quantity: str = ""  # what a smooth candidate depends on
     target: str = ""  # and what it moves
 
@@ -43,6 +46,27 @@ class Candidate:
     def named(self) -> bool:
         """Return whether this is a member of the catalogue."""
         return self.family != "smooth"
+
+    @property
+    def effect(self) -> Effect:
+        """Return the member of the catalogue; of what is in none, an effect without attributes."""
+        return CATALOGUE.get(self.family, UNNAMED)
+
+    @property
+    def gives_way(self) -> bool:
+        """Return whether more of this may take the arm to where it finds no equilibrium."""
+        return self.effect.softens or self.effect.adds_mass
+
+    @property
+    def turns_its_joint(self) -> bool:
+        """Return whether this turns a joint by the joint's own angle alone."""
+        own = Effect.angle_columns
+        return type(self.effect).angle_columns is not own
+
+    @property
+    def periodic(self) -> bool:
+        """Return whether this is one line of a periodic effect."""
+        return self.effect.periodic
 
     @property
     def of_no_quantity(self) -> bool:
@@ -69,6 +93,12 @@ def own_target(quantity: str) -> str:
     return f"joint_{int(index) + 1}" if stem in ("actual_q", "target_q") else ""
 
 
+def carrying(quantity: str) -> str:
+    """Return the joint that holds the torque of a quantity, as own_target ('' if none)."""
+    stem, _, index = quantity.rpartition("_")
+    return f"joint_{int(index) + 1}" if stem == HELD else ""
+
+
 def named_candidates(
     arm: Arm,
     channel: str,
@@ -84,7 +114,7 @@ def named_candidates(
     """
     found = []
     for identifier, effect in CATALOGUE.items():
-        if channel not in effect.channels or identifier in set(withheld):
+        if channel not in effect.channels or identifier in set(withheld) or effect.at_moment:
             continue
         for site in effect.sites(arm):
             inside = [t for t in base if t.effect == identifier and t.site.joint == site.joint]
@@ -102,7 +132,7 @@ def _at(
 ) -> list[Candidate]:
     parameters = effect.parameters(arm, site)
     free: tuple[float | None, ...] = (None,) * len(parameters)
-    if effect.identifier == "transmission_error":
+    if effect.periodic:
         orders = sorted(
             set(np.arange(1, WHOLE_ORDERS + 1).astype(float))
             | set(np.arange(2, 2 * HALF_ORDERS + 1) / 2)
@@ -116,7 +146,7 @@ def _at(
             for o in orders
             if o >= min(least, 3.0) or o in (1.0, 2.0)
         ]
-    if effect.identifier == "stiffness_nonlinearity" and not inside:
+    if effect.curved and not inside:
         return [
             Candidate(
                 effect.identifier,
@@ -127,20 +157,26 @@ def _at(
             )
             for s in SOFTENING
         ]
-    if effect.identifier == "tool_frame" and not with_rotation:
-        return [Candidate(effect.identifier, site, parameters[:3], (None,) * 3 + (0.0,) * 3)]
+    if effect.shapes:
+        had = {t.values[-1] for t in inside}
+        held = (None,) * (len(parameters) - 1)
+        return [
+            Candidate(effect.identifier, site, parameters[:-1], (*held, shape))
+            for shape in (*effect.shapes, *(had - {*effect.shapes}))
+        ]
+    if any(p.of_rotation for p in parameters) and not with_rotation:
+        shown = tuple(p for p in parameters if not p.of_rotation)
+        held = tuple(0.0 if p.of_rotation else None for p in parameters)
+        return [Candidate(effect.identifier, site, shown, held)]
     return [Candidate(effect.identifier, site, parameters, free)]
 
 
 def named_columns(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> Array:
     """Return d prediction / d parameter (N, k, d), ``base`` terms already in the model."""
-    J = observation.joint_columns
-    if candidate.family == "transmission_error" and J is not None:
-        assert candidate.site.joint is not None and candidate.site.order is not None
-        i = candidate.site.joint - 1
-        phase = candidate.site.order * observation.quantities[joint_quantity(observation, i)]
-        return np.stack([J[:, :, i] * np.sin(phase)[:, None], J[:, :, i] * np.cos(phase)[:, None]],
-                        axis=-1)  # fmt: skip
+    if candidate.effect.periodic:
+        by_angle = angle_columns(observation, candidate)
+        if by_angle is not None:
+            return by_angle
     if candidate.curve is not None:
         return _bent_columns(observation, candidate)
     columns = []
@@ -155,6 +191,17 @@ def named_columns(observation: Observation, candidate: Candidate, base: Sequence
             ahead = behind = observation.measured
         columns.append((ahead - behind) / (2 * h))
     return np.stack(columns, axis=-1)
+
+
+def angle_columns(observation: Observation, candidate: Candidate) -> Array | None:
+    """Return exact columns (N, k, d) of what turns a joint by its own angle; None for the rest."""
+    J, joint = observation.joint_columns, candidate.site.joint
+    if J is None or joint is None:
+        return None
+    angle = observation.quantities.get(joint_quantity(observation, joint - 1))
+    still = np.zeros(len(J))  # a joint that never moves has one angle
+    shape = candidate.effect.angle_columns(candidate.site, still if angle is None else angle)
+    return None if shape is None else J[:, :, joint - 1, None] * shape[:, None, :]
 
 
 def _bent_columns(observation: Observation, candidate: Candidate) -> Array:

@@ -1,7 +1,7 @@
-"""Delay and lag as they really act, not only by their slopes.
+"""What makes encoders come late, or rest elsewhere, as it really acts, not only by its slope.
 
-To first order both are the speed times the time, so that a search by slopes takes the one for the
-other, and what is then left looks like a third cause.
+To first order delay and lag both are the speed times the time, so that a search by slopes takes the
+one for the other, and what is then left looks like a third cause. Play has no slope at all.
 """
 
 from __future__ import annotations
@@ -13,30 +13,43 @@ from numpy.typing import NDArray
 
 from core.diagnosis.channels.observation import Observation
 from core.diagnosis.selection.candidate import Candidate, named_columns
-from core.dynamics import TRACKING
-from core.effects import Term
+from core.effects import CATALOGUE, Term
 
 Array = NDArray[np.float64]
-SHORTEST = 1e-6  # s: a chord needs a length
+SHORTEST = 1e-3  # usual sizes of the value: a chord needs a length
 
 
 def exact_columns(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> Array:
     """Return a candidate's columns (N, k, d) at the model found so far.
 
-    Of a delay or a lag it is the chord from nothing to the whole time that the joint comes late:
-    exact there for the one as for its twin, so that both compete on what they really predict.
+    In tracking it is the chord from nothing to the value found so far; of a delay or a lag to the
+    whole time that the joint comes late: exact there for the one as for its twin, so that both
+    compete on what they really predict.
     """
-    if candidate.family not in TRACKING:
+    if observation.channel != "tracking":
         return named_columns(observation, candidate, base)
-    inside = [t.values[0] for t in base if t.site.joint == candidate.site.joint]
+    if len(candidate.parameters) > 1:
+        return named_columns(observation, candidate, ())
+    inside = [
+        t.values[0] for t in base
+        if t.site.joint == candidate.site.joint and _alike(t, candidate)
+    ]  # fmt: skip
     nothing = observation.predict(())
     if inside:
-        time = float(np.sum(inside))
+        value = float(np.sum(inside))
     else:
         slope = named_columns(observation, candidate, ())[..., 0]
         gap = observation.measured - nothing
-        time = float(np.sum(slope * gap) / max(float(np.sum(slope**2)), 1e-300))
-    if time < SHORTEST:
+        value = float(np.sum(slope * gap) / max(float(np.sum(slope**2)), 1e-300))
+    parameter = candidate.parameters[0]
+    value = min(max(value, parameter.lower), parameter.upper)
+    if abs(value) < SHORTEST * parameter.scale:
         return named_columns(observation, candidate, ())
-    moved = observation.predict([candidate.term(np.array([time]))]) - nothing
-    return np.asarray(moved / time)[..., None]
+    moved = observation.predict([candidate.term(np.array([value]))]) - nothing
+    return np.asarray(moved / value)[..., None]
+
+
+def _alike(term: Term, candidate: Candidate) -> bool:
+    """Return whether a term's value is one of the candidate: of delays their sum is."""
+    delays = CATALOGUE[term.effect].delays and candidate.effect.delays
+    return delays or term.effect == candidate.family

@@ -42,14 +42,11 @@ def clash(space: Space, chosen: Sequence[int], new: int) -> bool:
         a = space.candidates[c]
         if not (a.named and b.named) or a.site.joint != b.site.joint:
             continue
-        if a.family == b.family == "transmission_error":
+        if a.family == b.family and a.periodic:
             lines += 1
             if abs((a.site.order or 0) - (b.site.order or 0)) < 0.75 or lines >= allowed:
                 return True
-        elif a.family == b.family or {a.family, b.family} == {
-            "axial_compliance",
-            "stiffness_nonlinearity",
-        }:
+        elif a.family in (b.family, b.effect.contains) or b.family == a.effect.contains:
             return True
     return False
 

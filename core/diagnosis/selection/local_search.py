@@ -12,7 +12,6 @@ Array = NDArray[np.float64]
 MERGED = 9  # terms up to which every pair is tried against one
 GROWTH = 30  # terms added to a set at most
 GATHERED = 4.0  # score that one kind of effect at two places may cost beyond two kinds
-BY_ANGLE = ("joint_offset", "transmission_error")  # what a joint does by its own angle alone
 
 
 def improve(space: Space, found: Found, named_only: bool = False) -> Found:
@@ -168,7 +167,7 @@ def packed(space: Space, found: Found) -> list[Found]:
     for joint in joints - {None}:
         own = {
             c for c in found.chosen
-            if space.candidates[c].site.joint == joint and space.candidates[c].family in BY_ANGLE
+            if space.candidates[c].site.joint == joint and space.candidates[c].turns_its_joint
         }  # fmt: skip
         if len(own) < 2:
             continue
@@ -184,7 +183,7 @@ def _lines(space: Space, rest: tuple[int, ...], joint: int) -> list[Found]:
     own = [
         k
         for k, candidate in enumerate(space.candidates)
-        if candidate.family == "transmission_error" and candidate.site.joint == joint
+        if candidate.periodic and candidate.site.joint == joint
     ]
     grown: list[Found] = []
     sets = [rest]

@@ -26,7 +26,7 @@ def look_for_wild(work: Work, columns: list[Array]) -> None:
     N, k = gap.shape
     usual, parts = [], []
     for c, block in zip(work.candidates, columns, strict=True):
-        if c.family == "transmission_error" and (c.site.order or 0) > 3:
+        if c.periodic and (c.site.order or 0) > 3:
             continue
         parts.append(block)
         usual += [p.scale for p in c.parameters]

@@ -98,7 +98,7 @@ def prices(candidates: Sequence[Candidate], freedom: float) -> Array:
     families = {c.family for c in candidates if c.named} or {""}
     count: dict[str, int] = {}
     for c in candidates:
-        count[_kind(c)] = count.get(_kind(c), 0) + 1
+        count[_kind(c)] = count.get(_kind(c), 0) + c.tried
     paid = []
     for c in candidates:
         tried = count[_kind(c)] * (len(families) if c.named else 1)
@@ -110,7 +110,7 @@ def prices(candidates: Sequence[Candidate], freedom: float) -> Array:
 
 def _kind(candidate: Candidate) -> str:
     """Return among how many of its like a candidate was tried: usual lines are few."""
-    if candidate.family == "transmission_error" and (candidate.site.order or 0) in USUAL_ORDERS:
+    if candidate.periodic and (candidate.site.order or 0) in USUAL_ORDERS:
         return "usual lines"
     if candidate.of_no_quantity:
         return "rivals"

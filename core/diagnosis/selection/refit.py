@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arm import Arm
-from core.diagnosis.selection.candidate import Candidate, named_columns
+from core.diagnosis.selection.candidate import Candidate, angle_columns
 from core.diagnosis.selection.problem import Found, Space
 from core.diagnosis.selection.state import Work, flat
-from core.effects import CATALOGUE, Term
+from core.effects import Term
 from core.errors import InputError
 
 Array = NDArray[np.float64]
@@ -152,20 +152,17 @@ def _share(
 
 def _freed(arm: Arm, candidate: Candidate) -> Candidate:
     """Return the candidate with what its columns held fixed (a softening) fitted too."""
-    if candidate.family != "stiffness_nonlinearity":
+    if not (candidate.effect.curved or candidate.effect.shapes):
         return candidate
-    parameters = CATALOGUE[candidate.family].parameters(arm, candidate.site)
+    parameters = candidate.effect.parameters(arm, candidate.site)
     return replace(candidate, parameters=parameters, fixed=(None,) * len(parameters), curve=None)
 
 
 def _slope(work: Work, candidate: Candidate, x: Array, others: tuple[Term, ...]) -> Array:
     """Return d prediction / d parameter (N, k, d) at the term's present values."""
-    J = work.observation.joint_columns
-    if candidate.family == "transmission_error" and J is not None:
-        return named_columns(work.observation, candidate, ())
-    if candidate.family == "joint_offset" and J is not None:
-        assert candidate.site.joint is not None
-        return np.asarray(J[:, :, candidate.site.joint - 1, None])
+    by_angle = angle_columns(work.observation, candidate)
+    if by_angle is not None:
+        return by_angle
     columns = []
     for k, parameter in enumerate(candidate.parameters):
         h = np.zeros(len(x))

@@ -121,8 +121,8 @@ def screened(space: Space, base: Sequence[int] = ()) -> NDArray[np.int64]:
 
 def _many(candidate: Candidate) -> bool:
     """Return whether a candidate is one of very many alike."""
-    line = candidate.family == "transmission_error"
-    return not candidate.named or (line and candidate.site.order not in USUAL_ORDERS)
+    usual = candidate.site.order in USUAL_ORDERS
+    return not candidate.named or (candidate.periodic and not usual)
 
 
 def part(space: Space, keep: NDArray[np.int64]) -> Space:

@@ -22,6 +22,7 @@ from core.diagnosis.selection.candidate import (
 )
 from core.diagnosis.selection.following import exact_columns
 from core.diagnosis.selection.local_search import pruned
+from core.diagnosis.selection.moments import step_candidates
 from core.diagnosis.selection.noise import Noise, estimate_noise
 from core.diagnosis.selection.outliers import look_again, look_for_wild, with_wild_explained
 from core.diagnosis.selection.problem import Found, Space, fit
@@ -29,15 +30,13 @@ from core.diagnosis.selection.refit import refit
 from core.diagnosis.selection.search import LARGE, screened_search
 from core.diagnosis.selection.smooth import smooth_candidates
 from core.diagnosis.selection.state import Raw, Work, flat, locate, sample_space
-from core.effects import CATALOGUE, Term
+from core.effects import Term
 from core.errors import InputError
 from core.model import Model
 
 Array = NDArray[np.float64]
 ROUNDS = 5
 FORBIDDEN = 1e9  # a price that no fit is worth
-BENDING = ("axial_compliance", "radial_compliance", "stiffness_nonlinearity",
-           "link_flexibility", "base_compliance", "payload")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -107,6 +106,9 @@ def select(
         columns = [exact_columns(work.observation, c, base) for c in work.candidates]
         if turn == 0:
             look_for_wild(work, columns)
+        stepping = step_candidates(work, columns, base, withheld)
+        work.candidates += [candidate for candidate, _ in stepping]
+        columns += [own for _, own in stepping]
         space, raw = sample_space(work, columns, base, smooth)
         inside = [locate(work.candidates, t)[0] for t in base]
         best = screened_search(space, base=inside)
@@ -145,7 +147,7 @@ def select(
 
 def _stiff(space: Space, best: Found, inside: list[int]) -> Found:
     """Return the best set without anything that gives way: what was found makes no arm."""
-    gives_way = np.array([c.family in BENDING for c in space.candidates])
+    gives_way = np.array([c.gives_way for c in space.candidates])
     stiff = replace(space, price=np.where(gives_way, FORBIDDEN, space.price))
     start = {*inside, *best.chosen} - {int(c) for c in np.flatnonzero(gives_way)}
     return screened_search(stiff, base=sorted(start))
@@ -205,11 +207,11 @@ def _bounded(candidate: Candidate, model: Model) -> Candidate:
 
     Of a curve the bound holds for what its two parts come to together.
     """
-    curved = candidate.curve is not None
-    if candidate.family not in ("axial_compliance", "radial_compliance") and not curved:
+    kind, curved = candidate.effect.flexibility, candidate.curve is not None
+    if not (kind or curved):
         return candidate
     axial, radial = model.compliance()
-    own = radial if candidate.family == "radial_compliance" else axial
+    own = radial if kind == "radial" else axial
     assert candidate.site.joint is not None
     lower = -float(own[candidate.site.joint - 1])
     bounded = replace(candidate.parameters[0], lower=lower)
@@ -217,12 +219,12 @@ def _bounded(candidate: Candidate, model: Model) -> Candidate:
 
 
 def _has_what_it_needs(candidate: Candidate, observation: Observation) -> bool:
-    if candidate.family == "transmission_error":  # of a joint that moves at all
+    if candidate.periodic:  # of a joint that moves at all
         assert candidate.site.joint is not None
         return joint_quantity(observation, candidate.site.joint - 1) in observation.quantities
     return all(
         any(q == need or q.startswith(f"{need}_") for q in observation.quantities)
-        for need in CATALOGUE[candidate.family].needs
+        for need in candidate.effect.needs
         if need != "approach"  # without reversals play is an offset: a tie to be told
     )
 

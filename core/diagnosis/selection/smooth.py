@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from core.arm import Arm
 from core.diagnosis.channels.observation import Observation
-from core.diagnosis.selection.candidate import Candidate, own_target
+from core.diagnosis.selection.candidate import Candidate, carrying, own_target
 from core.effects import Parameter, Site
 
 Array = NDArray[np.float64]
@@ -33,8 +33,9 @@ def smooth_candidates(observation: Observation, arm: Arm) -> list[Pair]:
             shapes.append(spline_basis(z))
         for target, directions in targets.items():
             own = target == own_target(name)
+            carries = target == carrying(name)
             for shape in shapes:
-                full = np.hstack([np.ones((len(z), 1)), shape]) if own else shape
+                full = np.hstack([np.ones((len(z), 1)), shape]) if own or carries else shape
                 found.append(_spread(name, target, directions, full))
             if own:
                 found += _bumps(name, target, z, directions)

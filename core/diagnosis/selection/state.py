@@ -102,7 +102,7 @@ def _unseen(candidate: Candidate, observation: Observation) -> float:
 
     It then stands behind the plain offset that it equals, as a tie.
     """
-    if candidate.family != "backlash" or candidate.site.joint is None:
+    if not candidate.effect.by_approach or candidate.site.joint is None:
         return 0.0
     return 0.0 if f"approach_{candidate.site.joint - 1}" in observation.quantities else UNSEEN
 

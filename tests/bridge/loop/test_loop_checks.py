@@ -22,6 +22,7 @@ from bridge.loop.supervisor import State, Supervisor
 from core.arm import builtin_arm
 from core.errors import InvalidStateError, StaleStateError
 from core.limits import ENVELOPE, RATE
+from core.model import Model
 from core.state import RobotState
 from drivers.driver import Driver
 
@@ -198,7 +199,7 @@ class Scripted(Driver):
     """A driver that does what it is told to; no wire could be so exact about three in a row."""
 
     def __init__(self) -> None:
-        super().__init__(500.0, 6)
+        super().__init__(500.0, Model(ARM))
         self.next: RobotState | Exception = state(0.0)
 
     def connect(self) -> None: ...
@@ -209,7 +210,7 @@ class Scripted(Driver):
         self.next = self.next._replace(timestamp=self.next.timestamp + T)
         return self.next
 
-    def write_setpoint(self, setpoint: object) -> None: ...
+    def _send(self, setpoint: object) -> None: ...
 
     def close(self) -> None: ...
 

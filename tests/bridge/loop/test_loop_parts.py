@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bridge.ipc.cycle_row import fill_row
-from bridge.ipc.shared_memory import ROWS, Command, Page, Phase
+from bridge.ipc.shared_memory import ROWS, Page, Phase, RunPage
 from bridge.loop.controller_clock import ControllerClock
 from bridge.loop.live_loads import LiveLoads
 from core.state import RobotState
@@ -169,17 +169,9 @@ def test_a_row_that_was_not_finished_is_not_read(page: Page) -> None:
     assert reader.drain()[:, 1].tolist() == [1]
 
 
-def test_commands_are_taken_once_and_stop_stays(page: Page) -> None:
-    assert page.take_command() == Command.NONE
-    page.ask(Command.ARM)
-    assert page.take_command() == Command.ARM
-    assert page.take_command() == Command.NONE
-    page.ask(Command.STOP)
-    page.ask(Command.ARM)
-    assert [page.take_command(), page.take_command()] == [Command.STOP] * 2
-
-
-def test_another_process_sees_the_same_page_and_its_death_leaves_it_whole(page: Page) -> None:
+def test_another_process_sees_the_same_page_and_its_death_leaves_it_whole() -> None:
+    page = RunPage(3)
+    page.renew()
     code = f"""
 import os, time
 from bridge.ipc.shared_memory import Page, Phase
@@ -199,3 +191,4 @@ os.abort()
     assert page.reader().drain()[:, 1].tolist() == list(range(10))
     assert 0 < page.silence < 30
     assert os.fstat(page.fd).st_nlink == 0
+    page.close()
