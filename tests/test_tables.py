@@ -7,7 +7,7 @@ import importlib
 import pytest
 
 from bridge.calibration.instruments import INSTRUMENTS
-from bridge.calibration.session.job_table import JOBS
+from bridge.calibration.jobs.table import JOBS
 from bridge.cell.simulation import SIMULATORS
 from bridge.cli.table import COMMANDS
 from bridge.daemon.sides import SIDES

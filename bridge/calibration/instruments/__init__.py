@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
     from bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
-    from bridge.calibration.instruments.settings import InstrumentSettings
+    from bridge.cell.settings.instruments import InstrumentSettings
 
 _HERE = "bridge.calibration.instruments"
 INSTRUMENTS: dict[str, str] = {
