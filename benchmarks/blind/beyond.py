@@ -95,6 +95,11 @@ def _parts(effect: str, values: dict[str, float]) -> list[Ingredient] | None:
         return [put.base_compliance(rest.get("x", 0.0), rest.get("y", 0.0), WIDE)]
     if effect == "gravity_direction":
         return [put.gravity_direction(rest.get("x", 0.0), rest.get("y", 0.0))]
+    if effect in ("target_slip", "payload_cog"):
+        three = np.array([rest.get(k, 0.0) for k in "xyz"])
+        if effect == "payload_cog":
+            return [put.payload_cog(three, WIDE)]
+        return [put.target_slip(three, rest["time"])] if "time" in rest else None
     return _of_joints(effect, rest)
 
 
@@ -109,6 +114,10 @@ def _of_joints(effect: str, rest: dict[str, float]) -> list[Ingredient] | None:
     if effect == "stiffness_nonlinearity":
         return [put.stiffness_nonlinearity(j, own["compliance"], own["moment"], WIDE)
                 for j, own in joints.items()]  # fmt: skip
+    if effect == "joint_slip":
+        if any("time" not in own for own in joints.values()):
+            return None
+        return [put.joint_slip(j, own[""], own["time"]) for j, own in joints.items()]
     if effect != "transmission_error":
         return None
     out = []

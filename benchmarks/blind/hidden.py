@@ -24,7 +24,7 @@ class Claim:
 
     effect: str
     joints: tuple[int, ...]
-    orders: tuple[float, ...] = ()
+    orders: tuple[float, ...] = ()  # of a slip: its moments, s
 
     @property
     def places(self) -> tuple[Place, ...]:
@@ -117,7 +117,9 @@ def claims_of(causes: Iterable[dict]) -> tuple[Claim, ...]:  # type: ignore[type
         joints.setdefault(effect, set()).update(int(j) for j in cause.get("joints") or [])
         for parameter in cause.get("parameters") or []:
             found = re.search(r"order_?([0-9.]+)", str(parameter["name"]))
-            if found:
+            if str(parameter["name"]).endswith("_time") and parameter.get("value") is not None:
+                orders.setdefault(effect, set()).add(float(parameter["value"]))
+            elif found:
                 orders.setdefault(effect, set()).add(float(found[1]))
     return tuple(
         Claim(e, tuple(sorted(j)), tuple(sorted(orders.get(e, ())))) for e, j in joints.items()

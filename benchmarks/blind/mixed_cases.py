@@ -74,7 +74,8 @@ def _with_remainder(
         left = without(others, alone)
         if float(left @ left) < CLEAR:
             return None
-    if not unlike_known(bench, unknown[:, 0], np.column_stack([frame, *columns])):
+    beside = np.column_stack([frame, *columns])
+    if not unlike_known(bench, unknown[:, 0], beside, "timestamp" in outside.depends_on):
         return None
     return Strange(Drawn(bench, tuple(parts), real), outside, float(strength), gap, known)
 

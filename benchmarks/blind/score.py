@@ -179,6 +179,7 @@ def _true_claims(label: Label) -> tuple[Claim, ...]:
     out = []
     for cause in label.causes:
         orders = {float(m[1]) for n in cause.parameters if (m := re.search(r"order([0-9.]+)", n))}
+        orders |= {v for n, v in cause.parameters.items() if n.endswith("_time")}
         out.append(Claim(cause.effect, cause.joints, tuple(sorted(orders))))
     return tuple(out)
 

@@ -57,7 +57,7 @@ def draw_outside(name: str, rng: Generator) -> Strange:
         if abs(strength) > 1e4 * outside.first:
             continue
         gap = outside_gap(bench, outside, strength)
-        if unlike_known(bench, gap, bench.frame()):
+        if unlike_known(bench, gap, bench.frame(), "timestamp" in outside.depends_on):
             real = outside.arm(bench.nominal, strength)
             return Strange(Drawn(bench, (), real), outside, strength, gap)
     raise RuntimeError(f"no clear draw of {name} in 100")
@@ -80,9 +80,9 @@ def outside_gap(
     return gap.ravel()
 
 
-def unlike_known(bench: Bench, gap: Array, beside: Array) -> bool:
+def unlike_known(bench: Bench, gap: Array, beside: Array, in_time: bool) -> bool:
     """Return whether no single effect of the catalogue takes the gap up, ``beside`` (m, k)."""
-    for hypothesis in singles(bench):
+    for hypothesis in singles(bench, in_time):
         columns = columns_of(bench, [hypothesis], bench.nominal)
         left = without(np.column_stack([beside, columns]), gap)
         if float(left @ left) < UNLIKE:

@@ -19,12 +19,12 @@ from bridge.cell.settings.metrics import MetricsSettings
 from bridge.cell.settings.web import WebSettings
 from core.arm import Arm
 from core.errors import ArmError, CellError, InputError
+from core.load_bounds import HEAVIEST
 from core.metrology import Metrology
 from core.model import Model
 from core.rotation import rpy_matrix, transform
 from drivers.ft_sensor.settings import FtSensorSettings
 
-HEAVIEST = 1.5  # times the rated payload: beyond, the number is a mistake
 FINEST = 1.0e-9  # m: what a sigma of zero counts as
 
 

@@ -7,9 +7,10 @@ from pathlib import Path
 import click
 import numpy as np
 
-from bridge.cell.cell import HEAVIEST, Cell
+from bridge.cell.cell import Cell
 from core.diagnosis.log_checks.units_and_clocks import check_units
 from core.errors import LogError
+from core.load_bounds import HEAVIEST
 from core.log.log import Log, read_log
 from core.log.sources import SourceOptions, source_of
 

@@ -51,6 +51,9 @@ class Robot(Section):
     urdf: str | None = Field(default=None, description="a file, seen from the cell's folder")
     dh: list[DhRow] | None = Field(default=None, description="standard DH rows")
     tip: str | None = Field(default=None, description="the URDF link that is the flange")
+    rated_payload: Annotated[Number, Field(gt=0)] | None = Field(
+        default=None, description="kg, of urdf and dh; of model it is known"
+    )
     calibration: Calibration | str | None = Field(
         default=None, description="UR's delta_* values, or its calibration.conf"
     )

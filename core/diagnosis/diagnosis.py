@@ -32,7 +32,7 @@ from core.log.log import Log
 from core.metrology import Metrology
 from core.model import Model
 from core.ranges import outside_findings
-from core.sessions import sessions_in, with_sessions
+from core.sessions import session_of, sessions_in, with_sessions
 
 Array = NDArray[np.float64]
 Observe = Callable[[Model, Log, Metrology], Observation | NotObservable]
@@ -158,7 +158,7 @@ def _diagnose(
         hint = misspelt(log.unknown, lacking, log.n)
         raise LogError(f"{log.path}: found no channel to diagnose, expected one of: {needs}{hint}")
     for channel in observed:
-        told += _channel_findings(channel)
+        told += _channel_findings(channel, log)
         soft = {*flexibility_effects().values()} - {*withhold}
         if simulated is None and len(soft) == 2 and _lacks_much(channel):
             told += softness_findings(model, log, metrology)
@@ -176,7 +176,8 @@ def _log_findings(model: Model, log: Log, metrology: Metrology) -> list[str]:
         return findings(log, model, metrology)
     found: dict[str, list[str]] = {}
     for name, part in zip(log.session_names, sessions_in(log), strict=True):
-        for text in findings(part, model, metrology):
+        own = position.session_model(model, part, metrology)
+        for text in findings(part, own, metrology):
             found.setdefault(text, []).append(name)
     told = [f"session {', '.join(names)}: {text}" for text, names in found.items()]
     if not log.one_clock:
@@ -348,11 +349,18 @@ def _overall(channels: Sequence[ChannelDiagnosis]) -> str:
     return "unexplained"
 
 
-def _channel_findings(channel: ChannelDiagnosis) -> list[str]:
+def _line_of(log: Log, row: int) -> str:
+    """Return the line of a row in its file; of several sessions with the session's name."""
+    if not log.session_names:
+        return str(log.line(row))
+    return f"{log.line(row)} of {log.session_names[int(session_of(log)[row])]}"
+
+
+def _channel_findings(channel: ChannelDiagnosis, log: Log) -> list[str]:
     told = []
     wild = channel.selection.observation.rows[~channel.selection.kept]
     if len(wild):
-        rows = ", ".join(str(int(r) + 2) for r in wild[:8])
+        rows = ", ".join(_line_of(log, int(r)) for r in wild[:8])
         told.append(
             f"{channel.channel}: {len(wild)} wild reading(s) set aside (row {rows}"
             f"{', ...' if len(wild) > 8 else ''} of the file)"

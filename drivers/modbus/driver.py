@@ -63,6 +63,7 @@ class ModbusDriver(Driver):
         self._longest_answer = max(LONGEST_ANSWER / self.rate, LEAST_ANSWER)  # s
         self._given = 0.0  # s, monotonic: when the last setpoint was given
         self._connected = False
+        self._answer: float | None = None  # s that the last question and its answer took
 
     # -- reading ----------------------------------------------------------------------------------
 
@@ -134,7 +135,8 @@ class ModbusDriver(Driver):
             sample = self._decoder.decode(self._read_blocks())
         except StaleStateError:
             return None
-        return None if time.monotonic() - asked > self._longest_answer else sample
+        self._answer = time.monotonic() - asked
+        return None if self._answer > self._longest_answer else sample
 
     def _read_blocks(self) -> list[bytes]:
         """Return the registers of one cycle: one block, where the profile's map allows it."""
@@ -206,6 +208,10 @@ class ModbusDriver(Driver):
         if self._nominal is None or self._sample is None:
             return state.target_q
         return self._nominal.without(state.target_q, self._sample.vectors["echo"])
+
+    def round_trip(self) -> float | None:
+        """Return how long the last reading took, s; see Driver.round_trip."""
+        return self._answer
 
     # -- writing ----------------------------------------------------------------------------------
 

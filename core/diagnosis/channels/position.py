@@ -168,6 +168,20 @@ def rounded_groups(q: Array, tolerance: float = 1e-3) -> NDArray[np.int64]:
     return np.asarray(np.unique(rounded, axis=0, return_inverse=True)[1].reshape(-1))
 
 
+def session_model(model: Model, log: Log, metrology: Metrology) -> Model:
+    """Return the model with the tool point of one session, where it was remounted."""
+    if not metrology.remounted or metrology.registered or not log.has("measured_position"):
+        return model
+    q = log.require("actual_q", "target_q")
+    measured = log.columns["measured_position"]
+    rows = np.flatnonzero(np.isfinite(measured).all(axis=1))
+    if 3 * len(rows) < 12:
+        return model
+    data = Data(q[rows], log.loads()[rows], measured[rows], None, registered=False)
+    tool = _placed(model, data, metrology).tool_in_flange
+    return replace(model, tool_in_flange=tool)
+
+
 def _placed(model: Model, data: Data, metrology: Metrology) -> Placement:
     """Return a first estimate of what is free in a session, outliers down-weighted."""
     frame, tool = IDENTITY, model.tool_in_flange
