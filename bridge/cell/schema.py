@@ -6,10 +6,10 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from bridge.calibration.settings import CalibrationSettings
 from bridge.cell.sections import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
-from bridge.metrics.settings import MetricsSettings
-from bridge.web.settings import WebSettings
+from bridge.cell.settings.calibration import CalibrationSettings
+from bridge.cell.settings.metrics import MetricsSettings
+from bridge.cell.settings.web import WebSettings
 from drivers.ft_sensor.settings import AnyFtSensor
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]

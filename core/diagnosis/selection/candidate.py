@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arm import Arm
-from core.diagnosis.channels.observation import HELD, Observation
+from core.diagnosis.observation import HELD, Observation
 from core.effects import CATALOGUE, Effect, Parameter, Site, Term
 from core.errors import InputError
 
