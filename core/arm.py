@@ -69,7 +69,7 @@ def dh_transform(a: float, alpha: float, d: float) -> Array:
 def arm_from_dh(
     rows: Sequence[Mapping[str, Any]], name: str = "dh", limits: JointLimits | None = None
 ) -> Arm:
-    """Return the arm of standard DH rows ``{a, alpha, d, offset, mass, cog}`` (CONTRACT, cell).
+    """Return the arm of standard DH rows ``{a, alpha, d, offset, mass, cog}``, as a cell has them.
 
     ``cog`` is in the row's own frame (DH frame i). Mass and cog may be left out (zero). Raises
     ArmError where a row lacks a, alpha or d, or holds something that is not a finite number.

@@ -204,7 +204,7 @@ def predict_torque(model: Model, motion: Motion, terms: Sequence[Term] = ()) -> 
 def predict_wrench(model: Model, motion: Motion, terms: Sequence[Term] = ()) -> Array:
     """Return the wrenches (N, 6), N and Nm, that the flange sensor would read, with ``terms``.
 
-    Flange axes, about the flange origin, payload included (CONTRACT, ``ft_raw_wrench``).
+    Flange axes, about the flange origin, payload included (docs/conventions.md, Loads).
     """
     own = acting((*model.terms, *terms), "wrench")
     motion, pieces = _carrying(model, motion, own)

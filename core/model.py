@@ -38,7 +38,7 @@ class Poses:
 
 @dataclass(frozen=True)
 class LinearForm:
-    """The paper's linear model at given shapes: pose change = ``regressor`` @ flexibilities."""
+    """Eq. 4 of docs/conventions.md at given shapes: pose change = ``regressor`` @ flexibilities."""
 
     regressor: Array  # (N, 6, 2n) m/(rad/Nm), Nm: axial 1..n, then radial 1..n
     jacobian: Array  # (N, 6, n) of the TCP, base axes
@@ -178,7 +178,7 @@ class Model:
         return self.without_terms().predict(q)
 
     def linear_form(self, q: Array, loads: Loads | None = None) -> LinearForm:
-        """Return the linear form (paper eqs. 18, 33, 35) at the model's present shape.
+        """Return the linear form (eq. 4 of docs/conventions.md) at the model's present shape.
 
         For a model without compliance this is the paper's A(q, F), to be multiplied with the 2n
         flexibilities. Raises InputError where a row has no equilibrium.

@@ -86,6 +86,13 @@ class Motion:
         )  # fmt: skip
 
     @property
+    def recorded_time(self) -> Array:
+        """Return the time (N,) from the first row on, pauses between stretches left out, s."""
+        steps = np.diff(self.t)
+        steps = np.where(np.diff(self.stretch) > 0, 0.0, steps)
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+    @property
     def direction(self) -> Array:
         """Return the sign of motion (N, n), smooth within the speeds at which it is unsure."""
         return np.asarray(np.tanh(4.0 * self.qd / self.still))
@@ -123,7 +130,8 @@ def motion_of(log: Log) -> Motion:
         valid=np.ones(len(rows), dtype=bool), stretch=np.zeros(len(rows), dtype=np.int64),
         start=float(t[0]), moving=moving, still=still,
     )  # fmt: skip
-    return _with_derivatives(motion, given) if moving else motion
+    session = log.columns["session"][rows] if log.session_names else np.zeros(len(rows))
+    return _with_derivatives(motion, given, np.diff(session) != 0) if moving else motion
 
 
 def is_moving(time: Array, q: Array, speed: Array | None = None) -> bool:
@@ -190,10 +198,12 @@ def _clock(log: Log, time: Array) -> tuple[Index, Array, str | None]:
     )
 
 
-def _with_derivatives(motion: Motion, given: Array | None) -> Motion:
+def _with_derivatives(
+    motion: Motion, given: Array | None, new_session: NDArray[np.bool_]
+) -> Motion:
     steps = np.diff(motion.t)
     step = float(np.median(steps))
-    stretch = np.concatenate([[0], np.cumsum(steps > GAP * step)])
+    stretch = np.concatenate([[0], np.cumsum((steps > GAP * step) | new_session)])
     qd, qdd = np.zeros_like(motion.q), np.zeros_like(motion.q)
     valid, noise = np.zeros(len(motion), dtype=bool), np.zeros(motion.q.shape[1])
     for number in range(int(stretch[-1]) + 1):

@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 
 from core.errors import InputError
+from core.files import read_text
 
 
 class ProfileError(InputError):
@@ -69,7 +70,7 @@ class ProfileDocument:
 def read_profile_document(path: Path) -> ProfileDocument:
     """Return a profile's YAML. Raises ProfileError where it cannot be read or is broken."""
     try:
-        loader = _Loader(path.read_text(encoding="utf-8-sig"))
+        loader = _Loader(read_text(path, "utf-8-sig"))
         root = loader.get_single_node()
         if not isinstance(root, yaml.MappingNode):
             raise ProfileError(f"{path}, line 1: found no keys, expected a profile (dbc: ...)")

@@ -32,6 +32,17 @@ RATIO = {
 }  # fmt: skip
 
 
+ONE_OF = {"axial_compliance", "stiffness_nonlinearity"}  # the second holds the first
+
+
+def some_effects(count: int, rng: Generator) -> tuple[str, ...]:
+    """Return that many different effects at random, never a joint's softness twice."""
+    while True:
+        chosen = tuple(str(e) for e in rng.choice(POSITION_EFFECTS, count, replace=False))
+        if not set(chosen) >= ONE_OF:
+            return chosen
+
+
 class Redraw(Exception):  # noqa: N818 - not an error: this draw does not show, take another
     """Raised where a draw would not show in the data, or only at an incredible size."""
 

@@ -1,6 +1,6 @@
 """The thirteen effects of the position channel as truth: how each changes the real arm.
 
-An ingredient is one effect at one joint (or none) with its parameter values under the contract's
+An ingredient is one effect at one joint (or none) with its parameter values under the program's
 names. ``apply`` turns a real arm into one that has it.
 """
 

@@ -16,6 +16,8 @@ from benchmarks.blind.session import Plan
 
 TRACKING = ("latency", "tracking_lag", "servo_droop", "dead_band")
 TRACKING_OUTSIDE = ("droop", "track_step", "speed_loss")
+TRACKING_REMAINDERS = ("coupled",)
+TORQUE_REMAINDERS = ("torque_field",)
 TORQUE = (
     "coulomb_friction", "viscous_friction", "rotor_inertia", "link_inertia", "torque_constant",
     "payload", "payload_cog", "torque_offset", "stribeck_friction", "load_friction", "link_cog",
@@ -197,6 +199,11 @@ def tracking_error(cell: MovingCell, name: str, rng: Generator) -> tuple[Array, 
     elif name == "track_step":
         when = cell.time[-1] * rng.uniform(0.3, 0.7)
         shape, columns = (cell.time > when).astype(float), ("timestamp",)
+    elif name == "coupled":  # a structure that swings as another joint accelerates
+        other = int(rng.choice([i for i in range(cell.kind.n) if i != j]))
+        shape = cell.motion.at(cell.time, 2)[:, other] * np.cos(q[:, j])
+        columns = (f"actual_q_{j}", f"actual_q_{other}", f"actual_qd_{other}",
+                   f"target_q_{j}", f"target_q_{other}")  # fmt: skip
     else:
         shape, columns = -(np.maximum(qd[:, j] - 0.3 * qd[:, j].max(), 0) ** 2), (f"actual_qd_{j}",)
     return _on_joint(cell, j, shape, rng), columns
@@ -204,15 +211,21 @@ def tracking_error(cell: MovingCell, name: str, rng: Generator) -> tuple[Array, 
 
 def torque_error(cell: MovingCell, name: str, rng: Generator) -> tuple[Array, tuple[str, ...]]:
     """Return a torque (N, n) outside the catalogue, and the columns it depends on."""
+    columns: tuple[str, ...]
     j = int(rng.integers(0, cell.kind.n))
     q, qd = cell.motion.at(cell.time), cell.motion.at(cell.time, 1)
     if name == "cogging":
         shape = np.sin(int(rng.integers(6, 40)) * q[:, j] + rng.uniform(-3, 3))
         columns: tuple[str, ...] = (f"actual_q_{j}",)
+    elif name == "torque_field":
+        other = int(rng.choice([i for i in range(cell.kind.n) if i != j]))
+        rate, phase = rng.normal(size=(5, 2)) * 1.5, rng.uniform(-np.pi, np.pi, 5)
+        shape = np.cos(q[:, [j, other]] @ rate.T + phase) @ rng.normal(size=5)
+        columns = (f"actual_q_{j}", f"actual_q_{other}")
     else:
         # the amount decays in time, so both the speed and the time are true answers
         shape = qd[:, j] * (np.exp(-cell.time / 10.0) - 0.35)
-        columns = ("timestamp", f"actual_qd_{j}")
+        columns = (f"actual_qd_{j}", "timestamp")
     return _on_joint(cell, j, shape, rng), columns
 
 

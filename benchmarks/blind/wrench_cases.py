@@ -15,6 +15,7 @@ from benchmarks.blind.session import Plan
 
 EFFECTS = ("ft_bias", "ft_drift", "ft_gain", "ft_misalignment", "payload", "payload_cog")
 OUTSIDE = ("ft_hose", "ft_step", "ft_overload")
+REMAINDERS = ("ft_field",)
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 
 
@@ -90,6 +91,7 @@ def outside_error(cell: WrenchCell, name: str, rng: Generator) -> tuple[Array, t
     """Return a reading error (N, 6) outside the catalogue, 4 to 10 floors, and its columns."""
     session, n = cell.bench.session, cell.bench.kind.n
     way = rng.normal(size=6) * cell.truth.sigma
+    columns: tuple[str, ...]
     if name == "ft_hose":
         j = n - int(rng.integers(1, 4))
         start = np.quantile(session.q[:, j], rng.uniform(0.2, 0.5))
@@ -97,6 +99,11 @@ def outside_error(cell: WrenchCell, name: str, rng: Generator) -> tuple[Array, t
     elif name == "ft_step":
         when = np.quantile(session.time, rng.uniform(0.3, 0.7))
         shape, columns = (session.time > when).astype(float), ("timestamp",)
+    elif name == "ft_field":  # a loom that winds up on two wrist joints
+        j, k = n - 2, n - 1
+        rate, phase = rng.normal(size=(5, 2)) * 1.2, rng.uniform(-np.pi, np.pi, 5)
+        shape = np.cos(session.q[:, [j, k]] @ rate.T + phase) @ rng.normal(size=5)
+        columns = (f"actual_q_{j}", f"actual_q_{k}")
     else:
         bent = session.payload_mass / cell.bench.kind.rated
         shape, columns = -(bent**3), ("payload",)

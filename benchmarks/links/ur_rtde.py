@@ -118,7 +118,9 @@ def _offset_sides(driver: UrRtdeDriver) -> Any:
         for register in registers.OFFSET_DOUBLES:
             io.setInputDoubleRegister(register, 0.0)
         io.setInputIntRegister(registers.OFFSET_RZ, 0)
-        io.setInputIntRegister(registers.CHECKSUM, registers.checksum([0] * 6, writer._sequence))
+        io.setInputIntRegister(
+            registers.CHECKSUM, registers.checksum([0] * 6, writer._sequence, writer._rates)
+        )
         io.setInputIntRegister(registers.HEARTBEAT, writer._sequence)
         io.setInputIntRegister(registers.SEQUENCE, writer._sequence)
 

@@ -6,11 +6,21 @@ Small pydantic models without a robot library behind them, so that a cell is rea
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, TypeAdapter, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    TypeAdapter,
+    field_validator,
+    model_validator,
+)
 
-from bridge.recording.settings import RecordingSettings as RecordingSettings
+from bridge.cell.settings.recording import RecordingSettings as RecordingSettings
+from core.addresses import is_loopback
 from drivers.can.settings import CanSettings
 from drivers.canopen.settings import CanopenSettings
 from drivers.modbus.settings import ModbusSettings
@@ -73,7 +83,7 @@ class LimitSettings(BaseModel):
         0.0, ge=0.0, description="distance kept from the arm's joint limits, rad"
     )
     following: float = Field(
-        0.35, gt=0.0, le=2.0, description="farthest a command may be from the actual joint, rad"
+        0.1, gt=0.0, le=0.5, description="farthest a command may be from the actual joint, rad"
     )
     ramp_time: float = Field(
         0.5, gt=0.0, le=10.0, description="s in which offsets ramp in and out at least"
@@ -85,16 +95,22 @@ class SetpointSettings(BaseModel):
 
     model_config = _FROZEN
 
-    source: Literal["target", "trajectory", "tcp", "modbus"] = "target"
+    source: Literal["target", "trajectory", "planner", "tcp", "modbus"] = "target"
     arm: bool = Field(False, description="true: `run` writes setpoints; false: it only observes")
     file: Path | None = Field(None, description="trajectory: CSV of timestamp, target_q_i")
+    socket: Path | None = Field(
+        None, description="planner: the Unix socket; left out: one in the daemon's runtime folder"
+    )
+    token_file: Path | None = Field(
+        None, description="tcp: a file that only its owner reads (mode 0600), with the token"
+    )
     host: str = Field("127.0.0.1", description="tcp, modbus: address to listen on, loopback only")
     port: int = Field(30310, ge=0, le=65535, description="tcp, modbus: port to listen on")
     timeout: float = Field(
         0.2,
         gt=0.0,
         le=5.0,
-        description="tcp, modbus: s without a setpoint after which the source is dry",
+        description="planner, tcp, modbus: s without a setpoint after which the source is dry",
     )
     start_tolerance: float = Field(
         0.02, gt=0.0, le=0.2, description="farthest the first setpoint may be from the arm, rad"
@@ -108,6 +124,16 @@ class SetpointSettings(BaseModel):
     @classmethod
     def _loopback(cls, value: str) -> str:
         """Refuse to listen where others could reach it: anyone who can write here moves the arm."""
-        if not (value == "localhost" or value.startswith("127.")):
-            raise ValueError("expected a loopback address (127.x.x.x)")
+        if not is_loopback(value):
+            raise ValueError("expected a loopback address (127.x.x.x, ::1)")
         return value
+
+    @model_validator(mode="after")
+    def _tcp_is_guarded(self) -> Self:
+        """Refuse a TCP port that anything on this machine, web pages too, could write to."""
+        if self.source == "tcp" and self.token_file is None:
+            raise ValueError(
+                "setpoints.token_file: found nothing with source: tcp, expected a file of mode "
+                "0600 with a token (openssl rand -hex 32), or source: planner, a Unix socket"
+            )
+        return self

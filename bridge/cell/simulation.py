@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bridge.cell.cell import Cell
+from core.addresses import is_loopback
 from core.errors import CellError
 from core.rotation import rotation_vector
 from drivers.driver import DriverSettings
@@ -100,7 +101,7 @@ def _address(cell: Cell, host: str | None) -> str:
     """Return the loopback address that the controller is served at. Raises CellError."""
     link = cell.file.link
     address = host or cell.file.simulation.host or str(getattr(link, "host", None) or HOST)
-    if not address.startswith("127."):
+    if not is_loopback(address):
         raise CellError(
             f"{cell.path}: simulation.host: found {address!r}, expected a loopback address "
             "(127.x.x.x): a simulated controller is never served to others"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any, Protocol
 
 from bridge.ipc.control_socket import Peer, refusal
@@ -12,6 +13,7 @@ from bridge.loop.supervisor import Cause, State
 
 LONGEST_ARMING = 25.0  # s: uploads a program to the robot
 LONGEST_RAMP = 20.0  # s
+LONGEST_TAKING = 20.0  # s: a new process of the loop may have to start first
 SOURCE_SILENT = 1.0  # s without a first setpoint after which arming is told to be waiting
 LOOK = 0.02  # s
 
@@ -45,11 +47,15 @@ class Controlled(Protocol):
     def status(self) -> dict[str, Any]:
         """Return the status document."""
 
-    def arm(self, by: str) -> None:
-        """Ask the loop to write."""
+    @property
+    def taken(self) -> int:
+        """Return the number of the newest request that a loop has taken."""
 
-    def disarm(self, by: str) -> None:
-        """Ask the loop to ramp out, or acknowledge a fault."""
+    def arm(self, by: str) -> int:
+        """Ask the loop to write; returns the request's number, 0 where none is made."""
+
+    def disarm(self, by: str) -> int:
+        """Ask this loop or the next one to ramp out, or acknowledge a fault; returns its number."""
 
     def note(self, event: Event) -> None:
         """Have an event told."""
@@ -87,7 +93,8 @@ class Control:
         if daemon.state != State.OBSERVING:
             return refusal(f"found state {daemon.state.name.lower()}, expected observing")
         mark = daemon.sequence
-        daemon.arm(by)
+        if not daemon.arm(by):
+            return refusal("the loop has ended, expected one that observes")
         return self._await_armed(mark)
 
     def _await_armed(self, mark: int) -> dict[str, Any]:
@@ -100,6 +107,8 @@ class Control:
                     return refusal(f"{event['cause']}: {event['detail']}")
                 if event.get("to") == State.COMPENSATING.name:
                     return _done("compensating")
+            if daemon.state == State.DISCONNECTED:
+                return refusal("the loop has ended before it was armed")
             idle = daemon.state == State.ARMED and daemon.phase == Phase.RUNNING
             waiting = (waiting or time.monotonic()) if idle else None
             if waiting is not None and time.monotonic() - waiting > SOURCE_SILENT:
@@ -108,18 +117,36 @@ class Control:
         return refusal(f"no answer of the loop within {LONGEST_ARMING:g} s")
 
     def _disarm(self, by: str) -> dict[str, Any]:
-        daemon, begun = self._daemon, time.monotonic()
-        if daemon.state == State.OBSERVING and not daemon.latched:
-            return _done("is observing already")
+        """Ask, always; what is answered is what a loop has taken, never what was hoped for."""
+        daemon = self._daemon
+        observed = daemon.state == State.OBSERVING and not daemon.latched
         fault = daemon.latched
-        daemon.disarm(by)
-        while time.monotonic() - begun < (SOURCE_SILENT if fault else LONGEST_RAMP):
-            if daemon.state == State.OBSERVING and not daemon.latched:
-                return _done(f"acknowledged ({fault}); observing" if fault else "observing")
-            time.sleep(LOOK)
+        number = daemon.disarm(by)
+        if not self._comes(lambda: daemon.taken >= number, LONGEST_TAKING):
+            return refusal(
+                f"no loop has taken it within {LONGEST_TAKING:g} s (the state is "
+                f"{daemon.state.name.lower()}); it is kept for the next one"
+            )
+
+        def observes() -> bool:
+            return daemon.state == State.OBSERVING and not daemon.latched
+
+        if self._comes(observes, SOURCE_SILENT if fault else LONGEST_RAMP):
+            if observed:
+                return _done("is observing already")
+            return _done(f"acknowledged ({fault}); observing" if fault else "observing")
         if fault:
             return _done(f"acknowledged ({fault}); observing as soon as the robot is fine")
         return refusal(f"still {daemon.state.name.lower()} after {LONGEST_RAMP:g} s")
+
+    @staticmethod
+    def _comes(what: Callable[[], bool], limit: float) -> bool:
+        until = time.monotonic() + limit
+        while not what():
+            if time.monotonic() > until:
+                return False
+            time.sleep(LOOK)
+        return True
 
 
 def _done(words: str) -> dict[str, Any]:

@@ -7,6 +7,7 @@ how it went.
 
 from __future__ import annotations
 
+import os
 import queue
 import subprocess
 import threading
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from bridge.cell.daemon_settings import DaemonSettings
-from bridge.cell.run_settings import configuration_for, settings_of
+from bridge.cell.run_settings import Configuration, configuration_for, settings_of
 from bridge.daemon.control import Control
 from bridge.daemon.opening import open_all
 from bridge.daemon.processes import LoopProcess
@@ -26,10 +27,12 @@ from bridge.daemon.service_manager import ServiceManager
 from bridge.daemon.sides import Sides
 from bridge.daemon.status import DaemonStatus
 from bridge.daemon.summary import RunSummary, Tally
+from bridge.ipc.command_page import Command, CommandPage
 from bridge.ipc.control_socket import ControlSocket
 from bridge.ipc.events import Event, EventBook
-from bridge.ipc.shared_memory import Command, Page, Phase
+from bridge.ipc.shared_memory import Phase, RunPage
 from bridge.loop.loop import LONGEST_STOP, Exit
+from bridge.loop.setpoint_stream import longest_withdrawal
 from bridge.loop.supervisor import State
 from core.errors import InputError, LinkError
 
@@ -39,6 +42,7 @@ TICK = 0.02  # s between two looks at the loop
 HEALTHY = 10.0  # s after which a restart counts as the first again
 STOP_MARGIN = 0.4  # s on top of the loop's own time: then it is ended by force
 STATUS_EVERY = 0.5  # s
+PROGRAM = f"the daemon's own program (pid {os.getpid()})"
 
 Say = Callable[[str], None]
 
@@ -48,15 +52,22 @@ class Daemon:
 
     def __init__(
         self,
-        settings: DaemonSettings,
+        given: DaemonSettings | Configuration,
         may_write: bool,
         say: Say = lambda _: None,
         log: Callable[[Event], None] | None = None,
     ) -> None:
-        self.configuration = configuration_for(settings)
+        if not isinstance(given, Configuration):
+            given = configuration_for(given)
+        self.configuration = given  # read once; loops get these very bytes
+        settings = given.settings
         self.may_write, self._say = may_write, say
         n = self.configuration.n
-        self.page = Page(n)  # one for the whole run, whatever becomes of the loops
+        self.page = RunPage(n)  # of the loop's process, one after the other
+        self._commands = CommandPage()  # one for the whole run; nobody else can write to it
+        self._requests: queue.SimpleQueue[tuple[int, Command, str]] = queue.SimpleQueue()
+        self._taken = 0
+        self._request_lock = threading.RLock()
         self._reader = self.page.reader()
         self.output: IO[bytes] | int = subprocess.DEVNULL  # of all processes of the run
         self.sides = Sides()
@@ -139,6 +150,11 @@ class Daemon:
         """Have an event told by the daemon's own thread."""
         self._posted.put(event)
 
+    def close_memory(self) -> None:
+        """Let go of what is shared with the loop and who reads along."""
+        self.page.close()
+        self._commands.close()
+
     def stop(self) -> None:
         """Ramp out and end."""
         self._stopping.set()
@@ -147,20 +163,47 @@ class Daemon:
         """Read the cell file again; what is wrong is told, and the old one stays."""
         self._reload.ask()
 
-    def arm(self, by: str = "") -> None:
-        """Ask the loop to write setpoints."""
-        if self.loop is not None and self.may_write:
-            self.told_to_arm(by)
-            self.page.ask(Command.ARM)
+    @property
+    def taken(self) -> int:
+        """Return the number of the newest request that a loop has taken."""
+        return self._taken
 
-    def told_to_arm(self, by: str) -> None:
-        """Take note of who or what has asked for arming."""
-        self._status.armed_by = by
+    def arm(self, by: str = PROGRAM) -> int:
+        """Ask the loop to write setpoints; returns the request's number, 0 where none is made."""
+        if self.loop is None or not self.may_write:
+            return 0
+        return self._request(Command.ARM, by)
 
-    def disarm(self, by: str = "") -> None:
-        """Ask the loop to ramp out and observe; in a fault, acknowledge it."""
-        if self.loop is not None:
-            self.page.ask(Command.DISARM)
+    def disarm(self, by: str = PROGRAM) -> int:
+        """Ask the loop, this or the next one, to ramp out and observe; in a fault, acknowledge it.
+
+        Returns the request's number: it counts once ``taken`` has come to it.
+        """
+        return self._request(Command.DISARM, by)
+
+    def ramp_out(self) -> None:
+        """Have the loop ramp out and observe, by nobody's wish; for the daemon's own thread."""
+        self._commands.ask(Command.RAMP_OUT)
+
+    def _request(self, command: Command, by: str) -> int:
+        with self._request_lock:
+            number = self._commands.number()
+            self._requests.put((number, command, by))
+        return number
+
+    def _pass_on(self) -> None:
+        """Write what was asked for, each request behind the event that says who asked.
+
+        There is no other way by which an ARM is written.
+        """
+        while not self._requests.empty():
+            number, command, by = self._requests.get()
+            words = f"{command.name.lower()} asked for by {by}"
+            self.book.add(
+                {"kind": "request", "command": command.name.lower(), "number": number, "by": by,
+                 "detail": words}
+            )  # fmt: skip
+            self._commands.ask(command, number)
 
     # -- the run ----------------------------------------------------------------------------------
 
@@ -169,8 +212,9 @@ class Daemon:
         with ExitStack() as stack:
             arm = open_all(self, stack, arm, by)
             while not self._stopping.is_set():
-                self._run_loop(arm, duration)
+                self._run_loop((by or PROGRAM) if arm else "", duration)
                 arm = self._reload.swap()  # else only a person starts the writing again
+                by = "the cell file" if arm else ""
                 if not self._stopping.is_set() and not self._reload.swapped:
                     self._pause()
                     self.restarts += 1
@@ -187,6 +231,9 @@ class Daemon:
     def _tick(self) -> None:
         """Look after everything but the loop."""
         self._take()
+        self._pass_on()
+        if self.page.promote():
+            self.sides.show(self.page)
         for event in self.sides.check():
             self.book.add(event)
         while not self._posted.empty():
@@ -198,15 +245,11 @@ class Daemon:
         if loop is None or not loop.hangs:
             self.manager.kick()
 
-    def _run_loop(self, arm: bool, duration: float | None) -> None:
-        """Run one process of the loop to its end."""
+    def _run_loop(self, armed_by: str, duration: float | None) -> None:
+        """Run one process of the loop to its end; ``armed_by``: who has it arm at its start."""
         self._last_state = State.DISCONNECTED
         self._failure = {}
-        loop = self.loop = LoopProcess(
-            self.settings, self.page, arm, self.may_write, self.output, self._loops,
-            self._status.latched,
-        )  # fmt: skip
-        self._loops += 1
+        loop = self.loop = self._start_loop(armed_by)
         stop_by = first_cycle = None
         try:
             while loop.exit_code is None:
@@ -222,7 +265,8 @@ class Daemon:
                     self._stopping.set()
                 self._reload.step(self.state, self.phase)
                 if (self._stopping.is_set() or self._reload.wants_end) and stop_by is None:
-                    stop_by = time.monotonic() + LONGEST_STOP + STOP_MARGIN
+                    needed = LONGEST_STOP + longest_withdrawal(self.settings.limits)
+                    stop_by = time.monotonic() + needed + STOP_MARGIN
                     if self._stopping.is_set():
                         self.manager.stopping()
                     loop.ask_to_stop()
@@ -238,12 +282,34 @@ class Daemon:
             self.loop = None
             loop.close()
 
+    def _start_loop(self, armed_by: str) -> LoopProcess:
+        """Start a process of the loop, for which only requests count that are still to come.
+
+        Beside them, a disarming that no loop has taken: whoever asked for it is owed it.
+        """
+        with self._request_lock:  # none is numbered and not yet written
+            self._pass_on()
+            after = self._commands.number()
+        order = {
+            "may_write": self.may_write, "number": self._loops, "latched": self._status.latched,
+            "after": after,
+        }  # fmt: skip
+        if self._commands.last_of(Command.DISARM) > self.page.taken:
+            self._commands.ask(Command.DISARM)
+        if armed_by and self.may_write:
+            self._request(Command.ARM, armed_by)
+            self._pass_on()
+        self._loops += 1
+        return LoopProcess(self.configuration, self.page, self._commands, order, self.output)
+
     def _take(self) -> None:
         """Take cycles and events over from the loop."""
+        taken = self.page.taken
         # in this order: who has heard of a change finds the state changed, and its rows counted
         events = [] if self.loop is None else self.loop.events()
         if self.loop is not None:
             self._last_state = State(self.page.state)
+        self._taken = taken
         rows = self._reader.drain()
         self.tally.add(rows)
         self._status.take(rows)
@@ -267,7 +333,7 @@ class Daemon:
             self._refused |= event["cause"] == "start refused"
             if detail:
                 self._faults.append(text)
-        elif detail and kind not in ("granted", "summary"):
+        elif detail and kind not in ("granted", "summary", "request"):
             self._say(detail)
 
     def _after(self, loop: LoopProcess) -> None:

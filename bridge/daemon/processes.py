@@ -2,59 +2,71 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import pickle
 import signal
+import socket
 import subprocess
 import sys
 import time
 from typing import IO, Any
 
-from bridge.cell.daemon_settings import DaemonSettings
-from bridge.ipc.shared_memory import Command, Page, Phase
+from bridge.cell.run_settings import Configuration
+from bridge.ipc.command_page import Command, CommandPage
+from bridge.ipc.sealed_memory import sealed_bytes
+from bridge.ipc.shared_memory import Phase, RunPage
 from bridge.ipc.side_process import environment
 from bridge.loop.loop import Exit
 
 STARTING_LIMIT = 180.0  # s: imports and, the first time, compilation
 ENDING_LIMIT = 2.0  # s
-_LONGEST_LINE = 65536
+_LONGEST_EVENT = 65536  # bytes
 
 
 class LoopProcess:
-    """One process of the loop, from its start to its end; ``number`` counts them from 0."""
+    """One process of the loop, from its start to its end.
+
+    It gets the files of its configuration as the daemon has read them, and reads no others.
+    ``order`` holds ``may_write``, ``number`` (processes counted from 0), ``latched``
+    and ``after`` (number of the last request that is not for it); see loop_main.
+    """
 
     def __init__(
-        self, settings: DaemonSettings, page: Page, arm: bool, may_write: bool,
-        log: IO[Any] | int, number: int = 0, latched: str = "",
+        self, configuration: Configuration, page: RunPage, commands: CommandPage,
+        order: dict[str, Any], log: IO[Any] | int,
     ) -> None:  # fmt: skip
         page.renew()
-        self.page = page
-        self._settings = settings
-        self._events, theirs = os.pipe()
-        os.set_blocking(self._events, False)
-        self._rest = b""
+        self.page, self._commands = page, commands
+        self._settings = settings = configuration.settings
+        files = sealed_bytes("gapbridge-files", pickle.dumps(dict(configuration.files)))
+        # sockets, not pipes: nobody can open them a second time through /proc
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        orders, stdin = socket.socketpair()
+        self._events = ours
+        ours.setblocking(False)
         self.started = time.monotonic()
         order = {
-            "settings": settings.model_dump(mode="json"), "n": page.n, "arm": arm, "number": number,
-            "latched": latched,
-            "may_write": may_write, "page": self.page.fd, "events": theirs, "parent": os.getpid(),
+            **order, "settings": settings.model_dump(mode="json"), "n": page.n,
+            "page": page.fd, "commands": commands.fd, "events": theirs.fileno(),
+            "files": files, "hash": configuration.hash,
+            "parent": os.getpid(),
         }  # fmt: skip
         try:
             # spawned, never forked: nothing of this process's threads and locks may be inherited;
             # in a session of its own, so that a Ctrl-C reaches it through the daemon only
             self._process = subprocess.Popen(
                 [sys.executable, "-X", "faulthandler", "-m", "bridge.loop.main"],
-                stdin=subprocess.PIPE, stdout=log, stderr=log, env=environment(),
-                pass_fds=(self.page.fd, theirs), start_new_session=True,
+                stdin=stdin.fileno(), stdout=log, stderr=log, env=environment(),
+                pass_fds=(page.fd, commands.fd, files, theirs.fileno()), start_new_session=True,
             )  # fmt: skip
         finally:
-            os.close(theirs)
-        assert self._process.stdin is not None
-        try:
-            self._process.stdin.write((json.dumps(order) + "\n").encode())
-            self._process.stdin.close()
-        except BrokenPipeError:
-            pass  # it is gone already, which the daemon sees
+            os.close(files)
+            theirs.close()
+            stdin.close()
+        with orders, contextlib.suppress(OSError):  # it is gone already, which the daemon sees
+            orders.sendall((json.dumps(order) + "\n").encode())
 
     @property
     def pid(self) -> int:
@@ -82,16 +94,15 @@ class LoopProcess:
 
     def events(self) -> list[dict[str, Any]]:
         """Return the events that have arrived."""
-        try:
-            data = os.read(self._events, _LONGEST_LINE)
-        except BlockingIOError:
-            return []
-        *lines, self._rest = (self._rest + data).split(b"\n")
-        return [json.loads(line) for line in lines if line]
+        found = []
+        with contextlib.suppress(OSError):
+            while data := self._events.recv(_LONGEST_EVENT):
+                found.append(json.loads(data))
+        return found
 
     def ask_to_stop(self) -> None:
         """Ask it to ramp out and end."""
-        self.page.ask(Command.STOP)
+        self._commands.ask(Command.STOP)
         if self.page.phase in (Phase.STARTING, Phase.CONNECTING):
             self.kill()  # nothing is written yet, and a constructor cannot be interrupted
 
@@ -104,7 +115,7 @@ class LoopProcess:
     def close(self) -> None:
         """Give everything back; ends the process where it still lives."""
         self.kill()
-        os.close(self._events)
+        self._events.close()
 
     def describe_end(self) -> str:
         """Return in words how it ended."""

@@ -7,15 +7,16 @@ was compensating before and the new cell says itself that it arms.
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bridge.cell.cell import complaints
 from bridge.cell.run_settings import Configuration, read_configuration
-from bridge.daemon.host import address_of
-from bridge.ipc.shared_memory import Command, Phase
+from bridge.ipc.shared_memory import Phase
 from bridge.loop.supervisor import State
 from core.errors import GapbridgeError
+from drivers.controller_address import address_of
 
 if TYPE_CHECKING:
     from bridge.daemon.daemon import Daemon
@@ -47,7 +48,7 @@ class Reload:
         if self._next is None or self.wants_end or phase == Phase.ARMING:
             return
         if state in (State.ARMED, State.COMPENSATING):
-            self._daemon.page.ask(Command.DISARM)
+            self._daemon.ramp_out()
         elif state != State.HOLDING:
             self.wants_end = True
 
@@ -95,7 +96,7 @@ class Reload:
             )
         before = daemon.settings
         kept = {name: getattr(before, name) for name in ("model_source", "hang_timeout", "backoff")}
-        return Configuration(settings.model_copy(update=kept), found.n, found.text)
+        return replace(found, settings=settings.model_copy(update=kept))
 
     def _tell(self, fine: bool, words: str) -> None:
         hashed = self._next.hash if self._next is not None else self._daemon.configuration.hash

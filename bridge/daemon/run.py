@@ -12,9 +12,8 @@ from typing import Any
 
 import click
 
-from bridge.cell import Cell, load_cell
-from bridge.cell.daemon_settings import DaemonSettings
-from bridge.cell.run_settings import settings_of
+from bridge.cell import Cell
+from bridge.cell.run_settings import Configuration, read_configuration
 from bridge.daemon.daemon import Daemon, Say
 from bridge.daemon.summary import RunSummary
 from bridge.ipc.events import Event
@@ -32,8 +31,8 @@ def run_cell(
     Prints what happens and a summary; returns the exit code. Raises InputError for a cell that
     cannot be run, LinkError where the robot cannot be reached. ``log`` gets every event.
     """
-    settings = settings_of(cell if isinstance(cell, Cell) else load_cell(cell))
-    summary = run_daemon(settings, observe, arm, duration, click.echo, log)
+    configuration = read_configuration(cell.path if isinstance(cell, Cell) else cell)
+    summary = run_daemon(configuration, observe, arm, duration, click.echo, log)
     for line in summary.lines():
         click.echo(line)
     gc.freeze()  # else Python's last collection, of all compiled code, delays the end by 0.5 s
@@ -41,7 +40,7 @@ def run_cell(
 
 
 def run_daemon(
-    settings: DaemonSettings,
+    configuration: Configuration,
     observe: bool = False,
     arm: bool = False,
     duration: float | None = None,
@@ -52,9 +51,9 @@ def run_daemon(
 
     Stops on SIGINT and SIGTERM, reads the cell file again on SIGHUP.
     """
-    daemon = Daemon(settings, may_write=not observe, say=say, log=log)
+    daemon = Daemon(configuration, may_write=not observe, say=say, log=log)
     by = "--arm" if arm else "the cell file"
-    wanted = not observe and (arm or settings.setpoints.arm)
+    wanted = not observe and (arm or configuration.settings.setpoints.arm)
     with _signals(daemon):
         return daemon.run(arm=wanted, duration=duration, by=by)
 

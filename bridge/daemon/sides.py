@@ -34,6 +34,11 @@ class Sides:
             if wanted(settings):
                 self._running[name] = SideProcess(module, order, page, log)
 
+    def show(self, page: Page) -> None:
+        """Have all change over to a page that the daemon shows."""
+        for side in self._running.values():
+            side.show(page)
+
     def tell(self, event: dict[str, Any]) -> None:
         """Pass an event on to each; never blocks."""
         for side in self._running.values():
@@ -43,9 +48,14 @@ class Sides:
         """Look after all; returns what they have told and what became of them, as events."""
         found = []
         for name, side in self._running.items():
-            found += side.events()
-            if (words := side.check()) is not None:
-                found.append({"kind": "side", "side": name, "detail": words})
+            for event in side.events():
+                if event.get("kind") == name:
+                    found.append(event)
+                else:  # states and requests are not a side process's to tell of
+                    words = f"{name} told of {str(event.get('kind'))[:40]!r}, not its to tell of"
+                    found.append({"kind": "side", "side": name, "detail": words})
+            if (wrong := side.check()) is not None:
+                found.append({"kind": "side", "side": name, "detail": wrong})
         return found
 
     def status(self) -> dict[str, dict[str, int | None]]:

@@ -1,16 +1,20 @@
-"""Memory shared by the loop's process, its parent and who reads along: heartbeat, commands, cycles.
+"""Memory that the loop's process writes and all others read: heartbeat, state, counts, cycles.
 
-One page lives as long as the daemon; processes of the loop come and go. One writer for each word, 8
-bytes each, and no locks: whichever side dies, stands still or is killed, the others go on. Cycles
-go through a ring; each row begins with its own number, so that a reader knows a row that is not
-whole, or was overwritten. Who only reads gets a descriptor that cannot be written to.
+One writer, words of 8 bytes each, and no locks: whichever side dies, stands still or is killed, the
+others go on. Cycles go through a ring; each row begins with its own number, so that a reader knows
+a row that is not whole, or was overwritten.
+
+A process of the loop maps its page and seals it (sealed_memory.py): nobody else can write to it.
+The next process gets a page of its own that begins as a copy, so cycles and counts go on over all
+processes of a run; the daemon and who reads along change over to it (RunPage, FollowedPage).
+Nothing is asked for through this memory: commands have their own (command_page.py).
 """
 
 from __future__ import annotations
 
-import mmap
+import contextlib
 import os
-import tempfile
+import socket
 import time
 from enum import IntEnum
 
@@ -18,12 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.ipc.counts import Count
+from bridge.ipc.sealed_memory import is_sealed, make_memory, map_as_reader, map_as_writer, seal
 
 Array = NDArray[np.float64]
 WORDS = 128
 ROWS = 8192  # cycles kept: 16 s at 500 Hz
+NAME = "gapbridge-cycles"  # of the memory, as /proc shows it
 # words; the heartbeat's time is a float in a word of its own
-_BEATS, _PHASE, _STATE, _COMMAND, _WRITTEN, _ENDED, _SEEN = range(7)
+_BEATS, _PHASE, _STATE, _TAKEN, _WRITTEN, _ENDED, _SEEN = range(7)
 _BEAT_TIME = 32
 _COUNTS = 64  # from here on one word for each Count, over all processes of the loop
 
@@ -36,15 +42,6 @@ class Phase(IntEnum):
     RUNNING = 2
     ARMING = 3
     ENDING = 4
-
-
-class Command(IntEnum):
-    """What the parent asks for."""
-
-    NONE = 0
-    ARM = 1
-    DISARM = 2
-    STOP = 3
 
 
 def slices_of(n: int) -> dict[str, slice]:
@@ -69,17 +66,21 @@ def slices_of(n: int) -> dict[str, slice]:
 class Page:
     """The shared memory, seen from any side.
 
-    Without ``fd`` it is made; with one it is joined, for reading only unless ``writable``.
+    Without ``fd`` it is made; with one it is joined, for reading only unless ``writable``. Who
+    joins it for writing is the last who can.
     """
 
     def __init__(self, n: int, fd: int | None = None, writable: bool = True) -> None:
         self.n = n
         self.slices = slices_of(n)
         self.width = max(part.stop for part in self.slices.values())
-        size = 8 * (WORDS + ROWS * self.width)
-        self.fd = _anonymous(size) if fd is None else fd
-        access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
-        self._map = mmap.mmap(self.fd, size, access=access)
+        self._size = 8 * (WORDS + ROWS * self.width)
+        self._attach(make_memory(NAME, self._size) if fd is None else fd, writable)
+
+    def _attach(self, fd: int, writable: bool) -> None:
+        """Look at this memory from now on; what was looked at before stays for who still does."""
+        self.fd = fd
+        self._map = (map_as_writer if writable else map_as_reader)(fd, self._size)
         self._words = np.frombuffer(self._map, np.int64, WORDS)
         self._times = np.frombuffer(self._map, np.float64, WORDS)
         rows = np.frombuffer(self._map, np.float64, ROWS * self.width, 8 * WORDS)
@@ -125,30 +126,23 @@ class Page:
         self._rows[written % ROWS, 0] = written
         self._words[_WRITTEN] = written + 1
 
-    def take_command(self) -> Command:
-        """Return what the parent asks for, once; STOP stays."""
-        command = Command(int(self._words[_COMMAND]))
-        if command in (Command.ARM, Command.DISARM):
-            self._words[_COMMAND] = Command.NONE
-        return command
+    def tell_taken(self, number: int) -> None:
+        """Tell up to which number requests have been taken; see command_page.py."""
+        self._words[_TAKEN] = number
 
-    # -- the parent's side ------------------------------------------------------------------------
+    # -- who reads --------------------------------------------------------------------------------
 
-    def renew(self) -> None:
-        """Make ready for a new process of the loop, the former being dead; cycles go on."""
-        self._times[_BEAT_TIME] = 0.0
-        for word in (_BEATS, _PHASE, _STATE, _COMMAND, _ENDED, _SEEN):
-            self._words[word] = 0
+    def follow(self) -> None:
+        """Change over to the page of the newest process of the loop, where there is another."""
 
     def open_for_reading(self) -> int:
         """Return a further descriptor of the page, to be closed by the caller; read-only."""
-        path = f"/proc/self/fd/{self.fd}"
-        return os.open(path, os.O_RDONLY) if os.path.exists(path) else os.dup(self.fd)
+        return _read_only(self.fd)
 
-    def ask(self, command: Command) -> None:
-        """Ask the loop for something; STOP is never taken back."""
-        if self._words[_COMMAND] != Command.STOP:
-            self._words[_COMMAND] = command
+    @property
+    def taken(self) -> int:
+        """Return the number of the newest request that the loop has taken."""
+        return int(self._words[_TAKEN])
 
     @property
     def phase(self) -> Phase:
@@ -206,6 +200,66 @@ class Page:
         os.close(self.fd)
 
 
+class RunPage(Page):
+    """The daemon's view, for reading only: one page after the other, cycles and counts going on."""
+
+    def __init__(self, n: int) -> None:
+        super().__init__(n, writable=False)
+        seal(self.fd)  # of no loop: it only says that nothing has happened yet
+        self._shown = os.dup(self.fd)  # the newest one that nobody but its loop can write to
+
+    def renew(self) -> None:
+        """Make a page for a new process of the loop, the former being dead; cycles go on."""
+        fd = make_memory(NAME, self._size)
+        head = self._words.copy()
+        head[[_BEATS, _PHASE, _STATE, _ENDED, _SEEN]] = 0
+        head[_BEAT_TIME] = 0
+        os.pwrite(fd, head.tobytes(), 0)
+        if self.written:
+            _write_whole(fd, self._rows, head.nbytes)
+        before = self.fd
+        self._attach(fd, writable=False)  # first: other threads read along
+        os.close(before)
+
+    def promote(self) -> bool:
+        """Show the page to who reads along once its loop has sealed it; returns whether it has."""
+        if os.path.sameopenfile(self.fd, self._shown) or not is_sealed(self.fd):
+            return False
+        os.close(self._shown)
+        self._shown = os.dup(self.fd)
+        return True
+
+    def open_for_reading(self) -> int:
+        """Return a descriptor of the page that is shown, to be closed by the caller."""
+        return _read_only(self._shown)
+
+    def close(self) -> None:
+        """Let go of the memory."""
+        super().close()
+        os.close(self._shown)
+
+
+class FollowedPage(Page):
+    """A side process's view: it changes over to each page that the daemon sends it."""
+
+    def __init__(self, n: int, fd: int, successors: socket.socket) -> None:
+        super().__init__(n, fd, writable=False)
+        self._successors = successors
+        successors.setblocking(False)
+
+    def follow(self) -> None:
+        """Change over to the newest page that has come."""
+        with contextlib.suppress(OSError):
+            while True:
+                data, found, _, _ = socket.recv_fds(self._successors, 1, 4)
+                if not data:  # the daemon is gone
+                    return
+                for fd in found:
+                    before = self.fd
+                    self._attach(fd, writable=False)
+                    os.close(before)
+
+
 class PageReader:
     """One reader of a page's cycles; any number of them read side by side."""
 
@@ -216,6 +270,7 @@ class PageReader:
 
     def drain(self) -> Array:
         """Return a copy of the rows (k, width) that came since the last call."""
+        self._page.follow()
         last = self._page.written
         if last < self.next:
             return np.empty((0, self._page.width))
@@ -225,12 +280,13 @@ class PageReader:
         return rows
 
 
-def _anonymous(size: int) -> int:
-    """Return the descriptor of zeroed memory that no name leads to."""
-    if hasattr(os, "memfd_create"):
-        fd = os.memfd_create("gapbridge", os.MFD_CLOEXEC)
-    else:
-        with tempfile.TemporaryFile() as file:
-            fd = os.dup(file.fileno())
-    os.ftruncate(fd, size)
-    return fd
+def _read_only(fd: int) -> int:
+    path = f"/proc/self/fd/{fd}"
+    return os.open(path, os.O_RDONLY) if os.path.exists(path) else os.dup(fd)
+
+
+def _write_whole(fd: int, rows: Array, at: int) -> None:
+    data = memoryview(rows.tobytes())
+    while data:
+        done = os.pwrite(fd, data, at)
+        data, at = data[done:], at + done

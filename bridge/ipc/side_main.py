@@ -11,6 +11,7 @@ import contextlib
 import json
 import os
 import select
+import socket
 import sys
 import threading
 import time
@@ -18,7 +19,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bridge.cell.daemon_settings import DaemonSettings
-from bridge.ipc.shared_memory import Page
+from bridge.ipc.shared_memory import FollowedPage, Page
 
 FAREWELL = 5.0  # s that a side process may take to end after the daemon
 NICENESS = 5  # the loop comes first
@@ -92,7 +93,7 @@ class Order:
     settings: DaemonSettings
     n: int  # joints
     session: str  # name of the daemon's run, run-YYYYmmdd-HHMMSS
-    page: Page  # attached, read-only
+    page: Page  # for reading only
     events: EventLines
     up: EventWriter
     extra: dict[str, Any]
@@ -113,7 +114,7 @@ def take_order() -> Order:
         settings=DaemonSettings.model_validate(given["settings"]),
         n=given["n"],
         session=given["session"],
-        page=Page(given["n"], given["page"], writable=False),
+        page=FollowedPage(given["n"], given["page"], socket.socket(fileno=given["pages"])),
         events=events,
         up=EventWriter(given["up"]),
         extra=given.get("extra", {}),

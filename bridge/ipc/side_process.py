@@ -9,6 +9,7 @@ import contextlib
 import fcntl
 import json
 import os
+import socket
 import subprocess
 import sys
 import termios
@@ -62,6 +63,15 @@ class SideProcess:
         else:
             self._down.tell(event)
 
+    def show(self, page: Page) -> None:
+        """Have it change over to another page; one that does not look gets it when it is anew."""
+        if self._process is None:
+            return
+        fd = page.open_for_reading()
+        with contextlib.suppress(OSError):
+            socket.send_fds(self._pages, [b"p"], [fd])
+        os.close(fd)
+
     def events(self) -> list[dict[str, Any]]:
         """Return the events that it has told."""
         return self._up.poll()
@@ -107,7 +117,9 @@ class SideProcess:
         with contextlib.suppress(OSError):
             fcntl.fcntl(ours, fcntl.F_SETPIPE_SZ, PIPE_SIZE)
         page = self._page.open_for_reading()
-        passed = (theirs, up_theirs, page)
+        self._pages, pages = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._pages.setblocking(False)
+        passed = (theirs, up_theirs, page, pages.detach())
         try:
             # spawned, never forked; in a session of its own, so that a Ctrl-C reaches the daemon
             # only, which then ends it in order
@@ -123,7 +135,9 @@ class SideProcess:
         self._down, self._up = EventWriter(ours), EventLines(up_ours)
         self._started = self._read_at = time.monotonic()
         self._has_read = False
-        order = {**self.order, "page": page, "events": theirs, "up": up_theirs}
+        order = {
+            **self.order, "page": page, "events": theirs, "up": up_theirs, "pages": passed[3],
+        }  # fmt: skip
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):  # gone already, which check() sees
             self._process.stdin.write((json.dumps(order) + "\n").encode())
@@ -159,6 +173,7 @@ class SideProcess:
         self._close_down()
         os.close(self._up.fd)
         self._up.closed = True
+        self._pages.close()
 
 
 def environment() -> dict[str, str]:

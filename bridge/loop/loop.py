@@ -15,18 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.cell.daemon_settings import DaemonSettings
+from bridge.ipc.command_page import Command, Commands
 from bridge.ipc.counts import Count
 from bridge.ipc.cycle_row import fill_row
-from bridge.ipc.shared_memory import Command, Page, Phase
-from bridge.loop.checks import RAMPING_OUT, LoopChecks
+from bridge.ipc.shared_memory import Page, Phase
+from bridge.loop.checks import NOTHING, RAMPING_OUT, UNSOLVED, LoopChecks
 from bridge.loop.controller_clock import ControllerClock
 from bridge.loop.link_monitor import StateWatch, hold_time
 from bridge.loop.live_loads import LiveLoads
-from bridge.loop.setpoint_stream import SetpointStream
+from bridge.loop.offset_in_force import OffsetInForce
+from bridge.loop.readiness import ModelCheck
+from bridge.loop.setpoint_stream import SetpointStream, longest_withdrawal
 from bridge.loop.supervisor import Cause, State, Supervisor
 from bridge.loop.writing import Writing
 from bridge.setpoint_source.source import Source, Told
 from core.errors import InvalidStateError, LinkError
+from core.load_bounds import LoadBounds
 from core.loads import Loads
 from core.model import Model
 from core.setpoint import Setpoint
@@ -35,7 +39,7 @@ from drivers.driver import Driver
 
 Vector = NDArray[np.float64]
 
-LONGEST_STOP = 1.0  # s from a request to stop to letting go, at rest or not
+LONGEST_STOP = 1.0  # s from a request to stop to letting go, beside what the cell's rates take
 HASTY_RAMP = 0.5  # s: what a stop takes for the ramp at most
 
 UNSENT = 2  # "attempted" of a cycle whose setpoint was computed and did not (wholly) leave
@@ -70,31 +74,43 @@ class Loop:
         self._page, self._tell = page, tell
         self._stream = SetpointStream(model, settings.limits, driver.rate)
         self._loads = LiveLoads(
-            model.arm.n, settings.setpoints.use_force, settings.setpoints.force_filter
-        )
+            model.arm.n, settings.setpoints.use_force, settings.setpoints.force_filter,
+            LoadBounds.of(model),
+        )  # fmt: skip
+        self._acting = Loads()  # of the last cycle
+        self._model_check = ModelCheck(model, settings.setpoints.use_force)
         self._clock = ControllerClock(driver.rate, hold_time(driver.rate))
         self._supervisor = Supervisor(self._changed)
         patience = settings.link.state_timeout
         self._watch = StateWatch(
             driver, model.arm, self._supervisor, page, tell, self._lose, patience
         )
-        self._checks = LoopChecks(driver.rate, self._supervisor, page, tell, patience)
+        self._checks = LoopChecks(
+            driver.rate, self._supervisor, page, tell, patience, driver.moves_arm
+        )
+        self._in_force = self._kept_offset()
         self._writing = Writing(
             settings.setpoints, driver, source, self._stream, self._supervisor, page, tell,
-            self._skip, self._lose,
+            self._skip, self._lose, self._in_force,
         )  # fmt: skip
         self._acknowledged = False  # a person has seen the fault; it ends when the robot is fine
         self._stop_by: float | None = None  # s, monotonic
         self._exit: Exit | None = None
         self.stop_requested = False  # set by signal handlers
 
+    def _kept_offset(self) -> OffsetInForce:
+        """Return where the offset that an arm is left with is kept."""
+        if not self._driver.moves_arm:  # the robot's own program takes it out
+            return OffsetInForce(self._driver.n, None)
+        return OffsetInForce.of_link(self._driver.n, self._settings.link)
+
     # -- the frame --------------------------------------------------------------------------------
 
-    def run(self, arm: bool, may_write: bool, latched: str = "") -> Exit:
+    def run(self, commands: Commands, may_write: bool, latched: str = "") -> Exit:
         """Connect and loop until told to stop, or until the link is lost.
 
-        ``arm``: arm as soon as a state is there. ``may_write`` False: nothing can arm. ``latched``:
-        the fault of a loop before this one that nobody has acknowledged.
+        ``commands``: the daemon's, and the only way to arm. ``may_write`` False: nothing can arm.
+        ``latched``: the fault of a loop before this one that nobody has acknowledged.
         """
         self._page.enter(Phase.CONNECTING)
         try:
@@ -107,18 +123,20 @@ class Loop:
         if latched:
             self._supervisor.take(Cause.LATCHED, latched)
         self._page.enter(Phase.RUNNING)
-        wanted = arm
+        wanted = False
         while self._exit is None:
             self._page.beat()
-            command = self._page.take_command()
-            if self.stop_requested or command == Command.STOP:
+            asked = commands.take()
+            for command in asked:
+                wanted = command == Command.ARM
+                if command in (Command.DISARM, Command.RAMP_OUT):
+                    self._disarm(command == Command.DISARM)
+            if asked:
+                self._page.tell_taken(commands.taken)
+            if self.stop_requested or commands.stop:
                 self._stop()
-            elif command == Command.DISARM:
-                wanted = False
-                self._disarm()
-            elif command == Command.ARM:
-                wanted = True
-            if wanted and may_write and self._page.seen and self._stop_by is None:
+            seen = self._page.seen and self._checks.rate.known
+            if wanted and may_write and seen and self._stop_by is None:
                 wanted = False
                 self._arm()
             if self._exit is None:
@@ -133,14 +151,35 @@ class Loop:
             words = "a fault is latched: acknowledge it first (gapbridge disarm)"
         elif not self._checks.fine:
             words = f"the robot is not ready: {self._checks.robot}"
+        elif not_ready := self._not_ready():
+            words = not_ready
         else:
             self._supervisor.take(Cause.ARM)
             return
         self._tell({"kind": "refused", "what": "arm", "detail": words})
 
-    def _disarm(self) -> None:
+    def _not_ready(self) -> str:
+        """Return in words why writing could come to nothing here; empty: it can."""
+        stream = self._stream
+        self._model_check.forget()
+        if self._checks.rate.doubt:
+            return self._checks.rate.doubt
+        if self._loads.doubt is not None:
+            return f"the load is implausible: {self._loads.doubt}"
+        if not stream.finite:
+            return "the model's correction is no number at the present pose"
+        if stream.unsolved:
+            return f"the correction cannot be solved at the present pose: {stream.unsolved}"
+        if not self._model_check.corrects(self._acting):
+            return (
+                "the model corrects nothing at any pose: found neither compliance nor an effect in "
+                "the cell that moves the TCP under what acts now"
+            )
+        return ""
+
+    def _disarm(self, by_a_person: bool) -> None:
         if self._supervisor.state == State.FAULT:
-            self._acknowledged = True
+            self._acknowledged |= by_a_person
         else:
             self._supervisor.take(Cause.DISARM)
 
@@ -164,7 +203,8 @@ class Loop:
     def _stop(self) -> None:
         """Ramp out, then end; a deadline makes sure of the end."""
         if self._stop_by is None:
-            self._stop_by = time.monotonic() + LONGEST_STOP
+            needed = LONGEST_STOP + longest_withdrawal(self._settings.limits)
+            self._stop_by = time.monotonic() + needed
             self._stream.hasten(HASTY_RAMP)
             self._supervisor.take(Cause.STOP)
         if not self._supervisor.state.writes or time.monotonic() > self._stop_by:
@@ -191,7 +231,7 @@ class Loop:
         except InvalidStateError as error:
             self._watch.doubt(str(error))
             return
-        missed = self._clock.take(state)
+        missed = self._clock.take(state, self._supervisor.state.writes)
         expiry = self._clock.expiry(state)
         is_fresh = self._watch.believe(expiry)
         self._page.tell_seen()
@@ -201,7 +241,9 @@ class Loop:
         supervisor, writing = self._supervisor, self._writing
         if supervisor.state == State.FAULT:
             writing.ready = False  # its own watchdog, or a person, has the robot
-        loads = self._loads.update(state)
+        loads = self._acting = self._loads.update(state)
+        self._checks.judge_loads(self._loads.doubt)
+        self._checks.judge_settings(state, self._driver)
         seen = time.monotonic()
         if is_fresh and supervisor.state == State.ARMED and writing.start(state, own):
             self._record(state, missed, own, loads, None, at=seen)
@@ -246,8 +288,12 @@ class Loop:
             nominal, corrected, offset = own, correction.q, correction.offset_in_base
             if not stream.finite:
                 self._supervisor.take(Cause.BAD_OUTPUT, "the model's correction is no number")
+            elif not self._model_check.corrects(loads):
+                self._checks.flags |= NOTHING
         else:
             nominal, corrected, offset = setpoint.nominal_q, setpoint.q, setpoint.offset_in_base
+        if stream.unsolved:
+            self._checks.flags |= UNSOLVED
         clamped = stream.clamped if setpoint is not None else 0
         late = 0.0 if at is None else time.monotonic() - at  # arming: no part of the cycle
         row, slices = page.next_row(), page.slices

@@ -1,9 +1,9 @@
 """The loop's process: ``python -m bridge.loop.main``, started by the daemon and by nobody else.
 
 It holds the loop and one driver, and is expendable: the robot's library can abort it, crash it or
-hang it. Settings come as one line of JSON on stdin; cycles go out through shared memory, events as
-lines of JSON through a pipe. It always ends by ``os._exit``, because destroying the library's
-objects is not safe.
+hang it. Settings come as one line of JSON on stdin, requests through memory that only the daemon
+writes to; cycles go out through shared memory, events as JSON through a socket. It always ends by
+``os._exit``, because destroying the library's objects is not safe.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import gc
 import importlib
 import json
 import os
+import pickle
 import signal
 import sys
 import time
@@ -25,14 +26,17 @@ import numpy as np
 
 from bridge.cell.daemon_settings import DaemonSettings
 from bridge.cell.sections import SetpointSettings
+from bridge.ipc.command_page import Commands
+from bridge.ipc.sealed_memory import all_bytes
 from bridge.ipc.shared_memory import Page, Phase
 from bridge.loop.loop import Exit, Loop
 from bridge.loop.realtime import become_realtime
 from bridge.loop.replay import ReplayedLoop
-from bridge.loop.setpoint_stream import SetpointStream
+from bridge.loop.setpoint_stream import SetpointStream, gate_bounds
 from bridge.setpoint_source import make_source
 from bridge.setpoint_source.source import Source
 from core.errors import GapbridgeError, InputError
+from core.files import read_only_from
 from core.loads import Loads
 from core.model import Model
 from drivers import make_driver
@@ -41,7 +45,7 @@ from drivers.ft_sensor.joined import DriverWithSensor
 from drivers.replay import ReplayDriver
 
 _PR_SET_PDEATHSIG = 1
-LONGEST_WORDS = 1000  # of an event: a line that a pipe takes whole or not at all
+LONGEST_WORDS = 1000  # of an event
 
 
 def main() -> None:
@@ -66,11 +70,13 @@ def main() -> None:
 
 
 def _run(order: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Exit:
-    settings = DaemonSettings.model_validate(order["settings"])
     page = Page(order["n"], order["page"])
     page.enter(Phase.STARTING)
+    files = pickle.loads(all_bytes(order["files"]))  # by the daemon, which started this process
+    read_only_from(files)  # the disk is the daemon's to read, at start and reload
+    settings = DaemonSettings.model_validate(order["settings"])
     model = _read_model(settings)
-    driver = make_driver(settings.link, model)
+    driver = make_driver(settings.link, model, gate_bounds(settings.limits))
     source = _make_source(settings, model, driver)
     loop = _make_loop(settings, model, driver, source, page, tell, order["number"])
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -79,15 +85,17 @@ def _run(order: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Exit:
     _compile(settings, model)
     if order["may_write"]:
         source.open()
-    tell({"kind": "granted", "detail": ", ".join(become_realtime(1.0 / driver.rate))})
-    return loop.run(order["arm"], order["may_write"], order["latched"])
+    granted = ", ".join(become_realtime(1.0 / driver.rate))
+    tell({"kind": "granted", "hash": order["hash"], "detail": granted})
+    commands = Commands(order["commands"], order["after"])
+    return loop.run(commands, order["may_write"], order["latched"])
 
 
 def _make_source(settings: DaemonSettings, model: Model, driver: Driver) -> Source:
     """Return where setpoints come from; on a recording they are in the recording."""
     is_replay = isinstance(driver, ReplayDriver)
     setpoints = SetpointSettings() if is_replay else settings.setpoints
-    return make_source(setpoints, model.arm.n, driver.moves_arm, settings.cell.parent)
+    return make_source(setpoints, model.arm.n, driver.moves_arm, settings.cell.parent, driver.rate)
 
 
 def _make_loop(
@@ -108,9 +116,8 @@ def _teller(events: int) -> Callable[[dict[str, Any]], None]:
         if len(event.get("detail", "")) > LONGEST_WORDS:
             event = {**event, "detail": event["detail"][:LONGEST_WORDS]}
         now = {"time": time.time(), "monotonic": time.monotonic()}
-        line = json.dumps({**now, **event}) + "\n"
-        with contextlib.suppress(OSError):
-            os.write(events, line.encode())
+        with contextlib.suppress(OSError):  # a message each: taken whole, or not at all
+            os.write(events, json.dumps({**now, **event}).encode())
 
     return tell
 

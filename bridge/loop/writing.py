@@ -12,11 +12,14 @@ from numpy.typing import NDArray
 from bridge.cell.sections import SetpointSettings
 from bridge.ipc.counts import Count
 from bridge.ipc.shared_memory import Page, Phase
+from bridge.loop.link_monitor import hold_time
+from bridge.loop.offset_in_force import OffsetInForce
 from bridge.loop.setpoint_stream import SetpointStream
 from bridge.loop.supervisor import Cause, State, Supervisor
 from bridge.setpoint_source.source import Source, SourceDryError
 from core.errors import (
     ForeignCommandError,
+    GateError,
     IneffectiveWriteError,
     LimitError,
     PartialWriteError,
@@ -47,10 +50,12 @@ class Writing:
         tell: Callable[[dict[str, Any]], None],
         skip: Callable[[], None],
         lose: Callable[[str], None],
+        in_force: OffsetInForce | None = None,
     ) -> None:
         self._settings, self._driver, self._source = settings, driver, source
         self._stream, self._supervisor, self._page = stream, supervisor, page
         self._tell, self._skip, self._lose = tell, skip, lose
+        self._in_force = in_force or OffsetInForce(driver.n, None)
         self.ready = False  # the driver is armed
         self.has_armed = False  # it was, at some time in this process
         self.unsent: Setpoint | None = None  # computed in the last cycle, and not (wholly) sent
@@ -81,13 +86,14 @@ class Writing:
             if not self.ready:
                 self._arm_driver(state)
                 return True
-            self._stream.start(own, state.timestamp)
+            in_force = self._in_force.at(own) if self._driver.moves_arm else None
+            nominal = self._stream.start(own, state.timestamp, in_force=in_force)
         except (WriteError, LimitError) as error:
             if isinstance(error, ForeignCommandError):
                 self._page.count(Count.FOREIGN)
             self._refuse_start(str(error))
             return True
-        self._source.begin(state.timestamp, own)
+        self._source.begin(state.timestamp, nominal)
         self._failed = 0
         self._supervisor.take(Cause.WRITING)
         return False
@@ -97,11 +103,21 @@ class Writing:
         self._page.enter(Phase.ARMING)
         self.has_armed = True
         try:
+            self._check_way()
             self._driver.arm(state)
             self.ready = True
         finally:
             self._page.enter(Phase.RUNNING)
             self._skip()
+
+    def _check_way(self) -> None:
+        """Refuse a link on which no state can be fresh. Raises WriteError."""
+        taken, most = self._driver.round_trip(), hold_time(self._driver.rate)
+        if taken is not None and taken > most:
+            raise WriteError(
+                f"link: a question and its answer take {1e3 * taken:.0f} ms, expected at most "
+                f"{1e3 * most:.0f} ms: no state behind a setpoint may be older"
+            )
 
     def _refuse_start(self, detail: str) -> None:
         self.release()
@@ -147,13 +163,21 @@ class Writing:
                 self._page.count(Count.LATE)
             else:
                 self._driver.write_setpoint(setpoint)
+                self._in_force.note(setpoint.q, stream.joint_offset, setpoint.offset_in_base)
                 self._failed = 0
+                self._judge_correction()
                 self._judge_sending(expiry)
                 return setpoint
         except WriteError as error:
             self.unsent = _copied(setpoint)
             self._fail(error)
         return None
+
+    def _judge_correction(self) -> None:
+        """End the motion where the model has no correction; the offset is on its way out."""
+        words = self._stream.unsolved
+        if words and self._supervisor.take(Cause.UNSOLVED, words):
+            self._page.count(Count.UNSOLVED)
 
     def _judge_sending(self, expiry: float) -> None:
         """End the motion where the system stopped this process between judging and sending."""
@@ -165,7 +189,9 @@ class Writing:
 
     def _fail(self, error: WriteError) -> None:
         """Act on a setpoint that could not be delivered."""
-        if isinstance(error, PartialWriteError):
+        if isinstance(error, GateError):
+            self._end(Count.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))
+        elif isinstance(error, PartialWriteError):
             self._repeat(str(error))
         elif isinstance(error, IneffectiveWriteError):
             self._end(Count.WRITE_INEFFECTIVE, Cause.INEFFECTIVE, str(error))

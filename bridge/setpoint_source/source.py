@@ -36,9 +36,12 @@ class Source(ABC):
     Constructors read what they need and open nothing. ``sample`` never blocks.
     """
 
-    def __init__(self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path) -> None:
+    def __init__(
+        self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
+    ) -> None:
         self.settings = settings
         self.n = n
+        self.rate = rate  # of the robot's cycles, Hz
 
     def open(self) -> None:
         """Open what the source listens on. Raises RunError."""

@@ -22,8 +22,10 @@ class TrajectorySource(Source):
     fault. Raises LogError where the file is not a trajectory of n joints.
     """
 
-    def __init__(self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path) -> None:
-        super().__init__(settings, n, moves_arm, folder)
+    def __init__(
+        self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
+    ) -> None:
+        super().__init__(settings, n, moves_arm, folder, rate)
         path = folder / (settings.file or "")
         log = read_log(path, n)
         self._q: Vector = np.ascontiguousarray(log.require("target_q"))

@@ -38,7 +38,7 @@ class Parameters:
     nominal: Model
     terms: tuple[Term, ...]  # one a site, all values zero
     place: tuple[tuple[int, int], ...]  # (p) number of the term, number of the value in it
-    names: tuple[str, ...]  # (p) CONTRACT's
+    names: tuple[str, ...]  # (p) as cells and reports name them
     units: tuple[str, ...]
     scales: Array  # (p,) a usual size of each
     lower: Array  # (p,) bounds; the whole flexibility, the nominal model's with it, is 0 or more

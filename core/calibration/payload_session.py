@@ -85,7 +85,7 @@ def _sensed(model: Model, shaping: list[Term], wrench: Array, motion: Motion) ->
 def calibrate_payload(model: Model, q: Array, wrench: Array) -> PayloadCalibration:
     """Return mass, centre of gravity and sensor bias from readings at rest.
 
-    ``q`` (N, n) rad, ``wrench`` (N, 6): ``ft_raw_wrench`` as CONTRACT has it, averaged at each
+    ``q`` (N, n) rad, ``wrench`` (N, 6): ``ft_raw_wrench`` of docs/conventions.md, averaged at each
     pose. Wild readings are weighed down and listed. Raises InputError where the readings do not
     fit together, ExcitationError where the orientations do not tell load from bias.
     """
@@ -159,7 +159,7 @@ def _notes(mass: float, std: float, outliers: NDArray[np.int64]) -> tuple[str, .
         notes.append("nothing that weighs hangs on the sensor: a centre of gravity is not told")
     elif mass < 0:
         notes.append(
-            f"the load weighs {mass:.3f} kg: the sensor's signs or axes are not the contract's "
+            f"the load weighs {mass:.3f} kg: the sensor's signs or axes are not those of a log "
             "(a mass at rest reads its weight, pointing down, in flange axes)"
         )
     if len(outliers):

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Estimate:
-    """One parameter, as it is told (CONTRACT's names and signs)."""
+    """One parameter, as it is reported; names and signs of docs/conventions.md."""
 
     name: str
     value: float

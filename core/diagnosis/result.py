@@ -104,7 +104,7 @@ def _at_bounds(effect: str, term: Term, arm: Arm) -> list[str]:
 
 
 def _not_shown(effect: str, term: Term, deviation: Array, arm: Arm) -> list[str]:
-    """Return a note on each parameter that these data leave open (CONTRACT: told, not hidden)."""
+    """Return a note on each parameter that these data leave open ; nothing is hidden."""
     notes = []
     for parameter, spread in zip(
         CATALOGUE[effect].parameters(arm, term.site), deviation, strict=False

@@ -136,7 +136,7 @@ def _difference(
     observation = channel.selection.observation
     try:
         apart = predict(question.one) - predict(question.other)
-        if observation.nuisance.shape[2]:
+        if observation.nuisance.shape[2] >= 6:
             seen = observation.predict(question.one) - observation.predict(question.other)
             apart = apart - _framed(observation.nuisance, seen, predict(question.other))
     except InputError:  # the arm would buckle under one of them
@@ -149,7 +149,8 @@ def _difference(
 def _framed(nuisance: Array, seen: Array, position: Array) -> Array:
     """Return how the frame that takes up the log's difference moves the readings of trials."""
     A = nuisance[:, :3].reshape(-1, nuisance.shape[2])
-    x = np.linalg.lstsq(A, seen[:, :3].ravel(), rcond=1e-9)[0]
+    # of several sessions the trials go on with the first one's frame
+    x = np.linalg.lstsq(A, seen[:, :3].ravel(), rcond=1e-9)[0][:6]
     return np.asarray(-frame_columns(position)[:, :3] @ x)
 
 

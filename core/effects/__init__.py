@@ -1,4 +1,4 @@
-"""The catalogue of effects: one table, in the order of CONTRACT."""
+"""The catalogue of effects: one table, by channel."""
 
 from __future__ import annotations
 

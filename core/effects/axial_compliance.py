@@ -28,6 +28,7 @@ class AxialCompliance(JointEffect):
     flexibility = "axial"
     channels = ("position",)
     motion = "payloads or pulls that change the torque about the joint's axis"
+    instead = "add a joint with the spring 1/c about the same axis"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the flexibility beyond the model's."""

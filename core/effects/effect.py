@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from core.arm import Arm
+    from core.effects.simulator import SimulatorChange
     from core.kernels.rates import ChainRate
     from core.kernels.reference import Chain, Rows
     from core.loads import Loads
@@ -63,7 +64,7 @@ class Term:
 
 @dataclass(frozen=True)
 class Reported:
-    """A parameter as it is told: in the unit and form of CONTRACT's signs."""
+    """A parameter as it is reported: in the unit and sign of docs/conventions.md."""
 
     name: str
     value: float
@@ -81,6 +82,7 @@ class Effect(ABC):
     channels: ClassVar[tuple[str, ...]]
     needs: ClassVar[tuple[str, ...]] = ()  # log columns beyond those of its channel
     motion: ClassVar[str] = ""  # what a log must contain so that the effect shows
+    instead: ClassVar[str] = ""  # what people do where a simulator's model cannot hold it
 
     # how people read it
     title: ClassVar[str] = ""  # in plain words; left out: the identifier without underscores
@@ -171,6 +173,10 @@ class Effect(ABC):
     def drive(self, term: Term, arm: Arm, torque: Array, motion: Motion) -> Array:
         """Return the joint torques that would be measured instead of ``torque`` (N, n)."""
         return torque
+
+    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
+        """Return what to change in a simulator's model, beside what ``shape`` changes."""
+        return ()
 
     def reported(self, arm: Arm, term: Term, covariance: Array | None) -> tuple[Reported, ...]:
         """Return the term's parameters as they are told; ``covariance`` is (k, k) or None."""

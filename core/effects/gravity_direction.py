@@ -28,6 +28,7 @@ class GravityDirection(Effect):
     needs_softness = True
     channels = ("position",)
     motion = "a compliant model and poses all around the base"
+    instead = "turn the base, or gravity in the world"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the rotation vector's x and y, base axes."""

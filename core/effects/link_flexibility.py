@@ -28,6 +28,7 @@ class LinkFlexibility(Effect):
     softens = True
     channels = ("position",)
     motion = "payloads or pulls in several directions, so that force and moment on the link differ"
+    instead = "add a pair of springs across the link at a third of its length, 4 EI / 3 L each"
 
     def sites(self, arm: Arm) -> tuple[Site, ...]:
         """Return the links between two joints that have a length."""

@@ -28,6 +28,7 @@ class RadialCompliance(JointEffect):
     sum_of = "base_compliance"
     channels = ("position",)
     motion = "payloads or pulls that change the moment across the joint's axis"
+    instead = "add two joints with the spring 1/c across the axis"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the flexibility beyond the model's."""

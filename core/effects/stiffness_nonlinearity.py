@@ -22,7 +22,7 @@ class StiffnessNonlinearity(JointEffect):
     Comes from strain-wave gears, whose teeth engage further under torque. It holds the linear part
     too, so it stands instead of the joint's ``axial_compliance``. Needs several loads: with one, it
     looks like a linear compliance.
-    Source: CONTRACT; stiffening curves of harmonic drives in makers' catalogues (K1 < K2 < K3).
+    Source: stiffening curves of harmonic drives in makers' catalogues (K1 < K2 < K3).
     """
 
     identifier = "stiffness_nonlinearity"
@@ -33,6 +33,7 @@ class StiffnessNonlinearity(JointEffect):
     contains = "axial_compliance"
     channels = ("position",)
     motion = "at least three well separated torques about the joint's axis"
+    instead = "add a joint with the spring 1/c + theta^2 / (2 c^3 M0^2)"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return c and the softening 1/M0^2, in which the curve starts linear."""

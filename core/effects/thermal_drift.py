@@ -20,7 +20,7 @@ class ThermalDrift(Effect):
 
     One coefficient of expansion for the arm; base, tool and centres of gravity do not grow. Needs
     joint temperatures that change over the session. Steel 12e-6, aluminium 23e-6 per kelvin.
-    Source: CONTRACT; VSB Ostrava 2021 on IRB1200 thermal drift.
+    Source: VSB Ostrava 2021 on IRB1200 thermal drift.
     """
 
     identifier = "thermal_drift"
@@ -29,6 +29,7 @@ class ThermalDrift(Effect):
     channels = ("position",)
     needs = ("joint_temperatures",)
     motion = "joint temperatures that change by several degrees"
+    instead = "scale the links' lengths for one temperature"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the coefficient of expansion."""

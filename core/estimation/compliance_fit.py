@@ -1,8 +1,8 @@
 """The least squares behind the identification: flexibilities, and what is unknown beside them.
 
-Gauss-Newton on the paper's linear form (eq. 35), taken again at the deflected shape, wild readings
-weighed down. Where the instrument is not registered, its frame and the tool point are estimated
-along: nuisances, projected out before anything is said of a flexibility.
+Gauss-Newton on the linear form (eq. 4 of docs/conventions.md), taken again at the deflected shape,
+outliers down-weighted. Where the instrument is not registered, its frame and the tool point are
+estimated along: nuisances, projected out before anything is said of a flexibility.
 """
 
 from __future__ import annotations
@@ -37,16 +37,43 @@ class Data:
     position: Array  # (N, 3) m, measured, instrument's frame
     rotation: Array | None  # (N, 3, 3)
     registered: bool  # the instrument measures the cell's TCP in base: nothing beside is unknown
+    session: NDArray[np.int64] | None = None  # (N,) session of each row; None: there is one
+    sessions: int = 1  # how many there are, in the whole data
+    remounted: bool = False  # each session has a tool point of its own
 
     def part(self, rows: NDArray[Any]) -> Data:
         """Return some of the rows."""
         rotation = None if self.rotation is None else self.rotation[rows]
-        return Data(self.q[rows], self.loads[rows], self.position[rows], rotation, self.registered)
+        session = None if self.session is None else self.session[rows]
+        return replace(
+            self, q=self.q[rows], loads=self.loads[rows], position=self.position[rows],
+            rotation=rotation, session=session,
+        )  # fmt: skip
+
+    @property
+    def frames(self) -> int:
+        """Return how many frames of the instrument are unknown."""
+        return 0 if self.registered else self.sessions
+
+    @property
+    def tools(self) -> int:
+        """Return how many tool points are unknown."""
+        if self.remounted:
+            return self.sessions
+        return 0 if self.registered else 1
 
     @property
     def nuisances(self) -> int:
-        """Return how many numbers are estimated beside the flexibilities: frame and tool point."""
-        return 0 if self.registered else 9
+        """Return how many numbers are estimated beside the flexibilities: frames, tool points."""
+        return 6 * self.frames + 3 * self.tools
+
+
+@dataclass(frozen=True)
+class Placements:
+    """Where the instrument stood, and where the target sat, in each of several sessions."""
+
+    frames: tuple[Registration, ...]
+    tool_shift: tuple[Array, ...]  # (3,) m, flange axes: against the model's tool point
 
 
 @dataclass(frozen=True)
@@ -65,7 +92,7 @@ class Fit:
     """Where a fit came to rest."""
 
     model: Model  # with the flexibilities and the tool point found
-    frame: Registration
+    frame: Registration | Placements
     weights: Array  # (N,)
     linear: Linear | None = None  # None: only the nuisances were fitted
 
@@ -89,8 +116,10 @@ def flexibilities(model: Model) -> Array:
     return found
 
 
-def residual(model: Model, data: Data, frame: Registration) -> tuple[Array, Poses]:
+def residual(model: Model, data: Data, frame: Registration | Placements) -> tuple[Array, Poses]:
     """Return measured minus predicted (N, 3 or 6) in base axes, and the predicted poses."""
+    if isinstance(frame, Placements):
+        return _residual_by_session(model, data, frame)
     poses = model.predict(data.q, data.loads)
     gap = frame.in_base(data.position) - poses.position
     if data.rotation is None:
@@ -99,12 +128,45 @@ def residual(model: Model, data: Data, frame: Registration) -> tuple[Array, Pose
     return np.hstack([gap, rotation_vector(turn)]), poses
 
 
-def nuisance_columns(model: Model, poses: Poses, width: int) -> Array:
-    """Return d(measured minus predicted) / d(frame step, tool point) as (N, width, 9), negated."""
+def _residual_by_session(model: Model, data: Data, placements: Placements) -> tuple[Array, Poses]:
+    gap = np.empty((len(data.q), 3 if data.rotation is None else 6))
+    position, rotation = np.empty((len(data.q), 3)), np.empty((len(data.q), 3, 3))
+    assert data.session is not None
+    for s, (frame, shift) in enumerate(zip(placements.frames, placements.tool_shift, strict=True)):
+        rows = np.flatnonzero(data.session == s)
+        if len(rows):
+            own = replace(data.part(rows), session=None, sessions=1)
+            gap[rows], poses = residual(shifted(model, shift), own, frame)
+            position[rows], rotation[rows] = poses.position, poses.rotation
+    return gap, Poses(position, rotation)
+
+
+def shifted(model: Model, tool_shift: Array) -> Model:
+    """Return the model with its tool point moved by ``tool_shift`` (3,), m, flange axes."""
+    tool = model.tool_in_flange.copy()
+    tool[:3, 3] += tool_shift
+    return replace(model, tool_in_flange=tool)
+
+
+def nuisance_columns(model: Model, poses: Poses, width: int, data: Data | None = None) -> Array:
+    """Return d(measured minus predicted) / d(frame step, tool point) as (N, width, 9), negated.
+
+    Of several sessions (``data``): all frames first, then the tool points, (N, width, nuisances).
+    """
     columns = np.zeros((len(poses.position), width, 9))
     columns[:, :, :6] = -frame_columns(poses.position)[:, :width]
     columns[:, :3, 6:] = poses.rotation @ model.tool_in_flange[:3, :3].T  # flange axes in base
-    return columns
+    if data is None or data.session is None:
+        return columns
+    whole = np.zeros((len(columns), width, data.nuisances))
+    for s in range(data.sessions):
+        rows = data.session == s
+        if data.frames:
+            whole[rows, :, 6 * s : 6 * s + 6] = columns[rows, :, :6]
+        at = 6 * data.frames + (3 * s if data.remounted else 0)
+        if data.tools:
+            whole[rows, :, at : at + 3] = columns[rows, :, 6:]
+    return whole
 
 
 def orthonormal(columns: Array) -> Array:
@@ -115,20 +177,58 @@ def orthonormal(columns: Array) -> Array:
 
 def fit_nuisances(model: Model, data: Data) -> Fit:
     """Return the frame and tool point that fit best, the model's flexibilities left alone."""
-    if data.registered:
+    if not data.nuisances:
         gap, _ = residual(model, data, IDENTITY)
         return Fit(model, IDENTITY, _robust_weights(gap)[0])
-    frame = register_robustly(data.position, model.predict(data.q, data.loads).position)
+    frame = _first_placements(model, data)
     for _ in range(NUISANCE_ROUNDS):
         gap, poses = residual(model, data, frame)
         weights, scale = _robust_weights(gap)
         per_cell = per_cell_of(weights, scale, gap.shape[1])
-        columns = nuisance_columns(model, poses, gap.shape[1]) * per_cell[..., None]
-        step = np.linalg.lstsq(columns.reshape(-1, 9), (gap * per_cell).ravel(), rcond=RANK)[0]
+        columns = nuisance_columns(model, poses, gap.shape[1], data) * per_cell[..., None]
+        flat = columns.reshape(gap.size, -1)
+        step = np.linalg.lstsq(flat, (gap * per_cell).ravel(), rcond=RANK)[0]
         model, frame = moved(model, frame, step)
         if np.abs(step).max() < SETTLED:
             break
     return Fit(model, frame, weights)
+
+
+def placed_gap(model: Model, data: Data) -> Array:
+    """Return what a model leaves (N, 3 or 6) of one session whose frame is fitted on itself.
+
+    So is its tool point where it was remounted; nothing else of the model moves.
+    """
+    one = replace(data, session=np.zeros(len(data.q), dtype=np.int64), sessions=1)
+    frame = _first_placements(model, one)
+    free = slice(0, one.nuisances if one.remounted else 6 * one.frames)
+    for _ in range(NUISANCE_ROUNDS):
+        gap, poses = residual(model, one, frame)
+        weights, scale = _robust_weights(gap)
+        per_cell = per_cell_of(weights, scale, gap.shape[1])
+        columns = nuisance_columns(model, poses, gap.shape[1], one)[:, :, free]
+        flat = (columns * per_cell[..., None]).reshape(gap.size, -1)
+        if not flat.shape[1]:
+            return gap
+        step = np.zeros(one.nuisances)
+        step[free] = np.linalg.lstsq(flat, (gap * per_cell).ravel(), rcond=RANK)[0]
+        model, frame = moved(model, frame, step)
+        if np.abs(step).max() < SETTLED:
+            break
+    return residual(model, one, frame)[0]
+
+
+def _first_placements(model: Model, data: Data) -> Registration | Placements:
+    """Return the frame of each session as the rigid arm has it, outliers down-weighted."""
+    predicted = model.predict(data.q, data.loads).position
+    if data.session is None:
+        return register_robustly(data.position, predicted)
+    frames = [
+        register_robustly(data.position[rows], predicted[rows])
+        if not data.registered and rows.any() else IDENTITY
+        for rows in (data.session == s for s in range(data.sessions))
+    ]  # fmt: skip
+    return Placements(tuple(frames), (np.zeros(3),) * data.sessions)
 
 
 def fit_flexibilities(
@@ -160,13 +260,28 @@ def _round(now: Fit, data: Data, kept: Mask, prior: tuple[Array, float], nonnega
     weights, scale = _robust_weights(gap)
     width = gap.shape[1]
     per_cell = per_cell_of(weights, scale, width)
-    form = model.linear_form(data.q, data.loads).regressor[:, :width]
+    form = regressor(model, data, now.frame)[:, :width]
     A = (form * per_cell[..., None]).reshape(-1, 2 * n)
     b = (gap * per_cell).ravel()
     F = np.zeros((len(b), 0))
     if data.nuisances:
-        F = (nuisance_columns(model, poses, width) * per_cell[..., None]).reshape(len(b), -1)
+        F = nuisance_columns(model, poses, width, data) * per_cell[..., None]
+        F = F.reshape(len(b), -1)
     return stepped(now, (F, A, b), weights, kept, prior, nonnegative=nonnegative)
+
+
+def regressor(model: Model, data: Data, frame: Registration | Placements) -> Array:
+    """Return the linear form's columns (N, 6, 2n), each session with its own tool point."""
+    if not isinstance(frame, Placements):
+        return model.linear_form(data.q, data.loads).regressor
+    assert data.session is not None
+    columns = np.empty((len(data.q), 6, 2 * model.arm.n))
+    for s, shift in enumerate(frame.tool_shift):
+        rows = np.flatnonzero(data.session == s)
+        if len(rows):
+            own = shifted(model, shift)
+            columns[rows] = own.linear_form(data.q[rows], data.loads[rows]).regressor
+    return columns
 
 
 def stepped(
@@ -225,11 +340,26 @@ def solve(
     return found
 
 
-def moved(model: Model, frame: Registration, step: NDArray[Any]) -> tuple[Model, Registration]:
-    """Return model and frame after a step of the nuisances: frame (6,), tool point (3,)."""
-    tool = model.tool_in_flange.copy()
-    tool[:3, 3] += step[6:]
-    return replace(model, tool_in_flange=tool), frame.moved(step[:6])
+def moved(
+    model: Model, frame: Registration | Placements, step: NDArray[Any]
+) -> tuple[Model, Registration | Placements]:
+    """Return model and frames after a step of the nuisances: frame (6,), tool point (3,).
+
+    Of several sessions: all frames, then one tool point, or one each where they were remounted.
+    """
+    if not isinstance(frame, Placements):
+        return shifted(model, step[6:]), frame.moved(step[:6])
+    count = len(frame.frames)
+    tools = len(step) - 6 * count if len(step) >= 6 * count else len(step)
+    turns, tool_steps = step[: len(step) - tools], step[len(step) - tools :].reshape(-1, 3)
+    frames = frame.frames
+    if len(turns):
+        pieces = turns.reshape(count, 6)
+        frames = tuple(f.moved(p) for f, p in zip(frames, pieces, strict=True))
+    if len(tool_steps) == 1:
+        return shifted(model, tool_steps[0]), replace(frame, frames=frames)
+    shifts = tuple(a + b for a, b in zip(frame.tool_shift, tool_steps, strict=True))
+    return model, Placements(frames, shifts)
 
 
 def per_cell_of(weights: Array, scale: Array, width: int) -> Array:

@@ -8,30 +8,34 @@ luck: what the data do not show stays at the model's value and is named (base_pa
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.effects.effect import typical_moment
-from core.errors import ExcitationError
+from core.errors import ExcitationError, LogError
 from core.estimation import base_parameters
 from core.estimation.compliance_fit import (
     Data,
     Fit,
     Mask,
+    Placements,
     fit_flexibilities,
     fit_nuisances,
     flexibilities,
     nuisance_columns,
     orthonormal,
+    placed_gap,
     residual,
 )
+from core.estimation.regions import joint_regions
 from core.estimation.registration import Registration
 from core.log.log import Log
 from core.metrology import Metrology
 from core.model import Model
 from core.rotation import rotation_matrix
+from core.sessions import session_of
 
 Array = NDArray[np.float64]
 FOLDS = 5
@@ -55,7 +59,7 @@ class Identification:
     covariance: Array  # (2n, 2n), axial then radial, of those shown with the others held
     identifiable: Mask  # (2n,): shown by the data; the others stand at the model's value
     combinations: tuple[str, ...]  # what the data cannot tell apart or do not show
-    registration: Registration
+    registration: Registration | Placements  # one frame, or one a session
     tool_offset: Array  # (3,) m, flange axes: found tool point minus the cell's; 0 if registered
     samples: int
     gap_rms: float  # m, before
@@ -64,6 +68,8 @@ class Identification:
     remaining_rms_held_out: float  # m, after, on the same poses
     outliers: NDArray[np.int64]  # rows weighed down as wild
     notes: tuple[str, ...]
+    remaining_rms_new_region: float = UNSEEN  # m, folds are regions of joint space
+    remaining_rms_new_session: float = UNSEEN  # m, folds are sessions
 
 
 @dataclass(frozen=True)
@@ -122,7 +128,12 @@ def identify_compliance(
     tell("checking on held-out poses")
     calm = fit.weights > 1e-6
     held_out = _held_out(model, data, task, calm)
-    return _result(model, data, used, (before, fit), shown, held_out)
+    found = _result(model, data, used, (before, fit), shown, held_out)
+    return replace(
+        found,
+        remaining_rms_new_region=_in_new_regions(model, data, task, calm),
+        remaining_rms_new_session=_in_new_sessions(model, data, task, calm),
+    )
 
 
 def data_of(log: Log, metrology: Metrology) -> tuple[Data, NDArray[np.int64]]:
@@ -139,7 +150,26 @@ def data_of(log: Log, metrology: Metrology) -> tuple[Data, NDArray[np.int64]]:
     used = np.flatnonzero(good)
     matrix = None if rotation is None else rotation_matrix(rotation[used])
     loads = log.loads()[used]
-    return Data(q[used], loads, measured[used], matrix, metrology.registered), used
+    data = Data(q[used], loads, measured[used], matrix, metrology.registered)
+    count = max(len(log.session_names), 1)
+    if count > 1 or metrology.remounted:
+        session = session_of(log)[used]
+        _check_sessions(log, session, metrology)
+        data = replace(data, session=session, sessions=count, remounted=metrology.remounted)
+    return data, used
+
+
+def _check_sessions(log: Log, session: NDArray[np.int64], metrology: Metrology) -> None:
+    """Raise LogError where a session has too few poses for what is free in it."""
+    free = (0 if metrology.registered else 6) + (3 if metrology.remounted else 0)
+    for s, name in enumerate(log.session_names):
+        found = int((session == s).sum())
+        if 3 * found < free + 3:
+            raise LogError(
+                f"{log.path}: session {name}: found {found} measured pose(s), expected at least "
+                f"{-(-(free + 3) // 3)}: its frame{' and tool point' if free > 6 else ''} are "
+                "fitted on them"
+            )
 
 
 def require_excitation(model: Model, data: Data, metrology: Metrology, usual: float) -> None:
@@ -154,7 +184,7 @@ def require_excitation(model: Model, data: Data, metrology: Metrology, usual: fl
     form = model.linear_form(data.q, data.loads).regressor[:, :3].reshape(-1, 2 * n)
     if data.nuisances:
         poses = model.predict(data.q, data.loads)
-        Q = orthonormal(nuisance_columns(model, poses, 3).reshape(len(form), -1))
+        Q = orthonormal(nuisance_columns(model, poses, 3, data).reshape(len(form), -1))
         form = form - Q @ (Q.T @ form)
     shown = np.linalg.norm(form, axis=0) * usual
     if not (shown > 3 * metrology.sigma).any():
@@ -205,6 +235,43 @@ def _held_out(model: Model, data: Data, task: _Task, calm: Mask) -> tuple[float,
     return _rms(np.vstack(left[0])), _rms(np.vstack(left[1]))
 
 
+def _in_new_regions(model: Model, data: Data, task: _Task, calm: Mask) -> float:
+    """Return the rms over calm rows of regions of joint space left out; nan: too few poses."""
+    if len(np.unique(np.round(data.q, 3), axis=0)) < 2 * FOLDS:
+        return UNSEEN
+    fold, left = joint_regions(data.q, FOLDS), []
+    for k in range(int(fold.max()) + 1):
+        seen, judged = data.part(fold != k), (fold == k) & calm
+        if data.session is not None and seen.session is not None:
+            judged &= np.isin(data.session, _placed_sessions(seen))
+        if not judged.any() or 3 * len(seen.q) <= data.nuisances + 2:
+            continue
+        fit = task.run(fit_nuisances(model, seen), seen)[0]
+        left.append(residual(fit.model, data.part(judged), fit.frame)[0][:, :3])
+    return _rms(np.vstack(left)) if len(left) > 1 else UNSEEN
+
+
+def _placed_sessions(data: Data) -> list[int]:
+    """Return the sessions with enough poses for a frame and a tool point of their own."""
+    assert data.session is not None
+    return [s for s in range(data.sessions) if 3 * int((data.session == s).sum()) >= 12]
+
+
+def _in_new_sessions(model: Model, data: Data, task: _Task, calm: Mask) -> float:
+    """Return the rms over calm rows of sessions left out, each placed on itself; nan: only one."""
+    if data.session is None or data.sessions < 2:
+        return UNSEEN
+    left = []
+    for s in range(data.sessions):
+        rest, own = data.session != s, (data.session == s) & calm
+        if not (rest.any() and own.any()):
+            continue
+        others = data.part(rest)
+        fit = task.run(fit_nuisances(model, others), others)[0]
+        left.append(placed_gap(fit.model, data.part(own))[:, :3])
+    return _rms(np.vstack(left)) if left else UNSEEN
+
+
 def _rms(gap: Array, spent: int = 0) -> float:
     """Return the rms of one coordinate of (N, 3) for ``spent`` fitted numbers."""
     return float(np.sqrt(np.sum(gap**2) / max(gap.size - spent, 1)))
@@ -239,6 +306,8 @@ def notes_of(fit: Fit, kept: Mask, wild: int, nuisances: int) -> list[str]:
         notes.append(f"at their bound of zero: {names}")
     if not kept.any():
         notes.append("these data show no flexibility at all: the model is left as it was")
-    if nuisances:
+    if isinstance(fit.frame, Placements) and len(fit.frame.frames) > 1:
+        notes.append("each session has a frame of its own, not written to the cell")
+    elif nuisances:
         notes.append("frame and tool point were estimated along and are not written to the cell")
     return notes

@@ -1,8 +1,8 @@
 """The compiled hot path: one bending chain, one row or many, no Python objects inside.
 
-Everything a model knows is brought into the two records below (core.situation fills them); the
-functions then solve the deflected shape, its Jacobian and its linear form. Conventions: CONTRACT,
-"Where things act". Lists of buffers instead of results, so that one row needs no allocation.
+Everything a model knows is brought into the two records below (core/model.py fills them); the
+functions then solve the deflected shape, its Jacobian and its linear form: eqs. 1 to 4 of
+docs/conventions.md. Lists of buffers instead of results, so that one row needs no allocation.
 """
 
 from __future__ import annotations
@@ -292,9 +292,9 @@ def jacobian(shape, J):  # type: ignore[no-untyped-def]
 def regressor_rows(chain, rows, A, jacobians, moments):  # type: ignore[no-untyped-def]
     """Write d pose / d flexibility (N, 6, 2n) at the shape the chain has: axial, then radial.
 
-    The paper's eqs. 18, 33, 35 with orientation beside position: column i is z_i M_z,i turned
-    about joint i, column n+i the radial moment likewise. Also the Jacobians (N, 6, n) and joint
-    moments (N, n, 3), base axes. Returns the first row without equilibrium, or -1.
+    Eqs. 3 and 4 of docs/conventions.md: column i is z_i M_z,i turned about joint i, column
+    n+i the radial moment likewise. Also the Jacobians (N, 6, n) and joint moments (N, n, 3), base
+    axes. Returns the first row without equilibrium, or -1.
     """
     n = chain.mass.shape[0]
     shape = Shape(

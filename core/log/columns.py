@@ -1,6 +1,6 @@
 """The columns of a log: their names, how many belong together, and which one a misspelt one means.
 
-Names are RTDE's (CONTRACT, "The log").
+Names are RTDE's.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Sequence
 # name -> number of columns: 0 = one column without index, None = one per joint
 COLUMNS: dict[str, int | None] = {
     "timestamp": 0,
+    "session": 0,
     "target_q": None,
     "actual_q": None,
     "actual_qd": None,
@@ -27,7 +28,7 @@ COLUMNS: dict[str, int | None] = {
 }
 INDEXED = re.compile(r"(.+)_(\d+)$")
 ALIKE = 0.85  # likeness of two names from which one may be the other misspelt
-# RTDE fields that look like the contract's and are none of them: never a slip of the pen
+# RTDE fields that look like a log's columns and are none of them: never a slip of the pen
 OTHERS = {
     "target_qd", "target_qdd", "target_moment", "target_current", "target_TCP_pose",
     "target_TCP_speed", "actual_current", "actual_current_window", "actual_TCP_pose",
@@ -36,7 +37,7 @@ OTHERS = {
 
 
 def is_known(name: str) -> bool:
-    """Return whether the contract names a column, index included."""
+    """Return whether a log may hold a column, index included."""
     match = INDEXED.match(name)
     return COLUMNS.get(name) == 0 or bool(match and COLUMNS.get(match[1], 0) != 0)
 

@@ -1,4 +1,4 @@
-"""Logs: what was measured, in RTDE's column names (CONTRACT, "The log").
+"""Logs: what was measured, in RTDE's column names.
 
 Reading checks shape and numbers and names row and column of what is wrong; what a channel needs is
 asked for when it is used. CSV goes through numpy, Parquet through pyarrow.
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import LogError
+from core.files import is_file, is_given, read_bytes, read_text
 from core.loads import Loads
 from core.log.columns import COLUMNS, INDEXED, is_known, misspelt, nearest, written
 
@@ -23,14 +24,17 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Log:
-    """One log: ``columns`` holds (N,) or (N, k) arrays by contract name; NaN: an empty cell."""
+    """One log: ``columns`` holds (N,) or (N, k) arrays by column name; NaN: an empty cell."""
 
     path: str
     columns: Mapping[str, Array]
     n: int  # joints
     first_row: int = 2  # line of the first data row in the file, for messages
     lines: NDArray[np.int64] | None = None  # (N,) line of each row; None: one after the other
-    unknown: tuple[str, ...] = ()  # names of the file's columns that the contract does not name
+    unknown: tuple[str, ...] = ()  # names of the file's columns that no channel reads
+    session_names: tuple[str, ...] = ()  # of several sessions; column session holds their index
+    numbers: NDArray[np.int64] | None = None  # (N,) of the rows of several sessions, from 1
+    one_clock: bool = True  # False: timestamps of later sessions were shifted behind the first's
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
@@ -97,6 +101,8 @@ class Log:
         """Return when each row was taken (N,): s of ``timestamp``, else the row's number from 1."""
         if self.has("timestamp"):
             return self.require("timestamp")
+        if self.numbers is not None:
+            return np.asarray(self.numbers, dtype=float)
         lines = np.arange(len(self)) + self.first_row if self.lines is None else self.lines
         return np.asarray(lines - self.first_row + 1, dtype=float)
 
@@ -117,7 +123,8 @@ class Log:
         """Return the log of some of the rows; each keeps the line that it had in the file."""
         lines = np.arange(len(self)) + self.first_row if self.lines is None else self.lines
         columns = {name: values[rows] for name, values in self.columns.items()}
-        return replace(self, columns=columns, lines=lines[rows])
+        numbers = None if self.numbers is None else self.numbers[rows]
+        return replace(self, columns=columns, lines=lines[rows], numbers=numbers)
 
 
 def last_motion(q: Array, dead_band: float = 1e-6) -> Array:
@@ -137,7 +144,7 @@ def read_log(path: Path | str, n: int) -> Log:
     ragged, a cell is no number, a vector has a gap in its indices or is not of its length.
     """
     path = Path(path)
-    if not path.is_file():
+    if not is_file(path):
         raise LogError(f"{path}: file not found, expected a CSV or Parquet log")
     if path.suffix.lower() in (".parquet", ".pq"):
         names, table = _read_parquet(path)
@@ -147,7 +154,7 @@ def read_log(path: Path | str, n: int) -> Log:
         raise LogError(f"{path}: found no data rows, expected at least one")
     columns = table_columns(path, [name for name in names if is_known(name)], table, n)
     if not columns:
-        raise LogError(f"{path}: columns: found none that the contract names{nearest(names)}")
+        raise LogError(f"{path}: columns: found none that a log may hold{nearest(names)}")
     unknown = tuple(name for name in names if not is_known(name))
     return Log(str(path), columns, n, unknown=unknown)
 
@@ -159,7 +166,7 @@ def _wanted(names: Sequence[str]) -> list[int]:
 def _read_csv(path: Path) -> tuple[list[str], Array]:
     """Return the names of all columns, and those that are known (rows, known columns)."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path, "utf-8-sig")
     except UnicodeDecodeError:
         raise LogError(f"{path}: found bytes that are no text, expected CSV (UTF-8)") from None
     lines = text.splitlines()
@@ -215,9 +222,10 @@ def _read_parquet(path: Path) -> tuple[list[str], Array]:
     from pyarrow import parquet
 
     try:
-        names = list(parquet.read_schema(path).names)
+        data = pyarrow.BufferReader(read_bytes(path)) if is_given() else path
+        names = list(parquet.read_schema(data).names)
         wanted = [names[i] for i in _wanted(names)]
-        frame = parquet.read_table(path, columns=wanted)
+        frame = parquet.read_table(data, columns=wanted)
         for name in wanted:
             kind = frame.schema.field(name).type
             types = pyarrow.types
@@ -234,7 +242,7 @@ def _read_parquet(path: Path) -> tuple[list[str], Array]:
 
 
 def table_columns(path: Path, names: Sequence[str], table: Array, n: int) -> dict[str, Array]:
-    """Return columns (N,) or (N, k) of a table (N, names), grouped by contract name.
+    """Return columns (N,) or (N, k) of a table (N, names), grouped by name.
 
     Raises LogError where a vector has a gap in its indices, or not its length.
     """

@@ -67,6 +67,12 @@ class CanSettings(DriverSettings, BusSettings):
         """Return the file of the map."""
         return Path(self.profile) if self.names_file else SHIPPED / f"{self.profile}.yaml"
 
+    def read_files(self) -> None:
+        """Read profile and DBC; see DriverSettings."""
+        from drivers.can.loading import read_profile
+
+        read_profile(self.profile_path, self.installation)
+
     def located(self, folder: Path) -> Self:
         """Return the settings with the profile's path seen from ``folder``; see DriverSettings."""
         if self.names_file:

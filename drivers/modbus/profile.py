@@ -16,7 +16,7 @@ from drivers.modbus.schema import Condition, Order, Place, ProfileFile, Turns, V
 from drivers.profile_file import ProfileDocument, ProfileError, read_profile_document
 
 Keys = tuple[str | int, ...]
-MAILBOX_WORDS, ECHO_WORDS = 9, 8
+MAILBOX_WORDS, ECHO_WORDS = 11, 8
 KINDS = {
     "position": "angle", "velocity": "speed", "target": "angle", "joint_torque": "torque",
     "temperature": "temperature", "force": "force", "moment": "torque",

@@ -128,7 +128,7 @@ UNUSABLE = {
                         "column measured_position_2: not found, expected 3"),
     "double vector": (table([*JOINTS, "actual_q_3"], [[1] * 7]), "actual_q_3: found twice"),
     "double scalar": (table(["payload", "payload"], [[1, 2]]), "column payload: found twice"),
-    "nothing known": (table(["x", "y"], [[1, 2]]), "found none that the contract names"),
+    "nothing known": (table(["x", "y"], [[1, 2]]), "found none that a log may hold"),
     "misspelt": (table(["mesured_position_0"], [[1]]),
                  "found 'mesured_position_0', did you mean 'measured_position'?"),
 }  # fmt: skip

@@ -11,7 +11,7 @@ from core.calibration.readings import Readings
 
 
 def write_log(readings: Readings, registered: bool, path: Path) -> None:
-    """Write readings in the contract's columns; those that an instrument did not give are left out.
+    """Write readings in a log's columns; those that an instrument did not give are left out.
 
     A log has one frame: of an instrument that was moved, rows of its first place alone are written.
     """

@@ -5,18 +5,20 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.channels.observation import HELD
+from core.derivatives import signal_noise
+from core.diagnosis.observation import HELD
 from core.estimation.identification import pose_groups
 from core.log.log import Log
 from core.motion import Motion
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-MOST_SAMPLES = 3000  # rows diagnosed of a long log, evenly picked
+MOST_SAMPLES = 30_000  # rows judged of a long log, evenly picked: what memory holds
 STRETCHES = 24  # conditions of a recording: even stretches of time
 FEWEST_CONDITIONS = 5
 SMALLEST_TORQUE = 1e-3  # Nm
 HARDLY = 1e-3  # share of the largest held torque by which one has to change to count
+REPEATED = 0.5  # distinct values over samples below which a signal comes in steps
 VARIES = 1e-9  # spread below which a quantity counts as constant
 
 
@@ -34,8 +36,8 @@ def conditions(motion: Motion) -> Index:
     Where the log holds fewer than five poses, another load counts as another condition.
     """
     if motion.moving:
-        span = max(float(motion.t[-1] - motion.t[0]), 1e-9)
-        number = (motion.t - motion.t[0]) / span * STRETCHES
+        t = motion.recorded_time
+        number = t / max(float(t[-1]), 1e-9) * STRETCHES
         return np.asarray(np.minimum(number.astype(np.int64), STRETCHES - 1))
     loads = motion.loads
     groups = pose_groups(motion.q)
@@ -58,7 +60,7 @@ def quantities(log: Log, motion: Motion) -> dict[str, Array]:
         "actual_q" if log.has("actual_q") else "target_q": motion.q,
         "actual_qd": motion.qd,
     }
-    for name in ("payload", "payload_cog", "joint_temperatures", "actual_TCP_force"):
+    for name in ("session", "payload", "payload_cog", "joint_temperatures", "actual_TCP_force"):
         column = log.get(name)
         columns[name] = None if column is None else column[motion.rows]
     for name, values in columns.items():
@@ -80,6 +82,30 @@ def held_torques(motion: Motion) -> dict[str, Array]:
         f"{HELD}_{i}": motion.held[:, i]
         for i in np.flatnonzero(np.ptp(motion.held, axis=0) > HARDLY * largest)
     }
+
+
+def instrument_noise(signal: Array, motion: Motion) -> Array | None:
+    """Return 1 sigma (k,) of a recorded signal (N, k) by differences of neighbouring samples.
+
+    Not less than its resolution makes (a step over the root of 12). None for poses at rest, whose
+    neighbours in the log have nothing in common.
+    """
+    if not motion.moving:
+        return None
+    whole = np.isfinite(signal).all(axis=1)
+    step = signal_step(signal[whole])
+    return np.maximum(signal_noise(signal[whole]), step / np.sqrt(12))
+
+
+def signal_step(signal: Array) -> Array:
+    """Return the step (k,) in which each signal (N, k) is reported; 0 where it has none."""
+    steps = np.zeros(signal.shape[1])
+    for j, values in enumerate(signal.T):
+        distinct = np.unique(values)
+        # a continuous signal repeats no value; a stepped one has far fewer values than samples
+        if 2 < len(distinct) < REPEATED * len(values):
+            steps[j] = float(np.diff(distinct).min())
+    return steps
 
 
 def joint_axes(n: int) -> tuple[str, ...]:

@@ -7,8 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.channels.observation import NotObservable, Observation
-from core.diagnosis.channels.recording import conditions, joint_axes, own_joints, picked, quantities
+from core.diagnosis.channels.recording import (
+    conditions,
+    instrument_noise,
+    joint_axes,
+    own_joints,
+    picked,
+    quantities,
+)
+from core.diagnosis.observation import NotObservable, Observation
 from core.diagnosis.selection.unnamed import unnamed_pulls
 from core.dynamics import predict_torque, with_pieces
 from core.effects import Term
@@ -16,6 +23,7 @@ from core.log.log import Log
 from core.metrology import Metrology
 from core.model import Model
 from core.motion import Motion, motion_of
+from core.sessions import session_of
 
 Array = NDArray[np.float64]
 ENOUGH = 0.4  # share of rows that must remain for rests to be left out too
@@ -27,7 +35,7 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
 
     Rows without derivatives (edges, gaps), with a torque that is not finite, or in which a joint
     turns round, so that nobody knows the sign of its friction, are left out; of long logs at most
-    3000 rows are taken, evenly, after the derivatives. An arm whose links have no mass has no
+    30,000 rows are taken, evenly, after the derivatives. An arm whose links have no mass has no
     torques to compare with. Raises LogError where the log holds something unusable.
     """
     measured = log.get("actual_current_as_torque")
@@ -39,6 +47,13 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     rows = picked(whole.valid & finite & _steady(whole))
     if not len(rows):
         return NotObservable("torque", ("actual_current_as_torque",))
+    return _observed(model, log, measured, whole, rows)
+
+
+def _observed(
+    model: Model, log: Log, measured: Array, whole: Motion, rows: NDArray[np.int64]
+) -> Observation:
+    """Return the channel at some rows of the motion."""
     motion = with_pieces(model, whole.pick(rows))
 
     def predict(terms: Sequence[Term]) -> Array:
@@ -62,6 +77,9 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
         order_in_time=motion.moving,
         friction=motion.direction if motion.moving else None,
         unnamed=lambda: unnamed_pulls(model, motion, "torque"),
+        instrument=instrument_noise(measured[whole.rows], whole),
+        fewer=lambda take: _observed(model, log, measured, whole, rows[take]),
+        session=session_of(log)[motion.rows] if log.session_names else None,
     )
 
 

@@ -8,22 +8,24 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.channels.observation import NotObservable, Observation, Predict
 from core.diagnosis.channels.recording import (
     Index,
     conditions,
     held_torques,
+    instrument_noise,
     joint_axes,
     own_joints,
     picked,
     quantities,
 )
+from core.diagnosis.observation import NotObservable, Observation, Predict
 from core.dynamics import predict_tracking, with_held
 from core.effects import Term
 from core.log.log import Log
 from core.metrology import Metrology
 from core.model import Model
 from core.motion import Motion, motion_of
+from core.sessions import session_of
 
 Array = NDArray[np.float64]
 SHORTEST_LEAD = 0.1  # s left out at the start of each stretch, whose past is unknown
@@ -35,7 +37,7 @@ LEADS = 4.0  # times the delay: what is left out where it is longer
 def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotObservable:
     """Return the tracking channel of a log (rad, one coordinate a joint), or what it lacks.
 
-    Delays are predicted on every row; of long logs at most 3000 rows are compared, evenly. The
+    Delays are predicted on every row; of long logs at most 30,000 rows are compared, evenly. The
     start of each stretch is left out, because the commands before it are unknown. ``sigma`` is the
     encoder's step over the root of 12. Raises LogError where the log holds something unusable.
     """
@@ -43,9 +45,14 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     if needs:
         return NotObservable("tracking", needs)
     motion = with_held(model, motion_of(log))
-    rows = picked(_known_past(motion))
+    return _observed(model, log, motion, picked(_known_past(motion)))
+
+
+def _observed(model: Model, log: Log, motion: Motion, rows: Index) -> Observation:
+    """Return the channel at some rows of the motion."""
     part = motion.pick(rows)
-    n = model.arm.n
+    n, target = model.arm.n, motion.target_q
+    assert target is not None
     return Observation(
         channel="tracking",
         unit="rad",
@@ -61,6 +68,9 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
         axes=joint_axes(n),
         joint_columns=own_joints(len(part), n),
         order_in_time=motion.moving,
+        instrument=instrument_noise(motion.q - target, motion),
+        fewer=lambda take: _observed(model, log, motion, rows[take]),
+        session=session_of(log)[part.rows] if log.session_names else None,
     )
 
 

@@ -8,8 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.derivatives import signal_noise
-from core.diagnosis.channels.observation import NotObservable, Observation
-from core.diagnosis.channels.recording import VARIES, conditions, picked, quantities
+from core.diagnosis.channels.recording import (
+    VARIES,
+    conditions,
+    instrument_noise,
+    picked,
+    quantities,
+)
+from core.diagnosis.observation import NotObservable, Observation
 from core.diagnosis.selection.unnamed import unnamed_pulls
 from core.dynamics import predict_wrench, with_pieces
 from core.effects import Term
@@ -17,6 +23,7 @@ from core.log.log import Log
 from core.metrology import Metrology
 from core.model import Model
 from core.motion import Motion, motion_of
+from core.sessions import session_of
 
 Array = NDArray[np.float64]
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -28,7 +35,7 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     """Return the wrench channel of a log (N), or what it lacks.
 
     Torques are weighed by the ratio of the noise of forces to that of torques. Rows without
-    derivatives and rows whose wrench is not finite are left out; of long logs at most 3000 rows
+    derivatives and rows whose wrench is not finite are left out; of long logs at most 30,000 rows
     are taken, evenly, after the derivatives. Raises LogError where the log holds something
     unusable.
     """
@@ -42,6 +49,13 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     rows = picked(whole.valid & np.isfinite(measured[whole.rows]).all(axis=1))
     if not len(rows):
         return NotObservable("wrench", ("ft_raw_wrench",))
+    return _observed(model, log, measured, whole, rows)
+
+
+def _observed(
+    model: Model, log: Log, measured: Array, whole: Motion, rows: NDArray[np.int64]
+) -> Observation:
+    """Return the channel at some rows of the motion."""
     motion = with_pieces(model, whole.pick(rows))
     value = measured[motion.rows]
 
@@ -65,6 +79,9 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
         axes=AXES,
         order_in_time=motion.moving,
         unnamed=lambda: unnamed_pulls(model, motion, "wrench"),
+        instrument=instrument_noise(measured[whole.rows], whole),
+        fewer=lambda take: _observed(model, log, measured, whole, rows[take]),
+        session=session_of(log)[motion.rows] if log.session_names else None,
     )
 
 

@@ -1,7 +1,8 @@
 """Forces of the wrong sign or in the wrong axes, suspected by name.
 
 An arm gives way in the direction of a pull, and a sensor reads it: where the data agree much better
-with the pull turned round, or taken in tool axes, the column does not mean what the contract says.
+with the pull turned round, or taken in tool axes, the column does not mean what a log's does
+(docs/conventions.md).
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ def _loads(log: Log, rows: Index, pull: Array | None) -> Loads:
 
 
 def _variants(model: Model, q: Array, pull: Array) -> dict[str, Array]:
-    """Return what the pull may mean: a name for each, '' for what the contract says."""
+    """Return what the pull may mean: a name for each, '' for what the column says."""
     hand = model.rigid_pose(q).rotation
     turned = np.hstack([(hand @ part[..., None])[..., 0] for part in (pull[:, :3], pull[:, 3:])])
     return {

@@ -31,7 +31,7 @@ FEW_POSES = 15
 
 
 def check_units(model: Model, log: Log) -> None:
-    """Raise LogError where a column's values can only be of another unit than the contract's.
+    """Raise LogError where a column's values can only be of another unit than a log's.
 
     Joints or rotations in degrees, positions or centres of gravity in millimetres, payloads in
     grams, temperatures in kelvin. An endless angle is no degrees: it is told as such, with its row.
@@ -135,7 +135,7 @@ def findings(log: Log, model: Model | None = None, metrology: Metrology | None =
 
 
 def _names(log: Log) -> list[str]:
-    """Return columns that nobody reads but whose name nearly is one of the contract's."""
+    """Return columns that nobody reads but whose name nearly is one of a log's."""
     told = []
     lacking = [name for name in COLUMNS if not log.has(name)]
     for unknown in log.unknown:

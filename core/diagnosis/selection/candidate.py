@@ -1,7 +1,7 @@
 """Candidates: everything that may stand behind a gap, each with its columns.
 
 A *named* candidate is an effect of the catalogue at one site; a *smooth* one is an unnamed function
-of one quantity (CONTRACT: what wins there is ``unexplained``). Columns are derivatives of the
+of one quantity (what wins there is ``unexplained``). Columns are derivatives of the
 channel's whole prediction, by central differences, at the model found so far.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arm import Arm
-from core.diagnosis.channels.observation import HELD, Observation
+from core.diagnosis.observation import HELD, Observation
 from core.effects import CATALOGUE, Effect, Parameter, Site, Term
 from core.errors import InputError
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.channels.observation import Observation
+from core.diagnosis.observation import Observation
 
 Array = NDArray[np.float64]
 LARGE = 150  # samples from which every coordinate is taken to scatter alike
@@ -77,6 +77,11 @@ def estimate_noise(
                     options={"maxiter": 80 * len(start), "xatol": 0.02, "fatol": 0.05})  # fmt: skip
     variance = np.exp(2 * np.clip(best.x, -60, 20))
     return _noise(observation, block, _floored(variance[:count], known), float(variance[-1]))
+
+
+def carried_to(observation: Observation, noise: Noise) -> Noise:
+    """Return the same noise, as estimated on other samples, for the samples of an observation."""
+    return _noise(observation, blocks(observation), noise.block_sigma**2, noise.joint_sigma**2)
 
 
 def _floored(variance: Array, known: float) -> Array:

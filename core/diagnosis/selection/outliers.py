@@ -51,6 +51,19 @@ def look_for_wild(work: Work, columns: list[Array]) -> None:
     work.kept = _keep(work, r)
 
 
+def inliers(work: Work, residual: Array) -> NDArray[np.bool_]:
+    """Return the samples (N,) that are no outliers of a residual (N, k), the nuisance refitted."""
+    nuisance = work.observation.nuisance
+    if nuisance.shape[2]:
+        W = work.noise.whitener
+        A, b = (W @ nuisance).reshape(-1, nuisance.shape[2]), (W @ residual[..., None]).ravel()
+        white = (W @ residual[..., None])[..., 0]
+        size = np.sqrt(np.mean(white**2, axis=1))
+        row = np.repeat(size < WILD_SIGMA * np.median(size), residual.shape[1])
+        residual = residual - nuisance @ np.linalg.lstsq(A[row], b[row], rcond=1e-12)[0]
+    return _keep(work, residual)
+
+
 def _distance(work: Work, residual: Array) -> Array:
     """Return how many standard deviations (rms over coordinates) each sample is off (N,)."""
     white = (work.noise.whitener @ residual[..., None])[..., 0]

@@ -7,8 +7,10 @@ to the robot's own motion through the inverse kinematics of the nominal arm. Reg
 input_double_register_18   offset x, m; 19 y, 20 z, 21 rotation vector x (rad), 22 y
 input_int_register_18      rotation vector z in 1e-9 rad
 input_int_register_19      sequence number
-input_int_register_20      checksum: sum of round(1e9 v) over the six, plus 31 sequence, mod 2^31
+input_int_register_20      checksum: sum of round(1e9 v) over the six, plus register 22, plus 31
+                           sequence, mod 2^31
 input_int_register_21      heartbeat: any change
+input_int_register_22      rates: 65536 times m/s in 4e-5, plus rad/s in 1e-4
 output_int_register_12     sequence of the last offset that was accepted
 output_int_register_13     1 running, 2 watchdog expired (ramping to zero), 3 bad checksum
 output_double_register_12  applied offset: 12 to 17, x, y, z, rotation vector
@@ -29,17 +31,18 @@ from drivers.simulated.ur.controller import CYCLE, Controller, ScriptError, Step
 NAME = "gapbridge_offset"
 RUNNING, EXPIRED, REJECTED = 1, 2, 3
 HEARTBEAT_LIMIT = 0.2  # s without a change
-SHIFT_STEP = 1.0e-4  # m per cycle
-TURN_STEP = 2.0e-4  # rad per cycle
+SHIFT_STEP = 1.0e-4  # m per cycle, at most
+TURN_STEP = 2.0e-4  # rad per cycle, at most
+RATE_UNITS = 4.0e-5, 1.0e-4  # m/s and rad/s per count
 
 NOTHING: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 _DOUBLES = tuple(f"input_double_register_{i}" for i in range(18, 23))
 _APPLIED = tuple(f"output_double_register_{i}" for i in range(12, 18))
 
 
-def checksum(offset: Sequence[float], sequence: int) -> int:
-    """Return the checksum of an offset (m, rad) with its sequence number."""
-    return (sum(round(v * 1e9) for v in offset) + 31 * sequence) % 2**31
+def checksum(offset: Sequence[float], sequence: int, rates: int) -> int:
+    """Return the checksum of an offset (m, rad) with its sequence number and rates."""
+    return (sum(round(v * 1e9) for v in offset) + rates + 31 * sequence) % 2**31
 
 
 class OffsetMotion:
@@ -95,6 +98,7 @@ class OffsetRegisters:
     def __init__(self, memory: dict[str, Any]) -> None:
         self._memory = memory
         self.wanted: Vector6 = NOTHING
+        self.steps = (SHIFT_STEP, TURN_STEP)  # m, rad: of one cycle
         self._sequence = int(memory["input_int_register_19"])
         self._heartbeat = memory["input_int_register_21"]
         self._silent = 0.0
@@ -120,17 +124,22 @@ class OffsetRegisters:
         x, y, z, rx, ry = (float(memory[name]) for name in _DOUBLES)
         offset: Vector6 = (x, y, z, rx, ry, memory["input_int_register_18"] * 1e-9)
         fits = all(map(math.isfinite, offset))
-        fits = fits and checksum(offset, sequence) == memory["input_int_register_20"]
+        rates = int(memory["input_int_register_22"])
+        fits = fits and checksum(offset, sequence, rates) == memory["input_int_register_20"]
         self._rejected = not fits
         if fits:
+            self.steps = (
+                min(CYCLE * RATE_UNITS[0] * (rates // 65536), SHIFT_STEP),
+                min(CYCLE * RATE_UNITS[1] * (rates % 65536), TURN_STEP),
+            )
             self._sequence, self.wanted = sequence, offset
             self._memory["output_int_register_12"] = sequence
 
 
-def approach(now: Vector6, wanted: Vector6) -> Vector6:
-    """Return `now` moved towards `wanted` by at most one cycle's step."""
+def approach(now: Vector6, wanted: Vector6, steps: tuple[float, float]) -> Vector6:
+    """Return `now` moved towards `wanted` by at most one cycle's steps, m and rad."""
     parts: list[float] = []
-    for first, most in ((0, SHIFT_STEP), (3, TURN_STEP)):
+    for first, most in zip((0, 3), steps, strict=True):
         here, goal = list(now[first : first + 3]), list(wanted[first : first + 3])
         length = math.dist(here, goal)
         share = 1.0 if length <= most else most / length
@@ -149,7 +158,7 @@ def offset_program(controller: Controller) -> Steps:
     try:
         while True:
             state = registers.cycle(CYCLE)
-            motion.applied = approach(motion.applied, registers.wanted)
+            motion.applied = approach(motion.applied, registers.wanted, registers.steps)
             memory["output_int_register_13"] = state
             memory.update(zip(_APPLIED, motion.applied, strict=True))
             yield

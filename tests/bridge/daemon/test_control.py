@@ -15,10 +15,12 @@ from typing import Any
 import pytest
 from daemon_cell import Robot, Run, gapbridge, wait_for
 
+from bridge.cell.runtime_folder import cell_key, runtime_folder
+from bridge.daemon import control
 from bridge.ipc import control_socket
 from bridge.ipc.control_client import ask, ask_socket, running
 from bridge.ipc.control_socket import ControlSocket, Peer
-from bridge.ipc.runtime_folder import cell_key, runtime_folder
+from bridge.ipc.shared_memory import Phase
 from bridge.loop.supervisor import State
 from core.errors import InputError, RunError
 
@@ -234,3 +236,60 @@ def test_the_same_cell_has_the_same_name_from_everywhere(
     monkeypatch.chdir(tmp_path)
     assert cell_key(Path("cell.yaml")) == cell_key(tmp_path / "cell.yaml")
     assert cell_key(tmp_path / "cell.yaml") != cell_key(tmp_path / "a" / "cell.yaml")
+
+
+def test_a_disarming_between_two_loops_is_kept_and_answered_by_the_next(robot: Robot) -> None:
+    cell = robot.cell(PATIENT)
+    with Run(cell, arm=True) as run:
+        run.wait(State.COMPENSATING, 60.0)
+        robot.bench("protective_stop")
+        run.wait(State.FAULT, 5.0)
+        robot.bench("unlock")
+        pid = run.daemon.loop_pid
+        assert pid is not None
+        os.kill(pid, 9)
+        run.wait(State.DISCONNECTED, 5.0)
+        assert run.daemon.latched
+        taken = run.daemon.taken
+        assert "acknowledged" in ask(cell, "disarm")  # by a person, while no loop is there
+        assert run.daemon.taken > taken
+        run.wait(State.OBSERVING, 60.0)
+        assert run.daemon.latched == ""
+
+
+class NoLoop:
+    """A daemon between two processes of the loop, of which no next one comes."""
+
+    state, phase, latched, may_write, sequence = State.DISCONNECTED, Phase.STARTING, "x", True, 0
+    taken, asked = 3, 3
+
+    def disarm(self, by: str) -> int:
+        self.asked += 1
+        return self.asked
+
+    def arm(self, by: str) -> int:
+        return 0
+
+    def note(self, event: dict[str, Any]) -> None:
+        self.event = event
+
+
+def test_a_disarming_that_no_loop_has_taken_is_not_called_done(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(control, "LONGEST_TAKING", 0.1)
+    daemon = NoLoop()
+    reply = control.Control(daemon).answer("disarm", Peer(1, 2))  # type: ignore[arg-type]
+    assert not reply["ok"]
+    assert "no loop has taken it" in reply["error"]
+    assert "kept for the next one" in reply["error"]
+    assert daemon.asked == 4
+
+
+def test_a_disarming_is_asked_for_though_the_arm_seems_to_observe() -> None:
+    """A person's arming may be on its way: what is asked for after it stands."""
+    daemon = NoLoop()
+    daemon.state, daemon.latched, daemon.taken = State.OBSERVING, "", 9
+    reply = control.Control(daemon).answer("disarm", Peer(1, 2))  # type: ignore[arg-type]
+    assert reply == {"ok": True, "answer": "is observing already"}
+    assert daemon.asked == 4

@@ -215,11 +215,12 @@ def test_a_trajectory_that_begins_elsewhere_is_refused_and_nothing_moves(robot: 
 
 
 def test_a_planner_moves_the_arm_and_its_silence_is_a_smooth_hold(robot: Robot) -> None:
-    cell = robot.cell(setpoints="{source: tcp, port: 30377}")
+    cell = robot.cell(setpoints="{source: planner, socket: planner.sock}")
     start = np.array(robot.settings.start_q)
     with Run(cell, arm=True) as run:
         run.wait(State.ARMED)
-        planner = socket.create_connection(("127.0.0.1", 30377), timeout=5)
+        planner = socket.socket(socket.AF_UNIX)
+        planner.connect(str(robot.folder / "planner.sock"))
 
         def send(q: np.ndarray) -> None:
             planner.sendall((json.dumps({"q": q.tolist()}) + "\n").encode())

@@ -13,13 +13,13 @@ import yaml
 from daemon_cell import Robot, wait_for
 from numpy.typing import NDArray
 
-from bridge.cell import load_cell
-from bridge.daemon.daemon import settings_of
+from bridge.cell.run_settings import read_configuration
+from bridge.cell.settings.recording import RecordingSettings
 from bridge.daemon.processes import LoopProcess
-from bridge.ipc.shared_memory import Command, Page
+from bridge.ipc.command_page import Command, CommandPage
+from bridge.ipc.shared_memory import RunPage
 from bridge.loop.supervisor import State
 from bridge.recording.recorder import Recorder
-from bridge.recording.settings import RecordingSettings
 from core.log.mcap_reading import read_columns
 
 COMPARED = (
@@ -39,8 +39,8 @@ class Loops:
     """Processes of the loop on one page, and a recorder of what they do."""
 
     def __init__(self, cell: Path, session: str, arm: bool = False) -> None:
-        self.settings = settings_of(load_cell(cell))
-        self.page = Page(6)
+        self.configuration = read_configuration(cell)
+        self.page, self.commands = RunPage(6), CommandPage()
         folder = cell.parent / "recordings"
         self.stem = folder / session
         self.recorder = Recorder(
@@ -50,7 +50,11 @@ class Loops:
         self.start(arm)
 
     def start(self, arm: bool) -> None:
-        self.loop = LoopProcess(self.settings, self.page, arm, True, -3, self._number)
+        order = {"may_write": True, "number": self._number, "latched": "",
+                 "after": self.commands.number()}  # fmt: skip
+        if arm:
+            self.commands.ask(Command.ARM)
+        self.loop = LoopProcess(self.configuration, self.page, self.commands, order, -3)
         self._number += 1
 
     def until(self, what: Callable[[], bool], limit: float = 120.0) -> None:
@@ -102,10 +106,10 @@ def test_a_run_with_writing_and_two_loops_is_replayed_bit_for_bit(robot: Robot) 
     loops.state(State.COMPENSATING)
     robot.bench("wrench 0 0 -60 0 0 0")
     loops.during(1.0)
-    loops.page.ask(Command.DISARM)
+    loops.commands.ask(Command.DISARM)
     loops.state(State.OBSERVING)
     loops.during(0.2)
-    loops.page.ask(Command.ARM)
+    loops.commands.ask(Command.ARM)
     loops.state(State.COMPENSATING)
     loops.during(0.8)
     loops.loop.kill()  # amidst the writing

@@ -13,15 +13,17 @@ from test_replayed_loop import assert_same_bits
 from bridge.cell import load_cell
 from bridge.cell.daemon_settings import DaemonSettings
 from bridge.cell.sections import SetpointSettings
-from bridge.ipc.shared_memory import Command, Page
+from bridge.cell.settings.recording import RecordingSettings
+from bridge.ipc.command_page import Command, CommandPage, Commands
+from bridge.ipc.shared_memory import Page
 from bridge.loop.loop import Exit, Loop
 from bridge.loop.main import _compile
 from bridge.loop.replay import ReplayedLoop
 from bridge.recording.recorder import Recorder
-from bridge.recording.settings import RecordingSettings
 from bridge.setpoint_source.target import TargetSource
 from core.errors import LinkError, PartialWriteError
 from core.log.mcap_reading import read_columns
+from core.model import Model
 from core.setpoint import Setpoint
 from core.state import RobotState
 from drivers.driver import Driver
@@ -38,10 +40,12 @@ HOME = np.array([0.3, -1.2, 1.4, -0.6, 0.4, 0.2])
 class Scripted(Driver):
     """A controller whose own program swings the arm, with mishaps at known cycles."""
 
-    def __init__(self, cycles: int, page: Page) -> None:
-        super().__init__(20.0, N, moves_arm=False)  # no deadline that a busy machine misses
+    def __init__(self, cycles: int, commands: CommandPage, model: Model) -> None:
+        super().__init__(20.0, model, moves_arm=False)  # no deadline that a busy machine misses
+        self._now = 0.0  # s, of the script
+        self.gate.clock = lambda: self._now
         self._count = iter(range(cycles))
-        self._page = page
+        self._commands = commands
         self._writes = itertools.count(1)
         self._random = np.random.default_rng(3)
 
@@ -56,10 +60,10 @@ class Scripted(Driver):
         if k is None:
             raise LinkError("the script has come to its end")
         if k in (700, 1500):
-            self._page.ask(Command.DISARM)
+            self._commands.ask(Command.DISARM)
         if k in (20, 900):
-            self._page.ask(Command.ARM)
-        t = 0.002 * k + (3.0 if k > 1300 else 0.0)  # a gap
+            self._commands.ask(Command.ARM)
+        t = self._now = 0.002 * k + (3.0 if k > 1300 else 0.0)  # a gap
         q = HOME + 0.2 * np.sin(t + np.arange(N))
         target = q + (0.1 if 400 <= k < 402 else 0.0)  # a jump
         force = self._random.normal(0.0, 8.0, 6)
@@ -70,15 +74,15 @@ class Scripted(Driver):
             payload_cog=np.array([0.0, 0.0, 0.06]), sensor_lost=lost,
         )  # fmt: skip
 
-    def write_setpoint(self, setpoint: Setpoint) -> None:
+    def _send(self, setpoint: Setpoint) -> None:
         if next(self._writes) % 53 == 0:
             raise PartialWriteError("half of it")
 
 
-def run(loop: Loop, page: Page, folder: Path, name: str) -> dict[str, Any]:
+def run(loop: Loop, page: Page, commands: CommandPage, folder: Path, name: str) -> dict[str, Any]:
     settings = RecordingSettings(folder=folder, keep_free=0.0)
     recorder = Recorder(settings, name, page, {}, lambda _: None)
-    assert loop.run(False, True) in (Exit.LINK, Exit.DONE)
+    assert loop.run(Commands(commands.fd), True) in (Exit.LINK, Exit.DONE)
     recorder.close()
     return read_columns(folder / name)
 
@@ -88,11 +92,11 @@ def test_refused_and_half_sent_setpoints_gaps_and_lost_sensors_are_replayed(tmp_
     cell.write_text(CELL)
     model = load_cell(cell).model
     settings = DaemonSettings(cell=cell)
-    page, told = Page(N), []
-    source = TargetSource(SetpointSettings(), N, False, tmp_path)
-    loop = Loop(settings, model, Scripted(1800, page), source, page, told.append)
+    page, commands, told = Page(N), CommandPage(), []
+    source = TargetSource(SetpointSettings(), N, False, tmp_path, 20.0)
+    loop = Loop(settings, model, Scripted(1800, commands, model), source, page, told.append)
     _compile(settings, model)  # else the first cycles are late
-    then = run(loop, page, tmp_path, "then")
+    then = run(loop, page, commands, tmp_path, "then")
     flags = then["flags"].astype(int)
     assert {0.0, 1.0, 2.0} == set(then["attempted"])
     refused = (then["attempted"] == 1) & (then["written"] == 0)
@@ -102,7 +106,7 @@ def test_refused_and_half_sent_setpoints_gaps_and_lost_sensors_are_replayed(tmp_
     assert (flags & 8).any()  # ramping out
     assert then["written"].sum() > 500
 
-    page = Page(N)
+    page, commands = Page(N), CommandPage()
     driver = ReplayDriver(ReplaySettings(file=tmp_path / "then", speed=100.0), model)
     again = ReplayedLoop(settings, model, driver, source, page, lambda _: None)
-    assert_same_bits(run(again, page, tmp_path, "again"), then, len(then["number"]))
+    assert_same_bits(run(again, page, commands, tmp_path, "again"), then, len(then["number"]))

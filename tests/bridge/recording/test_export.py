@@ -1,4 +1,4 @@
-"""Export: a recording becomes a log in the contract's columns."""
+"""Export: a recording becomes a log."""
 
 from __future__ import annotations
 

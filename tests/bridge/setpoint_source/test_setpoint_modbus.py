@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import mmap
+import os
 import shutil
 import subprocess
 import time
@@ -147,13 +149,31 @@ def test_an_arm_of_too_many_joints_is_refused() -> None:
 
 def test_a_record_that_is_half_written_is_not_seen() -> None:
     page = PlcPage(3)
-    other = PlcPage(3, page.fd)
-    page.put_setpoint(1, HERE)
-    assert other.setpoint() is not None
-    page._map[:8] = (3).to_bytes(8, "little")  # a version that says: being written
-    assert other.setpoint() is None
-    page._map.close()
-    other.close()
+    server = PlcPage(3, page.fds)
+    server.put_setpoint(1, HERE)
+    assert page.setpoint() is not None
+    server._setpoint._map[:8] = (3).to_bytes(8, "little")  # a version that says: being written
+    assert page.setpoint() is None
+    server._setpoint._map.close()
+    server._status._map.close()
+    page.close()
+
+
+def test_neither_side_can_write_what_is_the_others() -> None:
+    page = PlcPage(3)
+    server = PlcPage(3, page.fds)
+    assert page.is_sealed
+    with pytest.raises((TypeError, ValueError)):
+        page.put_setpoint(1, HERE)
+    with pytest.raises((TypeError, ValueError)):
+        server.put_status((3, 0, 0, 0), np.zeros(12))
+    for fd in page.fds:
+        with pytest.raises(PermissionError):
+            os.pwrite(fd, b"x", 0)
+        again = os.open(f"/proc/self/fd/{fd}", os.O_RDWR)
+        with pytest.raises(PermissionError):
+            mmap.mmap(again, 512)
+        os.close(again)
 
 
 def test_the_arm_goes_where_the_plc_says_and_the_plc_hears_of_it(tmp_path: Path) -> None:

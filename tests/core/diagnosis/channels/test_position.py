@@ -11,7 +11,7 @@ from core.errors import LogError
 from core.metrology import Metrology
 from core.model import Model
 
-# what the arm has more than the model, by the names that the contract gives it
+# what the arm has more than the model, by its names in cells
 TRUE = {
     "joint_offset": {"joint_offset_2": 8e-4},
     "transmission_error": {
