@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from core.diagnosis import position, torque, tracking, wrench
 from core.diagnosis.cause import Cause, Considered, causes_of, considered_of
 from core.diagnosis.held_out import HeldOut
-from core.diagnosis.judgement import Judgement, holding, judge, pure_error
+from core.diagnosis.judgement import Judgement, judge, pure_error, with_stand_ins
 from core.diagnosis.location import Where, locate
 from core.diagnosis.observation import NotObservable, Observation, thinned
 from core.diagnosis.rigid_suspicion import softness_findings
@@ -38,7 +39,6 @@ CHANNELS: Mapping[str, Observe] = {
 }
 
 
-NEEDLESS = 0.05  # share by which more may be left without a cause that seemed needless
 SOFTNESS = ("axial_compliance", "radial_compliance")
 # samples that a diagnosis looks at: more cost time and tell hardly more
 MOST = {"position": 1200, "wrench": 300, "tracking": 300, "torque": 300}
@@ -69,6 +69,8 @@ class ChannelDiagnosis:
     gap: Array = field(repr=False)  # (N, k) measured - predicted, frame fitted
     remaining: Array = field(repr=False)  # (N, k) with the causes in the model
     held_out: Array | None = field(repr=False)  # (kept,) rms of each held-out sample
+    stand_ins: tuple[Cause, ...] = ()  # not proved, but useful where nothing was fitted
+    along: tuple[Term, ...] = ()  # causes and stand-ins, fitted together
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,7 @@ class Diagnosis:
     next_measurements: tuple[Measurement, ...]
     findings: tuple[str, ...]
     model: Model = field(repr=False)  # with the causes in it
+    with_stand_ins: Model = field(repr=False)  # with the stand-ins too, fitted along
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -151,6 +154,7 @@ def _diagnose(
     return Diagnosis(
         _overall(observed), tuple(observed), tuple(hidden),
         next_measurements(model, log, observed), tuple(told), with_found(model, terms),
+        with_found(model, _for_the_model([_stood(c) for c in observed])),
     )  # fmt: skip
 
 
@@ -186,6 +190,18 @@ def _for_the_model(channels: Sequence[ChannelDiagnosis]) -> list[Term]:
     return [term for _, term in best.values()]
 
 
+def _stood(channel: ChannelDiagnosis) -> ChannelDiagnosis:
+    """Return the channel with its stand-ins as causes."""
+    if not channel.stand_ins:
+        return channel
+    fitted = {(t.effect, t.site): t for t in channel.along}
+    causes = [
+        replace(c, terms=tuple(fitted[t.effect, t.site] for t in c.terms))
+        for c in (*channel.causes, *channel.stand_ins)
+    ]
+    return replace(channel, causes=tuple(causes))
+
+
 def _lacks_much(channel: ChannelDiagnosis) -> bool:
     """Return whether poses leave a gap that no cause accounts for."""
     return channel.channel == "position" and channel.verdict in ("unexplained", "partly_explained")
@@ -205,7 +221,9 @@ def _channel(
 ) -> ChannelDiagnosis:  # fmt: skip
     selection = select(seen, model, withhold, progress)
     held = HeldOut(selection)
-    selection, verdict = _judged(selection, held, model)
+    verdict = with_stand_ins(selection, judge(selection, held))
+    stood_in = _stood_in(selection, verdict, held, model)
+    selection = standing(selection, model.arm, verdict.accused)
     chosen = [selection.term_index[p] for p in verdict.accused]
     gap, remaining = gaps(selection, chosen)
     k = 3 if seen.channel in ("position", "wrench") else gap.shape[1]
@@ -230,25 +248,25 @@ def _channel(
         p_value=verdict.p_value, depends_on=verdict.depends_on, verdict=word,
         selection=selection, judgement=verdict, gap=gap, remaining=remaining,
         held_out=np.sqrt(held.squares(chosen)) if held.possible else None,
+        **stood_in,
     )  # fmt: skip
 
 
-def _judged(selection: Selection, held: HeldOut, model: Model) -> tuple[Selection, Judgement]:
-    """Return the judgement, and the selection with the values of what it leaves accused.
-
-    An accusation that seemed needless stays where the others, fitted exactly, cannot do without.
-    """
-    judged = judge(selection)
-    kept = holding(selection, judged, held)
-    stood = standing(selection, model.arm, kept.accused)
-    if kept.accused != judged.accused and _left(stood) > (1 + NEEDLESS) * _left(selection):
-        return standing(selection, model.arm, judged.accused), judged
-    return stood, kept
-
-
-def _left(selection: Selection) -> float:
-    """Return the rms of what the terms leave of the kept samples."""
-    return float(np.sqrt(np.mean(selection.residual[selection.kept] ** 2)))
+def _stood_in(
+    selection: Selection, verdict: Judgement, held: HeldOut, model: Model
+) -> dict[str, Any]:
+    """Return the stand-ins as causes, and the terms of causes and stand-ins fitted together."""
+    if not verdict.stand_ins:
+        return {}
+    both = (*verdict.accused, *verdict.stand_ins)
+    along = standing(selection, model.arm, both)
+    told = causes_of(along, replace(verdict, accused=both, ties={}), held, model.arm)
+    own = {along.terms[p] for p in verdict.stand_ins}
+    shown = [replace(c, terms=tuple(t for t in c.terms if t in own)) for c in told]
+    return {
+        "stand_ins": tuple(c for c in shown if c.terms),
+        "along": tuple(along.terms[p] for p in both),
+    }
 
 
 def gaps(selection: Selection, chosen: Sequence[int]) -> tuple[Array, Array]:
@@ -313,6 +331,8 @@ def _channel_findings(channel: ChannelDiagnosis) -> list[str]:
         term = channel.selection.terms[position_]
         joint = f" of joint {term.site.joint}" if term.site.joint else ""
         told.append(f"{channel.channel}: {term.effect}{joint} is not accused: {reason}")
+        if position_ in channel.judgement.stand_ins:
+            told[-1] += "; poses not fitted gain by it: a stand-in"
     for cause in channel.causes:
         told += [f"{channel.channel}: {note}" for note in cause.notes]
     return told

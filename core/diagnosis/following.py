@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from core.diagnosis.candidate import Candidate, named_columns
 from core.diagnosis.observation import Observation
+from core.diagnosis.space import Found, Space, fit
 from core.dynamics import TRACKING
 from core.effects import Term
 
@@ -40,3 +41,22 @@ def exact_columns(observation: Observation, candidate: Candidate, base: Sequence
         return named_columns(observation, candidate, ())
     moved = observation.predict([candidate.term(np.array([time]))]) - nothing
     return np.asarray(moved / time)[..., None]
+
+
+def one_delay(space: Space, found: Found) -> Found:
+    """Return the set with all joints that answer late told as one effect of the controller.
+
+    Latency or lag, whichever fits all of these joints better: each joint by itself decides little.
+    """
+    site = {(k.family, k.site.joint): c for c, k in enumerate(space.candidates) if k.named}
+    late = [c for c in found.chosen if space.candidates[c].family in TRACKING]
+    if len(late) < 2:
+        return found
+    rest = [c for c in found.chosen if c not in late]
+    joints = sorted({space.candidates[c].site.joint or 0 for c in late})
+    sets = [
+        fit(space, (*rest, *(site[effect, j] for j in joints)))
+        for effect in TRACKING
+        if all((effect, j) in site for j in joints)
+    ]
+    return min(sets, key=lambda f: f.score, default=found)

@@ -13,6 +13,7 @@ from core.diagnosis.selection import Selection
 Array = NDArray[np.float64]
 FOLDS = 10
 RESAMPLES = 400
+RANK = 1e-13  # eigenvalue of unit columns below which a direction is none
 
 
 @dataclass(frozen=True)
@@ -26,9 +27,14 @@ class Shrink:
 
 
 class HeldOut:
-    """Cross-validation of sets of candidates in a selection's sample space, by condition."""
+    """Cross-validation of sets of candidates in a selection's sample space.
 
-    def __init__(self, selection: Selection, seed: int = 0) -> None:
+    Folds are conditions drawn at random, or ``parts`` (n,): numbers from 0 of each kept sample.
+    """
+
+    def __init__(
+        self, selection: Selection, seed: int = 0, parts: NDArray[np.int64] | None = None
+    ) -> None:
         self._space = selection.space
         self._raw, self._target = selection.raw, selection.raw.target
         self._nuisance = selection.raw.nuisance
@@ -38,11 +44,13 @@ class HeldOut:
         self._k, self._own = k, min(own, k)
         names, group = np.unique(selection.observation.groups[selection.kept], return_inverse=True)
         self._group, self._groups = group, len(names)
-        folds = min(FOLDS, len(names))
-        self.possible = folds >= 2 and len(self._target) > self._nuisance.shape[1] + 3
-        fold_of = np.random.default_rng(seed).permutation(len(names)) % max(folds, 1)
-        self._fold = np.repeat(fold_of[group], k)
-        self._folds = folds
+        if parts is None:
+            order = np.random.default_rng(seed).permutation(len(names))
+            parts = (order % min(FOLDS, len(names)))[group]
+        self._folds = int(parts.max()) + 1
+        self.possible = self._folds >= 2 and len(self._target) > self._nuisance.shape[1] + 3
+        self._fold = np.repeat(parts, k)
+        self._prior = selection.prior
         self._seed = seed
         self._known: dict[tuple[int, ...], Array] = {}
 
@@ -60,18 +68,28 @@ class HeldOut:
         return float(np.sqrt(np.mean(self.squares(chosen))))
 
     def _left(self, chosen: tuple[int, ...]) -> Array:
-        space = self._space
-        A = np.hstack([self._raw.columns(space, chosen), self._nuisance])
+        A = np.hstack([self._raw.columns(self._space, chosen), self._nuisance])
         if not A.shape[1]:
             return self._target
         unit = 1 / np.sqrt(np.einsum("ij,ij->j", A, A) + 1e-300)
         A = A * unit
+        whole, g = A.T @ A + np.diag((self._pull(chosen) * unit) ** 2), A.T @ self._target
         left = np.empty_like(self._target)
         for k in range(self._folds):
             out = self._fold == k
-            x = np.linalg.lstsq(A[~out], self._target[~out], rcond=1e-9)[0]
-            left[out] = self._target[out] - A[out] @ x
+            own, y = A[out], self._target[out]
+            inverse = np.linalg.pinv(whole - own.T @ own, rcond=RANK, hermitian=True)
+            left[out] = y - own @ (inverse @ (g - own.T @ y))
         return left
+
+    def _pull(self, chosen: tuple[int, ...]) -> Array:
+        """Return what pulls each number to nominal, nuisances included (0: nothing does)."""
+        parts = [
+            1 / self._prior[c] if c in self._prior
+            else np.zeros(int(self._space.start[c + 1] - self._space.start[c]))
+            for c in chosen
+        ]  # fmt: skip
+        return np.concatenate([*parts, np.zeros(self._nuisance.shape[1])])
 
     def shrink(self, with_set: Sequence[int], without_set: Sequence[int]) -> Shrink:
         """Return how far the gap shrinks from one set to another, with its interval."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,9 @@ from core.diagnosis.candidate import (
     joint_quantity,
     named_candidates,
 )
-from core.diagnosis.following import exact_columns
+from core.diagnosis.criteria import HEAVIEST
+from core.diagnosis.following import exact_columns, one_delay
+from core.diagnosis.geometry import Links, links_of, prior, with_links
 from core.diagnosis.neighbours import pruned
 from core.diagnosis.noise import Noise, estimate_noise
 from core.diagnosis.observation import Observation
@@ -46,7 +49,7 @@ class Selection:
 
     observation: Observation  # frame as finally estimated
     space: Space  # columns at the final model; kept samples only
-    found: Found
+    found: Found  # without the links, where their geometry as a whole is a cause
     terms: tuple[Term, ...]  # the named part, refitted exactly
     term_index: tuple[int, ...]  # candidate index of each term
     covariance: tuple[Array, ...]  # per term (d, d) of its fitted parameters
@@ -55,16 +58,61 @@ class Selection:
     residual: Array  # (N, k) measured - predicted by the named terms, frame estimated along
     base: tuple[Term, ...]
     raw: Raw  # the space before the nuisance was projected out
+    block: tuple[int, ...] = ()  # candidates of all links, where they are a cause as a whole
 
     @property
     def nuisance_basis(self) -> Array:
         """Return an orthonormal basis (m, p) of the nuisance in the sample space."""
         return self.raw.basis
 
+    @cached_property
+    def links(self) -> Links | None:
+        """Return the links' geometry as a whole, where it is a cause."""
+        return links_of(self.space, self.block) if self.block else None
+
+    @cached_property
+    def working(self) -> Space:
+        """Return the space in which ``found`` won: beside the links, where they are a cause."""
+        return self.space if self.links is None else self.links.beside(self.space, self.block)
+
+    def rows_of(self, columns: Array) -> Array:
+        """Return columns (N, k, d) as rows (m, d) of the working space."""
+        kept, B = self.kept, self.nuisance_basis
+        rows = (self.noise.whitener[kept] @ columns[kept]).reshape(len(B), -1)
+        rows = rows - B @ (B.T @ rows)
+        return np.asarray(rows if self.links is None else self.links.whitened(rows))
+
+    def fitted(self, chosen: Sequence[int]) -> dict[int, Array]:
+        """Return the linear values (d,) of a set of candidates; links are kept near nominal."""
+        space, size = self.space, np.diff(self.space.start)
+        pull = [1 / self.prior[c] if c in self.prior else np.zeros(size[c]) for c in chosen]
+        X = space.columns(chosen)
+        whole = X.T @ X + np.diag(np.concatenate([*pull, np.zeros(0)]) ** 2)
+        unit = 1 / np.sqrt(np.diag(whole) + 1e-300)
+        inverse = np.linalg.pinv(whole * np.outer(unit, unit), rcond=1e-12, hermitian=True)
+        x = unit * (inverse @ (unit * (X.T @ space.y)))
+        return dict(zip(chosen, np.split(x, np.cumsum(size[list(chosen)])[:-1]), strict=True))
+
+    def without_links(self) -> Selection:
+        """Return the selection with the links' geometry no cause, the rest as it is."""
+        index = [p for p, c in enumerate(self.term_index) if c not in self.block]
+        return replace(
+            self, block=(), found=fit(self.space, self.found.chosen),
+            terms=tuple(self.terms[p] for p in index),
+            term_index=tuple(self.term_index[p] for p in index),
+            covariance=tuple(self.covariance[p] for p in index),
+        )  # fmt: skip
+
     @property
     def used(self) -> float:
-        """Return the number of fitted unknowns, nuisance included."""
-        return float(self.raw.nuisance.shape[1] + sum(len(v) for v in self.found.values))
+        """Return the number of fitted unknowns, nuisance included; of the links what they use."""
+        links = 0.0 if self.links is None else self.links.used
+        return float(self.raw.nuisance.shape[1] + sum(len(v) for v in self.found.values)) + links
+
+    @cached_property
+    def prior(self) -> dict[int, Array]:
+        """Return 1 sigma (d,) of the numbers of each candidate that is kept near nominal."""
+        return {c: prior(self.space.candidates[c]) for c in self.block}
 
     @property
     def groups(self) -> NDArray[np.int64]:
@@ -94,12 +142,12 @@ def select(
     found: Found | None = None
     space: Space | None = None
     columns: list[Array] = []
-    smooth = smooth_candidates(observation, arm)
+    smooth = smooth_candidates(observation)
     for turn in range(ROUNDS):
         if progress:
             progress(f"{observation.channel}: round {turn + 1}")
         work.candidates = [
-            _bounded(c, model)
+            _bounded(c, model, observation)
             for c in named_candidates(arm, observation.channel, withheld, rotation, base, turns)
             if _has_what_it_needs(c, observation)
         ]
@@ -109,24 +157,27 @@ def select(
             look_for_wild(work, columns)
         space, raw = sample_space(work, columns, base, smooth)
         inside = [locate(work.candidates, t)[0] for t in base]
-        best = screened_search(space, base=inside)
+        best = one_delay(space, screened_search(space, base=inside))
         if turn > 0 and not work.kept.all():
             space, raw, best = with_wild_explained(work, columns, base, smooth, (space, raw, best))
+        near, best, block = with_links(space, best, inside)
         counted, whitened_by = work.kept.copy(), work.noise
         framed = work.observation
         try:
-            terms, index, covariance, residual = refit(work, space, _exactly(space, best, work))
+            exact = _exactly(near, best, work)
+            terms, index, covariance, residual = refit(work, space, exact, block)
         except InputError:  # absurd flexibilities: the arm would buckle
             work.observation = framed  # not the frame that went astray with them
-            best = _stiff(space, best, inside)
+            best, near, block = _stiff(space, best, inside), space, ()
             terms, index, covariance, residual = refit(work, space, best)
         straight = straightened(space, best.chosen, index, terms, covariance)
         if straight is not None:
-            best = pruned(space, fit(space, straight))
-            terms, index, covariance, residual = refit(work, space, best)
+            best = pruned(near, fit(near, straight))
+            terms, index, covariance, residual = refit(work, space, best, block)
         same = terms_alike(terms, base) and turn > 0
         found = best
-        free = 1 - sum(len(v) for v in best.values) / space.freedom
+        used = sum(len(v) for v in best.values) + (links_of(space, block).used if block else 0)
+        free = 1 - used / space.freedom
         changed = look_again(work, _less_smooth(work, space, best, smooth, residual), free)
         if same and not changed:
             break
@@ -135,11 +186,11 @@ def select(
     if len(space.y) >= LARGE and any(not space.candidates[c].named for c in found.chosen):
         work.kept, work.noise = counted.copy(), whitened_by
         # what goes into a model has to predict without the unnamed function beside it
-        alone = fit(space, [c for c in found.chosen if space.candidates[c].named])
-        terms, index, covariance, residual = refit(work, space, alone)
+        alone = fit(near, [c for c in found.chosen if space.candidates[c].named])
+        terms, index, covariance, residual = refit(work, space, alone, block)
     return Selection(
         work.observation, space, found, terms, index, covariance, counted, whitened_by,
-        residual, base, raw,
+        residual, base, raw, block,
     )  # fmt: skip
 
 
@@ -189,7 +240,10 @@ def standing(selection: Selection, arm: Arm, accused: Sequence[int]) -> Selectio
         return selection
     work = Work(selection.observation, arm, [], selection.noise, selection.kept)
     chosen = [selection.term_index[p] for p in accused]
-    fitted, index, spread, residual = refit(work, selection.space, fit(selection.space, chosen))
+    block = tuple(c for c in chosen if c in selection.block)
+    space = selection.working if block else selection.space
+    alone = fit(space, [c for c in chosen if c not in block])
+    fitted, index, spread, residual = refit(work, selection.space, alone, block)
     terms, covariance = list(selection.terms), list(selection.covariance)
     for c, term, own in zip(index, fitted, spread, strict=True):
         position = selection.term_index.index(c)
@@ -200,11 +254,14 @@ def standing(selection: Selection, arm: Arm, accused: Sequence[int]) -> Selectio
     )  # fmt: skip
 
 
-def _bounded(candidate: Candidate, model: Model) -> Candidate:
+def _bounded(candidate: Candidate, model: Model, observation: Observation) -> Candidate:
     """Return the candidate with bounds that keep the whole model physical (flexibility >= 0).
 
     Of a curve the bound holds for what its two parts come to together.
     """
+    if candidate.family == "payload":
+        mass = replace(candidate.parameters[0], **_loads_that_can_be(model, observation))
+        return replace(candidate, parameters=(mass, *candidate.parameters[1:]))
     curved = candidate.curve is not None
     if candidate.family not in ("axial_compliance", "radial_compliance") and not curved:
         return candidate
@@ -214,6 +271,13 @@ def _bounded(candidate: Candidate, model: Model) -> Candidate:
     lower = -float(own[candidate.site.joint - 1])
     bounded = replace(candidate.parameters[0], lower=lower)
     return replace(candidate, parameters=(bounded, *candidate.parameters[1:]))
+
+
+def _loads_that_can_be(model: Model, observation: Observation) -> dict[str, float]:
+    """Return how far a payload may be off: the true one is no less than nothing, and no giant."""
+    declared = observation.quantities.get("payload", np.array([model.payload_mass]))
+    most = HEAVIEST * max(float(declared.max()), model.arm.payload)
+    return {"lower": -float(declared.min()), "upper": most}
 
 
 def _has_what_it_needs(candidate: Candidate, observation: Observation) -> bool:

@@ -1,0 +1,96 @@
+"""The geometry of all links as one cause: many small numbers, none of which stands out alone.
+
+Its numbers have a prior (a normal one of an engineer's size), so that what the data do not show
+stays nominal. To a search it is then one more source of correlated noise: the sample space is
+whitened by it, and log det of what it adds is the price that it pays (marginal likelihood).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.candidate import Candidate
+from core.diagnosis.criteria import ANGLE, GEOMETRIC, LENGTH
+from core.diagnosis.search import screened_search
+from core.diagnosis.space import MARGIN, Found, Space
+
+Array = NDArray[np.float64]
+LINK = "link_geometry"
+KIN = (LINK, "joint_offset")
+NEVER = 1e9  # a price that no fit is worth
+
+
+def members(space: Space) -> tuple[int, ...]:
+    """Return the candidates of all links' geometry."""
+    return tuple(c for c, k in enumerate(space.candidates) if k.family == LINK)
+
+
+def prior(candidate: Candidate) -> Array:
+    """Return 1 sigma (d,) of each number of a link."""
+    return np.array([LENGTH if p.unit == "m" else ANGLE for p in candidate.parameters])
+
+
+@dataclass(frozen=True)
+class Links:
+    """The geometry of all links as noise of known size, in a sample space."""
+
+    directions: Array  # (m, d) orthonormal
+    spread: Array  # (d,) 1 sigma of the samples along each, by the prior alone
+
+    @property
+    def price(self) -> float:
+        """Return what their numbers cost in -2 log likelihood: log det of what they add."""
+        return float(np.sum(np.log1p(self.spread**2)))
+
+    @property
+    def used(self) -> float:
+        """Return how many numbers the samples determine."""
+        return float(np.sum(self.spread**2 / (1 + self.spread**2)))
+
+    def whitened(self, columns: Array) -> Array:
+        """Return columns (m, ...) in which the links are noise like any other."""
+        less = 1 - 1 / np.sqrt(1 + self.spread**2)
+        along = self.directions.T @ columns
+        return np.asarray(columns - self.directions @ (less * along.T).T)
+
+    def beside(self, space: Space, block: Sequence[int]) -> Space:
+        """Return the space beside them; ``block``, their candidates, can be in no set there."""
+        price = space.price.copy()
+        price[list(block)] = NEVER
+        return replace(space, y=self.whitened(space.y), X=self.whitened(space.X), price=price)
+
+
+def links_of(space: Space, block: Sequence[int]) -> Links:
+    """Return the geometry of all links, candidates ``block``, in a space."""
+    size = np.concatenate([prior(space.candidates[c]) for c in block])
+    U, s, _ = np.linalg.svd(space.columns(block) * size, full_matrices=False)
+    return Links(U, s)
+
+
+def with_links(
+    space: Space, best: Found, base: Sequence[int]
+) -> tuple[Space, Found, tuple[int, ...]]:
+    """Return the better explanation: as it is, or beside the links' geometry as a whole.
+
+    The space returned is the one in which the set was found; the links are in no set. They are
+    tried where several geometric causes or an unnamed function are needed without them.
+    """
+    block = members(space)
+    kin = [c for c in best.chosen if space.candidates[c].family in (*KIN, "smooth")]
+    tried = len(block) > 1 and set(block) <= set(base)
+    if len(block) < 2 or not (len(kin) >= GEOMETRIC or tried):
+        return space, best, ()
+    links = links_of(space, block)
+    near = links.beside(space, block)
+    start = sorted({*base, *best.chosen} - set(block))
+    start = [c for c in start if space.candidates[c].named]
+    other = screened_search(near, base=start)
+    families = {c.family for c in space.candidates if c.named}
+    price = links.price + 2 * float(np.log(len(families))) + MARGIN
+    if other.score + price < best.score:
+        return near, other, block
+    return space, best, ()
