@@ -48,6 +48,11 @@ if TYPE_CHECKING:
     help="Write the cell with the found effects added.",
 )
 @click.option(
+    "--stand-ins",
+    is_flag=True,
+    help="With --apply: also what is not proved, but shrinks the gap in regions not fitted.",
+)
+@click.option(
     "--withhold",
     multiple=True,
     metavar="EFFECT",
@@ -65,6 +70,7 @@ def diagnose(
     out: Path | None,
     json_file: Path | None,
     new_cell: Path | None,
+    stand_ins: bool,
     withhold: tuple[str, ...],
     sim: Path | None,
 ) -> None:
@@ -76,6 +82,8 @@ def diagnose(
 
     Example: gapbridge diagnose log.csv --cell cell.yaml --out out/diagnosis --apply better.yaml
     """
+    if stand_ins and new_cell is None:
+        raise InputError("--stand-ins: found no --apply, expected the cell to write")
     given = open_cell(cell)
     rows = open_log(log, given)
     _check_effects(withhold)
@@ -93,7 +101,7 @@ def diagnose(
     if json_file is not None:
         write_text(json_file, text)
     if new_cell is not None:
-        save_cell(given, new_cell, found.model)
+        save_cell(given, new_cell, found.with_stand_ins if stand_ins else found.model)
     written = [] if out is None else _write_folder(out, text, found, given, rows)
     for file in (*written, json_file, new_cell):
         if file is not None:

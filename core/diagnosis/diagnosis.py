@@ -191,14 +191,15 @@ def _for_the_model(channels: Sequence[ChannelDiagnosis]) -> list[Term]:
 
 
 def _stood(channel: ChannelDiagnosis) -> ChannelDiagnosis:
-    """Return the channel with its stand-ins as causes."""
+    """Return the channel with its stand-ins as causes, marked."""
     if not channel.stand_ins:
         return channel
     fitted = {(t.effect, t.site): t for t in channel.along}
     causes = [
-        replace(c, terms=tuple(fitted[t.effect, t.site] for t in c.terms))
+        replace(c, terms=tuple(
+            replace(fitted[t.effect, t.site], stand_in=c in channel.stand_ins) for t in c.terms))
         for c in (*channel.causes, *channel.stand_ins)
-    ]
+    ]  # fmt: skip
     return replace(channel, causes=tuple(causes))
 
 
@@ -223,7 +224,7 @@ def _channel(
     held = HeldOut(selection)
     verdict = with_stand_ins(selection, judge(selection, held))
     stood_in = _stood_in(selection, verdict, held, model)
-    selection = standing(selection, model.arm, verdict.accused)
+    selection = standing(selection, model.arm, verdict.accused, verdict.beside)
     chosen = [selection.term_index[p] for p in verdict.accused]
     gap, remaining = gaps(selection, chosen)
     k = 3 if seen.channel in ("position", "wrench") else gap.shape[1]

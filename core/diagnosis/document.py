@@ -56,6 +56,7 @@ def _channel(c: ChannelDiagnosis) -> dict[str, Any]:
             "depends_on": _quantities(c.where.depends_on),
         },
         "causes": [_cause(cause) for cause in c.causes],
+        "stand_ins": [_cause(stand_in) for stand_in in c.stand_ins],
         "considered": [
             {
                 "effect": k.effect,

@@ -7,14 +7,14 @@ whitened by it, and log det of what it adds is the price that it pays (marginal 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.diagnosis.candidate import Candidate
-from core.diagnosis.criteria import ANGLE, GEOMETRIC, LENGTH
+from core.diagnosis.criteria import ANGLE, GEOMETRIC, LENGTH, SHARES
 from core.diagnosis.search import screened_search
 from core.diagnosis.space import MARGIN, Found, Space
 
@@ -29,9 +29,9 @@ def members(space: Space) -> tuple[int, ...]:
     return tuple(c for c, k in enumerate(space.candidates) if k.family == LINK)
 
 
-def prior(candidate: Candidate) -> Array:
-    """Return 1 sigma (d,) of each number of a link."""
-    return np.array([LENGTH if p.unit == "m" else ANGLE for p in candidate.parameters])
+def prior(candidate: Candidate, share: float = 1.0) -> Array:
+    """Return 1 sigma (d,) of each number of a link; ``share`` is that of an engineer's size."""
+    return np.array([share * (LENGTH if p.unit == "m" else ANGLE) for p in candidate.parameters])
 
 
 @dataclass(frozen=True)
@@ -57,40 +57,54 @@ class Links:
         along = self.directions.T @ columns
         return np.asarray(columns - self.directions @ (less * along.T).T)
 
-    def beside(self, space: Space, block: Sequence[int]) -> Space:
+    def beside(self, space: Space, block: Iterable[int]) -> Space:
         """Return the space beside them; ``block``, their candidates, can be in no set there."""
         price = space.price.copy()
         price[list(block)] = NEVER
         return replace(space, y=self.whitened(space.y), X=self.whitened(space.X), price=price)
 
 
-def links_of(space: Space, block: Sequence[int]) -> Links:
-    """Return the geometry of all links, candidates ``block``, in a space."""
-    size = np.concatenate([prior(space.candidates[c]) for c in block])
-    U, s, _ = np.linalg.svd(space.columns(block) * size, full_matrices=False)
+def links_of(space: Space, sigma: Mapping[int, Array]) -> Links:
+    """Return the geometry of all links in a space; ``sigma`` is the prior of each candidate."""
+    size = np.concatenate(list(sigma.values()))
+    U, s, _ = np.linalg.svd(space.columns(list(sigma)) * size, full_matrices=False)
     return Links(U, s)
 
 
 def with_links(
     space: Space, best: Found, base: Sequence[int]
-) -> tuple[Space, Found, tuple[int, ...]]:
+) -> tuple[Space, Found, dict[int, Array]]:
     """Return the better explanation: as it is, or beside the links' geometry as a whole.
 
-    The space returned is the one in which the set was found; the links are in no set. They are
-    tried where several geometric causes or an unnamed function are needed without them.
+    The space returned is the one in which the set was found; the links are in no set, and their
+    prior is returned (empty where they are no cause). A search beside them pays where they do so
+    beside that set, or where it holds several geometric causes.
     """
     block = members(space)
-    kin = [c for c in best.chosen if space.candidates[c].family in (*KIN, "smooth")]
-    tried = len(block) > 1 and set(block) <= set(base)
-    if len(block) < 2 or not (len(kin) >= GEOMETRIC or tried):
-        return space, best, ()
-    links = links_of(space, block)
-    near = links.beside(space, block)
+    if len(block) < 2:
+        return space, best, {}
+    tried = []
+    for share in SHARES:
+        sigma = {c: prior(space.candidates[c], share) for c in block}
+        links = links_of(space, sigma)
+        tried.append((_beside_set(space, best, links, block) + links.price, sigma, links))
+    score, sigma, links = min(tried, key=lambda t: t[0])
+    families = {c.family for c in space.candidates if c.named}
+    tries = 2 * float(np.log(len(families) * len(SHARES))) + MARGIN
+    kin = [c for c in best.chosen if space.candidates[c].family in KIN]
+    if len(kin) < GEOMETRIC and score + tries >= best.score:
+        return space, best, {}
     start = sorted({*base, *best.chosen} - set(block))
     start = [c for c in start if space.candidates[c].named]
-    other = screened_search(near, base=start)
-    families = {c.family for c in space.candidates if c.named}
-    price = links.price + 2 * float(np.log(len(families))) + MARGIN
-    if other.score + price < best.score:
-        return near, other, block
-    return space, best, ()
+    other = screened_search(space, base=start, beside=lambda p: links.beside(p, members(p)))
+    if other.score + links.price + tries < best.score:
+        return links.beside(space, block), other, sigma
+    return space, best, {}
+
+
+def _beside_set(space: Space, best: Found, links: Links, block: Sequence[int]) -> float:
+    """Return the score of a set beside the links, the price of these left out."""
+    rest = [c for c in best.chosen if c not in block]
+    A, y = links.whitened(space.columns(rest)), links.whitened(space.y)
+    rss = float(np.sum((y - A @ np.linalg.lstsq(A, y, rcond=1e-9)[0]) ** 2))
+    return float(space.misfit(np.array(rss)) + space.price[rest].sum())

@@ -54,6 +54,7 @@ class Judgement:
     ]  # quantity, held-out share of what is not accounted for
     ties: dict[int, tuple[str, ...]]  # position -> effects that would do as well
     withdrawn: tuple[tuple[int, str], ...]  # position, reason
+    beside: tuple[int, ...] = ()  # unnamed functions that account for what is left
     stand_ins: tuple[
         int, ...
     ] = ()  # positions not accused that shrink the gap in regions not fitted
@@ -72,14 +73,15 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
     believed = [
         c for c in selection.term_index if c not in withdrawn and c not in selection.block
     ]  # fmt: skip
-    stays = withstanding(selection, believed)
+    stays, beside = withstanding(selection, believed)
     withdrawn |= {c: BESIDE for c in believed if c not in stays}
     fallen = bool(withdrawn)
     stays = [*stays, *selection.block]
     for c in _gainless(selection, stays, held):
         withdrawn[c] = "it does not shrink the gap on samples that its fit did not see"
         stays.remove(c)
-    return _told(whole, selection, stays, withdrawn, fallen)
+    judgement = _told(whole, selection, stays, withdrawn, fallen)
+    return replace(judgement, beside=tuple(beside))
 
 
 def _told(
@@ -165,7 +167,7 @@ def with_stand_ins(selection: Selection, judgement: Judgement) -> Judgement:
     if not (useful and held.possible):
         return judgement
     chosen = [*judgement.accused, *useful]
-    units = [u for u in _units(selection, useful)]
+    units = _units(selection, useful)
     while units:
         everything = [index[p] for p in chosen]
         rest = [[index[p] for p in chosen if p not in unit] for unit in units]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,6 @@ from numpy.typing import NDArray
 
 from core.arm import Arm
 from core.diagnosis.candidate import Candidate, named_columns
-from core.diagnosis.geometry import prior
 from core.diagnosis.space import Found, Space
 from core.diagnosis.work import Work, flat
 from core.effects import CATALOGUE, Term
@@ -18,25 +18,26 @@ from core.errors import InputError
 
 Array = NDArray[np.float64]
 REFITS = 8
+NO_PRIOR: Mapping[int, Array] = {}
 WEAK = 100.0  # usual sizes of a parameter: how far the data may take it against nothing
 
 
 def refit(
-    work: Work, space: Space, found: Found, block: tuple[int, ...] = ()
+    work: Work, space: Space, found: Found, links: Mapping[int, Array] = NO_PRIOR
 ) -> tuple[tuple[Term, ...], tuple[int, ...], tuple[Array, ...], Array]:
     """Refit the named terms exactly, smooth ones kept linear; moves the frame along.
 
-    ``block`` are further candidates (all links), each number of which is kept near nominal.
+    ``links`` are further candidates, with 1 sigma of each number: these are kept near nominal.
     """
-    index = (*(c for c in found.chosen if space.candidates[c].named), *block)
+    index = (*(c for c in found.chosen if space.candidates[c].named), *links)
     freed = {c: _freed(work.arm, space.candidates[c]) for c in index}
     smooth = [c for c in found.chosen if not space.candidates[c].named]
     x = [
         np.array(space.candidates[c].term(v).values)[: len(freed[c].parameters)]
         for c, v in zip(found.chosen, found.values, strict=True)
         if c in index
-    ] + [np.zeros(len(space.candidates[c].parameters)) for c in block]
-    usual = [prior(freed[c]) if c in block else _wide(freed[c]) for c in index]
+    ] + [np.zeros(len(space.candidates[c].parameters)) for c in links]
+    usual = [links[c] if c in links else _wide(freed[c]) for c in index]
     extra = space.columns(smooth)
     covariance: list[Array] = []
     for _ in range(REFITS):

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.diagnosis.candidate import Candidate
-from core.diagnosis.criteria import DRIFT, SIBLING, SIGMAS, UNKNOWNS
+from core.diagnosis.criteria import DRIFT, SIBLING, SIGMAS, STAND_IN_GAIN, UNKNOWNS
+from core.diagnosis.held_out import HeldOut
 from core.diagnosis.leftover import basis_of
 from core.diagnosis.observation import Observation
 from core.diagnosis.regions import parts
-from core.diagnosis.search import part
 from core.diagnosis.selection import Selection
 from core.diagnosis.smooth import targets
 from core.diagnosis.space import gains
@@ -30,12 +30,10 @@ LARGE = 900  # rows of the sample space from which several accusations go at a t
 HOPELESS = 0.6  # strength below which they do
 
 
-def withstanding(selection: Selection, believed: Sequence[int]) -> list[int]:
-    """Return the candidates, of those believed, that withstand the remainder."""
+def withstanding(selection: Selection, believed: Sequence[int]) -> tuple[list[int], list[int]]:
+    """Return the candidates, of those believed, that withstand, and the unnamed beside them."""
     remainder = _Remainder(selection)
     accused = list(believed)
-    if not accused:
-        return accused
     while accused:
         strength = remainder.strengths(accused)
         if strength.min() >= 1:
@@ -45,27 +43,21 @@ def withstanding(selection: Selection, believed: Sequence[int]) -> list[int]:
             worst = np.argsort(strength)[: max(1, len(accused) // 8)]
             out |= {int(i) for i in worst if strength[i] < HOPELESS}
         accused = [c for i, c in enumerate(accused) if i not in out]
-    return accused
+    return accused, remainder.beside
 
 
 def links_withstand(selection: Selection) -> bool:
-    """Return whether the geometry of all links keeps its effect on the samples.
+    """Return whether the geometry of all links predicts regions that its fit did not see.
 
-    Its single numbers are none of them sure; what they do together has to be.
+    None of its numbers is sure by itself, so what they do together is judged: it has to gain.
     """
-    space, block = selection.space, selection.block
-    remainder = _Remainder(selection)
+    space = selection.space
     named = [c for c in selection.found.chosen if space.candidates[c].named]
-    beside = space.columns(remainder.asked_for(named))
-    X = space.columns(block) * np.concatenate([selection.prior[c] for c in block])
-    effects = []
-    for others in (space.columns(named), np.hstack([space.columns(named), beside])):
-        Q = basis_of(others)
-        A, y = X - Q @ (Q.T @ X), space.y - Q @ (Q.T @ space.y)
-        effects.append(X @ np.linalg.solve(A.T @ A + np.eye(A.shape[1]), A.T @ y))
-    alone, along = effects
-    share = float(alone @ along) / max(float(alone @ alone), 1e-300)
-    return 1 / DRIFT <= share <= DRIFT
+    held = HeldOut(selection, parts=parts(selection.observation, selection.kept))
+    if not held.possible:
+        return False
+    links = [*named, *selection.block]
+    return held.shrink(links, named).interval[0] > STAND_IN_GAIN
 
 
 class _Remainder:
@@ -73,19 +65,19 @@ class _Remainder:
 
     def __init__(self, selection: Selection) -> None:
         self.space = selection.working
+        joints = selection.observation.joint_columns is not None
         unnamed = [
             c for c, k in enumerate(self.space.candidates) if _unnamed(k, selection.observation)
         ]
         self._index = np.array(unnamed, dtype=np.int64)
-        self._functions = part(self.space, self._index) if unnamed else None
         size = np.diff(self.space.start)[self._index]
         self._price = size * np.log(self.space.freedom) + 2 * np.log(max(len(unnamed), 2))
         self._asked = [c for c in selection.found.chosen if c in set(unnamed)]
-        # a constant is part of any function that moves a target
-        self._constant = {
-            name: selection.rows_of(directions)
-            for name, directions in targets(selection.observation).items()
-        }
+        self._first = self._asked  # beside which the accused were found
+        self.beside = self._asked  # those of the last question
+        # a constant is part of any function that moves a joint; of a sensor's axis it is a bias
+        moved = targets(selection.observation) if joints else {}
+        self._constant = {name: selection.rows_of(d) for name, d in moved.items()}
         part_of = parts(selection.observation, selection.kept)
         self._part = np.repeat(part_of, selection.observation.measured.shape[1])
 
@@ -93,12 +85,13 @@ class _Remainder:
         """Return of each accusation how far it is over what it takes to stay (1: just)."""
         # of a large log the functions asked for once stay, so that one more is asked for a round
         large = len(self.space.y) > LARGE and len(self._asked) >= UNKNOWNS
-        asked = self.asked_for(accused, 1 if large else UNKNOWNS)
+        asked = self.beside = self.asked_for(accused, 1 if large else UNKNOWNS)
         if len(self.space.y) > LARGE:
             self._asked = asked
         beside = self._beside(asked)
         value, spread, shown = self._values(accused, beside)
-        alone = np.linalg.lstsq(self._unit(accused), self.space.y, rcond=1e-9)[0]
+        found = np.hstack([self._unit(accused), self.space.columns(self._first)])
+        alone = np.linalg.lstsq(found, self.space.y, rcond=1e-9)[0]
         sigmas, steady, begin = [], [], 0
         for c in accused:
             size = int(self.space.start[c + 1] - self.space.start[c])
@@ -118,13 +111,12 @@ class _Remainder:
     def asked_for(self, accused: Sequence[int], most: int = UNKNOWNS) -> list[int]:
         """Return the unnamed functions that the residual asks for, at the price of chance alone."""
         space, asked = self.space, list(self._asked)
-        for _ in range(most if self._functions is not None else 0):
-            assert self._functions is not None
+        for _ in range(most if len(self._index) else 0):
             basis = basis_of(np.hstack([space.columns(accused), self._beside(asked)]))
             left = space.y - basis @ (basis.T @ space.y)
             freedom = max(space.freedom - basis.shape[1], 1.0)
             variance = max(float(left @ left) / freedom, space.floor)
-            gain = gains(self._functions, left, basis)[0] / variance - self._price
+            gain = gains(space, left, basis)[0][self._index] / variance - self._price
             gain[np.isin(self._index, asked)] = -np.inf
             if gain.max() <= 0:
                 break
@@ -176,10 +168,13 @@ class _Remainder:
 def _unnamed(candidate: Candidate, observation: Observation) -> bool:
     """Return whether a candidate stands for an unknown, and not for a named effect's own form.
 
-    Of joints that are measured one by one, a function of a joint's own speed is friction or delay.
+    A function of a joint's own last motion that moves it is play. Of joints that are measured one
+    by one, a function of a joint's own speed is friction or delay.
     """
     if candidate.named:
         return False
     stem, _, index = candidate.quantity.rpartition("_")
-    own = stem in ("actual_qd", "target_qd") and candidate.target.endswith(f"_{int(index) + 1}")
-    return not (own and observation.channel in ("torque", "tracking"))
+    own = index.isdigit() and candidate.target.endswith(f"_{int(index) + 1}")
+    if observation.channel in ("torque", "tracking"):
+        return not (own and stem in ("actual_qd", "target_qd"))
+    return not (own and stem == "approach")

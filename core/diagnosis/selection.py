@@ -7,7 +7,7 @@ prediction, frames and all), wild readings looked at again; until the set stays 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,7 +22,7 @@ from core.diagnosis.candidate import (
 )
 from core.diagnosis.criteria import HEAVIEST
 from core.diagnosis.following import exact_columns, one_delay
-from core.diagnosis.geometry import Links, links_of, prior, with_links
+from core.diagnosis.geometry import Links, links_of, with_links
 from core.diagnosis.neighbours import pruned
 from core.diagnosis.noise import Noise, estimate_noise
 from core.diagnosis.observation import Observation
@@ -58,17 +58,23 @@ class Selection:
     residual: Array  # (N, k) measured - predicted by the named terms, frame estimated along
     base: tuple[Term, ...]
     raw: Raw  # the space before the nuisance was projected out
-    block: tuple[int, ...] = ()  # candidates of all links, where they are a cause as a whole
+    prior: dict[int, Array] = field(default_factory=dict)  # 1 sigma (d,) of the numbers of each
+    # link's candidate, where the geometry of all links is a cause
 
     @property
     def nuisance_basis(self) -> Array:
         """Return an orthonormal basis (m, p) of the nuisance in the sample space."""
         return self.raw.basis
 
+    @property
+    def block(self) -> tuple[int, ...]:
+        """Return the candidates of all links, where their geometry is a cause as a whole."""
+        return tuple(self.prior)
+
     @cached_property
     def links(self) -> Links | None:
         """Return the links' geometry as a whole, where it is a cause."""
-        return links_of(self.space, self.block) if self.block else None
+        return links_of(self.space, self.prior) if self.prior else None
 
     @cached_property
     def working(self) -> Space:
@@ -97,7 +103,7 @@ class Selection:
         """Return the selection with the links' geometry no cause, the rest as it is."""
         index = [p for p, c in enumerate(self.term_index) if c not in self.block]
         return replace(
-            self, block=(), found=fit(self.space, self.found.chosen),
+            self, prior={}, found=fit(self.space, self.found.chosen),
             terms=tuple(self.terms[p] for p in index),
             term_index=tuple(self.term_index[p] for p in index),
             covariance=tuple(self.covariance[p] for p in index),
@@ -108,11 +114,6 @@ class Selection:
         """Return the number of fitted unknowns, nuisance included; of the links what they use."""
         links = 0.0 if self.links is None else self.links.used
         return float(self.raw.nuisance.shape[1] + sum(len(v) for v in self.found.values)) + links
-
-    @cached_property
-    def prior(self) -> dict[int, Array]:
-        """Return 1 sigma (d,) of the numbers of each candidate that is kept near nominal."""
-        return {c: prior(self.space.candidates[c]) for c in self.block}
 
     @property
     def groups(self) -> NDArray[np.int64]:
@@ -141,6 +142,7 @@ def select(
     work = Work(observation, arm, [], first, kept)
     found: Found | None = None
     space: Space | None = None
+    near: Space | None = None  # the same, beside the links where their geometry is a cause
     columns: list[Array] = []
     smooth = smooth_candidates(observation)
     for turn in range(ROUNDS):
@@ -151,7 +153,11 @@ def select(
             for c in named_candidates(arm, observation.channel, withheld, rotation, base, turns)
             if _has_what_it_needs(c, observation)
         ]
-        space, columns = None, []  # the last round's, as large as the new ones: not both at a time
+        space, near, columns = (
+            None,
+            None,
+            [],
+        )  # the last round's, as large as the new ones: not both at a time
         columns = [exact_columns(work.observation, c, base) for c in work.candidates]
         if turn == 0:
             look_for_wild(work, columns)
@@ -160,37 +166,37 @@ def select(
         best = one_delay(space, screened_search(space, base=inside))
         if turn > 0 and not work.kept.all():
             space, raw, best = with_wild_explained(work, columns, base, smooth, (space, raw, best))
-        near, best, block = with_links(space, best, inside)
+        near, best, links = with_links(space, best, inside)
         counted, whitened_by = work.kept.copy(), work.noise
         framed = work.observation
         try:
             exact = _exactly(near, best, work)
-            terms, index, covariance, residual = refit(work, space, exact, block)
+            terms, index, covariance, residual = refit(work, space, exact, links)
         except InputError:  # absurd flexibilities: the arm would buckle
             work.observation = framed  # not the frame that went astray with them
-            best, near, block = _stiff(space, best, inside), space, ()
+            best, near, links = _stiff(space, best, inside), space, {}
             terms, index, covariance, residual = refit(work, space, best)
         straight = straightened(space, best.chosen, index, terms, covariance)
         if straight is not None:
             best = pruned(near, fit(near, straight))
-            terms, index, covariance, residual = refit(work, space, best, block)
+            terms, index, covariance, residual = refit(work, space, best, links)
         same = terms_alike(terms, base) and turn > 0
         found = best
-        used = sum(len(v) for v in best.values) + (links_of(space, block).used if block else 0)
+        used = sum(len(v) for v in best.values) + (links_of(space, links).used if links else 0)
         free = 1 - used / space.freedom
         changed = look_again(work, _less_smooth(work, space, best, smooth, residual), free)
         if same and not changed:
             break
         base = terms
-    assert space is not None and found is not None
+    assert space is not None and near is not None and found is not None
     if len(space.y) >= LARGE and any(not space.candidates[c].named for c in found.chosen):
         work.kept, work.noise = counted.copy(), whitened_by
         # what goes into a model has to predict without the unnamed function beside it
         alone = fit(near, [c for c in found.chosen if space.candidates[c].named])
-        terms, index, covariance, residual = refit(work, space, alone, block)
+        terms, index, covariance, residual = refit(work, space, alone, links)
     return Selection(
         work.observation, space, found, terms, index, covariance, counted, whitened_by,
-        residual, base, raw, block,
+        residual, base, raw, links,
     )  # fmt: skip
 
 
@@ -231,19 +237,26 @@ def _less_smooth(
     return np.asarray(residual - both @ np.linalg.lstsq(rows, target, rcond=1e-9)[0])
 
 
-def standing(selection: Selection, arm: Arm, accused: Sequence[int]) -> Selection:
+def standing(
+    selection: Selection, arm: Arm, accused: Sequence[int], beside: Sequence[int] = ()
+) -> Selection:
     """Return the selection with some of its terms (positions) refitted as all there is.
 
-    Values that were fitted beside a withdrawn term are not those that stand without it.
+    Values that were fitted beside a withdrawn term are not those that stand without it. ``beside``
+    are unnamed functions that account for what is left: in a short log it would bias the values; a
+    long one averages over it, and its model has to predict without them.
     """
-    if not accused or len(accused) == len(selection.terms):
+    short = len(selection.space.y) < LARGE
+    if not accused or (len(accused) == len(selection.terms) and not (short and beside)):
         return selection
     work = Work(selection.observation, arm, [], selection.noise, selection.kept)
     chosen = [selection.term_index[p] for p in accused]
-    block = tuple(c for c in chosen if c in selection.block)
-    space = selection.working if block else selection.space
-    alone = fit(space, [c for c in chosen if c not in block])
-    fitted, index, spread, residual = refit(work, selection.space, alone, block)
+    links = selection.prior if set(chosen) & set(selection.prior) else {}
+    space = selection.working if links else selection.space
+    if short:
+        chosen += beside
+    alone = fit(space, [c for c in chosen if c not in links])
+    fitted, index, spread, residual = refit(work, selection.space, alone, links)
     terms, covariance = list(selection.terms), list(selection.covariance)
     for c, term, own in zip(index, fitted, spread, strict=True):
         position = selection.term_index.index(c)

@@ -11,7 +11,7 @@ prediction.
 from __future__ import annotations
 
 from abc import ABC
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -54,6 +54,7 @@ class Term:
     effect: str
     site: Site
     values: tuple[float, ...]
+    stand_in: bool = field(default=False, compare=False)  # True: useful, but not proved
 
     def with_values(self, values: Array) -> Term:
         """Return the same term with other values."""
