@@ -48,12 +48,13 @@ def _best_bump(selection: Selection, i: int, rest: Array, y: Array) -> float:
 
     observation = selection.observation
     assert observation.joint_columns is not None
+    joint = observation.joint_columns[:, :, i, None]
     z = observation.quantities[joint_quantity(observation, i)]
     low, span = float(z.min()), float(np.ptp(z))
 
     def left(at: Array) -> float:
         bump = np.exp(-0.5 * ((z - at[0]) / np.exp(at[1])) ** 2)
-        x = selection.rows_of(observation.joint_columns[:, :, i, None] * bump[:, None, None])[:, 0]
+        x = selection.rows_of(joint * bump[:, None, None])[:, 0]
         x = x - rest @ (rest.T @ x)
         size = float(x @ x)
         return float(y @ y) - (float(x @ y) ** 2 / size if size > 1e-9 else 0.0)

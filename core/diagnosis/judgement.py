@@ -183,7 +183,7 @@ def with_stand_ins(selection: Selection, judgement: Judgement) -> Judgement:
 def _units(selection: Selection, positions: Sequence[int]) -> list[tuple[int, ...]]:
     """Return the positions each by itself, the links' geometry in one."""
     links = tuple(p for p in positions if selection.term_index[p] in selection.block)
-    single = [(p,) for p in positions if p not in links]
+    single: list[tuple[int, ...]] = [(p,) for p in positions if p not in links]
     return [*single, links] if links else single
 
 

@@ -92,7 +92,9 @@ class _Remainder:
         value, spread, shown = self._values(accused, beside)
         found = np.hstack([self._unit(accused), self.space.columns(self._first)])
         alone = np.linalg.lstsq(found, self.space.y, rcond=1e-9)[0]
-        sigmas, steady, begin = [], [], 0
+        begin = 0
+        sigmas: list[float] = []
+        steady: list[float] = []
         for c in accused:
             size = int(self.space.start[c + 1] - self.space.start[c])
             own = np.arange(begin, begin + size)[shown[begin : begin + size]]

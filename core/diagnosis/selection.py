@@ -273,7 +273,8 @@ def _bounded(candidate: Candidate, model: Model, observation: Observation) -> Ca
     Of a curve the bound holds for what its two parts come to together.
     """
     if candidate.family == "payload":
-        mass = replace(candidate.parameters[0], **_loads_that_can_be(model, observation))
+        least, most = _loads_that_can_be(model, observation)
+        mass = replace(candidate.parameters[0], lower=least, upper=most)
         return replace(candidate, parameters=(mass, *candidate.parameters[1:]))
     curved = candidate.curve is not None
     if candidate.family not in ("axial_compliance", "radial_compliance") and not curved:
@@ -286,11 +287,11 @@ def _bounded(candidate: Candidate, model: Model, observation: Observation) -> Ca
     return replace(candidate, parameters=(bounded, *candidate.parameters[1:]))
 
 
-def _loads_that_can_be(model: Model, observation: Observation) -> dict[str, float]:
+def _loads_that_can_be(model: Model, observation: Observation) -> tuple[float, float]:
     """Return how far a payload may be off: the true one is no less than nothing, and no giant."""
     declared = observation.quantities.get("payload", np.array([model.payload_mass]))
     most = HEAVIEST * max(float(declared.max()), model.arm.payload)
-    return {"lower": -float(declared.min()), "upper": most}
+    return -float(declared.min()), most
 
 
 def _has_what_it_needs(candidate: Candidate, observation: Observation) -> bool:
