@@ -51,6 +51,8 @@ class Arm:
     limits: JointLimits
     payload: float = np.inf  # kg, rated
     joint_names: tuple[str, ...] = field(default=())
+    # (n, 3, 3): axes of the URDF link, or of the DH row, in the frame of link i; None: the same
+    body_axes: Array | None = None
 
     @property
     def n(self) -> int:
@@ -67,7 +69,7 @@ def dh_transform(a: float, alpha: float, d: float) -> Array:
 def arm_from_dh(
     rows: Sequence[Mapping[str, Any]], name: str = "dh", limits: JointLimits | None = None
 ) -> Arm:
-    """Return the arm of standard DH rows ``{a, alpha, d, offset, mass, cog}`` (CONTRACT, cell).
+    """Return the arm of standard DH rows ``{a, alpha, d, offset, mass, cog}``, as a cell has them.
 
     ``cog`` is in the row's own frame (DH frame i). Mass and cog may be left out (zero). Raises
     ArmError where a row lacks a, alpha or d, or holds something that is not a finite number.
@@ -76,7 +78,7 @@ def arm_from_dh(
         raise ArmError("robot.dh: found no rows, expected one row {a, alpha, d} per joint")
     n = len(rows)
     links = np.tile(np.eye(4), (n + 1, 1, 1))
-    mass, cog = np.zeros(n), np.zeros((n, 3))
+    mass, cog, axes = np.zeros(n), np.zeros((n, 3)), np.empty((n, 3, 3))
     turn = np.eye(4)
     for i, row in enumerate(rows):
         where = f"robot.dh row {i + 1}"
@@ -89,9 +91,10 @@ def arm_from_dh(
         mass[i] = _number(row, "mass", where, 0.0)
         if mass[i] < 0:
             raise ArmError(f"{where}: mass: found {mass[i]:g}, expected 0 or more kg")
-        in_row = _centre(row, where)
-        cog[i] = links[i + 1][:3, :3] @ in_row + links[i + 1][:3, 3]
-    return Arm(name, links, mass, cog, np.zeros((n, 3, 3)), limits or JointLimits.none(n))
+        in_row, axes[i] = _centre(row, where), links[i + 1][:3, :3]
+        cog[i] = axes[i] @ in_row + links[i + 1][:3, 3]
+    inertia, limits = np.zeros((n, 3, 3)), limits or JointLimits.none(n)
+    return Arm(name, links, mass, cog, inertia, limits, body_axes=axes)
 
 
 def _centre(row: Mapping[str, Any], where: str) -> Array:

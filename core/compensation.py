@@ -8,24 +8,36 @@ one.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core import kernel
-from core.kernel import JIT, Chain
+from core.effects import CATALOGUE, settling
+from core.kernels import reference as kernel
 from core.kernels import single
+from core.kernels.least_offset import LARGEST_OFFSET as LARGEST_OFFSET
+from core.kernels.least_offset import smallest_offset
+from core.kernels.packed import (
+    arm_block,
+    chain_of,
+    row_of,
+    shape_of,
+    shape_size,
+    sizes_of,
+    view_row,
+    view_shape,
+)
+from core.kernels.reference import JIT, Chain
 from core.kernels.single import LEVER, MAX_STEPS, SCRATCH, TOLERANCE
-from core.least_offset import LARGEST_OFFSET as LARGEST_OFFSET
-from core.least_offset import smallest_offset
 from core.loads import Loads
 from core.model import Model, Poses
-from core.packed import arm_block, chain_of, row_of, shape_of, shape_size, sizes_of, view_row
 
 Array = NDArray[np.float64]
 NOTHING = Loads()
+LEADS = 2  # times that a servo's rest is looked at for the command that leads there
 
 
 class Correction(NamedTuple):
@@ -172,6 +184,7 @@ class Compensator:
         self._wanted = rest[:12]
         self._view = view_row(self._row, n)
         self._conditions = model.conditions()
+        self._settling = settling(model.terms)
         self._stiff_links = not chain.flexibility.any()
         self._pose = np.zeros(12)
         # what acts where nothing is given
@@ -181,13 +194,14 @@ class Compensator:
     def correct(self, nominal_q: Array, loads: Loads | None = None) -> Correction:
         """Return the corrected setpoint for ``nominal_q`` (n,); ``loads`` holds one row.
 
-        The wanted pose is the rigid, effect-free arm's at ``nominal_q``. A row that cannot be
+        The wanted pose is the rigid, effect-free arm's at ``nominal_q``. Where servos are known to
+        rest elsewhere than commanded, the setpoint makes up for that too. A row that cannot be
         solved comes back with the distance left in ``residual`` (inf: no equilibrium).
         """
         n, loads = self._n, loads or NOTHING
         found, nominal = np.empty(n + 6), np.ascontiguousarray(nominal_q, dtype=float)
         q, moved = found[:n], found[n:]
-        if self._stiff_links and not self._conditions:
+        if self._stiff_links and not self._conditions and not self._settling:
             mass, cog, wrench = loads.payload_mass, loads.payload_cog, loads.wrench
             best, steps = single.correct(
                 self._block, nominal, self._mass if mass is None else mass,
@@ -199,6 +213,7 @@ class Compensator:
             _want(rigid, self._rigid_row, self._rigid_shape, nominal, self._wanted)
             best, steps = self._solve_conditioned(nominal, loads, q)
             self._offset[:] = q - nominal if best < np.inf else 0.0
+            self._lead(loads, q)
             _want(rigid, self._rigid_row, self._rigid_shape, q, self._pose)
             _moved(self._wanted, self._pose, self._offset, moved)
         return Correction(q, moved, best, steps)
@@ -226,6 +241,21 @@ class Compensator:
                 break
         return best, steps
 
+    def _lead(self, loads: Loads, q: Array) -> None:
+        """Change encoder angles ``q`` (n,) into the commands whose servos rest there."""
+        if not self._settling:
+            return
+        shape = view_shape(self._shape, self._n)
+        held = -np.sum(shape.axis * shape.moment, axis=1)[None]
+        wanted, command = q.copy(), q[None].copy()
+        for _ in range(LEADS):
+            rests = command
+            for term in self._settling:
+                effect = CATALOGUE[term.effect]
+                rests = effect.settle(term, self.model.arm, rests, held, loads.approach)
+            command = command + (wanted - rests)
+        q[:] = command[0]
+
     def _load(self, loads: Loads) -> None:
         """Write what acts into the row's own buffers."""
         row, mass, cog, wrench = self._view, loads.payload_mass, loads.payload_cog, loads.wrench
@@ -237,7 +267,8 @@ class Compensator:
 def correct(model: Model, nominal_q: Array, loads: Loads | None = None) -> Correction:
     """Return the corrected setpoints of many rows (N, n): ``Compensator.correct`` row by row."""
     q = np.atleast_2d(np.asarray(nominal_q, dtype=float))
-    loads, live = loads or Loads(), Compensator(model)
+    # what slipped once has slipped: setpoints are for what comes
+    loads, live = replace(loads or Loads(), time=None), Compensator(model)
     results = [live.correct(q[r], loads[r : r + 1]) for r in range(len(q))]
     return Correction(
         np.array([c.q for c in results]).reshape(q.shape),

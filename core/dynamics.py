@@ -20,24 +20,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.effects import CATALOGUE, Term
-from core.kernel import Chain
+from core.effects import CATALOGUE, Term, acting
+from core.kernels.reference import Chain
 from core.model import Model
 from core.motion import Motion, Pieces
 
 Array = NDArray[np.float64]
-
-# The way from load to reading: effects act in this order, whatever order they were found in.
-SENSING = ("payload", "ft_misalignment", "ft_gain", "ft_drift", "ft_bias")
-TRACKING = ("latency", "tracking_lag")
-DRIVING = (
-    "payload",
-    "link_inertia",
-    "rotor_inertia",
-    "viscous_friction",
-    "coulomb_friction",
-    "torque_constant",
-)
+LIGHTEST = 1e-6  # kg, of a link whose centre of gravity is anywhere
 
 
 @dataclass(frozen=True)
@@ -96,38 +85,64 @@ def pieces_of(model: Model, motion: Motion) -> Pieces:
     """Return what each part of the model's rigid arm contributes along a motion.
 
     The model's own effects count where they move the geometry or the gravity (joint offsets, say);
-    its payload effect does not count here, it enters by ``sense`` and ``drive``.
+    what loads the sensor or the motors does not count here, it enters by ``sense`` and ``drive``.
     """
-    geometry = replace(model, terms=tuple(t for t in model.terms if t.effect != "payload"))
+    own = {"wrench", "torque"}
+    geometry = replace(
+        model, terms=tuple(t for t in model.terms if not own & {*CATALOGUE[t.effect].channels})
+    )
     chain, rows = geometry.chain(), geometry.rows(motion.q, motion.loads)
     frames = frames_of(chain, rows.q, motion.qd, motion.qdd)
     n, count = model.arm.n, len(motion)
     gravity, axis = chain.gravity, frames.rotation[:, :n, :, 2]
     link_torque = np.zeros((count, n, n))
-    for i in range(n):
+
+    def link_at(i: int, cog: Array) -> Array:
+        """Return the torques (N, n) of one link with its centre of gravity at ``cog`` (3,)."""
         R = frames.rotation[:, i]
-        point, acceleration = frames.at(i, R @ chain.cog[i])
+        point, acceleration = frames.at(i, R @ cog)
         inertia = R @ model.arm.inertia[i] @ np.swapaxes(R, 1, 2)
         omega, alpha = frames.omega[:, i], frames.alpha[:, i]
         moment = _times(inertia, alpha) + np.cross(omega, _times(inertia, omega))
         force = chain.mass[i] * (acceleration - gravity)
-        link_torque[:, i, : i + 1] = _about_axes(frames, axis, i + 1, point, force, moment)
+        torque = np.zeros((count, n))
+        torque[:, : i + 1] = _about_axes(frames, axis, i + 1, point, force, moment)
+        return torque
+
+    for i in range(n):
+        link_torque[:, i] = link_at(i, chain.cog[i])
     hand = frames.rotation[:, n]
-    payload_at, acceleration = frames.at(n, _times(hand, rows.payload_cog))
-    payload_force = acceleration - gravity
     sensor = _bent_flange(model, motion, frames)
-    in_hand, _ = sensor.at(n, _times(sensor.rotation[:, n], rows.payload_cog))
     tcp_in_hand = sensor.origin[:, n] + sensor.rotation[:, n] @ chain.tool_position
     tcp = frames.origin[:, n] + hand @ chain.tool_position
     pull, couple = rows.wrench[:, :3], rows.wrench[:, 3:]
     nothing = np.zeros((count, 3))
+
+    def payload_from(shift: Array) -> tuple[Array, Array]:
+        cog = rows.payload_cog + shift
+        place, acceleration = frames.at(n, _times(hand, cog))
+        force = acceleration - gravity
+        in_hand, _ = sensor.at(n, _times(sensor.rotation[:, n], cog))
+        return (
+            _about_axes(frames, axis, n, place, force, nothing),
+            _at_flange(sensor, in_hand, -force, nothing),
+        )
+
+    def link_from(i: int, moment: Array) -> Array:
+        shift = moment / max(float(chain.mass[i]), LIGHTEST)
+        return link_at(i, chain.cog[i] + shift) - link_torque[:, i]
+
+    payload_torque, payload_wrench = payload_from(np.zeros(3))
     return Pieces(
         link_torque=link_torque,
-        payload_torque=_about_axes(frames, axis, n, payload_at, payload_force, nothing),
+        payload_torque=payload_torque,
         external_torque=-_about_axes(frames, axis, n, tcp, pull, couple),
-        payload_wrench=_at_flange(sensor, in_hand, -payload_force, nothing),
+        payload_wrench=payload_wrench,
         external_wrench=_at_flange(sensor, tcp_in_hand, pull, couple),
         payload_mass=rows.payload_mass,
+        carried_mass=rows.payload_mass,
+        payload_from=payload_from,
+        link_from=link_from,
     )
 
 
@@ -162,6 +177,11 @@ def _at_flange(frames: Frames, point: Array, force: Array, moment: Array) -> Arr
     return np.concatenate([_times(hand, force), _times(hand, whole)], axis=1)
 
 
+def with_held(model: Model, motion: Motion) -> Motion:
+    """Return the motion with the torques that the joints hold in it at rest."""
+    return replace(motion, held=model.held_torque(motion.q, motion.loads))
+
+
 def with_pieces(model: Model, motion: Motion) -> Motion:
     """Return the motion with the model's contributions, which effects and predictions need."""
     return replace(motion, pieces=pieces_of(model, motion))
@@ -169,22 +189,27 @@ def with_pieces(model: Model, motion: Motion) -> Motion:
 
 def predict_torque(model: Model, motion: Motion, terms: Sequence[Term] = ()) -> Array:
     """Return the joint torques (N, n), Nm, that would be measured, with further ``terms``."""
-    pieces = _pieces(model, motion)
+    own = acting((*model.terms, *terms), "torque")
+    motion, pieces = _carrying(model, motion, own)
     torque: Array = pieces.link_torque.sum(axis=1) + pieces.external_torque
     torque = torque + pieces.payload_mass[:, None] * pieces.payload_torque
-    for term in _in_order(model, terms, DRIVING):
-        torque = CATALOGUE[term.effect].drive(term, model.arm, torque, motion)
+    for term in own:
+        effect = CATALOGUE[term.effect]
+        if motion.load is None and not effect.carried:
+            motion = replace(motion, load=torque)
+        torque = effect.drive(term, model.arm, torque, motion)
     return torque
 
 
 def predict_wrench(model: Model, motion: Motion, terms: Sequence[Term] = ()) -> Array:
     """Return the wrenches (N, 6), N and Nm, that the flange sensor would read, with ``terms``.
 
-    Flange axes, about the flange origin, payload included (CONTRACT, ``ft_raw_wrench``).
+    Flange axes, about the flange origin, payload included (docs/conventions.md, Loads).
     """
-    pieces = _pieces(model, motion)
+    own = acting((*model.terms, *terms), "wrench")
+    motion, pieces = _carrying(model, motion, own)
     wrench = pieces.payload_mass[:, None] * pieces.payload_wrench + pieces.external_wrench
-    for term in _in_order(model, terms, SENSING):
+    for term in own:
         wrench = CATALOGUE[term.effect].sense(term, model.arm, wrench, motion)
     return wrench
 
@@ -194,15 +219,16 @@ def predict_tracking(model: Model, motion: Motion, terms: Sequence[Term] = ()) -
     if motion.target_q is None:
         raise ValueError("the motion has no target_q")
     q = motion.target_q
-    for term in _in_order(model, terms, TRACKING):
+    if motion.held is None:
+        motion = with_held(model, motion)
+    for term in acting((*model.terms, *terms), "tracking"):
         q = CATALOGUE[term.effect].track(term, model.arm, q, motion)
     return q
 
 
-def _pieces(model: Model, motion: Motion) -> Pieces:
-    return pieces_of(model, motion) if motion.pieces is None else motion.pieces
-
-
-def _in_order(model: Model, terms: Sequence[Term], order: tuple[str, ...]) -> list[Term]:
-    acting = [t for t in (*model.terms, *terms) if t.effect in order]
-    return sorted(acting, key=lambda term: order.index(term.effect))
+def _carrying(model: Model, motion: Motion, terms: Sequence[Term]) -> tuple[Motion, Pieces]:
+    """Return the motion, with pieces that know what the terms add to the payload's mass."""
+    pieces = pieces_of(model, motion) if motion.pieces is None else motion.pieces
+    more = sum(t.values[0] for t in terms if CATALOGUE[t.effect].adds_mass)
+    pieces = replace(pieces, carried_mass=pieces.payload_mass + more)
+    return replace(motion, pieces=pieces, load=None), pieces

@@ -16,7 +16,8 @@
         │   └── WriteError          a setpoint could not be delivered
         │       ├── PartialWriteError       a part of it has left; the next one is sent whole
         │       ├── IneffectiveWriteError   it was sent and nothing came of it
-        │       └── ForeignCommandError     somebody else commands the arm
+        │       ├── ForeignCommandError     somebody else commands the arm
+        │       └── GateError               the gate before the wire refused it: nothing was sent
         └── LimitError        a setpoint that must not leave
 """
 
@@ -85,6 +86,10 @@ class IneffectiveWriteError(WriteError):
 
 class ForeignCommandError(WriteError):
     """Somebody else commands the arm: two masters, expected one."""
+
+
+class GateError(WriteError):
+    """The last check before the wire refused a setpoint; nothing of it was sent."""
 
 
 class LimitError(RunError):

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.kernel import JIT
+from core.kernels.reference import JIT
 
 if TYPE_CHECKING:
     from core.motion import Motion
@@ -50,6 +50,26 @@ def lagged(time: Array, command: Array, constant: float, first: float) -> Array:
     dense = np.append(grid.ravel(), time[-1])
     late = _follow(dense, interpolate(time, command, dense), constant, first)
     return np.asarray(late[::fine])
+
+
+def played(command: Array, width: float, first: float) -> Array:
+    """Return what follows a command (N,) with play of half width ``width``, from ``first`` on.
+
+    It stands still while the command is within the width, and is pushed along at either end of it.
+    A negative width, which only steps of a solver ask for, is continued oddly.
+    """
+    result = _pushed(command, abs(width), first)
+    return np.asarray(result if width >= 0 else 2 * command - result)
+
+
+@njit(**JIT)  # type: ignore[misc,untyped-decorator,unused-ignore]
+def _pushed(command: Array, width: float, first: float) -> Array:
+    moved = np.empty_like(command)
+    now = first
+    for k in range(len(command)):
+        now = min(max(now, command[k] - width), command[k] + width)
+        moved[k] = now
+    return moved
 
 
 @njit(**{**JIT, "error_model": "python"})  # type: ignore[misc,untyped-decorator,unused-ignore]

@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from core.errors import LimitError
-from core.kernel import JIT
+from core.kernels.reference import JIT
 
 Array = NDArray[np.float64]
 LONGEST_GAP = 5.0  # cycles: after a longer one, no more than this many cycles' steps are allowed
@@ -48,7 +48,7 @@ class Limits:
     offset_rate: float = 0.05
     offset_rotation_rate: float = 0.1
     joint_offset: float = 0.05
-    following: float = 0.35
+    following: float = 0.1
     cycle: float = 0.002
 
     def __post_init__(self) -> None:
@@ -64,7 +64,7 @@ class Limits:
 
 
 class Limited(NamedTuple):
-    """What may leave; the arrays are the limiter's own and hold until its next call.
+    """What may leave; the arrays are the limiter's own, read-only, and hold until its next call.
 
     A tuple, because one is made in every cycle.
     """
@@ -95,6 +95,7 @@ class Limiter:
         # one block: each array handed to compiled code is unwrapped anew in every call
         self._block = np.concatenate([numbers, *bounds, np.zeros(3 * n + 6)])
         self._q, self._nominal, self._delta, self._offset = _kept(self._block)
+        self._out = _read_only(self._q), _read_only(self._offset)
         self._q[:] = self._nominal[:] = np.nan
 
     @property
@@ -103,23 +104,33 @@ class Limiter:
         return bool(np.isfinite(self._q[0]))
 
     @property
+    def joint_offset(self) -> Array:
+        """Return the joint offset (n,) that left last, rad: read-only, of this moment."""
+        return _read_only(self._delta)
+
+    @property
     def offset_in_base(self) -> Array:
         """Return a copy of the TCP offset (6,) that left last, m and rad."""
         return self._offset.copy()
 
-    def start(self, q: Array) -> None:
-        """Begin a stream: the arm is commanded to ``q`` (n,) rad, with no offset.
+    def start(
+        self, q: Array, delta: Array | None = None, offset_in_base: Array | None = None
+    ) -> None:
+        """Begin a stream: the arm is commanded to ``q`` (n,) rad.
 
-        Raises LimitError where that is not finite or outside the joint limits.
+        ``delta`` (n,) rad of it, with its TCP offset (6,), is an offset that is in force already;
+        left out: none is. Raises LimitError where that is not finite or outside the joint limits.
         """
         if not np.isfinite(q).all():
             raise LimitError(f"start: found {q}, expected finite joints")
         if (q < self.limits.lower).any() or (q > self.limits.upper).any():
             raise LimitError(f"start: found {q}, expected joints within their limits")
+        if delta is not None and not np.isfinite(delta).all():
+            raise LimitError(f"start: found an offset of {delta}, expected finite joints")
         self._q[:] = q
-        self._nominal[:] = q
-        self._delta[:] = 0.0
-        self._offset[:] = 0.0
+        self._delta[:] = 0.0 if delta is None else delta
+        self._nominal[:] = q - self._delta
+        self._offset[:] = 0.0 if offset_in_base is None else offset_in_base
 
     def reset(self) -> None:
         """End the stream; ``limit`` refuses until ``start``."""
@@ -151,7 +162,7 @@ class Limiter:
         if clamped:
             for bit in range(len(CLAMPS)):
                 self.counts[bit] += clamped >> bit & 1
-        return Limited(self._q, self._offset, clamped)
+        return Limited(*self._out, clamped)
 
     def _reason(self, code: int, nominal_q: Array, actual_q: Array, dt: float) -> str:
         if code == _BAD_GAP:
@@ -174,11 +185,18 @@ class Limiter:
             joint = int(np.argmax(np.abs(self._q - actual_q)))
             return (
                 f"setpoint: joint {joint + 1} is {abs(self._q[joint] - actual_q[joint]):.4f} rad "
-                f"from its command, expected at most {self.limits.following:g}"
+                f"from its command, expected at most {self.limits.following:g} (limits.following)"
             )
         if not self.started:
             return "setpoint: found no start of the stream, expected start() before limit()"
         return "setpoint: found a number that is not finite, expected finite ones"
+
+
+def _read_only(array: Array) -> Array:
+    """Return a view through which nobody else changes the limiter's own numbers."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def _kept(block: Array) -> tuple[Array, Array, Array, Array]:

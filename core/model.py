@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arm import Arm
-from core.effects import CATALOGUE, Site, Term
+from core.effects import CATALOGUE, Site, Term, flexibility_effects, settling
 from core.effects.effect import Effect
 from core.errors import InputError
-from core.kernel import Chain, Rows
 from core.kernels import many
+from core.kernels.reference import Chain, Rows
 from core.loads import Loads
 from core.rotation import rotation_vector
 
@@ -36,7 +36,7 @@ class Poses:
 
 @dataclass(frozen=True)
 class LinearForm:
-    """The paper's linear model at given shapes: pose change = ``regressor`` @ flexibilities."""
+    """Eq. 4 of docs/conventions.md at given shapes: pose change = ``regressor`` @ flexibilities."""
 
     regressor: Array  # (N, 6, 2n) m/(rad/Nm), Nm: axial 1..n, then radial 1..n
     jacobian: Array  # (N, 6, n) of the TCP, base axes
@@ -67,8 +67,9 @@ class Model:
         self, axial: Sequence[float] | Array, radial: Sequence[float] | Array
     ) -> Model:
         """Return the model with these joint flexibilities (n each, rad/Nm) instead of its own."""
-        kept = [t for t in self.terms if t.effect not in ("axial_compliance", "radial_compliance")]
-        for effect, values in (("axial_compliance", axial), ("radial_compliance", radial)):
+        kept = [t for t in self.terms if not CATALOGUE[t.effect].flexibility]
+        named = flexibility_effects()
+        for effect, values in ((named["axial"], axial), (named["radial"], radial)):
             if len(values) != self.arm.n:
                 raise InputError(f"{effect}: found {len(values)} values, expected {self.arm.n}")
             kept += [Term(effect, Site(i + 1), (float(v),)) for i, v in enumerate(values) if v]
@@ -144,14 +145,36 @@ class Model:
         count = len(rows.q)
         position, rotation = np.empty((count, 3)), np.empty((count, 3, 3))
         _require_equilibrium(many.predict(chain, rows, position, rotation))
+        if loads is not None and loads.time is not None:
+            for term in self.terms:
+                CATALOGUE[term.effect].before(term, chain, position, rotation, loads)
         return Poses(position, rotation)
+
+    def held_torque(self, q: Array, loads: Loads | None = None) -> Array:
+        """Return the torques (N, n), Nm, that the joints hold at rest at encoder angles ``q``.
+
+        Gravity, payload and pull, about the joints' axes where the bent arm has them; positive
+        where the motor pushes towards positive q. Raises InputError where a row has no equilibrium.
+        """
+        form = self.linear_form(q, loads)
+        return -np.asarray(np.einsum("nij,nji->ni", form.moment, form.jacobian[:, 3:]))
+
+    def settled(self, commands: Array, loads: Loads | None = None) -> Array:
+        """Return where the encoders (N, n) come to rest for ``commands`` (N, n), rad."""
+        terms, q = settling(self.terms), np.atleast_2d(commands)
+        if terms:
+            loads = loads or Loads()
+            held = self.held_torque(q, loads)
+            for term in terms:
+                q = CATALOGUE[term.effect].settle(term, self.arm, q, held, loads.approach)
+        return q
 
     def rigid_pose(self, q: Array) -> Poses:
         """Return the TCP poses of the rigid, effect-free arm at ``q`` (N, n)."""
         return self.without_terms().predict(q)
 
     def linear_form(self, q: Array, loads: Loads | None = None) -> LinearForm:
-        """Return the linear form (paper eqs. 18, 33, 35) at the model's present shape.
+        """Return the linear form (eq. 4 of docs/conventions.md) at the model's present shape.
 
         For a model without compliance this is the paper's A(q, F), to be multiplied with the 2n
         flexibilities. Raises InputError where a row has no equilibrium.

@@ -6,6 +6,7 @@ first has derivatives. Which one it is follows from its timestamps and steps.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from core.derivatives import differentiate
 from core.errors import LogError
 from core.loads import Loads
-from core.log import Log
+from core.log.log import Log
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -43,6 +44,11 @@ class Pieces:
     payload_wrench: Array  # (N, 6) N, Nm per kg of payload at its declared centre of gravity
     external_wrench: Array  # (N, 6) N, Nm of the surroundings
     payload_mass: Array  # (N,) kg, declared
+    carried_mass: Array  # (N,) kg, with what the effects at hand add to it
+    # torques (N, n) and wrench (N, 6) per kg of payload, its centre shifted by (3,) m, flange axes
+    payload_from: Callable[[Array], tuple[Array, Array]]
+    # torques (N, n) that a first moment (3,) kg m of a link (from 0) takes more, link axes
+    link_from: Callable[[int, Array], Array]
 
 
 @dataclass(frozen=True)
@@ -62,6 +68,8 @@ class Motion:
     moving: bool  # False: poses at rest
     still: Array  # (n,) rad/s below which the direction of motion is unsure
     pieces: Pieces | None = None
+    load: Array | None = None  # (N, n) Nm of the rigid arm with payload and pull, no friction
+    held: Array | None = None  # (N, n) Nm that each joint holds at rest: gravity, payload, pull
 
     def __len__(self) -> int:
         return len(self.t)
@@ -74,7 +82,15 @@ class Motion:
             target_q=None if self.target_q is None else self.target_q[rows],
             loads=self.loads[index], rows=self.rows[rows], valid=self.valid[rows],
             stretch=self.stretch[rows], pieces=None,
+            held=None if self.held is None else self.held[rows],
         )  # fmt: skip
+
+    @property
+    def recorded_time(self) -> Array:
+        """Return the time (N,) from the first row on, pauses between stretches left out, s."""
+        steps = np.diff(self.t)
+        steps = np.where(np.diff(self.stretch) > 0, 0.0, steps)
+        return np.concatenate([[0.0], np.cumsum(steps)])
 
     @property
     def direction(self) -> Array:
@@ -114,7 +130,8 @@ def motion_of(log: Log) -> Motion:
         valid=np.ones(len(rows), dtype=bool), stretch=np.zeros(len(rows), dtype=np.int64),
         start=float(t[0]), moving=moving, still=still,
     )  # fmt: skip
-    return _with_derivatives(motion, given) if moving else motion
+    session = log.columns["session"][rows] if log.session_names else np.zeros(len(rows))
+    return _with_derivatives(motion, given, np.diff(session) != 0) if moving else motion
 
 
 def is_moving(time: Array, q: Array, speed: Array | None = None) -> bool:
@@ -181,10 +198,12 @@ def _clock(log: Log, time: Array) -> tuple[Index, Array, str | None]:
     )
 
 
-def _with_derivatives(motion: Motion, given: Array | None) -> Motion:
+def _with_derivatives(
+    motion: Motion, given: Array | None, new_session: NDArray[np.bool_]
+) -> Motion:
     steps = np.diff(motion.t)
     step = float(np.median(steps))
-    stretch = np.concatenate([[0], np.cumsum(steps > GAP * step)])
+    stretch = np.concatenate([[0], np.cumsum((steps > GAP * step) | new_session)])
     qd, qdd = np.zeros_like(motion.q), np.zeros_like(motion.q)
     valid, noise = np.zeros(len(motion), dtype=bool), np.zeros(motion.q.shape[1])
     for number in range(int(stretch[-1]) + 1):

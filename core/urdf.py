@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from core.arm import Arm, JointLimits
 from core.errors import ArmError
+from core.files import read_text
 from core.rotation import rotation_matrix, rpy_matrix, transform
 
 Array = NDArray[np.float64]
@@ -49,7 +50,7 @@ def arm_from_urdf(path: Path | str, tip: str | None = None) -> Arm:
 
 def _parse(path: Path) -> ElementTree.Element:
     try:
-        root = ElementTree.fromstring(path.read_text(encoding="utf-8"))
+        root = ElementTree.fromstring(read_text(path))
     except FileNotFoundError:
         raise ArmError(f"{path}: robot.urdf: file not found") from None
     except (OSError, UnicodeDecodeError) as error:
@@ -150,7 +151,8 @@ def _arm(
             columns[key].append(value if value > 0 else np.inf)
     limits = JointLimits(**{key: np.array(values) for key, values in columns.items()})
     names = tuple(str(j.get("name")) for j in moving)
-    return Arm(name, fixed, mass, cog, inertia, limits, joint_names=names)
+    axes = np.array([_align_z(_axis(joint, f"{path}: joint")).T[:3, :3] for joint in moving])
+    return Arm(name, fixed, mass, cog, inertia, limits, joint_names=names, body_axes=axes)
 
 
 def _limit(text: str, key: str, label: str) -> float:

@@ -10,6 +10,7 @@ from core.errors import LinkError
 if TYPE_CHECKING:
     from core.model import Model
     from drivers.driver import Driver, DriverSettings
+    from drivers.gate import GateBounds
 
 DRIVERS: dict[str, str] = {
     "can": "drivers.can.driver:CanDriver",
@@ -21,10 +22,11 @@ DRIVERS: dict[str, str] = {
 """Driver name in a cell file -> ``module:Class``, imported when it is used."""
 
 
-def make_driver(settings: DriverSettings, model: Model) -> Driver:
+def make_driver(settings: DriverSettings, model: Model, bounds: GateBounds | None = None) -> Driver:
     """Return the driver that the settings name, not yet connected.
 
-    ``model`` tells it the arm and the tool. Raises LinkError where the driver's library is missing.
+    ``model`` tells it the arm and the tool, ``bounds`` what its gate lets pass (left out: the
+    defaults of a cell file). Raises LinkError where the driver's library is missing.
     """
     name = str(getattr(settings, "driver", ""))
     if name not in DRIVERS:
@@ -34,4 +36,7 @@ def make_driver(settings: DriverSettings, model: Model) -> Driver:
         found = getattr(importlib.import_module(module), kind)
     except ImportError as error:
         raise LinkError(f"link.driver {name}: its library cannot be imported: {error}") from None
-    return cast("Driver", found(settings, model))
+    driver = cast("Driver", found(settings, model))
+    if bounds is not None:
+        driver.gate.hold_to(bounds)
+    return driver

@@ -1,7 +1,8 @@
 """What a driver is: four methods between a controller's wire and the loop.
 
-``connect``, ``read_state``, ``write_setpoint`` and ``close`` are what every driver must have. Three
-more have a sensible default: ``arm``, ``release`` and ``nominal_q``.
+``connect``, ``read_state``, ``write_setpoint`` and ``close`` are what every driver has; ``arm`` and
+``release`` stand around the writing. Whatever is written passes the gate (drivers/gate.py) here, in
+the base: a driver implements ``_send``, ``_make_ready`` and ``_let_go``, and cannot go around it.
 """
 
 from __future__ import annotations
@@ -9,16 +10,19 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self, final
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from core.model import Model
 from core.setpoint import Setpoint
 from core.state import RobotState
+from drivers.gate import Gate
 
 Vector = NDArray[np.float64]
+GATED = ("write_setpoint", "arm", "release")  # of the base alone
 
 
 class DriverSettings(BaseModel):
@@ -47,6 +51,9 @@ class DriverSettings(BaseModel):
         """
         return self
 
+    def read_files(self) -> None:
+        """Read, through core.files, all files that the driver will read. Raises InputError."""
+
 
 class Driver(ABC):
     """One link to one controller, for one thread.
@@ -55,10 +62,21 @@ class Driver(ABC):
     and only the side that reads. ``write_setpoint`` is the only call after which an arm moves.
     """
 
-    def __init__(self, rate: float, n: int, moves_arm: bool = True) -> None:
+    def __init__(self, rate: float, model: Model, moves_arm: bool = True) -> None:
         self.rate = rate  # Hz: cycles per second that read_state is paced at
-        self.n = n  # joints
+        self.n = model.arm.n  # joints
         self.moves_arm = moves_arm  # setpoints are the arm's motion; False: they ride on its own
+        self.gate = Gate(rate, model, moves_arm)
+
+    def __init_subclass__(cls, **keys: Any) -> None:
+        """Refuse a driver that goes around the gate. Raises TypeError."""
+        super().__init_subclass__(**keys)
+        for name in GATED:
+            if name in cls.__dict__:
+                raise TypeError(
+                    f"{cls.__name__}.{name}: found a driver's own, expected _send, _make_ready and "
+                    "_let_go: what is written passes the gate of the base"
+                )
 
     @abstractmethod
     def connect(self) -> None:
@@ -72,19 +90,36 @@ class Driver(ABC):
         none comes within the settings' timeout, InvalidStateError where it cannot be believed.
         """
 
-    @abstractmethod
+    @final
     def write_setpoint(self, setpoint: Setpoint) -> None:
-        """Send one setpoint that came out of the limiter. Raises WriteError."""
+        """Send one setpoint that came out of the limiter; needs ``arm`` before.
+
+        Raises WriteError: GateError where the gate refuses it, and then nothing was sent.
+        """
+        self.gate.check(setpoint)
+        self._send(setpoint)
+        self.gate.sent()
+
+    @abstractmethod
+    def _send(self, setpoint: Setpoint) -> None:
+        """Send one setpoint that has passed the gate. Raises WriteError."""
 
     @abstractmethod
     def close(self) -> None:
         """Leave the link: the arm stops where setpoints moved it. Never raises; may be repeated."""
 
+    @final
     def arm(self, state: RobotState) -> None:
         """Make ready for writing; may take seconds and never moves the arm. Raises WriteError.
 
         ``state`` is the sample last read; states read before are stale afterwards.
         """
+        self.gate.end()
+        self._make_ready(state)
+        self.gate.begin(state.target_q, state.actual_q)
+
+    def _make_ready(self, state: RobotState) -> None:
+        """Do what ``arm`` promises; see there."""
 
     def keep_alive(self) -> None:
         """Feed the robot's own watchdog where that may wait; before each setpoint.
@@ -92,11 +127,33 @@ class Driver(ABC):
         Raises WriteError.
         """
 
+    @final
     def release(self) -> None:
         """Stop writing: the arm comes to rest and the controller is as before ``arm``.
 
-        May take a while. Raises WriteError where the link is gone.
+        Takes no offset out by itself: the limiter has done that, or the robot's program does it at
+        the cell's rates. May take a while. Raises WriteError where the link is gone.
         """
+        self.gate.end()
+        self._let_go()
+
+    def _let_go(self) -> None:
+        """Do what ``release`` promises; see there."""
+
+    def round_trip(self) -> float | None:
+        """Return how long a question and its answer take now, s; None where nothing can be asked.
+
+        No state is younger than that way lets it be: asked before arming. Raises WriteError where
+        no answer comes.
+        """
+        return None
+
+    def mismatch(self) -> str | None:
+        """Return in words how the controller is set otherwise than the cell says; None: it is not.
+
+        Asked about once a second while the arm is armed; where the link does not show it: None.
+        """
+        return None
 
     def nominal_q(self, state: RobotState) -> Vector:
         """Return the joints (n,) that the robot itself wants, without our correction, rad."""

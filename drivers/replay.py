@@ -51,7 +51,7 @@ class ReplaySettings(DriverSettings):
 
         Raises InputError where there is none.
         """
-        from core.recording.reading import files_of
+        from core.log.mcap_reading import files_of
 
         path = (folder / self.file).resolve()
         try:
@@ -96,7 +96,8 @@ class ReplayDriver(Driver):
             raise LogError(
                 f"{settings.file}: found {n} joints, expected {model.arm.n} as the cell's arm has"
             )
-        super().__init__(float(first["rate"]), n)
+        super().__init__(float(first["rate"]), model)
+        self.gate.clock = lambda: self._last  # a recording may go by faster than it was made
         self.cycle: Cycle | None = None
         self._left: Iterator[Mapping[str, Vector]] = iter(())
         self._begun = 0.0  # s, monotonic: when the recording's time 0 was
@@ -128,7 +129,7 @@ class ReplayDriver(Driver):
         assert self.cycle is not None
         return self.cycle.own_q
 
-    def write_setpoint(self, setpoint: Setpoint) -> None:
+    def _send(self, setpoint: Setpoint) -> None:
         """Move nothing: there is no arm."""
 
     def close(self) -> None:
@@ -136,7 +137,7 @@ class ReplayDriver(Driver):
         self._left = iter(())
 
     def _rows(self) -> Iterator[Mapping[str, Vector]]:
-        from core.recording.reading import read_batches  # only who replays loads MCAP
+        from core.log.mcap_reading import read_batches  # only who replays loads MCAP
 
         for batch in read_batches(self.settings.file):
             for k in range(len(batch)):

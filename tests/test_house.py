@@ -51,3 +51,15 @@ def test_files_that_the_readme_names_exist() -> None:
 @pytest.mark.parametrize("target", ["demo", "test", "check", "coverage"])
 def test_make_has_the_targets_that_are_promised(target: str) -> None:
     assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
+
+
+def test_sources_cite_only_files_that_exist() -> None:
+    sources = [p for top in ("core", "drivers", "bridge") for p in (ROOT / top).rglob("*.py")]
+    cited = {
+        (source, name)
+        for source in sources
+        for name in re.findall(r"(?:docs|config)/[\w/]+\.\w+", source.read_text(encoding="utf-8"))
+    }
+    assert cited
+    assert not [(str(s), name) for s, name in cited if not (ROOT / name).is_file()]
+    assert not [str(s) for s in sources if "CONTRACT" in s.read_text(encoding="utf-8")]

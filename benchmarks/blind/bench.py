@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import Generator
+from numpy.typing import NDArray
 
 from benchmarks.blind.arms import ARMS, ArmKind
 from benchmarks.blind.draws import Redraw
@@ -19,7 +20,7 @@ from benchmarks.blind.measuring import (
     without,
 )
 from benchmarks.blind.mechanics import Array, RealArm, Session, Shape, stand, turn
-from benchmarks.blind.session import Plan, draw_session
+from benchmarks.blind.session import Plan, draw_session, parted
 
 CLEAR = 150.0  # what each cause must add to chi-square that nothing else in the case can take up
 
@@ -35,6 +36,14 @@ class Bench:
     instrument: Instrument
     model: Shape  # what the nominal model predicts
     floor: float  # m rms per coordinate
+    fresh: Session | None = None  # poses of regions that the log does not show
+    stations: tuple[tuple[Array, Array], ...] = ()  # frames (R, p) of the sessions after the first
+
+    @property
+    def session_of(self) -> NDArray[np.int64]:
+        """Return which session each row is of (N,), from 0."""
+        count = len(self.session.q)
+        return np.arange(count) * (len(self.stations) + 1) // count
 
     @property
     def weights(self) -> Array:
@@ -56,6 +65,9 @@ class Bench:
         """Return the whitened columns of the unknown tracker frame (m, 6), or none (m, 0)."""
         columns = frame_columns(self.model, self.instrument.sigma_turn is not None)
         whitened = columns * np.tile(self.weights, len(self.session.q))[:, None]
+        if self.stations:  # a frame for each session
+            own = np.repeat(self.session_of, len(self.weights))[:, None]
+            return np.hstack([whitened * (own == s) for s in range(len(self.stations) + 1)])
         return whitened[:, :0] if self.instrument.registered else whitened
 
 
@@ -68,9 +80,10 @@ def draw_bench(
     sigma: float = 2e-5,
     target_floor: tuple[float, float] = (2.2e-5, 4.5e-5),
     with_rotation: bool | None = None,
+    drawing: ArmKind | None = None,
 ) -> Bench:
     """Return a random cell with a session; None leaves a choice to chance."""
-    kind = ARMS[arm or str(rng.choice(list(ARMS)))]
+    kind = drawing or ARMS[arm or str(rng.choice(list(ARMS)))]
     soft = rng.random() < 0.4 if compliant is None else compliant
     lateral = 0.0 if rng.random() < 0.3 else 0.35
     tool = np.round(kind.tool * np.array([
@@ -86,13 +99,18 @@ def draw_bench(
         gravity=np.array([0.0, 0.0, up * 9.80665]),
         reference_temperature=plan.reference_temperature,
     )
-    session = draw_session(kind, plan, rng)
+    fresh = None
+    if plan.beyond:
+        whole = draw_session(kind, replace(plan, poses=plan.poses + plan.beyond), rng)
+        session, fresh = parted(whole, plan, rng)
+    else:
+        session = draw_session(kind, plan, rng)
     model = stand(nominal, session)
     rotated = rng.random() < 0.35 if with_rotation is None else with_rotation
     floor = rng.uniform(*target_floor)
     lever = float((joint_lever(model) ** 2).sum(axis=0).mean())
     instrument = Instrument(
-        registered=bool(rng.random() < 0.5),
+        registered=bool(rng.random() < 0.5) and plan.sessions == 1,
         rotation=turn(rng.normal(size=(1, 3)) * 2)[0],
         position=rng.uniform(-3, 3, 3),
         sigma=sigma,
@@ -101,7 +119,12 @@ def draw_bench(
     )
     if instrument.registered:
         instrument = replace(instrument, rotation=np.eye(3), position=np.zeros(3))
-    return Bench(kind, nominal, session, plan, instrument, model, floor_of(model, instrument))
+    stations = tuple(
+        (turn(rng.normal(size=(1, 3)) * 2)[0], rng.uniform(-3, 3, 3))
+        for _ in range(plan.sessions - 1)
+    )
+    floor = floor_of(model, instrument)
+    return Bench(kind, nominal, session, plan, instrument, model, floor, fresh, stations)
 
 
 def _short(values: Array) -> Array:

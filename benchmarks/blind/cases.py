@@ -1,22 +1,26 @@
 """Draws cases by kind and seed.
 
 Kinds of the position channel: ``none``; an effect (``backlash``); several (``backlash+payload``);
-``pair``, ``triple`` (at random); ``withheld:EFFECT``; ``outside:NAME``; ``hard:EFFECT`` and
-``hard:none``; ``bad:NAME``; ``size:EFFECT@RATIO`` (at one place, gap over floor). Other channels:
-``wrench:``, ``tracking:``, ``torque:`` with an effect, several, ``none``, or one outside the
-catalogue.
+``pair``, ``triple``, ``four``, ``five`` (at random); ``mixed:COUNT`` or ``mixed:REMAINDER`` (known
+effects and an unknown remainder); ``arm:one``, ``arm:two`` (an arm drawn at random);
+``sessions:one``, ``sessions:two``; ``laid_out:clustered``, ``student``, ``doubled``;
+``withheld:EFFECT``; ``outside:NAME``; ``hard:EFFECT`` and ``hard:none``; ``bad:NAME``;
+``size:EFFECT@RATIO`` (at one place, gap over floor). Other channels: ``wrench:``, ``tracking:``,
+``torque:`` with an effect, several, ``pair``, ``mixed``, ``none``, or one outside the catalogue.
 """
 
 from __future__ import annotations
 
 import zlib
+from copy import deepcopy
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.random import Generator
 
-from benchmarks.blind import draws, special_cases
+from benchmarks.blind import draws, mixed_cases, special_cases
 from benchmarks.blind.channel_cases import (
     EFFECTS,
     ChannelCase,
@@ -28,13 +32,19 @@ from benchmarks.blind.label import Label
 from benchmarks.blind.measuring import read_arm
 from benchmarks.blind.mechanics import Array
 from benchmarks.blind.outside import OUTSIDE
+from benchmarks.blind.remainders import ALONE, REMAINDERS
 from benchmarks.blind.special_cases import Strange
 from benchmarks.blind.static_cases import Drawn, Wish, causes_of, draw_static, write_static
 from benchmarks.blind.wrench_cases import WrenchCell
 
 CHANNELS = tuple(EFFECTS)
-# the stiffening of a joint holds its linear part: never both
-ONE_OF = {"axial_compliance", "stiffness_nonlinearity"}
+COUNTS = {"pair": 2, "triple": 3, "four": 4, "five": 5}
+MIXED = ("1", "2", "3")
+LAYOUTS = {
+    "laid_out": special_cases.draw_laid_out,
+    "arm": special_cases.draw_arms,
+    "sessions": special_cases.draw_sessions,
+}
 
 
 @dataclass(frozen=True)
@@ -52,22 +62,27 @@ def generator_of(kind: str, seed: int) -> Generator:
     return np.random.default_rng([seed, zlib.crc32(kind.removeprefix("withheld:").encode())])
 
 
+@lru_cache(maxsize=2)
+def drawn_case(kind: str, seed: int) -> tuple[Static | ChannelCase, Generator]:
+    """Return a case's truth, and the generator as it stands after the draw; do not move it."""
+    rng = generator_of(kind, seed)
+    return draw_case(kind, rng), rng
+
+
 def effects_of(kind: str, rng: Generator) -> tuple[str, ...]:
     """Return the effects that a kind puts into the position channel."""
     if kind == "none":
         return ()
-    if kind in ("pair", "triple"):
-        count = 2 if kind == "pair" else 3
-        while True:
-            chosen = tuple(str(e) for e in rng.choice(draws.POSITION_EFFECTS, count, replace=False))
-            if not set(chosen) >= ONE_OF:
-                return chosen
+    if kind in COUNTS:
+        return draws.some_effects(COUNTS[kind], rng)
     effects = tuple(kind.split("+"))
     for effect in effects:
         if effect not in draws.POSITION_EFFECTS:
             raise ValueError(f"kind: found {effect!r}, expected an effect of the position channel")
-    if set(effects) >= ONE_OF:
-        raise ValueError(f"kind: found {kind!r}, expected one of {' and '.join(sorted(ONE_OF))}")
+    if set(effects) >= draws.ONE_OF:
+        raise ValueError(
+            f"kind: found {kind!r}, expected one of {' and '.join(sorted(draws.ONE_OF))}"
+        )
     return effects
 
 
@@ -79,8 +94,13 @@ def draw_case(kind: str, rng: Generator) -> Static | ChannelCase:
     if group == "outside":
         strange = special_cases.draw_outside(rest, rng)
         return Static(strange.drawn, strange, strange.gap, wild=False)
+    if group == "mixed":
+        strange = _draw_mixed(rest, rng)
+        return Static(strange.drawn, strange, strange.gap, wild=False)
     if group == "bad":
         drawn = special_cases.draw_bad(rest, rng)
+    elif group in LAYOUTS:
+        drawn = LAYOUTS[group](rest, rng)
     elif group == "hard":
         drawn = special_cases.draw_hard(effects_of(rest, rng), rng)
     elif group == "":
@@ -94,13 +114,22 @@ def draw_case(kind: str, rng: Generator) -> Static | ChannelCase:
     return Static(drawn, None, drawn.bench.whitened_gap(drawn.real), wild=group == "hard")
 
 
+def _draw_mixed(what: str, rng: Generator) -> Strange:
+    if what in MIXED:
+        return mixed_cases.draw_mixed(int(what), None, rng)
+    if what not in REMAINDERS:
+        known = ", ".join((*MIXED, *REMAINDERS))
+        raise ValueError(f"kind: found mixed:{what}, expected one of {known}")
+    return mixed_cases.draw_mixed(int(rng.integers(1, 4)), what, rng)
+
+
 def make_case(kind: str, seed: int, folder: Path) -> Label:
     """Write the case's log.csv and cell.yaml into ``folder``; return its truth.
 
     Nothing of the label is written there. Raises ValueError where the kind is unknown.
     """
-    rng = generator_of(kind, seed)
-    case = draw_case(kind, rng)
+    case, at = drawn_case(kind, seed)
+    rng = deepcopy(at)
     if isinstance(case, ChannelCase):
         write_channel_case(Path(folder), case, rng)
         return _channel_label(kind, seed, case)
@@ -111,6 +140,8 @@ def make_case(kind: str, seed: int, folder: Path) -> Label:
         misread = case.strange.misread if case.strange else None
         measured = read_arm(drawn.real, bench.session, bench.instrument, rng, misread)
     facts = write_static(Path(folder), drawn, rng, measured)
+    if bench.fresh is not None:
+        facts["beyond"] = len(bench.fresh.q)
     causes = causes_of(drawn.parts)
     outside = case.strange.outside if case.strange else None
     return Label(
@@ -123,6 +154,7 @@ def make_case(kind: str, seed: int, folder: Path) -> Label:
         gap_rms=drawn.shown_rms(case.gap),
         depends_on=outside.depends_on if outside else (),
         outside=outside.name if outside else None,
+        akin=outside.akin if outside else (),
         withhold=tuple(c.effect for c in causes) if kind.startswith("withheld:") else (),
         facts=facts,
     )
@@ -143,6 +175,7 @@ def _channel_label(kind: str, seed: int, case: ChannelCase) -> Label:
         gap_rms=float(np.sqrt(np.mean(case.gap**2))) * case.floor_rms,
         depends_on=case.depends_on,
         outside=case.outside,
+        akin=case.akin,
         withhold=tuple(c.effect for c in causes) if kind.startswith("withheld:") else (),
         facts=facts,
     )
@@ -160,7 +193,7 @@ def group_of(kind: str) -> str:
         if kind in own:
             return group
     head = kind.partition(":")[0]
-    if head in ("withheld", "outside", "hard", "bad", "size"):
+    if head in ("withheld", "outside", "hard", "bad", "size", "mixed", *LAYOUTS):
         return head
     return "several" if "+" in kind else "known"
 
@@ -172,8 +205,13 @@ def position_kinds() -> dict[str, tuple[str, ...]]:
         "clean": ("none",),
         "known": known,
         "several": ("pair", "triple"),
+        "many": ("four", "five"),
+        "mixed": tuple(f"mixed:{c}" for c in MIXED),
+        "arm": tuple(f"arm:{c}" for c in special_cases.ONE_OR_TWO),
+        "sessions": tuple(f"sessions:{c}" for c in special_cases.ONE_OR_TWO),
+        "laid_out": tuple(f"laid_out:{n}" for n in special_cases.LAID_OUT),
         "withheld": tuple(f"withheld:{e}" for e in known),
-        "outside": tuple(f"outside:{n}" for n in OUTSIDE),
+        "outside": tuple(f"outside:{n}" for n in (*OUTSIDE, *ALONE)),
         "hard": tuple(f"hard:{e}" for e in (*known, "none")),
         "bad": tuple(f"bad:{n}" for n in special_cases.BAD),
     }

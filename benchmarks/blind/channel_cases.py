@@ -12,8 +12,9 @@ from benchmarks.blind import moving_cases as moving
 from benchmarks.blind import wrench_cases as wrench
 from benchmarks.blind.bench import Bench
 from benchmarks.blind.draws import Redraw
+from benchmarks.blind.measuring import without
 from benchmarks.blind.mechanics import Array
-from benchmarks.blind.parametric import Parametric, Values, draw_values
+from benchmarks.blind.parametric import CLEAR, Parametric, Place, Values, draw_values
 from benchmarks.blind.session import Plan
 from benchmarks.blind.writing import write_cell, write_log
 
@@ -23,10 +24,26 @@ OUTSIDE = {
     "tracking": moving.TRACKING_OUTSIDE,
     "torque": moving.TORQUE_OUTSIDE,
 }
+# remainders of mixed cases: none that an effect of the catalogue could be
+REMAINDERS = {
+    "wrench": (*wrench.OUTSIDE, *wrench.REMAINDERS),
+    "tracking": ("track_step", "speed_loss", *moving.TRACKING_REMAINDERS),
+    "torque": ("cogging", "warm_friction", *moving.TORQUE_REMAINDERS),
+}
+# what a remainder holds at first order: effects, of the whole cell or of the joint itself
+AKIN: dict[str, tuple[tuple[str, bool], ...]] = {
+    "ft_hose": (("ft_bias", True),), "ft_field": (("ft_bias", True),),
+    "ft_step": (("ft_bias", True), ("ft_drift", True)), "ft_overload": (("ft_bias", True),),
+    "speed_loss": (("latency", False), ("tracking_lag", False)),
+    "warm_friction": (("viscous_friction", False), ("coulomb_friction", False)),
+    "torque_field": (("torque_offset", False),),
+}  # fmt: skip
+SIZE = (0.5, 1.5)  # a remainder over the known effects together
+UNLIKE = 100.0  # chi-square that known effects and any one more must leave of a remainder
 RATIOS = {"wrench": (3.0, 15.0), "tracking": (60.0, 1000.0), "torque": (0.7, 6.0)}
 NONNEGATIVE = (
     "latency", "tracking_lag", "coulomb_friction", "viscous_friction", "rotor_inertia", "payload",
-    "link_inertia",
+    "link_inertia", "servo_droop", "dead_band", "stribeck_friction", "load_friction",
 )  # fmt: skip
 
 
@@ -40,6 +57,7 @@ class ChannelCase:
     error: Array | None  # (N, k) outside the catalogue
     outside: str | None
     depends_on: tuple[str, ...]
+    akin: tuple[Place, ...] = ()  # what the unknown holds at first order
 
     @property
     def bench(self) -> Bench:
@@ -58,6 +76,11 @@ class ChannelCase:
         return gap if self.error is None else gap + (self.error / self.truth.sigma).ravel()
 
     @property
+    def known_gap(self) -> Array:
+        """Return the gap to explain: of a mixed case that of its known effects alone."""
+        return self.truth.gap(self.values) if self.values else self.gap
+
+    @property
     def floor_rms(self) -> float:
         """Return the noise per coordinate in the channel's unit; of a wrench, its forces."""
         sigma = self.truth.sigma[:3] if self.channel == "wrench" else self.truth.sigma
@@ -68,9 +91,11 @@ DRAWS = 600  # a delay and a lag are hardly told apart in most slow motions
 
 
 def draw_channel_case(channel: str, what: str, rng: Generator) -> ChannelCase:
-    """Return a case: ``what`` is none, effects joined by +, pair, or a name outside."""
+    """Return a case: ``what`` is none, effects joined by +, pair, mixed, or a name outside."""
+    if what == "mixed":
+        return _draw_mixed(channel, rng)
     effects: tuple[str, ...] = ()
-    strange = what if what in OUTSIDE[channel] else None
+    strange = what if what in (*OUTSIDE[channel], *REMAINDERS[channel]) else None
     if what == "pair":
         effects = tuple(str(e) for e in rng.choice(EFFECTS[channel], 2, replace=False))
     elif strange is None and what != "none":
@@ -92,6 +117,57 @@ def draw_channel_case(channel: str, what: str, rng: Generator) -> ChannelCase:
     raise RuntimeError(f"no clear draw of {channel}:{what} in {DRAWS}")
 
 
+def _draw_mixed(channel: str, rng: Generator) -> ChannelCase:
+    """Return one to three known effects beside a remainder of half to one and a half their size."""
+    for _ in range(DRAWS):
+        most = min(3, len(EFFECTS[channel]) - 1)
+        count = int(rng.integers(1, most + 1)) if most > 1 else 1
+        effects = tuple(str(e) for e in rng.choice(EFFECTS[channel], count, replace=False))
+        name = str(rng.choice(REMAINDERS[channel]))
+        cell = _draw_cell(channel, rng)
+        try:
+            values = draw_values(
+                cell.truth, effects, rng, RATIOS[channel], lambda e: e not in NONNEGATIVE
+            )
+        except Redraw:
+            continue
+        error, columns = _error(cell, name, rng)
+        known = cell.truth.gap(values)
+        size = float(np.sqrt(np.mean(known**2) / np.mean((error / cell.truth.sigma) ** 2)))
+        error = error * size * rng.uniform(*SIZE)
+        akin = _akin(name, columns)
+        if {p for p in values if p in akin} or not _told_apart(cell.truth, values, error):
+            continue
+        return ChannelCase(channel, cell, values, error, name, columns, akin)
+    raise RuntimeError(f"no clear draw of {channel}:mixed in {DRAWS}")
+
+
+def _akin(name: str, columns: tuple[str, ...]) -> tuple[Place, ...]:
+    """Return the places of a remainder's first order; its own joint is the first column's."""
+    joints = [int(c.rpartition("_")[2]) + 1 for c in columns if c != "timestamp" and "_" in c
+              and c.rpartition("_")[2].isdigit()]  # fmt: skip
+    return tuple((effect, None if whole else joints[0]) for effect, whole in AKIN.get(name, ()))
+
+
+def _told_apart(truth: Parametric, values: Values, error: Array) -> bool:
+    """Return whether each known place shows beside the remainder, and it beside any place more."""
+    unknown = (error / truth.sigma).ravel()
+    full = truth.gap(values)
+    for place in values:
+        rest = {p: v for p, v in values.items() if p != place}
+        columns = np.column_stack([truth.columns(rest, values), unknown])
+        left = without(columns, full - truth.gap(rest))
+        if float(left @ left) < CLEAR:
+            return False
+    own = truth.columns(values, values)
+    for place in truth.candidates:
+        columns = own if place in values else np.hstack([own, truth.columns([place], values)])
+        left = without(columns, unknown)
+        if float(left @ left) < UNLIKE:
+            return False
+    return True
+
+
 def _draw_cell(channel: str, rng: Generator) -> wrench.WrenchCell | moving.MovingCell:
     if channel == "wrench":
         plan = Plan(poses=60, blocks=int(rng.integers(2, 5)), pulled=float(rng.uniform(0, 0.3)))
@@ -104,7 +180,7 @@ def _error(
 ) -> tuple[Array, tuple[str, ...]]:
     if isinstance(cell, wrench.WrenchCell):
         return wrench.outside_error(cell, name, rng)
-    if name in moving.TRACKING_OUTSIDE:
+    if name in (*moving.TRACKING_OUTSIDE, *moving.TRACKING_REMAINDERS):
         return moving.tracking_error(cell, name, rng)
     return moving.torque_error(cell, name, rng)
 
@@ -168,6 +244,9 @@ def channel_kinds() -> dict[str, tuple[str, ...]]:
         "clean": tuple(f"{c}:none" for c in EFFECTS),
         "known": known,
         "several": tuple(f"{c}:pair" for c in EFFECTS),
+        "mixed": tuple(f"{c}:mixed" for c in EFFECTS),
         "withheld": tuple(f"withheld:{k}" for k in known),
-        "outside": tuple(f"{c}:{n}" for c, own in OUTSIDE.items() for n in own),
+        "outside": tuple(
+            f"{c}:{n}" for c in OUTSIDE for n in dict.fromkeys((*OUTSIDE[c], *REMAINDERS[c]))
+        ),
     }

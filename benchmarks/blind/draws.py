@@ -16,16 +16,31 @@ from benchmarks.blind.mechanics import RealArm, Session
 
 PER_JOINT = (
     "joint_offset", "link_geometry", "transmission_error", "axial_compliance",
-    "radial_compliance", "link_flexibility", "stiffness_nonlinearity", "backlash",
+    "radial_compliance", "link_flexibility", "stiffness_nonlinearity", "backlash", "joint_slip",
 )  # fmt: skip
-WHOLE_ARM = ("tool_frame", "base_compliance", "gravity_direction", "payload", "thermal_drift")
+WHOLE_ARM = (
+    "tool_frame", "base_compliance", "gravity_direction", "payload", "thermal_drift",
+    "target_slip", "payload_cog",
+)  # fmt: skip
 POSITION_EFFECTS = PER_JOINT + WHOLE_ARM
-NEEDS_COMPLIANCE = ("gravity_direction", "payload")
+NEEDS_COMPLIANCE = ("gravity_direction", "payload", "payload_cog")
 # gap over floor: most effects are clear, some are small by nature
 RATIO = {
     "gravity_direction": (2.0, 6.0), "thermal_drift": (2.0, 6.0), "payload": (2.0, 10.0),
+    "payload_cog": (2.0, 8.0),
     "link_flexibility": (3.0, 12.0), "stiffness_nonlinearity": (5.0, 15.0),
 }  # fmt: skip
+
+
+ONE_OF = {"axial_compliance", "stiffness_nonlinearity"}  # the second holds the first
+
+
+def some_effects(count: int, rng: Generator) -> tuple[str, ...]:
+    """Return that many different effects at random, never a joint's softness twice."""
+    while True:
+        chosen = tuple(str(e) for e in rng.choice(POSITION_EFFECTS, count, replace=False))
+        if not set(chosen) >= ONE_OF:
+            return chosen
 
 
 class Redraw(Exception):  # noqa: N818 - not an error: this draw does not show, take another
@@ -59,8 +74,17 @@ def draw(
         return [put.payload(0.1 * kind.rated, 0.6 * kind.rated)]
     if effect == "thermal_drift":
         return [put.thermal_drift(1.5e-5)]
+    if effect == "target_slip":
+        return [put.target_slip(rng.normal(size=3) * 1e-3, _moment(session, rng))]
+    if effect == "payload_cog":
+        return [put.payload_cog(rng.normal(size=3) * 0.02, 1.5 * kind.tool)]
     assert joint is not None
     return _JOINT_DRAWS[effect](joint, Site(kind, arm, session, rng))
+
+
+def _moment(session: Session, rng: Generator) -> float:
+    """Return a moment (s) of a session, away from its ends."""
+    return float(np.quantile(session.time, rng.uniform(0.15, 0.85)))
 
 
 @dataclass(frozen=True)
@@ -122,6 +146,10 @@ def _nonlinear(j: int, at: Site) -> list[Ingredient]:
     return [put.stiffness_nonlinearity(j, soft, usual * at.rng.uniform(0.2, 0.6), 15 * soft)]
 
 
+def _joint_slip(j: int, at: Site) -> list[Ingredient]:
+    return [put.joint_slip(j, at.rng.choice([-1, 1]) * 1e-3, _moment(at.session, at.rng))]
+
+
 def _backlash(j: int, at: Site) -> list[Ingredient]:
     return [put.backlash(j, 3e-4)]
 
@@ -135,4 +163,5 @@ _JOINT_DRAWS: dict[str, Callable[[int, Site], list[Ingredient]]] = {
     "link_flexibility": _link_flexibility,
     "stiffness_nonlinearity": _nonlinear,
     "backlash": _backlash,
+    "joint_slip": _joint_slip,
 }

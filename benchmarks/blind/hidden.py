@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.blind import twins
-from benchmarks.blind.cases import Static, draw_case, generator_of
+from benchmarks.blind.cases import Static, drawn_case
 from benchmarks.blind.channel_cases import ChannelCase
 from benchmarks.blind.measuring import without
 from benchmarks.blind.mechanics import Session
@@ -24,7 +24,7 @@ class Claim:
 
     effect: str
     joints: tuple[int, ...]
-    orders: tuple[float, ...] = ()
+    orders: tuple[float, ...] = ()  # of a slip: its moments, s
 
     @property
     def places(self) -> tuple[Place, ...]:
@@ -37,7 +37,7 @@ class Hidden:
 
     def __init__(self, kind: str, seed: int) -> None:
         """Draw the case again; nothing is read from its folder."""
-        self.case: Static | ChannelCase = draw_case(kind, generator_of(kind, seed))
+        self.case: Static | ChannelCase = drawn_case(kind, seed)[0]
 
     def size_of(self, claims: Iterable[Claim]) -> int:
         """Return how many numbers the claims may choose."""
@@ -65,15 +65,20 @@ class Hidden:
     def left_over(self, claims: Iterable[Claim]) -> float:
         """Return the chi-square that the best version of the claims leaves of the true gap.
 
-        Claims that the truth cannot make sense of (unknown effect or joint) explain nothing.
+        Of a mixed case it is the gap of its known effects alone. Claims that the truth cannot
+        make sense of (unknown effect or joint) explain nothing.
         """
         claims = list(claims)
         if isinstance(self.case, ChannelCase):
             places = [p for c in claims for p in self._resolved(c)]
-            return self.case.truth.left_over(self.case.gap, places)
+            return self.case.truth.left_over(self.case.known_gap, places)
+        strange = self.case.strange
+        mixed = strange is not None and strange.known_gap is not None
+        gap = strange.known_gap if strange is not None and mixed else self.case.gap
+        assert gap is not None
         hypotheses = [(e, j, c.orders or (1.0, 2.0)) for c in claims for e, j in c.places]
         try:
-            return twins.left_over(self.case.drawn.bench, self.case.gap, hypotheses)
+            return twins.left_over(self.case.drawn.bench, gap, hypotheses)
         except (ValueError, IndexError):
             return float("inf")
 
@@ -112,7 +117,9 @@ def claims_of(causes: Iterable[dict]) -> tuple[Claim, ...]:  # type: ignore[type
         joints.setdefault(effect, set()).update(int(j) for j in cause.get("joints") or [])
         for parameter in cause.get("parameters") or []:
             found = re.search(r"order_?([0-9.]+)", str(parameter["name"]))
-            if found:
+            if str(parameter["name"]).endswith("_time") and parameter.get("value") is not None:
+                orders.setdefault(effect, set()).add(float(parameter["value"]))
+            elif found:
                 orders.setdefault(effect, set()).add(float(found[1]))
     return tuple(
         Claim(e, tuple(sorted(j)), tuple(sorted(orders.get(e, ())))) for e, j in joints.items()

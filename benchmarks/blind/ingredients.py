@@ -1,6 +1,6 @@
 """The thirteen effects of the position channel as truth: how each changes the real arm.
 
-An ingredient is one effect at one joint (or none) with its parameter values under the contract's
+An ingredient is one effect at one joint (or none) with its parameter values under the program's
 names. ``apply`` turns a real arm into one that has it.
 """
 
@@ -187,6 +187,45 @@ def gravity_direction(x: float, y: float) -> Ingredient:
 
     return Ingredient("gravity_direction", None, ("gravity_direction_x", "gravity_direction_y"),
                       (x, y), (True, True), (0.2, 0.2), change)  # fmt: skip
+
+
+def joint_slip(joint: int, value: float, moment: float) -> Ingredient:
+    """Return a joint whose zero steps by a value (rad) at a moment (s)."""
+
+    def change(arm: RealArm, v: Array) -> RealArm:
+        return _with_angle(arm, joint - 1, lambda s: np.where(s.time >= moment, float(v[0]), 0.0))
+
+    names = (f"joint_slip_{joint}", f"joint_slip_{joint}_time")
+    return Ingredient(
+        "joint_slip", joint, names, (value, moment), (True, False), (0.1, np.inf), change
+    )
+
+
+def target_slip(shift: Array, moment: float) -> Ingredient:
+    """Return a target that moves on the tool at a moment (s), flange axes."""
+
+    def change(arm: RealArm, v: Array) -> RealArm:
+        def moved(session: Session, down: Array) -> Array:
+            return np.where((session.time >= moment)[:, None], v[:3], 0.0)
+
+        return replace(arm, tool_shifts=(*arm.tool_shifts, moved))
+
+    names = (*(f"target_slip_{k}" for k in "xyz"), "target_slip_time")
+    return Ingredient(
+        "target_slip", None, names, (*map(float, shift), moment), (True,) * 3 + (False,),
+        (0.1,) * 3 + (np.inf,), change,
+    )  # fmt: skip
+
+
+def payload_cog(shift: Array, limit: float) -> Ingredient:
+    """Return a load whose centre of gravity is elsewhere (flange axes)."""
+
+    def change(arm: RealArm, v: Array) -> RealArm:
+        return replace(arm, payload_shift=arm.payload_shift + v)
+
+    names = tuple(f"payload_cog_{k}" for k in "xyz")
+    values = tuple(map(float, shift))
+    return Ingredient("payload_cog", None, names, values, (True,) * 3, (limit,) * 3, change)
 
 
 def payload(value: float, limit: float) -> Ingredient:

@@ -28,6 +28,7 @@ class Label:
     depends_on: tuple[str, ...] = ()  # columns that an effect outside the catalogue depends on
     outside: str | None = None  # what it is, where it stands in no catalogue
     withhold: tuple[str, ...] = ()  # effects to take out of the catalogue
+    akin: tuple[tuple[str, int | None], ...] = ()  # what the unknown holds at first order
     twins: tuple[tuple[str, str], ...] = ()  # (effect, why it is the same here), known beforehand
     facts: dict[str, str | float | bool] = field(default_factory=dict)  # how the case was laid out
 

@@ -22,6 +22,7 @@ class Instrument:
     sigma: float  # m, one coordinate
     sigma_turn: float | None  # rad; None where it measures positions alone
     joint_sigma: float  # rad, the arm's repeatability, drawn anew at every pose
+    freedom: float | None = None  # of Student's t, where the noise has long tails
 
 
 def gap(real: Shape, model: Shape) -> Array:
@@ -98,20 +99,28 @@ def read_arm(
         arm,
         angle_errors=(
             *arm.angle_errors,
-            _constant(rng.normal(0, instrument.joint_sigma, session.q.shape)),
+            _constant(noise(instrument, instrument.joint_sigma, session.q.shape, rng)),
         ),
     )
     shape = stand(shaken, session)
     position = shape.tcp @ instrument.rotation.T + instrument.position
     if misread is not None:
         position = misread(session, position)
-    position = position + rng.normal(0, instrument.sigma, position.shape)
+    position = position + noise(instrument, instrument.sigma, position.shape, rng)
     if instrument.sigma_turn is None:
         return position, None
-    shake = turn(rng.normal(0, instrument.sigma_turn, position.shape))
+    shake = turn(noise(instrument, instrument.sigma_turn, position.shape, rng))
     return position, Rotation.from_matrix(
         shake @ instrument.rotation @ shape.tcp_rotation
     ).as_rotvec()
+
+
+def noise(instrument: Instrument, sigma: float, shape: tuple[int, ...], rng: Generator) -> Array:
+    """Return noise of this standard deviation: normal, or Student's t with long tails."""
+    if instrument.freedom is None:
+        return rng.normal(0, sigma, shape)
+    spread = np.sqrt(instrument.freedom / (instrument.freedom - 2))
+    return np.asarray(rng.standard_t(instrument.freedom, shape) * sigma / spread)
 
 
 def _constant(values: Array) -> Callable[[Session], Array]:

@@ -84,6 +84,7 @@ class RealArm:
     link_softness: Array | None = None  # (n,) 1/EI, 1/(N m2)
     base_softness: tuple[float, float] = (0.0, 0.0)  # rad/Nm about x and y of base
     more_payload: float = 0.0  # kg
+    payload_shift: Array = field(default_factory=lambda: np.zeros(3))  # m, flange axes
     expansion: float = 0.0  # 1/K
     reference_temperature: float = 25.0
     angle_errors: tuple[AngleError, ...] = ()
@@ -255,7 +256,9 @@ def loads_of(arm: RealArm, session: Session, shape: Shape) -> Loads:
     moment = np.zeros((n + 1, poses, 3))
     moment[:n] = cross(shape.cog, force[:n])
     carried = (session.payload_mass + arm.more_payload)[:, None] * arm.gravity
-    where = shape.flange_position + _apply(shape.flange_rotation, session.payload_cog)
+    where = shape.flange_position + _apply(
+        shape.flange_rotation, session.payload_cog + arm.payload_shift
+    )
     force[n] = carried + session.tcp_wrench[:, :3]
     moment[n] = cross(where, carried) + cross(shape.tcp, session.tcp_wrench[:, :3])
     moment[n] += session.tcp_wrench[:, 3:]

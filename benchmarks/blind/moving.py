@@ -82,6 +82,46 @@ def torque_shares(
     return links, carried
 
 
+def cog_columns(
+    rows: tuple[Row, ...], gravity: Array, payload: tuple[float, Array],
+    q: Array, qd: Array, qdd: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Return torques (n, N, n, 3) per kg m of each link's first moment, and (N, n, 3) of the load.
+
+    First moments in the axes of the row; the load's per metre of shift in the flange. To first
+    order in the shift: inertia about the old centre of gravity moves along with the mass.
+    """
+    import pinocchio as pin
+
+    model, _ = pinocchio_arm(rows, gravity)
+    data = model.createData()
+    n, count = len(rows), len(q)
+    step = 1e-4
+    last = rows[-1]
+    flange = pin.SE3(turn(np.array([[last.alpha, 0, 0]]))[0], np.array([last.a, 0, last.d]))
+    places = [pin.SE3(turn(np.array([[r.alpha, 0, 0]]))[0], np.array([r.a, 0, r.d])) for r in rows]
+
+    def moved(mass: float, place: pin.SE3, at: Array, way: Array) -> Array:
+        ends = [
+            pin.Inertia(mass, place.act(at + s * way), np.zeros((3, 3))).toDynamicParameters()
+            for s in (step, -step)
+        ]
+        return np.asarray((ends[0] - ends[1]) / (2 * step))
+
+    per_link = np.array([
+        [moved(max(r.mass, 1e-9), p, np.array(r.cog), e) / max(r.mass, 1e-9) for e in np.eye(3)]
+        for r, p in zip(rows, places, strict=True)
+    ])  # fmt: skip
+    per_load = np.array([moved(payload[0], flange, payload[1], e) for e in np.eye(3)])
+    links, carried = np.empty((n, count, n, 3)), np.empty((count, n, 3))
+    for t in range(count):
+        regressor = pin.computeJointTorqueRegressor(model, data, q[t], qd[t], qdd[t])
+        blocks = regressor.reshape(n, n, 10)
+        links[:, t] = np.einsum("jlk,lek->lje", blocks, per_link)
+        carried[t] = blocks[:, n - 1, :] @ per_load.T
+    return links, carried
+
+
 def pinocchio_arm(rows: tuple[Row, ...], gravity: Array) -> tuple[pin.Model, list[pin.Inertia]]:
     """Return the arm as a Pinocchio model, and the inertia of each link in its joint's frame."""
     import pinocchio as pin

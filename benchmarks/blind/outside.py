@@ -30,6 +30,8 @@ class Outside:
     read: Reading | None = None
     ratio: tuple[float, float] = (3.0, 10.0)
     first: float = 1e-4  # a strength to start sizing from
+    akin: tuple[tuple[str, int | None], ...] = ()  # what may be accused with the rest admitted
+    near: tuple[tuple[str, int | None], ...] = ()  # where no known effect is told from it
 
 
 def angle_of(joint: int, shape: Callable[[Session], Array]) -> Callable[[RealArm, float], RealArm]:
@@ -85,11 +87,12 @@ def cross_coupling(bench: Bench, rng: Generator) -> Outside:
     return Outside("cross_coupling", (f"actual_q_{driver}",), angle_of(driven, carried))
 
 
-def joint_slip(bench: Bench, rng: Generator) -> Outside:
-    """Return a joint that slips on its shaft once in the session."""
+def joint_creep(bench: Bench, rng: Generator) -> Outside:
+    """Return a joint that creeps on its shaft for a while in the session: no step, a ramp."""
     j = _shown_joint(bench, rng)
-    when = float(np.quantile(bench.session.time, rng.uniform(0.25, 0.75)))
-    return Outside("joint_slip", TIME, angle_of(j, lambda s: (s.time > when).astype(float)))
+    start, end = np.quantile(bench.session.time, [rng.uniform(0.1, 0.3), rng.uniform(0.6, 0.9)])
+    return Outside("joint_creep", TIME, angle_of(
+        j, lambda s: np.clip((s.time - start) / (end - start), 0.0, 1.0)))  # fmt: skip
 
 
 def tracker_knocked(bench: Bench, rng: Generator) -> Outside:
@@ -221,7 +224,7 @@ def tower_bending(bench: Bench, rng: Generator) -> Outside:
 OUTSIDE = {
     make.__name__: make
     for make in (
-        chipped_tooth, encoder_scale, cross_coupling, joint_slip, tracker_knocked, tracker_drift,
+        chipped_tooth, encoder_scale, cross_coupling, joint_creep, tracker_knocked, tracker_drift,
         tracker_refraction, tracker_eccentric, loose_tool, tool_plate, hose, tower_bending,
     )
 }  # fmt: skip

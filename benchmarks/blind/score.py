@@ -1,18 +1,21 @@
-"""Scores one diagnosis (the contract's JSON) against the truth of its case."""
+"""Scores one diagnosis (its JSON) against the truth of its case."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from benchmarks.blind.beyond import true_beyond
 from benchmarks.blind.cases import group_of
-from benchmarks.blind.hidden import SAME, Claim, Hidden, claims_of
+from benchmarks.blind.hidden import SAME, Claim, Hidden, Place, claims_of
 from benchmarks.blind.label import Label
 
 NOWHERE = "not in the catalogue"
+EXPLAINED = ("clean", "known", "several", "many", "arm", "sessions", "laid_out")
 UNLIKE = 100.0  # chi-square from which on a tie told is no tie
 
 
@@ -27,7 +30,8 @@ class CaseScore:
     channel: str
     put_in: tuple[str, ...]
     named: tuple[str, ...]
-    outcome: str  # right | right_tie | tie_untold | abstained | missed | wrong | failed
+    outcome: str  # right | right_tie | tie_untold | abstained | missed | wrong | failed;
+    # mixed also: partly (some known effects) | unadmitted (the remainder passed over)
     false: tuple[str, ...] = ()  # effects accused that are neither true nor a true twin
     joints_right: bool | None = None
     owned_up: bool = False  # unexplained and structured
@@ -38,6 +42,10 @@ class CaseScore:
     seconds: float | None = None
     message: str = ""
     label: Label | None = None
+    known: int = 0  # effects put in beside a remainder
+    known_named: int = 0
+    told_beyond: float | None = None  # what is told to remain in a region not fitted, unit
+    true_beyond: float | None = None  # what truly remains there
 
     @property
     def ok(self) -> bool:
@@ -70,8 +78,11 @@ def score(label: Label, diagnosis: dict[str, Any], seconds: float | None = None)
     unexplained = own.get("unexplained") or {}
     structured = bool(unexplained.get("structured"))
     group = group_of(label.kind)
+    mixed = bool(label.causes) and label.outside is not None
     unknown = bool(label.withhold) or label.outside is not None
-    if unknown:
+    if mixed:
+        verdict = _mixed(label, claims, causes, structured)
+    elif unknown:
         verdict = _unknown(label, claims, structured)
     elif not label.causes:
         clean = not claims and not structured
@@ -80,8 +91,9 @@ def score(label: Label, diagnosis: dict[str, Any], seconds: float | None = None)
         verdict = _known(label, claims, causes)
         if verdict.outcome == "abstained" and structured and label.facts.get("settling_drift"):
             verdict = Verdict("right_tie")  # a drift that settles may be owned up to as another
-    explained = group in ("clean", "known", "several") and verdict.outcome in ("right", "right_tie")
+    explained = group in EXPLAINED and verdict.outcome in ("right", "right_tie")
     held_out = own.get("remaining_rms_held_out") or own.get("remaining_rms")
+    told_beyond = own.get("remaining_rms_new_region") if label.facts.get("beyond") else None
     exact = verdict.outcome == "right" and _same_joints(label, claims)
     exact = exact and not label.facts.get("settling_drift")
     return CaseScore(
@@ -97,11 +109,15 @@ def score(label: Label, diagnosis: dict[str, Any], seconds: float | None = None)
         joints_right=verdict.joints_right,
         owned_up=structured,
         depends_right=_depends(label, unexplained) if unknown else None,
-        z=_z_scores(label, causes) if exact else {},
+        z=_z_scores(label, _of_named(label, causes) if mixed else causes) if exact or mixed else {},
         remainder=held_out / label.floor_rms if explained and held_out is not None else None,
         needless_ties=verdict.needless,
         seconds=seconds,
         label=label,
+        known=len(label.effects) if mixed else 0,
+        known_named=verdict.named if mixed else 0,
+        told_beyond=told_beyond,
+        true_beyond=None if told_beyond is None else true_beyond(label, causes),
     )
 
 
@@ -113,12 +129,57 @@ class Verdict:
     false: tuple[str, ...] = ()
     joints_right: bool | None = None
     needless: tuple[str, ...] = ()
+    named: int = 0  # of the known effects of a mixed case
+
+
+def _mixed(
+    label: Label, claims: tuple[Claim, ...], causes: list[dict[str, Any]], structured: bool
+) -> Verdict:
+    """Return the verdict of known effects beside a remainder.
+
+    Right is: all known effects named where they are, nothing else but the remainder's first
+    order, and structure left over. What makes the data of the known effects as well is no error.
+    """
+    truth = {p for c in _true_claims(label) for p in c.places}
+    own = [(c, p) for c in claims for p in c.places if p not in label.akin]
+    extra = [p for _, p in own if p not in truth and (p[0], None) not in truth]
+    there = {e for e in label.effects if _places_of(e, truth) <= {p for _, p in own}
+             or (e, None) in {p for _, p in own}}  # fmt: skip
+    if extra or there != label.effects:
+        rest = tuple(Claim(c.effect, (p[1],) if p[1] is not None else (), c.orders)
+                     for c, p in own)  # fmt: skip
+        if rest and _same_data(_true_claims(label), rest, Hidden(label.kind, label.seed)):
+            there, extra = set(label.effects), []
+    told = {str(c["effect"]): {str(e) for e in c.get("indistinguishable_from") or []}
+            for c in causes}  # fmt: skip
+    lost = label.effects - there
+    tied = {e for e in lost if any(e in told.get(p[0], ()) for p in extra)}
+    extra = [p for p in extra if not told.get(p[0], set()) & tied]
+    false = tuple(sorted({p[0] for p in extra}))
+    named = len(there | tied)
+    if false:
+        return Verdict("wrong", false, named=named)
+    if named < len(label.effects):
+        return Verdict("abstained" if not claims else "partly", named=named)
+    outcome = ("right_tie" if tied else "right") if structured else "unadmitted"
+    return Verdict(outcome, named=named)
+
+
+def _places_of(effect: str, places: Iterable[Place]) -> set[Place]:
+    return {p for p in places if p[0] == effect}
+
+
+def _of_named(label: Label, causes: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the accusations of true effects at their true joints alone."""
+    joints = {c.effect: set(c.joints) for c in label.causes}
+    return [c for c in causes if joints.get(c["effect"]) == {int(j) for j in c.get("joints") or []}]
 
 
 def _true_claims(label: Label) -> tuple[Claim, ...]:
     out = []
     for cause in label.causes:
         orders = {float(m[1]) for n in cause.parameters if (m := re.search(r"order([0-9.]+)", n))}
+        orders |= {v for n, v in cause.parameters.items() if n.endswith("_time")}
         out.append(Claim(cause.effect, cause.joints, tuple(sorted(orders))))
     return tuple(out)
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.random import Generator
+from scipy.cluster.vq import kmeans2
 
 from benchmarks.blind.arms import ArmKind
 from benchmarks.blind.mechanics import Array, Session
+
+REGIONS = 24  # of joint space, of which whole ones are kept back
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,31 @@ class Plan:
     span: float = 1.0  # share of each joint's range that is used
     warming: float = 20.0  # K
     reference_temperature: float = 25.0
+    clusters: int = 0  # poses lie in so many small heaps; 0: all over the range
+    sessions: int = 1  # the tracker stands elsewhere in each
+    doubled: bool = False  # every row stands twice in the log
+    beyond: int = 0  # poses kept back: whole regions of joint space that the log does not show
+
+
+def parted(session: Session, plan: Plan, rng: Generator) -> tuple[Session, Session]:
+    """Return the session without whole regions of joint space, and the poses of those."""
+    scale = np.maximum(np.std(session.q, axis=0), 1e-9)
+    _, region = kmeans2(session.q / scale, REGIONS, minit="++", rng=rng)
+    away = np.zeros(len(session.q), dtype=bool)
+    for own in rng.permutation(REGIONS):
+        if away.sum() >= plan.beyond:
+            break
+        away |= region == own
+    kept, fresh = (_rows(session, rows) for rows in (~away, away))
+    if plan.both_sides and not plan.approach_written:  # it is read from the rows that are there
+        approach = np.sign(np.diff(kept.q, axis=0, prepend=kept.q[:1]))
+        overshoot = np.where(approach == 0, 0.0, 0.05)
+        kept = replace(kept, approach=approach, from_where=kept.q - overshoot * approach)
+    return kept, fresh
+
+
+def _rows(session: Session, rows: Array) -> Session:
+    return Session(**{f.name: getattr(session, f.name)[rows] for f in fields(session)})
 
 
 def draw_session(kind: ArmKind, plan: Plan, rng: Generator) -> Session:
@@ -61,6 +89,10 @@ def _angles(kind: ArmKind, plan: Plan, rng: Generator) -> Array:
     strata = np.argsort(rng.random((plan.poses, kind.n)), axis=0)
     unit = (strata + rng.random((plan.poses, kind.n))) / plan.poses
     q = middle + half * (2 * unit - 1)
+    if plan.clusters:
+        heaps = middle + half * rng.uniform(-0.9, 0.9, (plan.clusters, kind.n))
+        near = heaps[rng.integers(0, plan.clusters, plan.poses)]
+        q = np.clip(near + half * rng.normal(0, 0.06, q.shape), low, high)
     if plan.moving is not None:
         still = [i for i in range(kind.n) if i not in plan.moving]
         q[:, still] = middle[still] + half[still] * rng.uniform(-0.5, 0.5, len(still))

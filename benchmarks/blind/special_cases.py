@@ -9,9 +9,11 @@ import numpy as np
 from numpy.random import Generator
 
 from benchmarks.blind.bench import Bench, draw_bench
+from benchmarks.blind.draws import some_effects
 from benchmarks.blind.measuring import read_arm, without
-from benchmarks.blind.mechanics import Array, Session
+from benchmarks.blind.mechanics import Array, RealArm, Session
 from benchmarks.blind.outside import NEED_COMPLIANCE, OUTSIDE, Outside
+from benchmarks.blind.remainders import REMAINDERS
 from benchmarks.blind.session import Plan
 from benchmarks.blind.static_cases import Drawn, Wish, draw_plan, draw_static
 from benchmarks.blind.twins import columns_of, singles
@@ -29,6 +31,7 @@ class Strange:
     outside: Outside
     strength: float
     gap: Array  # whitened, the frame not taken out
+    known_gap: Array | None = None  # of the known effects alone, in a mixed case
 
     @property
     def misread(self) -> Callable[[Session, Array], Array] | None:
@@ -44,7 +47,7 @@ def draw_outside(name: str, rng: Generator) -> Strange:
     soft = True if name in NEED_COMPLIANCE else None
     for _ in range(100):
         bench = draw_bench(rng, draw_plan(rng), compliant=soft)
-        outside = OUTSIDE[name](bench, rng)
+        outside = (OUTSIDE.get(name) or REMAINDERS[name])(bench, rng)
         ratio = float(np.exp(rng.uniform(*np.log(outside.ratio))))
         strength = outside.first
         for _step in range(2):
@@ -54,15 +57,20 @@ def draw_outside(name: str, rng: Generator) -> Strange:
         if abs(strength) > 1e4 * outside.first:
             continue
         gap = outside_gap(bench, outside, strength)
-        if _unlike_known(bench, gap):
+        if unlike_known(bench, gap, bench.frame(), "timestamp" in outside.depends_on):
             real = outside.arm(bench.nominal, strength)
             return Strange(Drawn(bench, (), real), outside, strength, gap)
     raise RuntimeError(f"no clear draw of {name} in 100")
 
 
-def outside_gap(bench: Bench, outside: Outside, strength: float) -> Array:
-    """Return the whitened gap of an effect outside the catalogue, misreadings included."""
-    arm = outside.arm(bench.nominal, strength)
+def outside_gap(
+    bench: Bench, outside: Outside, strength: float, real: RealArm | None = None
+) -> Array:
+    """Return the whitened gap of an effect outside the catalogue, misreadings included.
+
+    ``real`` is the arm with the effect in it; left out, the nominal one with this effect alone.
+    """
+    arm = outside.arm(bench.nominal, strength) if real is None else real
     gap = bench.whitened_gap(arm).reshape(len(bench.session.q), -1)
     if outside.read is not None:
         instrument = bench.instrument
@@ -72,12 +80,11 @@ def outside_gap(bench: Bench, outside: Outside, strength: float) -> Array:
     return gap.ravel()
 
 
-def _unlike_known(bench: Bench, gap: Array) -> bool:
-    """Return whether no single effect of the catalogue takes the gap up."""
-    frame = bench.frame()
-    for hypothesis in singles(bench):
+def unlike_known(bench: Bench, gap: Array, beside: Array, in_time: bool) -> bool:
+    """Return whether no single effect of the catalogue takes the gap up, ``beside`` (m, k)."""
+    for hypothesis in singles(bench, in_time):
         columns = columns_of(bench, [hypothesis], bench.nominal)
-        left = without(np.column_stack([frame, columns]), gap)
+        left = without(np.column_stack([beside, columns]), gap)
         if float(left @ left) < UNLIKE:
             return False
     return True
@@ -87,6 +94,41 @@ def draw_hard(effects: tuple[str, ...], rng: Generator) -> Drawn:
     """Return a cell seen in 30 poses with 50 um of noise."""
     plan = replace(draw_plan(rng, poses=30), blocks=3)
     return draw_static(Wish(effects, plan, HARD_SIGMA, (5.5e-5, 7e-5)), rng)
+
+
+LAID_OUT = ("clustered", "student", "doubled")
+ONE_OR_TWO = {"one": 1, "two": 2}
+
+
+def draw_laid_out(name: str, rng: Generator) -> Drawn:
+    """Return one known effect in poses in heaps, in long-tailed noise, or in doubled rows."""
+    plan = draw_plan(rng)
+    if name == "clustered":
+        plan = replace(plan, clusters=int(rng.integers(7, 11)))
+    elif name == "doubled":
+        plan = replace(plan, poses=35, doubled=True, approach_written=True)
+    elif name != "student":
+        raise ValueError(f"kind: found laid_out:{name}, expected one of {', '.join(LAID_OUT)}")
+    freedom = 3.0 if name == "student" else None
+    return draw_static(Wish(some_effects(1, rng), plan, freedom=freedom), rng)
+
+
+def draw_arms(name: str, rng: Generator) -> Drawn:
+    """Return one or two known effects of an arm that is drawn at random too."""
+    wish = Wish(some_effects(_count(name), rng), any_arm=True)
+    return draw_static(wish, rng)
+
+
+def draw_sessions(name: str, rng: Generator) -> Drawn:
+    """Return one or two known effects in two sessions, the tracker elsewhere in each."""
+    plan = replace(draw_plan(rng, poses=90), sessions=2)
+    return draw_static(Wish(some_effects(_count(name), rng), plan), rng)
+
+
+def _count(name: str) -> int:
+    if name not in ONE_OR_TWO:
+        raise ValueError(f"kind: found {name!r}, expected one of {', '.join(ONE_OR_TWO)}")
+    return ONE_OR_TWO[name]
 
 
 def wild_readings(drawn: Drawn, rng: Generator, share: float = 0.03) -> tuple[Array, Array | None]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.random import Generator
+from scipy.spatial.transform import Rotation
 
 from benchmarks.blind import draws
 from benchmarks.blind.bench import Bench, all_clear, combined, draw_bench, size
@@ -15,8 +16,11 @@ from benchmarks.blind.ingredients import Ingredient
 from benchmarks.blind.label import Cause
 from benchmarks.blind.measuring import without
 from benchmarks.blind.mechanics import Array, RealArm, stand
+from benchmarks.blind.random_arms import draw_arm
 from benchmarks.blind.session import Plan
 from benchmarks.blind.writing import write_cell, write_log
+
+MANY = 3  # effects; with more, each sits at one joint
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,8 @@ class Wish:
     joints: dict[str, list[int]] | None = None  # of effects that sit at joints
     ratio: float | None = None  # gap over floor of each part
     clear: bool = True  # each part stands clear of the others
+    freedom: float | None = None  # of Student's t, where the noise has long tails
+    any_arm: bool = False  # an arm drawn at random, of no class
 
 
 def draw_static(wish: Wish, rng: Generator) -> Drawn:
@@ -64,10 +70,12 @@ def draw_static(wish: Wish, rng: Generator) -> Drawn:
     for _ in range(200):
         bench = draw_bench(
             rng, wish.plan or draw_plan(rng), compliant=soft, sigma=wish.sigma,
-            target_floor=wish.floor,
+            target_floor=wish.floor, drawing=draw_arm(rng) if wish.any_arm else None,
         )  # fmt: skip
+        if wish.freedom is not None:
+            bench = replace(bench, instrument=replace(bench.instrument, freedom=wish.freedom))
         try:
-            bench, parts = _draw_parts(bench, wish, rng)
+            bench, parts = draw_parts(bench, wish, rng)
         except Redraw:
             continue
         if parts and wish.clear and not all_clear(bench, parts):
@@ -82,11 +90,12 @@ def _places(effect: str, wish: Wish, bench: Bench, rng: Generator) -> list[int] 
         return [None]
     count = int(rng.choice([1, 2, 3], p=[0.55, 0.3, 0.15]))
     most = 1 if wish.ratio is not None else 3 if len(wish.effects) == 1 else 2
+    most = 1 if len(wish.effects) > MANY else most
     chosen = [int(j) for j in rng.permutation(draws.sites(effect, bench.kind))]
     return sorted((wish.joints or {}).get(effect, chosen[: min(count, most)]))
 
 
-def _draw_parts(bench: Bench, wish: Wish, rng: Generator) -> tuple[Bench, list[Ingredient]]:
+def draw_parts(bench: Bench, wish: Wish, rng: Generator) -> tuple[Bench, list[Ingredient]]:
     """Return the parts, sized. The nominal axial compliance of a stiffening joint is taken out."""
     parts: list[Ingredient] = []
     for effect in wish.effects:
@@ -122,6 +131,19 @@ def causes_of(parts: tuple[Ingredient, ...]) -> tuple[Cause, ...]:
     return tuple(out)
 
 
+def _elsewhere(bench: Bench, position: Array, rotation: Array | None) -> tuple[Array, Array | None]:
+    """Return readings as the tracker gives them from where it stands in each session."""
+    position, rotation = position.copy(), None if rotation is None else rotation.copy()
+    first = bench.instrument
+    for s, (R, p) in enumerate(bench.stations, 1):
+        own, change = bench.session_of == s, R @ first.rotation.T
+        position[own] = (position[own] - first.position) @ change.T + p
+        if rotation is not None:
+            rotation[own] = (Rotation.from_matrix(change) * Rotation.from_rotvec(rotation[own])
+                             ).as_rotvec()  # fmt: skip
+    return position, rotation
+
+
 def write_static(
     folder: Path, drawn: Drawn, rng: Generator, measured: tuple[Array, Array | None]
 ) -> dict[str, str | float | bool]:
@@ -145,6 +167,15 @@ def write_static(
     columns["measured_position"] = position
     if rotation is not None:
         columns["measured_rotation"] = rotation
+    if bench.stations:
+        columns["session"] = bench.session_of.astype(float)
+        position, rotation = _elsewhere(bench, position, rotation)
+        columns["measured_position"] = position
+        if rotation is not None:
+            columns["measured_rotation"] = rotation
+    if bench.plan.doubled:
+        columns = {name: np.repeat(column, 2, axis=0) for name, column in columns.items()}
+        columns["timestamp"][1::2] += 1.0
     write_log(folder / "log.csv", columns)
     metrology: dict[str, float | bool] = {
         "registered": bench.instrument.registered, "sigma": bench.instrument.sigma,

@@ -66,10 +66,34 @@ def criteria(scores: Sequence[CaseScore]) -> list[Criterion]:
         Criterion("hard data: false accusations", *_at(0.01, _share(
             bool(s.false) for s in hard), at_least=False)),
     ]  # fmt: skip
+    many, mixed = _of(scores, "many"), _of(scores, "mixed")
+    out += [
+        _criterion("four and more at once: exactly those", 0.90, many),
+        _criterion("arms drawn at random", 0.95, _of(scores, "arm")),
+        _criterion("two sessions, one frame each", 0.95, _of(scores, "sessions")),
+        _criterion("poses in heaps, long-tailed noise, doubled rows", 0.95,
+                   _of(scores, "laid_out")),
+        Criterion("beside a remainder: known effects named", *_at(0.90, _share(
+            k < s.known_named for s in mixed for k in range(s.known)))),
+        Criterion("beside a remainder: it is admitted", *_at(0.95, _share(
+            s.owned_up for s in mixed))),
+        Criterion("beside a remainder: false accusations", *_at(0.01, _share(
+            bool(s.false) for s in mixed), at_least=False)),
+    ]  # fmt: skip
+    told = [s.told_beyond / s.true_beyond for s in scores if s.told_beyond and s.true_beyond]
+    for at_least, target in ((True, 0.8), (False, 1.25)):
+        word = "at least" if at_least else "at most"
+        out.append(Criterion(f"told remainder of a new region over the true one, median, {word}",
+                             float(np.median(told)) if told else None, target, at_least,
+                             len(told), "ratio"))  # fmt: skip
     remainders = [s.remainder for s in scores if s.remainder is not None]
     out.append(_median("held-out remainder over the floor, median", 1.10, remainders, "ratio"))
     z = z_scores(scores)
     out.append(Criterion("parameters with |z| < 3", *_at(0.97, _share(abs(x) < 3 for x in z))))
+    for at_least, target in ((True, 0.93), (False, 0.97)):
+        word = "at least" if at_least else "at most"
+        out.append(Criterion(f"95 % intervals that hold the truth, {word}",
+                             *_at(target, _share(abs(x) < 1.96 for x in z), at_least)))  # fmt: skip
     static = [s.seconds for s in scores if s.channel in ("position", "wrench") and s.seconds]
     moving = [s.seconds for s in scores if s.channel in ("tracking", "torque") and s.seconds]
     out.append(_median("static case, median time", 2.0, static, "seconds"))

@@ -19,7 +19,9 @@ from benchmarks.blind.measuring import axial_moments, without
 from benchmarks.blind.mechanics import Array, RealArm
 
 SAME = 20.0  # chi-square below which no fair test tells two hypotheses apart 98 times in 100
-Hypothesis = tuple[str, int | None, tuple[float, ...]]  # effect, joint, orders of its lines
+# effect, joint, orders of its lines; of a slip its moments, s
+Hypothesis = tuple[str, int | None, tuple[float, ...]]
+SLIPS = ("joint_slip", "target_slip")
 
 
 def probes(
@@ -39,6 +41,10 @@ def probes(
         return [put.payload(0.01 * kind.rated, kind.rated)]
     if effect == "thermal_drift":
         return [put.thermal_drift(1e-6)]
+    if effect == "payload_cog":
+        return [put.payload_cog(e * 1e-3, 1.0) for e in np.eye(3)]
+    if effect == "target_slip":
+        return [put.target_slip(e * 1e-4, moment) for moment in orders for e in np.eye(3)]
     if joint is None:
         raise ValueError(f"{effect} needs a joint")
     return _joint_probes(bench, effect, joint, orders)
@@ -71,6 +77,8 @@ def _joint_probes(
         usual = float(np.abs(axial_moments(bench.nominal, bench.session)[:, joint - 1]).max())
         knees = np.array([0.15, 0.3, 0.6, 1.2, 10.0]) * max(usual, 1e-6)
         return [put.stiffness_nonlinearity(joint, soft, k, 1.0) for k in knees]
+    if effect == "joint_slip":
+        return [put.joint_slip(joint, 1e-5, moment) for moment in orders]
     if effect == "backlash":
         return [put.backlash(joint, 1e-5)]
     raise ValueError(f"effect: found {effect!r}, expected one of the position channel")
@@ -94,14 +102,23 @@ def left_over(bench: Bench, real_gap: Array, hypotheses: Iterable[Hypothesis]) -
     return float(left @ left)
 
 
-def singles(bench: Bench) -> list[Hypothesis]:
-    """Return every effect at every place, periodic ones with one and two cycles a turn."""
+def singles(bench: Bench, in_time: bool = True) -> list[Hypothesis]:
+    """Return every effect at every place, periodic ones with one and two cycles a turn.
+
+    A slip stands there at each of eight moments, where the gap may go by time at all.
+    """
     soft = bool(np.any(bench.nominal.axial))
     out: list[Hypothesis] = []
     for effect in draws.POSITION_EFFECTS:
         if effect in draws.NEEDS_COMPLIANCE and not soft:
             continue
-        if effect in draws.PER_JOINT:
+        if effect in SLIPS and not in_time:
+            continue
+        if effect in SLIPS:
+            places = draws.sites(effect, bench.kind) if effect in draws.PER_JOINT else [None]
+            moments = np.quantile(bench.session.time, np.linspace(0.15, 0.85, 8))
+            out += [(effect, j, (float(t),)) for j in places for t in moments]
+        elif effect in draws.PER_JOINT:
             out += [(effect, j, (1.0, 2.0)) for j in draws.sites(effect, bench.kind)]
         else:
             out.append((effect, None, ()))

@@ -1,4 +1,4 @@
-"""Writes what the diagnosis may see: log.csv and cell.yaml, in the contract's words."""
+"""Writes what the diagnosis may see: log.csv and cell.yaml, as any user writes them."""
 
 from __future__ import annotations
 

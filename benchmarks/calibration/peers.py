@@ -40,7 +40,7 @@ from core.calibration.observables import make_observable
 from core.calibration.parameters import DEFAULT, Parameters
 from core.calibration.readings import Readings
 from core.loads import Loads
-from core.log import read_log
+from core.log.log import read_log
 from core.metrology import Metrology
 from core.model import Model
 

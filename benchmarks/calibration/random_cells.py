@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arm import Arm, JointLimits, arm_from_dh, builtin_arm
-from core.calibration.capsules import Box
 from core.calibration.plan import Payload
-from core.calibration.space import Place, Space, reach
 from core.model import Model
+from core.planning.capsules import Box
+from core.planning.workspace import Place, Space, reach
 from core.rotation import rotation_matrix
 
 Array = NDArray[np.float64]

@@ -30,7 +30,7 @@ from benchmarks.calibration.laid_out import (
     lay_out,
     readings_of,
 )
-from core.calibration.budget import Stated, budget
+from core.calibration.budget.budget import Stated, budget
 from core.calibration.fit import calibrate
 from core.calibration.observables import make_observable
 from core.calibration.parameters import Parameters

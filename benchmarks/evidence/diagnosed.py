@@ -17,7 +17,7 @@ from benchmarks.evidence import DATA
 from benchmarks.evidence.measured import distances, published, registered, split
 from bridge.cell import load_cell
 from core.diagnosis.diagnosis import Diagnosis, diagnose
-from core.log import Log, read_log
+from core.log.log import Log, read_log
 from core.metrology import Metrology
 from core.model import Model
 

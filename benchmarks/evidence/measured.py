@@ -18,11 +18,11 @@ import yaml
 from benchmarks.evidence import DATA
 from bridge.cell import load_cell
 from core.errors import InputError
-from core.identification import identify_compliance, pose_groups
-from core.log import Log, read_log
+from core.estimation.identification import identify_compliance, pose_groups
+from core.estimation.registration import Registration, frame_columns, register_robustly
+from core.log.log import Log, read_log
 from core.metrology import Metrology
 from core.model import Model
-from core.registration import Registration, frame_columns, register_robustly
 
 HELD_OUT = 5  # every fifth pose
 PAIRS = [("tsinghua_ur5_grid", "tsinghua_ur5_random"), ("barrett_wam_grid", "barrett_wam_random"),

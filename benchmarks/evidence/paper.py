@@ -14,9 +14,9 @@ import numpy as np
 from benchmarks.evidence.arms import dh_rows
 from benchmarks.evidence.finite_elements import STIFF, Frame, FrameArm, NodalLoad
 from core.arm import arm_from_dh
-from core.identification import identify_compliance
+from core.estimation.identification import identify_compliance
 from core.loads import Loads
-from core.log import Log
+from core.log.log import Log
 from core.metrology import Metrology
 from core.model import Model
 

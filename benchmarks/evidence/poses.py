@@ -13,9 +13,9 @@ import numpy as np
 
 from benchmarks.evidence.finite_elements import STIFF, Frame, FrameArm, NodalLoad
 from benchmarks.evidence.paper import TUBE, frame_arm, rigid_model
-from core.identification import Identification, identify_compliance
+from core.estimation.identification import Identification, identify_compliance
 from core.loads import Loads
-from core.log import Log
+from core.log.log import Log
 from core.metrology import Metrology
 from core.rotation import rotation_matrix
 

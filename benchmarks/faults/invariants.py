@@ -12,15 +12,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from benchmarks.faults.wire.seen import Fresh, Numbers, Write
-from drivers.simulated.kinematics import gap, tcp_in_base
-from drivers.simulated.plant_arm import Frame, PlantArm
+from drivers.simulated.plant.kinematics import gap, tcp_in_base
+from drivers.simulated.plant.plant_arm import Frame, PlantArm
 
+OBSERVING, ARMED = 1, 2
 WRITING = (3, 4)  # compensating, holding
 GRACE = 0.03  # s: a write seen so long after the state has changed was on its way
 SURE = 0.002  # s: the same where the loop's own word says when it changed
 GAP = 5.0  # cycles: a longer gap allows no larger step
 WINDOW = 12  # writes over which the rate is checked
 ZEROS = (0.0,) * 6
+RATE_KEPT = 0.98  # of the cell's rate: the robot's program has it rounded down
+STAYED = 0.005  # rad: a stream that begins so near to the last one's end goes on from there
 START_AWAY = 0.03  # rad: how far a stream may begin from where the arm was seen
 AHEAD = 4  # states that the client may have been sent and not read yet, on top of ``fresh``
 LONGEST_LIST = 50
@@ -46,6 +49,9 @@ class Bounds:
     fresh: float = 0.04
     burst: float = 0.0  # s for which the transport may hold small packets back
     lag: float = 0.04
+    withdraws: float = (
+        math.inf
+    )  # s of silence after which the robot's own program withdraws offsets
 
 
 @dataclass
@@ -101,6 +107,7 @@ class Checker:
         self._last_writing = -math.inf  # s: when the supervisor was last in a state that writes
         self._stream, self._ended = Stream(), Stream()
         self._ended_at = -math.inf  # s
+        self._written, self._written_at = ZEROS, -math.inf  # the last offset on the wire; s
         self._unused = 0.0  # states that no write has followed yet
 
     @property
@@ -154,9 +161,9 @@ class Checker:
         if not all(math.isfinite(v) and abs(v) < 1e3 for v in write.values):
             found.add(f"{write.where}: {write.values}")
             return
-        if write.kind == "offset" and not any(write.values) and self._lets_go(write):
-            self._end_stream(write.early)
-            return  # an offset of zero takes out what may be there; it may always leave
+        if write.kind == "offset" and write.state not in WRITING and self._announces(write):
+            self._written, self._written_at = write.values, write.time
+            return
         if write.kind == "joints" and write.state not in WRITING and self._holds(write):
             return
         found.writes += 1
@@ -174,10 +181,35 @@ class Checker:
                 if not low - 1e-4 <= q <= high + 1e-4:
                     found.add(f"joint {i}: {q:.4f} rad is outside its limits")
 
-    def _lets_go(self, write: Write) -> bool:
-        """Return whether nothing is written any more: the page tells so after the letting go."""
-        late = self._fresh is not None and write.early - self._fresh.time > self.bounds.fresh
-        return late or write.state not in WRITING
+    def _announces(self, write: Write) -> bool:
+        """Return whether an offset of zero says that one will come: none is in force before it.
+
+        That is part of arming, which may have been refused by the time that the tap sees it.
+        """
+        b, left = self.bounds, self._in_force(write.time)
+        bare = math.hypot(*left[:3]) <= b.offset_rate * b.cycle + 2.0 * b.grain
+        bare = bare and math.hypot(*left[3:]) <= b.rotation_rate * b.cycle + 2.0 * b.grain_rotation
+        return bare and not any(write.values) and write.state in (OBSERVING, ARMED)
+
+    def _in_force(self, time: float) -> Numbers:
+        """Return the offset (6,) that the wire's last one has come to, the robot's program at it.
+
+        It stays until the robot's program has been silent for long enough, and goes at the rates
+        of the cell: whoever writes next goes on from there.
+        """
+        b = self.bounds
+        if not any(self._written) or math.isinf(b.withdraws):
+            return self._written
+        silent = max(time - self._written_at - b.withdraws, 0.0)
+        offset = self._written
+        parts: list[float] = []
+        for first, rate in ((0, b.offset_rate), (3, b.rotation_rate)):
+            vector = offset[first : first + 3]
+            length = math.hypot(*vector)
+            # a program's rate is rounded down, and its silence counted in its own cycles
+            left = max(length - RATE_KEPT * rate * silent, 0.0)
+            parts += [v * left / length if left else 0.0 for v in vector]
+        return tuple(parts)
 
     def _holds(self, write: Write) -> bool:
         """Return whether joints are those where the arm stands: it is being enabled or left."""
@@ -215,7 +247,8 @@ class Checker:
             return write.values
         b, stream = self.bounds, self._stream
         if stream.nominal is None:
-            stream.nominal = tcp_in_base(b.arm, write.values, b.tool)
+            stream.nominal = self._nominal_of(write.values)
+            stream.offset = gap(stream.nominal, tcp_in_base(b.arm, write.values, b.tool))
             if self._fresh is not None:
                 away = max(abs(x - y) for x, y in zip(write.values, self._fresh.q, strict=True))
                 if away > START_AWAY:
@@ -224,6 +257,18 @@ class Checker:
             now = tcp_in_base(b.arm, write.values, b.tool)
             stream.joints = (write.values, gap(stream.nominal, now))
         return stream.joints[1]
+
+    def _nominal_of(self, q: Numbers) -> Frame:
+        """Return where the TCP was wanted as a stream of joints begins.
+
+        Where the last one has left the arm, its offset is still in it: what was wanted is older.
+        """
+        last, b = self._ended, self.bounds
+        if last.nominal is not None and len(last.joints[0]) == len(q):
+            away = max(abs(x - y) for x, y in zip(q, last.joints[0], strict=True))
+            if away < STAYED:
+                return last.nominal
+        return tcp_in_base(b.arm, q, b.tool)
 
     def _check_size(self, write: Write, offset: Numbers) -> None:
         b = self.bounds
@@ -236,7 +281,8 @@ class Checker:
 
     def _check_step(self, write: Write, offset: Numbers) -> None:
         b, found, stream = self.bounds, self.found, self._stream
-        shift, turn = _apart(offset, stream.offset)
+        before = self._in_force(write.early) if write.kind == "offset" else stream.offset
+        shift, turn = _apart(offset, before)
         found.largest_step = max(found.largest_step, shift)
         found.largest_turn = max(found.largest_turn, turn)
         if shift > b.offset_rate * GAP * b.cycle * 1.001 + 2.0 * b.grain:
@@ -255,6 +301,8 @@ class Checker:
                 break
         stream.recent.append((since, offset))
         stream.offset = offset
+        if write.kind == "offset":
+            self._written, self._written_at = offset, write.time
 
     def _moments(self, write: Write) -> tuple[float, float]:
         """Return from when and until when the time of a write's state can be, s.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import shutil
 import socket
@@ -19,9 +20,9 @@ from benchmarks.faults.wire.rtde import RtdeDecoder
 from benchmarks.faults.wire.seen import Decoder
 from benchmarks.faults.wire.socketcand import PiperDecoder
 from bridge.cell import load_cell
-from drivers.simulated.kinematics import frame_of
-from drivers.simulated.plant_arm import plant_arm
-from drivers.simulated.settings import START_Q
+from drivers.simulated.plant.kinematics import frame_of
+from drivers.simulated.plant.plant_arm import plant_arm
+from drivers.simulated.ur.settings import START_Q
 from drivers.ur_rtde.driver import OFFSET_SCRIPT
 
 CONFIG = Path(__file__).parents[2] / "config"
@@ -75,6 +76,7 @@ class Link(ABC):
     hold = 0.1
     grain, grain_rotation = 1e-8, 1e-8
     burst = 0.0
+    withdraws = math.inf  # s of silence after which the robot's own program withdraws offsets
     behind = True  # a client may have been sent more than it has read; not where it has to ask
 
     def __init__(self, rate: float | None = None) -> None:
@@ -133,6 +135,7 @@ class Link(ABC):
             plant_arm(found.arm), tool, limits.offset, limits.offset_rotation, limits.offset_rate,
             limits.offset_rotation_rate, 1.0 / self.rate, self.grain, self.grain_rotation,
             self.fresh, self.burst, self.fresh if self.behind else 0.0,
+            self.withdraws,
         )  # fmt: skip
 
 
@@ -183,6 +186,7 @@ class UrOffset(UrServo):
 
     name, usual_rate, moves_arm, mode = "ur_rtde offset", 125.0, False, "offset"
     grain, grain_rotation = 2e-8, 2e-8
+    withdraws = 0.2  # gb_silence of gapbridge_offset.script
 
     def prepare(self, peer: Peer, host: str, writing: bool = False) -> None:
         """Have the robot's own program run."""
@@ -204,6 +208,7 @@ class Modbus(Link):
     name, usual_rate, moves_arm, base, main = "modbus mailbox", 50.0, False, UR, "modbus"
     hold = 0.2
     port = 15020
+    withdraws = 0.5  # watchdog of drivers/modbus/profiles/ur.yaml
     grain, grain_rotation = 2e-6, 2e-6
     behind = False
 

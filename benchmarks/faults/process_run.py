@@ -17,19 +17,20 @@ import psutil
 from benchmarks.faults.punctual import go_first
 from benchmarks.faults.running import Event, Told
 from bridge.cell import load_cell
-from bridge.shared_page import Page
-from bridge.supervisor import State
+from bridge.ipc.shared_memory import NAME, Page
+from bridge.loop.supervisor import State
 
 CODE = """
 import ctypes, json, signal, sys
 from pathlib import Path
 from bridge.cli import main
-from bridge.daemon_run import run_cell
+from bridge.daemon.run import run_cell
 def tell(event):
     print(json.dumps(event, default=str), file=sys.stderr, flush=True)
 sys.exit(run_cell(Path(sys.argv[1]), arm=True, log=tell))
 """
 PAGE_LIMIT = 90.0  # s
+LOOK_EVERY = 0.02  # s between two looks for the page of a new loop
 END_LIMIT = 6.0  # s for every process of a run to be gone
 
 
@@ -42,6 +43,7 @@ class ProcessRun(Told):
         self.error: BaseException | None = None
         self.said = ""
         self._page: Page | None = None
+        self._looked = 0.0  # s, monotonic: when the newest page was last looked for
         self._process: subprocess.Popen[str] | None = None
 
     def start(self) -> None:
@@ -65,24 +67,36 @@ class ProcessRun(Told):
                 self.said += line
 
     def _join(self, until: float) -> Page:
-        """Return the page of the daemon, which has it open under a name that tells it."""
-        folder = Path(f"/proc/{self.pid}/fd")
+        """Return the newest page of the daemon; raises TimeoutError where there is none."""
         while time.monotonic() < until:
-            with contextlib.suppress(OSError):
-                for name in os.listdir(folder):
-                    if os.readlink(folder / name).startswith("/memfd:gapbridge"):
-                        fd = os.open(folder / name, os.O_RDONLY)
-                        with contextlib.suppress(OSError, ValueError):
-                            return Page(self._n, fd, writable=False)
+            found = self._newest()
+            if found is not None:
+                return Page(self._n, found, writable=False)
             if not self.alive:
                 break
             time.sleep(0.02)
         raise TimeoutError(f"the daemon did not start: {self.said[-300:]}")
 
+    def _newest(self) -> int | None:
+        """Return a descriptor of the page of the newest loop: memory is numbered as it is made."""
+        folder, found = Path(f"/proc/{self.pid}/fd"), dict[int, str]()
+        with contextlib.suppress(OSError):
+            for name in os.listdir(folder):
+                if os.readlink(folder / name).startswith(f"/memfd:{NAME}"):
+                    found[os.stat(folder / name).st_ino] = name
+            if found and (self._page is None or max(found) != os.fstat(self._page.fd).st_ino):
+                return os.open(folder / found[max(found)], os.O_RDONLY)
+        return None
+
     @property
     def page(self) -> Page:
-        """Return the run's shared page."""
+        """Return the shared page of the run's newest loop."""
         assert self._page is not None
+        now = time.monotonic()
+        if now - self._looked > LOOK_EVERY:
+            self._looked = now
+            if (fd := self._newest()) is not None:
+                self._page = Page(self._n, fd, writable=False)
         return self._page
 
     @property
@@ -108,7 +122,7 @@ class ProcessRun(Told):
 
     def state_word(self) -> int:
         """Return the supervisor's state from the shared page, -1 where there is none yet."""
-        return -1 if self._page is None else self._page.state
+        return -1 if self._page is None else self.page.state
 
     def processes(self) -> dict[str, psutil.Process]:
         """Return the processes of the run by the module that they run, ``daemon`` itself too."""

@@ -16,7 +16,7 @@ from benchmarks.faults.proxy import Proxy
 from benchmarks.faults.punctual import be_punctual
 from benchmarks.faults.running import Running
 from benchmarks.faults.tap import Tap
-from bridge.supervisor import State
+from bridge.loop.supervisor import State
 from core.errors import LinkError
 
 SOME = 40  # messages decoded at a time

@@ -24,7 +24,7 @@ from bridge.fleet.cell_source import OneCell
 from bridge.fleet.dask_workers import DaskWorkers
 from bridge.fleet.journal import Journal
 from bridge.fleet.local_workers import LocalWorkers
-from bridge.fleet.running import run, tasks_of
+from bridge.fleet.runner import run, tasks_of
 from bridge.fleet.session import find_sessions
 from bridge.fleet.task import DONE, Outcome, Task, perform
 from bridge.fleet.workers import Workers

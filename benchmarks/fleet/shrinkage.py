@@ -13,12 +13,12 @@ import numpy as np
 from benchmarks.blind.mechanics import Array
 from benchmarks.fleet.simulating import KIND, TYPE, Habits, columns, write_type_cell
 from bridge.cell import load_cell
-from core.compliance_fit import Data, fit_nuisances, residual
 from core.errors import ExcitationError
-from core.hierarchy import fit_type
-from core.hierarchy_evidence import evidence, usual_flexibility
-from core.identification import identify_compliance
-from core.log import Log
+from core.estimation.compliance_fit import Data, fit_nuisances, residual
+from core.estimation.hierarchical import fit_type
+from core.estimation.hierarchical_evidence import evidence, usual_flexibility
+from core.estimation.identification import identify_compliance
+from core.log.log import Log
 from core.metrology import Metrology
 from core.model import Model
 

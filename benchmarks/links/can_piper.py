@@ -23,7 +23,7 @@ from bridge.cell.cell import Cell
 from bridge.cell.simulation import simulated_peer
 from drivers.can.driver import CanDriver
 from drivers.can.settings import CanSettings
-from drivers.simulated.peer_server import PeerThread
+from drivers.simulated.peer.peer_server import PeerThread
 
 HOST, PORT = "127.77.0.4", 29921
 BURST = 0.0015  # s in which all frames of one sample have come

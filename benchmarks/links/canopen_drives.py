@@ -22,7 +22,7 @@ from bridge.cell.cell import Cell
 from bridge.cell.simulation import simulated_peer
 from drivers.canopen.driver import CanopenDriver
 from drivers.canopen.settings import CanopenSettings
-from drivers.simulated.peer_server import PeerThread
+from drivers.simulated.peer.peer_server import PeerThread
 
 HOST, PORT = "127.77.0.3", 29920
 PACE = 0.010  # s from one SYNC to the next, as the drives are told

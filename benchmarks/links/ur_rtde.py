@@ -15,7 +15,7 @@ from typing import Any
 from benchmarks.links.case import Cycles, LinkCase, OurCycle, Pause
 from benchmarks.links.serving import served_cell
 from bridge.cell.cell import Cell
-from drivers.simulated.settings import SCRIPT_PORT
+from drivers.simulated.ur.settings import SCRIPT_PORT
 from drivers.ur_rtde import registers
 from drivers.ur_rtde.driver import OFFSET_SCRIPT, UrRtdeDriver
 from drivers.ur_rtde.settings import UrRtdeSettings
@@ -118,7 +118,9 @@ def _offset_sides(driver: UrRtdeDriver) -> Any:
         for register in registers.OFFSET_DOUBLES:
             io.setInputDoubleRegister(register, 0.0)
         io.setInputIntRegister(registers.OFFSET_RZ, 0)
-        io.setInputIntRegister(registers.CHECKSUM, registers.checksum([0] * 6, writer._sequence))
+        io.setInputIntRegister(
+            registers.CHECKSUM, registers.checksum([0] * 6, writer._sequence, writer._rates)
+        )
         io.setInputIntRegister(registers.HEARTBEAT, writer._sequence)
         io.setInputIntRegister(registers.SEQUENCE, writer._sequence)
 

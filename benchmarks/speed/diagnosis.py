@@ -12,7 +12,7 @@ from typing import Any
 from benchmarks.blind.cases import make_case
 from bridge.cell import load_cell
 from core.diagnosis.diagnosis import diagnose
-from core.log import Log, read_log
+from core.log.log import Log, read_log
 from core.model import Model
 
 CASES = ("pair", "triple", "torque:pair", "tracking:pair")

@@ -10,7 +10,7 @@ from benchmarks.fleet.simulating import write_fleet
 from bridge.cell import load_cell
 from core.diagnosis.diagnosis import diagnose
 from core.effects import CATALOGUE
-from core.log import Log, read_log
+from core.log.log import Log, read_log
 from core.metrology import Metrology
 from core.model import Model
 

@@ -10,13 +10,13 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from benchmarks.speed import task
+from benchmarks.speed.linear_fit import fit_linear
 from benchmarks.speed.peers.pinocchio_task import PinocchioTask
 from benchmarks.speed.sides import Side, compared, interleaved
-from core import kernel
-from core.calibration.foreseen import empty_readings
 from core.calibration.observables import make_observable
+from core.calibration.observables.foreseen import empty_readings
 from core.calibration.parameters import Parameters
-from core.linear_fit import fit_linear
+from core.kernels import reference as kernel
 from core.loads import Loads
 from core.model import Model
 

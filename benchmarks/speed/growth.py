@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.speed import diagnosis_growth, task
-from core.kernel import Chain, Rows
+from benchmarks.speed.linear_fit import fit_linear
 from core.kernels.many import predict
+from core.kernels.reference import Chain, Rows
 from core.kernels.single import correct
-from core.linear_fit import fit_linear
 
 ROWS = (10, 100, 1_000, 10_000, 100_000)
 JOINTS = (2, 3, 4, 5, 6, 7, 8, 10, 12)

@@ -26,9 +26,9 @@ import psutil
 from numpy.typing import NDArray
 
 from benchmarks.machine_stalls import MachineStalls, Missed
-from core.recording.reading import SUFFIX, read_columns
-from drivers.simulated.process import SimulatedController
-from drivers.simulated.settings import simulated_cell
+from core.log.mcap_reading import SUFFIX, read_columns
+from drivers.simulated.ur.process import SimulatedController
+from drivers.simulated.ur.settings import simulated_cell
 
 HOST, RATE = "127.78.0.5", 500.0
 SETTLED = 5.0  # s of compensating before anything is counted

@@ -9,13 +9,13 @@ import numpy as np
 from scipy.linalg import lstsq
 
 from benchmarks.speed import task
+from benchmarks.speed.linear_fit import fit_linear
 from benchmarks.speed.peers import numpy_task
 from benchmarks.speed.peers.cpp import Cpp, compiler
 from benchmarks.speed.peers.pinocchio_task import PinocchioTask
 from benchmarks.speed.sides import Side, compared, interleaved
 from core.kernels.factor import regressor_blocks
 from core.kernels.threads import in_ranges
-from core.linear_fit import fit_linear
 
 OURS, THREADS = "ours", "ours, all threads"
 NUMPY, C, PINOCCHIO = "plain numpy, blocks", "C++ (vectors of eight)", "Pinocchio, loop"

@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 
 from benchmarks.speed import task
+from benchmarks.speed.first_order import block_of, first_order
 from benchmarks.speed.peers import numpy_task
 from benchmarks.speed.peers.casadi_task import casadi_setpoint
 from benchmarks.speed.peers.cpp import Cpp, compiler
 from benchmarks.speed.peers.pinocchio_task import PinocchioTask
 from benchmarks.speed.sides import Call, Side, compared, interleaved
-from bridge.realtime import become_realtime
+from bridge.loop.realtime import become_realtime
 from core.compensation import Compensator
 from core.kernels import single
-from core.kernels.first_order import block_of, first_order
+from core.kernels.packed import pack
 from core.loads import Loads
-from core.packed import pack
 
 OURS, EXACT, EXACT_CALL = (
     "ours, first order",
@@ -144,8 +144,8 @@ def stream(rounds: int) -> dict[str, Any]:
 
 
 def _stream(rounds: int) -> dict[str, Any]:
-    from bridge.setpoint_stream import SetpointStream
-    from bridge.settings import LimitSettings
+    from bridge.cell.sections import LimitSettings
+    from bridge.loop.setpoint_stream import SetpointStream
     from core.state import RobotState
 
     made = SetpointStream(task.bent(), LimitSettings(), 500.0)

@@ -7,18 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from bridge.calibration.instruments.settings import Base
-from bridge.calibration.order import Order
-from bridge.calibration.settings import BoxEntry, CalibrationSettings, JointRange, RangeEntry
+from bridge.calibration.options import Order
 from bridge.cell import Cell
-from core.calibration.capsules import Box
-from core.calibration.design import far_end, plan
+from bridge.cell.settings.calibration import BoxEntry, CalibrationSettings, JointRange, RangeEntry
+from bridge.cell.settings.instruments import Base
 from core.calibration.observables import Observable, make_observable
 from core.calibration.parameters import DEFAULT, Parameters
 from core.calibration.plan import Payload, Plan
-from core.calibration.space import Place, Space
 from core.errors import CellError
 from core.metrology import Metrology
+from core.planning.capsules import Box
+from core.planning.design import far_end, plan
+from core.planning.workspace import Place, Space
 
 REPEATABILITY = 5e-5  # m, 1 sigma of one coordinate, where the cell does not tell it
 NEEDS_PLACE = {"distance": "fixed end", "sphere": "sphere", "point": "point"}

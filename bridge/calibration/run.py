@@ -11,21 +11,21 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.book import Book
-from bridge.calibration.bringing import Bringing
-from bridge.calibration.conversation import Conversation
-from bridge.calibration.folders import begun_entry, check_begun, session_folder
+from bridge.calibration.format import load_text
 from bridge.calibration.instruments.instrument import AnyInstrument, ReadingError, Surroundings
-from bridge.calibration.job import Job
-from bridge.calibration.jobs import make_job
-from bridge.calibration.joint_sources import make_joints
-from bridge.calibration.journal import Journal
-from bridge.calibration.order import Order
-from bridge.calibration.plan_document import write_poses
+from bridge.calibration.jobs.job import Job
+from bridge.calibration.jobs.table import make_job
+from bridge.calibration.joints.joint_source import JointSource, PlannedJoints
+from bridge.calibration.options import Order
 from bridge.calibration.planning import loads_of, metrology_of, space_of, with_loads
-from bridge.calibration.stand import JointSource, PlannedJoints
-from bridge.calibration.talk import InputEnded, Talk, Word
-from bridge.calibration.words import load_text
+from bridge.calibration.session.folders import begun_entry, check_begun, session_folder
+from bridge.calibration.session.joint_sources import make_joints
+from bridge.calibration.session.journal import Journal
+from bridge.calibration.session.measuring import Conversation
+from bridge.calibration.session.plan_document import write_poses
+from bridge.calibration.session.positioning import Bringing
+from bridge.calibration.session.prompt import InputEnded, Talk, Word
+from bridge.calibration.session.session import Book
 from bridge.cell import Cell
 from core.calibration.plan import PlannedPose
 from core.errors import CellError, LinkError

@@ -8,23 +8,23 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
-from bridge.calibration.settings import CalibrationSettings
 from bridge.cell.document import Document, read_document
 from bridge.cell.effects import compliance_terms, term_of
 from bridge.cell.message import message, messages
 from bridge.cell.robot import build_arm
 from bridge.cell.schema import CellFile, Frame, Simulation
-from bridge.metrics.settings import MetricsSettings
-from bridge.settings import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
-from bridge.web.settings import WebSettings
+from bridge.cell.sections import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
+from bridge.cell.settings.calibration import CalibrationSettings
+from bridge.cell.settings.metrics import MetricsSettings
+from bridge.cell.settings.web import WebSettings
 from core.arm import Arm
 from core.errors import ArmError, CellError, InputError
+from core.load_bounds import HEAVIEST
 from core.metrology import Metrology
 from core.model import Model
 from core.rotation import rpy_matrix, transform
 from drivers.ft_sensor.settings import FtSensorSettings
 
-HEAVIEST = 1.5  # times the rated payload: beyond, the number is a mistake
 FINEST = 1.0e-9  # m: what a sigma of zero counts as
 
 
@@ -71,11 +71,15 @@ class Cell:
 
     @property
     def setpoints(self) -> SetpointSettings:
-        """Return section ``setpoints``, its file seen from here instead of the cell's folder."""
-        given = self.file.setpoints
-        if given.file is None:
-            return given
-        return given.model_copy(update={"file": self.path.parent / given.file})
+        """Return section ``setpoints``, its paths seen from here instead of the cell's folder."""
+        given, folder = self.file.setpoints, self.path.parent
+        return given.model_copy(
+            update={
+                name: folder / path
+                for name in ("file", "socket", "token_file")
+                if (path := getattr(given, name)) is not None
+            }
+        )
 
     @property
     def recording(self) -> RecordingSettings:
@@ -106,6 +110,12 @@ class Cell:
                 "folder": folder / given.folder, "instrument": given.instrument.located(folder),
             }
         )  # fmt: skip
+
+    @property
+    def fitted_range(self) -> dict[str, tuple[float, float]]:
+        """Return the least and largest value of each log column that the model was fitted on."""
+        origin = self.file.provenance
+        return {} if origin is None else dict(origin.fitted)
 
     @property
     def simulation(self) -> Simulation:

@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 
 from core.errors import CellError
+from core.files import read_text
 
 Keys = Sequence[str | int]
 
@@ -91,7 +92,7 @@ def parse(text: str, path: Path) -> Document:
 def read_document(path: Path) -> Document:
     """Return the document of a YAML file; raises CellError where it cannot be read."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path, "utf-8-sig")
     except FileNotFoundError:
         raise CellError(f"{path}: file not found, expected a cell file (YAML)") from None
     except IsADirectoryError:

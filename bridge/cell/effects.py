@@ -10,11 +10,10 @@ import numpy as np
 from bridge.cell.message import nearest
 from bridge.cell.schema import Compliance, EffectEntry
 from core.arm import Arm
-from core.effects import Parameter, Site, Term, effect_named
+from core.effects import CATALOGUE, Parameter, Site, Term, effect_named, flexibility_effects
 from core.errors import CellError, InputError
 
 VALUE = "value"  # the name in the file of a parameter that has none of its own
-FLEXIBILITIES = {"axial_compliance": "axial", "radial_compliance": "radial"}
 
 
 def term_of(entry: EffectEntry, arm: Arm, where: str) -> Term:
@@ -29,7 +28,7 @@ def term_of(entry: EffectEntry, arm: Arm, where: str) -> Term:
         allowed = "no joint" if joints == [None] else f"a joint of {joints[0]} to {joints[-1]}"
         found = "none" if entry.joint is None else entry.joint
         raise CellError(f"{where}.joint: found {found}, expected {allowed} for {entry.effect}")
-    if (entry.order is not None) != (entry.effect == "transmission_error"):
+    if (entry.order is not None) != effect.periodic:
         raise CellError(
             f"{where}.order: found {'none' if entry.order is None else entry.order}, expected "
             f"{'cycles per turn' if entry.order is None else 'none'} for {entry.effect}"
@@ -67,7 +66,7 @@ def name_of(parameter: Parameter) -> str:
 def compliance_terms(compliance: Compliance, arm: Arm) -> tuple[Term, ...]:
     """Return the terms of the compliance section; zeros are left out."""
     terms = []
-    for effect, key in FLEXIBILITIES.items():
+    for key, effect in flexibility_effects().items():
         values = getattr(compliance, key)
         if values is None:
             continue
@@ -82,17 +81,18 @@ def compliance_terms(compliance: Compliance, arm: Arm) -> tuple[Term, ...]:
 
 def compliance_entry(terms: Sequence[Term], n: int) -> dict[str, list[float]]:
     """Return the compliance section of a model's terms: n values per key."""
-    entry = {key: np.zeros(n) for key in FLEXIBILITIES.values()}
+    entry = {key: np.zeros(n) for key in flexibility_effects()}
     for term in terms:
+        key = CATALOGUE[term.effect].flexibility
         if _in_section(term) and term.site.joint is not None:
-            entry[FLEXIBILITIES[term.effect]][term.site.joint - 1] += term.values[0]
+            entry[key][term.site.joint - 1] += term.values[0]
     # what is below zero is no flexibility: it stands among the effects
     return {key: np.maximum(values, 0.0).tolist() for key, values in entry.items()}
 
 
 def _in_section(term: Term) -> bool:
     """Return whether a term belongs to the section; a stand-in keeps its mark among effects."""
-    return term.effect in FLEXIBILITIES and not term.stand_in
+    return bool(CATALOGUE[term.effect].flexibility) and not term.stand_in
 
 
 def _negative_terms(terms: Sequence[Term]) -> list[Term]:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import configparser
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from bridge.cell.schema import Calibration, Robot
 from core.arm import Arm, arm_from_dh, builtin_arm
 from core.errors import ArmError, CellError
+from core.files import is_file, read_text
 from core.urdf import arm_from_urdf
 
 DELTAS = ("delta_theta", "delta_a", "delta_d", "delta_alpha")
@@ -31,14 +33,22 @@ def build_arm(robot: Robot, folder: Path) -> Arm:
         raise CellError(
             f"robot.calibration: found beside robot.{given[0]}, expected only beside robot.model"
         )
+    if robot.rated_payload is not None and robot.model is not None:
+        raise CellError(
+            "robot.rated_payload: found beside robot.model, expected only beside robot.urdf or "
+            "robot.dh: of a built-in arm it is known"
+        )
     if robot.model is not None:
         return builtin_arm(robot.model, _calibration(robot.calibration, folder))
     if robot.urdf is not None:
         path = folder / robot.urdf
-        if not path.is_file():
+        if not is_file(path):
             raise CellError(f"robot.urdf: file not found: {path}, expected a URDF")
-        return arm_from_urdf(path, robot.tip)
-    return arm_from_dh([row.model_dump() for row in robot.dh or []])
+        arm = arm_from_urdf(path, robot.tip)
+    else:
+        arm = arm_from_dh([row.model_dump() for row in robot.dh or []])
+    rated = robot.rated_payload
+    return arm if rated is None else replace(arm, payload=rated)
 
 
 def _calibration(
@@ -58,7 +68,7 @@ def read_calibration(path: Path) -> dict[str, list[float]]:
     """
     parser = configparser.ConfigParser(interpolation=None)
     try:
-        parser.read_string(path.read_text(encoding="utf-8"), source=str(path))
+        parser.read_string(read_text(path), source=str(path))
     except FileNotFoundError:
         raise ArmError(
             f"robot.calibration: file not found: {path}, expected a calibration.conf"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +14,11 @@ import yaml
 from bridge.cell.cell import Cell
 from bridge.cell.document import Document, number_text, parse
 from bridge.cell.effects import compliance_entry, effect_entries
-from bridge.output_file import write_text
+from bridge.document.output_file import write_text
 from core.errors import CellError
 from core.model import Model
 
+PLAIN = re.compile(r"(?!(?:y|n|yes|no|on|off|true|false|null|nan|inf)$)[a-z][a-z_]*", re.IGNORECASE)
 PATHS: tuple[tuple[str, ...], ...] = (
     ("robot", "urdf"),
     ("robot", "calibration"),
@@ -142,8 +145,10 @@ def _flow(value: Any) -> str:
         return "{" + ", ".join(f"{k}: {_flow(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list):
         return "[" + ", ".join(_flow(v) for v in value) + "]"
-    if isinstance(value, bool):
-        return str(value).lower()
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    if isinstance(value, str):
+        return value if PLAIN.fullmatch(value) else json.dumps(value, ensure_ascii=False)
     return number_text(value) if isinstance(value, float) else str(value)
 
 

@@ -1,15 +1,15 @@
-"""The cell file's keys (CONTRACT, "The cell file"), and what may stand there."""
+"""The cell file's keys, and what may stand there."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from bridge.calibration.settings import CalibrationSettings
-from bridge.metrics.settings import MetricsSettings
-from bridge.settings import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
-from bridge.web.settings import WebSettings
+from bridge.cell.sections import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
+from bridge.cell.settings.calibration import CalibrationSettings
+from bridge.cell.settings.metrics import MetricsSettings
+from bridge.cell.settings.web import WebSettings
 from drivers.ft_sensor.settings import AnyFtSensor
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -51,6 +51,9 @@ class Robot(Section):
     urdf: str | None = Field(default=None, description="a file, seen from the cell's folder")
     dh: list[DhRow] | None = Field(default=None, description="standard DH rows")
     tip: str | None = Field(default=None, description="the URDF link that is the flange")
+    rated_payload: Annotated[Number, Field(gt=0)] | None = Field(
+        default=None, description="kg, of urdf and dh; of model it is known"
+    )
     calibration: Calibration | str | None = Field(
         default=None, description="UR's delta_* values, or its calibration.conf"
     )
@@ -120,6 +123,27 @@ class Simulation(Section):
     bench_port: int | None = Field(default=None, gt=0, lt=65536, strict=True)
 
 
+class SourceFile(Section):
+    """A file that a result was made from."""
+
+    role: str = Field(description="log, cell or sim")
+    name: str = Field(description="without its folder")
+    sha256: str | None = Field(default=None, description="of its bytes")
+
+
+class Provenance(Section):
+    """Where the model in this cell comes from, as fit, calibrate and --apply write it."""
+
+    version: str = Field(default="", description="of Gapbridge")
+    time: str = Field(default="", description="when it was written, UTC")
+    command: str = Field(default="", description="that wrote it")
+    arguments: dict[str, Any] = Field(default={}, description="of the command")
+    files: list[SourceFile] = []
+    fitted: dict[str, tuple[Number, Number]] = Field(
+        default={}, description="least and largest value of each column that was fitted on"
+    )
+
+
 class CellFile(Section):
     """The whole file."""
 
@@ -144,3 +168,6 @@ class CellFile(Section):
         default=CalibrationSettings(), description="instrument, loads, ...: of calibration sessions"
     )
     simulation: Simulation = Simulation()
+    provenance: Provenance | None = Field(
+        default=None, description="where the model comes from; written by the commands"
+    )

@@ -13,14 +13,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bridge.cell.cell import Cell
+from core.addresses import is_loopback
 from core.errors import CellError
 from core.rotation import rotation_vector
 from drivers.driver import DriverSettings
 from drivers.simulated.ft_sensor.serving import served_sensor
-from drivers.simulated.peer import Peer, make_peer
-from drivers.simulated.peer_server import PeerServer, serve_peer
-from drivers.simulated.server import serve
-from drivers.simulated.settings import (
+from drivers.simulated.peer.peer import Peer, make_peer
+from drivers.simulated.peer.peer_server import PeerServer, serve_peer
+from drivers.simulated.ur.server import serve
+from drivers.simulated.ur.settings import (
     BENCH_PORT,
     ServerSettings,
     simulated_arm,
@@ -100,7 +101,7 @@ def _address(cell: Cell, host: str | None) -> str:
     """Return the loopback address that the controller is served at. Raises CellError."""
     link = cell.file.link
     address = host or cell.file.simulation.host or str(getattr(link, "host", None) or HOST)
-    if not address.startswith("127."):
+    if not is_loopback(address):
         raise CellError(
             f"{cell.path}: simulation.host: found {address!r}, expected a loopback address "
             "(127.x.x.x): a simulated controller is never served to others"

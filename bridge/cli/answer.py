@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from core.diagnosis.cause import Cause
+from collections.abc import Sequence
+
 from core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
+from core.diagnosis.result import Cause
 from core.diagnosis.separation import Measurement
 from core.effects import Reported
 
@@ -15,13 +17,14 @@ VERDICTS = {
 }
 SMALL = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}  # gaps are told in units that people read
 SHOWN = 6  # next measurements
+CHANGED = 3  # parameters of a cause that changed between sessions
 
 
 def answer(diagnosis: Diagnosis) -> str:
     """Return the whole answer, lines joined; joints count from 1."""
     lines = [f"verdict: {VERDICTS[diagnosis.verdict]}"]
     for channel in diagnosis.channels:
-        lines += ["", *_channel(channel)]
+        lines += ["", *_channel(channel, diagnosis.sessions)]
     if diagnosis.not_observable:
         lines.append("")
     for hidden in diagnosis.not_observable:
@@ -44,7 +47,7 @@ def size(value: float | None, unit: str) -> str:
     return f"{value * factor:.4g} {name}"
 
 
-def _channel(channel: ChannelDiagnosis) -> list[str]:
+def _channel(channel: ChannelDiagnosis, sessions: tuple[str, ...]) -> list[str]:
     unit = channel.unit
     lines = [
         f"{channel.channel}: {VERDICTS[channel.verdict]}",
@@ -54,11 +57,13 @@ def _channel(channel: ChannelDiagnosis) -> list[str]:
     ]
     for cause in channel.causes:
         lines += [f"  {line}" for line in _cause(cause, unit)]
+        lines += [f"    {line}" for line in _changed(channel, cause, sessions)]
     if channel.causes:
         lines.append(
             f"  remaining {size(channel.remaining_rms, unit)}, on held-out samples "
             f"{size(channel.remaining_rms_held_out, unit)}"
         )
+    lines += [f"  {line}" for line in _elsewhere(channel, sessions)]
     for stand_in in channel.stand_ins:
         lines.append(
             f"  stand-in: {_named(stand_in)}: not proved, but the gap shrinks by it in regions "
@@ -71,6 +76,48 @@ def _channel(channel: ChannelDiagnosis) -> list[str]:
             + (f"; it depends on {depends}" if depends else "")
         )
     return lines
+
+
+def _elsewhere(channel: ChannelDiagnosis, sessions: tuple[str, ...]) -> list[str]:
+    """Return what to expect where nothing was fitted; a figure that cannot be had is said to be."""
+    unit, found = channel.unit, channel.elsewhere
+    region = "unknown (too few samples)" if found.new_region is None else size(
+        found.new_region, unit)  # fmt: skip
+    session = "unknown (one session)" if found.new_session is None else size(
+        found.new_session, unit)  # fmt: skip
+    lines = [f"to expect in a new region of joint space {region}, in a new session {session}"]
+    if found.by_session:
+        each = ", ".join(f"{sessions[s]} {size(rms, unit)}" for s, rms in found.by_session)
+        lines.append(f"each session under a fit of the others: {each}")
+    return lines
+
+
+def _changed(channel: ChannelDiagnosis, cause: Cause, sessions: tuple[str, ...]) -> list[str]:
+    """Return whether a cause carries from session to session, with its values where not."""
+    across = next((c for c in channel.carried if c.effect == cause.effect), None)
+    if across is None:
+        return []
+    if across.carries:
+        return [f"carries: the same in {len(across.values)} sessions"]
+    lines = [f"changed between sessions (p = {across.p_value:.2g} if it had not):"]
+    most = _most_changed([parameters for _, parameters in across.values])
+    for s, parameters in across.values:
+        each = "; ".join(_parameter(parameters[k]) for k in most)
+        lines.append(f"  {sessions[s]}: {each}")
+    if len(most) < len(across.values[0][1]):
+        lines.append("  (those that changed most; all are in the JSON)")
+    return lines
+
+
+def _most_changed(values: Sequence[Sequence[Reported]]) -> list[int]:
+    """Return the indices of the parameters that differ most, in sigmas, most first."""
+    sigmas = []
+    for same in zip(*values, strict=True):
+        numbers = [p.value for p in same]
+        spread = max((p.std or 0.0) for p in same)
+        sigmas.append((max(numbers) - min(numbers)) / max(spread, 1e-300))
+    order = sorted(range(len(sigmas)), key=lambda k: -sigmas[k])
+    return order[:CHANGED]
 
 
 def _cause(cause: Cause, unit: str) -> list[str]:

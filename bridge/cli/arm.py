@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from bridge.cli.options import cell_argument
-from bridge.control_client import ask
+from bridge.ipc.control_client import ask
 
 
 @click.command()

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import click
 
-import bridge
 from core.errors import RunError
 
-CHECKOUT = Path(bridge.__file__).resolve().parent.parent
+CHECKOUT = Path(__file__).resolve().parents[2]
 BENCHMARK = "benchmarks.blind.__main__"
 
 

@@ -8,7 +8,7 @@ import click
 
 from bridge.calibration.instruments.choice import instrument_settings
 from bridge.cli.options import cell_argument, open_cell
-from bridge.output_file import require_writable
+from bridge.document.output_file import require_writable
 
 EPILOG = """\b
 At every question:
@@ -100,7 +100,7 @@ def calibrate(
     if new_cell is not None:
         require_writable(new_cell, cell)
     chosen = instrument_settings(given, instrument)
-    from bridge.calibration.order import Order
+    from bridge.calibration.options import Order
     from bridge.calibration.run import run_session  # takes the numerical libraries along
 
     kind = "verify" if verify else "payload" if payload_only else "tool" if tool_only else "whole"

@@ -7,9 +7,10 @@ from pathlib import Path
 import click
 import numpy as np
 
-from bridge.cli.options import cell_option, csv_option, log_argument, open_cell, open_log
+from bridge.cell.opened_log import open_log
+from bridge.cli.options import cell_option, csv_option, log_argument, open_cell, warn_outside
 from bridge.cli.progress import progress
-from bridge.output_file import require_writable, write_table
+from bridge.document.output_file import require_writable, write_table
 from core.compensation import correct
 from core.errors import InputError
 from core.model import Array
@@ -33,6 +34,7 @@ def compensate(log: Path, cell: Path, out: Path) -> None:
     """
     given = open_cell(cell)
     rows = open_log(log, given)
+    warn_outside(rows, given)
     require_writable(out, log, cell)
     nominal = rows.require("target_q", "actual_q")
     loads = rows.loads()

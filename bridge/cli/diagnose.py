@@ -3,30 +3,42 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from bridge.cell import Cell, save_cell
+from bridge.cell.opened_log import open_log
 from bridge.cli.answer import answer
-from bridge.cli.options import cell_option, log_argument, open_cell, open_log
+from bridge.cli.options import (
+    cell_option,
+    logs_argument,
+    open_cell,
+    open_logs,
+    remounted_option,
+    warn_outside,
+)
 from bridge.cli.progress import status
-from bridge.output_file import require_writable, write_text
+from bridge.document.output_file import FOLDER_MODE, require_writable, write_text
+from bridge.document.provenance import fitted, provenance
 from core.diagnosis.diagnosis import Diagnosis
 from core.diagnosis.diagnosis import diagnose as diagnose_log
 from core.diagnosis.document import document
 from core.effects import effect_named
 from core.errors import InputError, LogError
-from core.log import Log
+from core.log.log import Log
+from core.metrology import Metrology
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 
 @click.command()
-@log_argument
+@logs_argument
 @cell_option
+@remounted_option
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
@@ -65,8 +77,9 @@ if TYPE_CHECKING:
     help="Take the prediction, row by row, from a log of your own simulator.",
 )
 def diagnose(
-    log: Path,
+    logs: tuple[Path, ...],
     cell: Path,
+    remounted: bool,
     out: Path | None,
     json_file: Path | None,
     new_cell: Path | None,
@@ -74,34 +87,40 @@ def diagnose(
     withhold: tuple[str, ...],
     sim: Path | None,
 ) -> None:
-    """Diagnose the sim-to-real gap of a log.
+    """Diagnose the sim-to-real gap of a log, or of several sessions of one arm.
 
     Says in plain sentences where it lies, what causes it and how far it shrinks. An effect is named
     only where it shrinks the gap on poses that its fit did not see; what the catalogue does not
-    explain is said, with what it depends on.
+    explain is said, with what it depends on. Several logs (or a column session in one) are sessions
+    that share the effects; each has a frame of its own, and with --remounted a tool point.
 
     Example: gapbridge diagnose log.csv --cell cell.yaml --out out/diagnosis --apply better.yaml
     """
     if stand_ins and new_cell is None:
         raise InputError("--stand-ins: found no --apply, expected the cell to write")
     given = open_cell(cell)
-    rows = open_log(log, given)
+    rows = open_logs(logs, given)
+    warn_outside(rows, given)
     _check_effects(withhold)
     simulated = None if sim is None else _simulated(sim, given, rows)
-    inputs = [log, cell] + ([sim] if sim else [])
+    inputs = [*logs, cell, *([sim] if sim else [])]
     for file in (json_file, new_cell):
         if file is not None:
             require_writable(file, *inputs)
     if out is not None:
         _folder(out)
     with status("diagnosing") as tell:
-        found = _diagnose(given, rows, withhold, simulated, tell)
+        metrology = replace(given.metrology, remounted=remounted)
+        found = _diagnose(given, rows, metrology, withhold, simulated, tell)
     click.echo(answer(found))
-    text = json.dumps(document(found), indent=1, allow_nan=False) + "\n"
+    origin = provenance({"log": logs, "cell": [cell], "sim": [sim] if sim else []})
+    told = document(found) | {"provenance": origin}
+    text = json.dumps(told, indent=1, allow_nan=False) + "\n"
     if json_file is not None:
         write_text(json_file, text)
     if new_cell is not None:
-        save_cell(given, new_cell, found.with_stand_ins if stand_ins else found.model)
+        applied = found.with_stand_ins if stand_ins else found.model
+        save_cell(given, new_cell, applied, {"provenance": fitted(origin, rows)})
     written = [] if out is None else _write_folder(out, text, found, given, rows)
     for file in (*written, json_file, new_cell):
         if file is not None:
@@ -109,14 +128,12 @@ def diagnose(
 
 
 def _diagnose(
-    cell: Cell, log: Log, withhold: tuple[str, ...], simulated: Log | None,
+    cell: Cell, log: Log, metrology: Metrology, withhold: tuple[str, ...], simulated: Log | None,
     tell: Callable[[str], None],
 ) -> Diagnosis:  # fmt: skip
     extra: dict[str, Any] = {} if simulated is None else {"simulated": simulated}
     try:
-        return diagnose_log(
-            cell.model, log, cell.metrology, withhold=withhold, progress=tell, **extra
-        )
+        return diagnose_log(cell.model, log, metrology, withhold=withhold, progress=tell, **extra)
     except InputError as error:
         text = str(error)
         raise type(error)(text if text.startswith(log.path) else f"{log.path}: {text}") from None
@@ -147,7 +164,7 @@ def _folder(path: Path) -> None:
     if not path.parent.is_dir():
         raise InputError(f"{path}: found no folder {path.parent}, expected an existing one")
     try:
-        path.mkdir(exist_ok=True)
+        path.mkdir(FOLDER_MODE, exist_ok=True)
     except OSError as error:
         raise InputError(f"{path}: folder cannot be made: {error.strerror}") from None
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -10,23 +12,27 @@ from rich.console import Console
 from rich.table import Table
 
 from bridge.cell import Cell, save_cell
-from bridge.cli.large_log import LargeLog, is_large
-from bridge.cli.options import cell_option, log_argument, open_cell, open_log
+from bridge.cli.large_log import LargeLog, has_sessions, is_large
+from bridge.cli.options import cell_option, logs_argument, open_cell, open_logs, remounted_option
 from bridge.cli.progress import progress, status
-from bridge.output_file import require_writable
+from bridge.document.output_file import require_writable
+from bridge.document.provenance import provenance
 from core.errors import ExcitationError
-from core.identification import Identification, identify_compliance
-from core.streamed_identification import identify_streamed
+from core.estimation.identification import Identification, identify_compliance
+from core.estimation.streamed import identify_streamed
+from core.metrology import Metrology
+from core.ranges import merged, range_of
 
 
 @click.command()
-@log_argument
+@logs_argument
 @cell_option
+@remounted_option
 @click.option(
     "--out", required=True, type=click.Path(path_type=Path), help="The new cell file to write."
 )
-def fit(log: Path, cell: Path, out: Path) -> None:
-    """Identify the compliance of a cell from a log.
+def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
+    """Identify the compliance of a cell from a log, or from several sessions of one arm.
 
     Least squares on measured TCP poses (measured_position, and measured_rotation where the log has
     it) under different payloads or pulls. Effects that are in the cell stay in it. Writes NEW_CELL:
@@ -34,32 +40,47 @@ def fit(log: Path, cell: Path, out: Path) -> None:
     cell, and is told. Where the metrology is not registered, its frame and the tool point are
     estimated along, before as well as after, and not written. Declines, with the reason, where
     nothing in the log excites the compliance. A log of more than 20,000 rows is read in pieces,
-    so that memory does not grow with it; so is a recording of the daemon (.mcap).
+    so that memory does not grow with it; so is a recording of the daemon (.mcap). Several logs (or
+    a column session in one) are sessions: each has a frame of its own, and with --remounted a tool
+    point, and all share the flexibilities.
 
     Example: gapbridge fit log.csv --cell cell.yaml --out calibrated.yaml
     """
     given = open_cell(cell)
-    require_writable(out, log, cell)
+    require_writable(out, *logs, cell)
+    metrology = replace(given.metrology, remounted=remounted)
     try:
-        found = _identified(log, given)
+        found, ranges = _identified(logs, given, metrology)
     except ExcitationError as error:
-        raise ExcitationError(f"{log}: {error}") from None
+        raise ExcitationError(f"{', '.join(map(str, logs))}: {error}") from None
+    origin = provenance({"log": logs, "cell": [cell]}) | {"fitted": ranges}
     # frame and tool point that were estimated along stay out of the cell
-    save_cell(given, out, given.model.with_compliance(found.axial, found.radial))
+    model = given.model.with_compliance(found.axial, found.radial)
+    save_cell(given, out, model, {"provenance": origin})
     tell(found)
     click.echo(f"{out}: written")
 
 
-def _identified(path: Path, cell: Cell) -> Identification:
-    """Return what the log shows; one of many rows passes by in pieces."""
-    if is_large(path):
+def _identified(
+    paths: Sequence[Path], cell: Cell, metrology: Metrology
+) -> tuple[Identification, dict[str, list[float]]]:
+    """Return what the logs show, and the ranges fitted on; one of many rows passes in pieces."""
+    if (
+        len(paths) == 1
+        and is_large(paths[0])
+        and not (has_sessions(paths[0]) or metrology.remounted)
+    ):
+        log = LargeLog(paths[0], cell)
         with status("fitting") as tell_step:
-            return identify_streamed(
-                cell.model, LargeLog(path, cell), cell.metrology, progress=tell_step
-            )
-    rows = open_log(path, cell)
+            found = identify_streamed(cell.model, log, metrology, progress=tell_step)
+        return found, _listed(merged(range_of(piece) for piece in log))
+    rows = open_logs(paths, cell)
     with progress("fitting"):
-        return identify_compliance(cell.model, rows, cell.metrology)
+        return identify_compliance(cell.model, rows, metrology), _listed(range_of(rows))
+
+
+def _listed(ranges: Mapping[str, tuple[float, float]]) -> dict[str, list[float]]:
+    return {name: list(ends) for name, ends in ranges.items()}
 
 
 def tell(found: Identification) -> None:
@@ -83,6 +104,12 @@ def tell(found: Identification) -> None:
     if np.isfinite(found.remaining_rms_held_out):
         change = _change(found.gap_rms_held_out, found.remaining_rms_held_out)
         click.echo(f"on poses left out of the fit: {change}")
+    for where, left in (
+        ("a new region of joint space", found.remaining_rms_new_region),
+        ("a new session", found.remaining_rms_new_session),
+    ):
+        if np.isfinite(left):
+            click.echo(f"to expect in {where}, rms in mm: {left * 1e3:.4f}")
     for line in (*found.notes, *found.combinations):
         click.echo(f"note: {line}")
 

@@ -17,7 +17,7 @@ from bridge.fleet.folder import require_folder
 from bridge.fleet.journal import Journal
 from bridge.fleet.local_workers import LocalWorkers
 from bridge.fleet.outcome_words import ending
-from bridge.fleet.running import Done, run, tasks_of
+from bridge.fleet.runner import Done, run, tasks_of
 from bridge.fleet.session import Found, find_sessions
 from bridge.fleet.task import BAD, DONE, Outcome, Work
 from bridge.fleet.workers import Workers
@@ -82,7 +82,7 @@ def diagnose(withhold: tuple[str, ...], **given: Any) -> None:
     for name in withhold:
         effect_named(name)
     done, found = _run("diagnose", diagnosing.work, {"withhold": list(withhold)}, **given)
-    from bridge.fleet.writing import write_diagnosed
+    from bridge.fleet.output import write_diagnosed
 
     _told(done, found, *write_diagnosed(done, found, given["out"]))
 
@@ -104,7 +104,7 @@ def fit(cells: Path | None, **given: Any) -> None:
     if cells is not None:
         require_folder(cells, "--apply")
     done, found = _run("fit", fitting.work, {}, **given)
-    from bridge.fleet.writing import write_fitted
+    from bridge.fleet.output import write_fitted
 
     _told(done, found, *write_fitted(done, found, given["out"], cells))
 

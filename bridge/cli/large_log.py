@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bridge.cell import Cell
-from bridge.cli.options import check_log
+from bridge.cell.opened_log import check_log
 from core.errors import LogError
-from core.log import Log
-from core.log_pieces import PARQUET, RECORDING, LogPieces
-from core.recording.reading import files_of
+from core.log.log import Log
+from core.log.mcap_reading import files_of
+from core.log.pieces import PARQUET, LogPieces
+from core.log.sources import source_of
+from core.log.sources.recording import Recording
 
 LARGE = 20_000  # rows from which a log is read in pieces
 BYTES = 8_000_000  # of a text file that holds about as many
@@ -35,8 +37,9 @@ class LargeLog:
 
 def is_large(path: Path) -> bool:
     """Return whether a log is to be read in pieces. Raises LogError where it cannot be read."""
-    if path.suffix.lower() == RECORDING:
-        return True
+    source = source_of(path)
+    if source is not None:
+        return source.identifier == Recording.identifier
     if not path.is_file():
         return False
     if path.suffix.lower() not in PARQUET:
@@ -47,3 +50,16 @@ def is_large(path: Path) -> bool:
         return LogPieces(path, 0).count() > LARGE
     except (pyarrow.ArrowException, OSError) as error:
         raise LogError(f"{path}: found no readable Parquet file ({error})") from None
+
+
+def has_sessions(path: Path) -> bool:
+    """Return whether a log's rows belong to several sessions (a column ``session``)."""
+    if source_of(path) is not None or not path.is_file():
+        return False
+    if path.suffix.lower() in PARQUET:
+        from pyarrow import parquet
+
+        return "session" in parquet.read_schema(path).names
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        header = file.readline().replace(";", ",").strip().split(",")
+    return "session" in [name.strip().strip('"') for name in header]

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
-import numpy as np
 
 from bridge.cell import Cell, load_cell
-from bridge.cell.cell import HEAVIEST
-from core.diagnosis.suspicion import check_units
-from core.errors import LogError
-from core.log import Log, read_log
+from bridge.cell.opened_log import open_log
+from core.log.log import Log
+from core.ranges import outside
+from core.sessions import join_sessions
 
 log_argument = click.argument("log", type=click.Path(path_type=Path))
+logs_argument = click.argument(
+    "logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path)
+)
+remounted_option = click.option(
+    "--remounted",
+    is_flag=True,
+    help="The target was taken off between sessions: each has a tool point of its own.",
+)
 cell_argument = click.argument("cell", type=click.Path(path_type=Path))
 cell_option = click.option(
     "--cell", required=True, type=click.Path(path_type=Path), help="The cell file (YAML)."
@@ -31,27 +39,18 @@ def open_cell(path: Path) -> Cell:
     return cell
 
 
-def open_log(path: Path, cell: Cell) -> Log:
-    """Return a log for a cell's arm.
+def open_logs(paths: Sequence[Path], cell: Cell) -> Log:
+    """Return one log, or several as the sessions of one; so is one with a column ``session``.
 
-    Raises LogError where a payload is out of range, angles look like degrees or positions like
-    millimetres.
+    Raises LogError as ``open_log`` does, and where the sessions do not belong together.
     """
-    log = read_log(path, cell.arm.n)
-    check_log(log, cell)
-    return log
+    return join_sessions([open_log(path, cell) for path in paths], cell.model)
 
 
-def check_log(log: Log, cell: Cell) -> None:
-    """Raise LogError where a log's numbers cannot be meant for a cell's arm."""
-    for name in ("actual_q", "target_q"):
-        if np.isinf(log.columns.get(name, np.zeros(0))).any():
-            log.require(name)  # names the cell
-    check_units(cell.model, log)
-    mass, rated = log.get("payload"), cell.arm.payload
-    if mass is not None and (mass > HEAVIEST * rated).any():
-        row = int(np.argmax(mass > HEAVIEST * rated))
-        raise LogError(
-            f"{log.path}: row {log.line(row)}, column payload: found {mass[row]:g} kg, out of "
-            f"range: expected 0 to {rated:g} kg, what {cell.arm.name} is rated for"
-        )
+def warn_outside(log: Log, cell: Cell) -> None:
+    """Print a warning where a log's poses, loads or temperatures lie outside what was fitted.
+
+    What was fitted stands in the cell's ``provenance``; cells without one give no warning.
+    """
+    for text in outside(log, cell.fitted_range):
+        click.echo(f"warning: {log.path}: {text}", err=True)

@@ -7,8 +7,9 @@ from pathlib import Path
 import click
 import numpy as np
 
-from bridge.cli.options import cell_option, csv_option, log_argument, open_cell, open_log
-from bridge.output_file import require_writable, write_table
+from bridge.cell.opened_log import open_log
+from bridge.cli.options import cell_option, csv_option, log_argument, open_cell, warn_outside
+from bridge.document.output_file import require_writable, write_table
 from core.errors import InputError, LogError
 
 
@@ -19,7 +20,8 @@ from core.errors import InputError, LogError
 def predict(log: Path, cell: Path, out: Path) -> None:
     """Predict the TCP pose of every row of a log.
 
-    Joints come from actual_q (where there is none, from target_q), loads from the payload,
+    Joints come from actual_q (where there is none, from target_q, less what the servos are known to
+    give way), loads from the payload,
     payload_cog, actual_TCP_force, joint_temperatures and approach columns. Writes
     predicted_position_0..2 (m) and predicted_rotation_0..2 (rotation vector, rad), in base.
 
@@ -27,10 +29,13 @@ def predict(log: Path, cell: Path, out: Path) -> None:
     """
     given = open_cell(cell)
     rows = open_log(log, given)
+    warn_outside(rows, given)
     require_writable(out, log, cell)
-    q = rows.require("actual_q", "target_q")
+    q, loads = rows.require("actual_q", "target_q"), rows.loads()
     try:
-        poses = given.model.predict(q, rows.loads())
+        if not rows.has("actual_q"):
+            q = given.model.settled(q, loads)
+        poses = given.model.predict(q, loads)
     except LogError:
         raise
     except InputError as error:

@@ -9,7 +9,7 @@ import click
 
 from bridge.cli.optional import member
 from bridge.cli.options import cell_argument, open_cell
-from bridge.log_lines import JsonLines
+from bridge.ipc.log_lines import JsonLines
 from core.errors import InputError
 
 
@@ -41,7 +41,7 @@ def run(cell: Path, observe: bool, arm: bool, duration: float | None, log: str) 
     if observe and arm:
         raise InputError("--observe: found beside --arm, expected one of them")
     given = open_cell(cell)
-    result = member("bridge.daemon_run", "run_cell", "run")(
+    result = member("bridge.daemon.run", "run_cell", "run")(
         given,
         observe=observe,
         arm=arm,

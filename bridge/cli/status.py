@@ -7,8 +7,8 @@ from pathlib import Path
 
 import click
 
-from bridge.control_client import ask, running
-from bridge.status import lines
+from bridge.daemon.status_document import lines
+from bridge.ipc.control_client import ask, running
 
 
 @click.command()

@@ -17,6 +17,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "bridge.cli.export:export_recording",
         "Turn a recording of the daemon into a log.",
     ),
+    "convert": (
+        "bridge.cli.convert:convert",
+        "Turn a ROS bag, an MCAP file or a LeRobot dataset into a log.",
+    ),
     "fit": ("bridge.cli.fit:fit", "Identify the compliance of a cell from a log."),
     "predict": ("bridge.cli.predict:predict", "Predict the TCP pose of every row of a log."),
     "compensate": (
@@ -24,6 +28,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Correct the setpoint of every row of a log.",
     ),
     "diagnose": ("bridge.cli.diagnose:diagnose", "Diagnose the sim-to-real gap of a log."),
+    "patch": (
+        "bridge.cli.patch:patch",
+        "Write a cell's effects into a simulator's model.",
+    ),
     "fleet": ("bridge.cli.fleet:fleet", "Diagnose or fit many arms over many sessions."),
     "blind": ("bridge.cli.blind:blind", "Run the blind benchmark of the diagnosis."),
     "explain": ("bridge.cli.explain:explain", "Explain an effect of the catalogue."),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bridge.demo.poses import Load
 from core.errors import LinkError
-from drivers.simulated.settings import ServerSettings
+from drivers.simulated.ur.settings import ServerSettings
 
 Array = NDArray[np.float64]
 READINGS_PERIOD = 0.01  # s between two readings of the tracker

@@ -23,11 +23,11 @@ from bridge.demo.rests import Rests, joined, write_log
 from bridge.demo.result import Result
 from bridge.demo.session import Session
 from bridge.demo.terminal import show
-from bridge.output_file import write_text
-from bridge.warm_up import warm_up
+from bridge.document.output_file import write_text
+from bridge.loop.warm_up import warm_up
 from core.errors import RunError
-from core.identification import identify_compliance
-from core.log import read_log
+from core.estimation.identification import identify_compliance
+from core.log.log import read_log
 
 Array = NDArray[np.float64]
 PORTS = UrRtdeLink.ports

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bridge.demo.poses import Load
 from bridge.demo.result import Result, visits_of_poses
-from core import kernel
+from core.kernels import reference as kernel
 from core.loads import Loads
 from core.model import Model
 

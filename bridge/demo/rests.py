@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.demo.poses import Load
-from bridge.output_file import write_table
+from bridge.document.output_file import write_table
 from core.errors import RunError
 from core.rotation import rotation_matrix, rotation_vector
 
@@ -128,7 +128,7 @@ def joined(parts: list[Rests]) -> Rests:
 
 
 def write_log(path: Path, rests: Rests, joints: bool = True) -> None:
-    """Write rests as a log in the contract's columns, with or without the joints as read."""
+    """Write rests as a log in a log's columns, with or without the joints as read."""
     columns = {
         "timestamp": rests.timestamp,
         "target_q": rests.nominal_q,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bridge.demo.poses import TEST_LOADS, Load
 from bridge.demo.rests import Rests
-from core.identification import Identification
+from core.estimation.identification import Identification
 from core.model import Model
 
 Array = NDArray[np.float64]

@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.cell import Cell
-from bridge.daemon import Daemon, settings_of
-from bridge.daemon_settings import DaemonSettings
+from bridge.cell.daemon_settings import DaemonSettings
+from bridge.daemon.daemon import Daemon, settings_of
+from bridge.daemon.summary import RunSummary
 from bridge.demo.bench import Tracker
 from bridge.demo.links.link import DemoLink
 from bridge.demo.poses import Load
 from bridge.demo.rests import Rests, rests
 from bridge.demo.result import LoopFigures
-from bridge.summary import RunSummary
-from bridge.supervisor import Cause, State
+from bridge.loop.supervisor import Cause, State
 from core.errors import LinkError, RunError
-from core.recording.reading import read_columns
+from core.log.mcap_reading import read_columns
 
 Array = NDArray[np.float64]
 ATTEMPTS = 8  # a machine that others keep busy may end several runs in a row

@@ -11,7 +11,7 @@ import numpy as np
 from bridge.cell import Cell
 from core.diagnosis.diagnosis import diagnose
 from core.diagnosis.document import document
-from core.log import Log
+from core.log.log import Log
 
 EPOCH = 1.0e9  # s: timestamps beyond count from 1970, those below from some start
 

@@ -7,9 +7,9 @@ from typing import Any
 
 from bridge.cell import Cell
 from bridge.fleet.diagnosing import facts
-from core.compliance_fit import flexibilities
-from core.hierarchy_evidence import evidence, usual_flexibility
-from core.log import Log
+from core.estimation.compliance_fit import flexibilities
+from core.estimation.hierarchical_evidence import evidence, usual_flexibility
+from core.log.log import Log
 
 
 def work(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:

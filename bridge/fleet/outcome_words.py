@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bridge.fleet.running import Done
+from bridge.fleet.runner import Done
 from bridge.fleet.session import Found
 from bridge.fleet.task import BAD, CRASHED, DIED, DONE
 

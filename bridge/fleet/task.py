@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from bridge.cell import Cell, load_cell
-from bridge.cli.options import open_log
+from bridge.cell.opened_log import open_log
 from core.errors import GapbridgeError
-from core.log import Log
+from core.log.log import Log
 
 Work = Callable[[Cell, Log, Mapping[str, Any]], dict[str, Any]]
 DONE, BAD, CRASHED, DIED = "done", "bad", "crashed", "died"

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.daemon_settings import DaemonSettings
-from bridge.reread import RereadSettings
-from bridge.shared_page import Page
+from bridge.cell.daemon_settings import DaemonSettings
+from bridge.cell.reread import RereadSettings
+from bridge.ipc.shared_memory import Page
 from core.limits import CLAMPS
 
 Array = NDArray[np.float64]

@@ -17,8 +17,8 @@ from prometheus_client.core import (
 )
 from prometheus_client.registry import Collector
 
+from bridge.loop.supervisor import State
 from bridge.metrics.counts import Buckets, Counts
-from bridge.supervisor import State
 
 AXES = ("x", "y", "z")
 DROPPED = "dropped_"  # what counts of samples that could not be believed begin with

@@ -13,12 +13,12 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
+from bridge.ipc.side_main import Order, take_order
 from bridge.metrics.counts import Counts
 from bridge.metrics.families import Families
 from bridge.served.credentials import read_token
 from bridge.served.guard import Guard
 from bridge.served.server import serve
-from bridge.side_main import Order, take_order
 from core.errors import GapbridgeError
 
 TURN = 0.25  # s between two looks at the shared page

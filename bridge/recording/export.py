@@ -1,4 +1,4 @@
-"""From a recording to a log: the contract's columns, and what the daemon made of them beside."""
+"""From a recording to a log: a log's columns, and what the daemon made of them beside."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.output_file import replacing_bytes
+from bridge.document.output_file import replacing_bytes
+from bridge.recording.finishing import finish_recording
 from core.errors import InputError, LogError
-from core.log_columns import COLUMNS
-from core.recording.reading import Batch, read_batches
-from core.recording.schema import ENUM_FIELD
+from core.log.columns import COLUMNS
+from core.log.mcap_reading import Batch, read_batches
+from core.log.mcap_schema import ENUM_FIELD
 
 if TYPE_CHECKING:
     import pyarrow
@@ -89,9 +90,11 @@ def moment(text: str) -> float | datetime:
 def export(recording: Path, out: Path, span: Span | None = None) -> Exported:
     """Write a recording's cycles as a log: CSV, or Parquet where the suffix of ``out`` says so.
 
-    Columns that no cycle carries are left out. Raises LogError where the recording cannot be used
+    Columns that no cycle carries are left out. A recording that was cut off is finished on the way,
+    where its folder can be written to. Raises LogError where the recording cannot be used
     or holds no cycle of the stretch.
     """
+    finish_recording(recording)
     first, last = _bounds(recording, span or Span())
     columns = _columns_of(recording, first, last)
     exported, every = Exported(), _every(recording)

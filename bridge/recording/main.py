@@ -13,9 +13,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from bridge.ipc.side_main import Order, take_order
 from bridge.recording.recorder import Recorder
 from bridge.recording.redaction import redacted
-from bridge.side_main import Order, take_order
 
 LOOK_EVERY = 0.1  # s
 QUIET = 0.6  # s without a heartbeat of the loop after which a lost daemon's run is over

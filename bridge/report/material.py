@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
 from core.diagnosis.held_out import HeldOut
-from core.log import Log
+from core.log.log import Log
 from core.model import Model
 
 Array = NDArray[np.float64]

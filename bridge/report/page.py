@@ -8,11 +8,11 @@ from pathlib import Path
 
 from plotly.offline import get_plotlyjs
 
-from bridge.output_file import write_text
+from bridge.document.output_file import write_text
 from bridge.report.material import Material
 from bridge.report.section import SECTIONS
 from core.diagnosis.diagnosis import Diagnosis
-from core.log import Log
+from core.log.log import Log
 from core.model import Model
 
 FILE = "report.html"

@@ -7,7 +7,7 @@ import numpy as np
 from bridge.report.fragment import Cell, Raw, bullets, heading, html_of, paragraph, table
 from bridge.report.material import Material
 from bridge.report.words import effect_words, joints_words, listed, number, unit_of
-from core.diagnosis.cause import Cause
+from core.diagnosis.result import Cause
 from core.diagnosis.separation import Measurement
 from core.effects import Reported
 

@@ -5,37 +5,13 @@ from __future__ import annotations
 import math
 import re
 
+from core.effects import CATALOGUE
+
 CHANNELS = {
     "position": "Position of the tool",
     "wrench": "Force at the flange",
     "tracking": "Following the command",
     "torque": "Joint torques",
-}
-EFFECTS = {
-    "joint_offset": "joint zero is off",
-    "link_geometry": "link measures differ",
-    "tool_frame": "tool (TCP) sits elsewhere",
-    "transmission_error": "periodic gear error",
-    "axial_compliance": "joint twists under load",
-    "radial_compliance": "joint tilts under load",
-    "link_flexibility": "link bends under load",
-    "stiffness_nonlinearity": "joint stiffens under load",
-    "base_compliance": "foundation gives way",
-    "gravity_direction": "base is not level",
-    "payload": "load weighs more or less than declared",
-    "backlash": "play in the joint",
-    "thermal_drift": "links grow as they warm up",
-    "ft_bias": "force sensor zero is off",
-    "ft_drift": "force sensor zero drifts",
-    "ft_gain": "force sensor scale is off",
-    "ft_misalignment": "force sensor is turned",
-    "latency": "joint reacts late",
-    "tracking_lag": "joint lags behind",
-    "coulomb_friction": "constant friction",
-    "viscous_friction": "friction grows with speed",
-    "rotor_inertia": "motor inertia is missing",
-    "link_inertia": "link weighs more or less",
-    "torque_constant": "torque reading is scaled",
 }
 VERDICTS = {
     "no_gap": "No gap",
@@ -63,6 +39,7 @@ _COLUMNS = {
     "actual_qd": "speed of joint",
     "joint_temperatures": "temperature of joint",
     "approach": "last motion of joint",
+    "held_torque": "torque held by joint",
 }
 _VECTORS = {
     "payload_cog": "centre of gravity of the load",
@@ -75,7 +52,8 @@ _AXES = ("x", "y", "z", "about x", "about y", "about z")
 
 def effect_words(identifier: str) -> str:
     """Return an effect in plain words; its identifier where there are none."""
-    return EFFECTS.get(identifier, identifier.replace("_", " "))
+    effect = CATALOGUE.get(identifier)
+    return (effect.title if effect else "") or identifier.replace("_", " ")
 
 
 def quantity_words(name: str) -> str:
@@ -98,7 +76,7 @@ def quantity_unit(name: str) -> tuple[str, float]:
         return "deg", 180 / math.pi
     units = {
         "actual_qd": "rad/s", "joint_temperatures": "°C", "actual_TCP_force": "N",
-        "timestamp": "s", "approach": "",
+        "timestamp": "s", "approach": "", "held_torque": "Nm",
     }  # fmt: skip
     for start, unit in units.items():
         if name.startswith(start):

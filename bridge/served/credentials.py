@@ -8,6 +8,7 @@ from pathlib import Path
 
 from bridge.served.settings import ServedSettings
 from core.errors import InputError
+from core.files import is_given, read_bytes
 
 SHORTEST_TOKEN = 32  # characters: beyond guessing, however fast
 LONGEST_TOKEN = 1024
@@ -26,9 +27,8 @@ def read_token(path: Path, key: str) -> str:
     ``key`` names the cell's key in messages; the token itself is in none.
     """
     try:
-        with path.open("rb") as file:
-            mode = path.stat().st_mode
-            raw = file.read(LONGEST_TOKEN + 2)
+        mode = 0o600 if is_given() else path.stat().st_mode  # else who handed it on has checked
+        raw = read_bytes(path)[: LONGEST_TOKEN + 2]
     except OSError as error:
         raise InputError(f"{key}: {path}: {error.strerror}, expected a file with a token") from None
     if stat.S_IMODE(mode) & 0o077:

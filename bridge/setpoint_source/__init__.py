@@ -7,24 +7,28 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
+    from bridge.cell.sections import SetpointSettings
     from bridge.setpoint_source.source import Source
-    from bridge.settings import SetpointSettings
 
 SOURCES: dict[str, str] = {
     "target": "bridge.setpoint_source.target:TargetSource",
     "trajectory": "bridge.setpoint_source.trajectory:TrajectorySource",
     "modbus": "bridge.setpoint_source.modbus:ModbusSource",
+    "planner": "bridge.setpoint_source.planner:PlannerSource",
     "tcp": "bridge.setpoint_source.tcp:TcpSource",
 }
 """Name in a cell file (setpoints.source) -> ``module:Class``, imported when it is used."""
 
 
-def make_source(settings: SetpointSettings, n: int, moves_arm: bool, folder: Path) -> Source:
+def make_source(
+    settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float = 500.0
+) -> Source:
     """Return the source that the settings name, not yet open.
 
     ``n``: joints; ``moves_arm``: whether setpoints are the arm's only motion; ``folder``: where
-    relative paths start. Raises InputError where it cannot be used.
+    relative paths start; ``rate``: of the robot's cycles, Hz. Raises InputError where it cannot be
+    used.
     """
     module, kind = SOURCES[settings.source].split(":")
     found = getattr(importlib.import_module(module), kind)
-    return cast("Source", found(settings, n, moves_arm, folder))
+    return cast("Source", found(settings, n, moves_arm, folder, rate))

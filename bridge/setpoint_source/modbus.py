@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bridge.cell.sections import SetpointSettings
 from bridge.setpoint_source.glide import Glide
 from bridge.setpoint_source.modbus_page import MOST_JOINTS, PlcPage
 from bridge.setpoint_source.source import Source, Told
-from bridge.settings import SetpointSettings
 from core.errors import InputError, RunError
 
 Vector = NDArray[np.float64]
@@ -27,8 +27,10 @@ class ModbusSource(Source):
     Raises InputError for an arm with more joints than the registers hold.
     """
 
-    def __init__(self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path) -> None:
-        super().__init__(settings, n, moves_arm, folder)
+    def __init__(
+        self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
+    ) -> None:
+        super().__init__(settings, n, moves_arm, folder, rate)
         if n > MOST_JOINTS:
             raise InputError(f"setpoints.source modbus: found {n} joints, expected {MOST_JOINTS}")
         self._glide = Glide(settings.timeout, "new sequence number")
@@ -45,17 +47,20 @@ class ModbusSource(Source):
         server = self._server = subprocess.Popen(
             [sys.executable, "-m", "bridge.setpoint_source.modbus_server"],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment,
-            pass_fds=(page.fd,),
+            pass_fds=page.fds,
         )  # fmt: skip
         assert server.stdin is not None
         assert server.stdout is not None
         order = {"host": self.settings.host, "port": self.settings.port, "n": self.n}
-        server.stdin.write(json.dumps({**order, "page": page.fd}) + "\n")
+        server.stdin.write(json.dumps({**order, "pages": page.fds}) + "\n")
         server.stdin.flush()
         said = json.loads(server.stdout.readline() or '{"failure": "its server ended"}')
         if "failure" in said:
             self.close()
             raise RunError(f"setpoints: {said['failure']}")
+        if not page.is_sealed:
+            self.close()
+            raise RunError("setpoints: its server did not seal what it writes to")
         self.port = int(said["port"])
 
     def close(self) -> None:

@@ -5,55 +5,87 @@ from __future__ import annotations
 import mmap
 import os
 import struct
-import tempfile
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bridge.ipc.sealed_memory import is_sealed, make_memory, map_as_reader, map_as_writer
+
 Vector = NDArray[np.float64]
 MOST_JOINTS = 10
 _HEAD = struct.Struct("<qqqqq")
-_HALF = 512  # bytes of one direction
+_SIZE = 512  # bytes of one record
 ATTEMPTS = 100
 
 
-class PlcPage:
-    """Two records, one a direction, each whole or not seen.
+class Record:
+    """One way's newest numbers, whole or not seen; sealed by its writer (sealed_memory.py).
 
-    A record's first word is a version: odd while it is being written.
+    Its first word is a version: odd while it is being written.
     """
 
-    def __init__(self, n: int, fd: int | None = None) -> None:
-        self.n = n
-        self.fd = _anonymous(2 * _HALF) if fd is None else fd
-        self._map = mmap.mmap(self.fd, 2 * _HALF)
+    def __init__(self, fd: int, writes: bool) -> None:
+        self.fd = fd
+        self._map: mmap.mmap = (map_as_writer if writes else map_as_reader)(fd, _SIZE)
 
-    def _write(self, at: int, words: tuple[int, int, int, int], values: Vector) -> None:
-        version = _HEAD.unpack_from(self._map, at)[0]
-        struct.pack_into("<q", self._map, at, version + 1)
+    def write(self, words: tuple[int, int, int, int], values: Vector) -> None:
+        """Replace the record."""
+        version = _HEAD.unpack_from(self._map)[0]
+        struct.pack_into("<q", self._map, 0, version + 1)
         data = values.astype("<f8").tobytes()
-        self._map[at + _HEAD.size : at + _HEAD.size + len(data)] = data
-        _HEAD.pack_into(self._map, at, version + 1, *words)
-        struct.pack_into("<q", self._map, at, version + 2)
+        self._map[_HEAD.size : _HEAD.size + len(data)] = data
+        _HEAD.pack_into(self._map, 0, version + 1, *words)
+        struct.pack_into("<q", self._map, 0, version + 2)
 
-    def _read(self, at: int, count: int) -> tuple[tuple[int, ...], Vector] | None:
+    def read(self, count: int) -> tuple[tuple[int, ...], Vector] | None:
         """Return words and numbers, or None where they are being written all the while."""
         for _ in range(ATTEMPTS):
-            version, *words = _HEAD.unpack_from(self._map, at)
-            values = np.frombuffer(self._map, "<f8", count, at + _HEAD.size).copy()
-            if version % 2 == 0 and version == struct.unpack_from("<q", self._map, at)[0]:
+            version, *words = _HEAD.unpack_from(self._map)
+            values = np.frombuffer(self._map, "<f8", count, _HEAD.size).copy()
+            if version % 2 == 0 and version == struct.unpack_from("<q", self._map)[0]:
                 return tuple(words), values
         return None
+
+    def close(self) -> None:
+        """Let go of the memory."""
+        self._map.close()
+        os.close(self.fd)
+
+
+class PlcPage:
+    """Two records, one a direction: each side writes its own and only reads the other's.
+
+    Without descriptors it is the loop's side, which makes both; with the two (setpoint, status) it
+    is the server's.
+    """
+
+    def __init__(self, n: int, fds: tuple[int, int] | None = None) -> None:
+        self.n = n
+        is_server = fds is not None
+        if fds is None:
+            fds = make_memory("gapbridge-plc", _SIZE), make_memory("gapbridge-told", _SIZE)
+        self._setpoint = Record(fds[0], writes=is_server)
+        self._status = Record(fds[1], writes=not is_server)
+
+    @property
+    def fds(self) -> tuple[int, int]:
+        """Return the descriptors of setpoint and status, for the server."""
+        return self._setpoint.fd, self._status.fd
+
+    @property
+    def is_sealed(self) -> bool:
+        """Return whether nobody but its own side can write to either."""
+        return all(map(is_sealed, self.fds))
 
     # -- from the PLC -----------------------------------------------------------------------------
 
     def put_setpoint(self, sequence: int, q: Vector) -> None:
         """Hand a setpoint (n,) rad to the loop."""
-        self._write(0, (sequence, 1, 0, 0), q)
+        self._setpoint.write((sequence, 1, 0, 0), q)
 
     def setpoint(self) -> tuple[int, Vector] | None:
         """Return sequence number and joints (n,) rad; None where there are none yet."""
-        found = self._read(0, self.n)
+        found = self._setpoint.read(self.n)
         if found is None or not found[0][1]:
             return None
         return found[0][0], found[1]
@@ -62,24 +94,13 @@ class PlcPage:
 
     def put_status(self, words: tuple[int, int, int, int], values: Vector) -> None:
         """Tell state, sequence taken, cycle and flags; corrected, nominal (n,), offset (6,)."""
-        self._write(_HALF, words, values)
+        self._status.write(words, values)
 
     def status(self) -> tuple[tuple[int, ...], Vector] | None:
         """Return what ``put_status`` has told last."""
-        return self._read(_HALF, 2 * self.n + 6)
+        return self._status.read(2 * self.n + 6)
 
     def close(self) -> None:
         """Let go of the memory."""
-        self._map.close()
-        os.close(self.fd)
-
-
-def _anonymous(size: int) -> int:
-    """Return the descriptor of zeroed memory that no name leads to."""
-    if hasattr(os, "memfd_create"):
-        fd = os.memfd_create("gapbridge-plc", os.MFD_CLOEXEC)
-    else:
-        with tempfile.TemporaryFile() as file:
-            fd = os.dup(file.fileno())
-    os.ftruncate(fd, size)
-    return fd
+        self._setpoint.close()
+        self._status.close()

@@ -116,11 +116,11 @@ def _end_with_parent() -> None:
 
 
 def main() -> None:
-    """Serve as one line of JSON on stdin says: host, port, n, page."""
+    """Serve as one line of JSON on stdin says: host, port, n, pages."""
     logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
     order = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    asyncio.run(serve(PlcPage(order["n"], order["page"]), order["host"], order["port"]))
+    asyncio.run(serve(PlcPage(order["n"], tuple(order["pages"])), order["host"], order["port"]))
 
 
 if __name__ == "__main__":

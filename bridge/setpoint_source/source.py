@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.settings import SetpointSettings
+from bridge.cell.sections import SetpointSettings
 from core.errors import RunError
 
 Vector = NDArray[np.float64]
@@ -36,9 +36,12 @@ class Source(ABC):
     Constructors read what they need and open nothing. ``sample`` never blocks.
     """
 
-    def __init__(self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path) -> None:
+    def __init__(
+        self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
+    ) -> None:
         self.settings = settings
         self.n = n
+        self.rate = rate  # of the robot's cycles, Hz
 
     def open(self) -> None:
         """Open what the source listens on. Raises RunError."""

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bridge.cell.sections import SetpointSettings
 from bridge.setpoint_source.source import Source
-from bridge.settings import SetpointSettings
 
 Vector = NDArray[np.float64]
 
@@ -20,8 +20,10 @@ class TargetSource(Source):
     written last: then it is where the arm stood when writing began.
     """
 
-    def __init__(self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path) -> None:
-        super().__init__(settings, n, moves_arm, folder)
+    def __init__(
+        self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
+    ) -> None:
+        super().__init__(settings, n, moves_arm, folder, rate)
         self._stands = moves_arm
         self._start: Vector | None = None
 

@@ -1,143 +1,77 @@
-"""Setpoints from a planner over TCP on loopback: one line per setpoint.
+"""Setpoints from a planner over TCP on loopback, behind a token; lines as in planner.py.
 
-A line is JSON, ``{"q": [..n..]}``, or n numbers with commas between, rad. The newest line counts.
-Where a planner is slower than the loop, joints glide from setpoint to setpoint over the time that
-two lines are apart. A bad line is answered with ``error: ...`` and not used.
+The first line is ``token TOKEN``. Anything else ends the connection: an HTTP request, which any
+web page can have a browser send here, ends with its first line.
 """
 
 from __future__ import annotations
 
-import contextlib
-import json
-import math
+import hmac
+import ipaddress
 import socket
-from pathlib import Path
+import time
 
-import numpy as np
-from numpy.typing import NDArray
+from bridge.served.credentials import read_token
+from bridge.setpoint_source.planner import Connection, PlannerSource
+from core.errors import InputError
 
-from bridge.setpoint_source.glide import Glide
-from bridge.setpoint_source.source import Source
-from bridge.settings import SetpointSettings
-from core.errors import RunError
-
-Vector = NDArray[np.float64]
-LONGEST_LINE = 4096  # bytes
-MOST_BYTES = 65536  # read in one cycle
+FIRST_LINE = 2.0  # s in which the token has to come
 
 
-class TcpSource(Source):
-    """Listens for one planner at a time; a second one is turned away. Never blocks."""
+class TcpSource(PlannerSource):
+    """Listens for one planner at a time; who does not know the token is turned away."""
 
-    def __init__(self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path) -> None:
-        super().__init__(settings, n, moves_arm, folder)
-        self._listener: socket.socket | None = None
-        self._planner: socket.socket | None = None
-        self._buffer = b""
-        self._glide = Glide(settings.timeout, "line")
-        self.bad_lines = 0
+    _token = b""
 
     @property
     def port(self) -> int:
         """Return the port it listens on."""
         return int(self._listener.getsockname()[1]) if self._listener is not None else 0
 
+    @property
+    def where(self) -> str:
+        """Return where it listens."""
+        return f"{self.settings.host}:{self.settings.port}"
+
     def open(self) -> None:
-        """Listen. Raises RunError where the address is taken."""
-        address = (self.settings.host, self.settings.port)
-        listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        """Listen. Raises RunError where the address is taken, InputError without a token."""
+        path = self.settings.token_file
+        if path is None:
+            raise InputError("setpoints.token_file: found nothing, expected a file with a token")
+        self._token = read_token(path, "setpoints.token_file").encode()
+        super().open()
+
+    def _listen(self) -> socket.socket:
+        # the name is not asked for: what it leads to may change
+        host = "127.0.0.1" if self.settings.host == "localhost" else self.settings.host
+        v6 = ipaddress.ip_address(host).version == 6
+        listener = socket.socket(socket.AF_INET6 if v6 else socket.AF_INET, socket.SOCK_STREAM)
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            listener.bind(address)
-        except OSError as error:
+            listener.bind((host, self.settings.port))
+        except OSError:
             listener.close()
-            raise RunError(
-                f"setpoints: cannot listen on {address[0]}:{address[1]}: {error.strerror}"
-            ) from None
-        listener.listen(4)
-        listener.setblocking(False)
-        self._listener = listener
+            raise
+        return listener
 
-    def close(self) -> None:
-        """Close planner and listener."""
-        for found in (self._planner, self._listener):
-            if found is not None:
-                found.close()
-        self._planner = self._listener = None
-
-    def first(self, own_q: Vector) -> Vector | None:
-        """Return the newest setpoint where one has come lately."""
-        self._receive()
-        return self._glide.first()
-
-    def begin(self, timestamp: float, own_q: Vector) -> None:
-        """Start from where the arm stands."""
-        self._glide.begin(own_q)
-
-    def sample(self, timestamp: float, own_q: Vector) -> Vector:
-        """Return the setpoint of this moment. Raises SourceDryError where no line came in time."""
-        if self._receive():
-            self._glide.turn()
-        return self._glide.sample()
-
-    def _receive(self) -> bool:
-        """Take what has arrived; returns whether there is a new setpoint."""
-        self._accept()
-        planner, new = self._planner, False
-        if planner is None:
-            return False
-        try:
-            data = planner.recv(MOST_BYTES)
-        except BlockingIOError:
-            return False
-        except OSError:
-            data = b""
-        if not data:
-            planner.close()
-            self._planner, self._buffer = None, b""
-            return False
-        *lines, self._buffer = (self._buffer + data).split(b"\n")
-        if len(self._buffer) > LONGEST_LINE:
-            self._refuse("a line without end")
-            self._buffer = b""
-        for line in lines:
-            new |= self._take(line)
-        return new
-
-    def _accept(self) -> None:
-        if self._listener is None:
-            return
-        try:
-            planner, _ = self._listener.accept()
-        except OSError:
-            return
-        planner.setblocking(False)
-        if self._planner is not None:
-            with contextlib.suppress(OSError):
-                planner.send(b"error: another planner is connected\n")
-            planner.close()
-            return
-        planner.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._planner = planner
-
-    def _take(self, line: bytes) -> bool:
-        text = line.strip()
-        if not text:
-            return False
-        try:
-            found = json.loads(text)["q"] if text.startswith(b"{") else text.split(b",")
-            values = [float(v) for v in found]
-        except (ValueError, KeyError, TypeError, RecursionError):
-            self._refuse(f'found {text[:60].decode("utf-8", "replace")!r}, expected {{"q": [...]}}')
-            return False
-        if len(values) != self.n or not all(map(math.isfinite, values)):
-            self._refuse(f"found {len(values)} numbers, expected {self.n} finite ones, rad")
-            return False
-        self._glide.take(np.array(values))
+    def _may_connect(self, link: socket.socket) -> bool:
+        link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return True
 
-    def _refuse(self, words: str) -> None:
-        self.bad_lines += 1
-        if self._planner is not None:
-            with contextlib.suppress(OSError):
-                self._planner.send(f"error: {words}\n".encode())
+    def _admit(self, connection: Connection, line: bytes) -> bool:
+        word, _, given = line.partition(b" ")
+        if word == b"token" and hmac.compare_digest(given.strip(), self._token):
+            connection.admitted = True
+        else:
+            self._end(connection, "expected the token in the first line: token TOKEN")
+        return True
+
+    def _receive(self) -> bool:
+        late = time.monotonic() - FIRST_LINE
+        for connection in self._waiting:
+            if not connection.admitted and not connection.closed and connection.opened < late:
+                self._end(connection, f"no token within {FIRST_LINE:g} s")
+        return super()._receive()
+
+    def _tidy(self) -> None:
+        """Leave nothing: a port needs no tidying."""

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bridge.cell.sections import SetpointSettings
 from bridge.setpoint_source.source import Source
-from bridge.settings import SetpointSettings
 from core.errors import LogError
-from core.log import read_log
+from core.log.log import read_log
 
 Vector = NDArray[np.float64]
 
@@ -22,8 +22,10 @@ class TrajectorySource(Source):
     fault. Raises LogError where the file is not a trajectory of n joints.
     """
 
-    def __init__(self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path) -> None:
-        super().__init__(settings, n, moves_arm, folder)
+    def __init__(
+        self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
+    ) -> None:
+        super().__init__(settings, n, moves_arm, folder, rate)
         path = folder / (settings.file or "")
         log = read_log(path, n)
         self._q: Vector = np.ascontiguousarray(log.require("target_q"))

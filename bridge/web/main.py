@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import sys
 
+from bridge.ipc.side_main import Order, take_order
 from bridge.served.credentials import read_token
 from bridge.served.server import serve
-from bridge.side_main import Order, take_order
 from bridge.web.app import make_app
 from bridge.web.stream import Stream
 from bridge.web.watched import Watched, encoded

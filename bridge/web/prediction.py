@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.daemon_settings import DaemonSettings
+from bridge.cell.daemon_settings import DaemonSettings
 from core.dynamics import predict_wrench
 from core.errors import GapbridgeError
 from core.loads import Loads

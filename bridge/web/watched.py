@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.daemon_settings import DaemonSettings
-from bridge.reread import RereadSettings
-from bridge.shared_page import ROWS, Page
-from bridge.supervisor import State
+from bridge.cell.daemon_settings import DaemonSettings
+from bridge.cell.reread import RereadSettings
+from bridge.ipc.shared_memory import ROWS, Page
+from bridge.loop.supervisor import State
 from bridge.web.history import COLUMNS, STEP, History
 from bridge.web.prediction import WrenchPrediction
 from bridge.web.timing import Timing

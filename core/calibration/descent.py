@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from core.calibration.noise import Noise
 from core.calibration.observables.nuisance import Nuisance
 from core.calibration.problem import Problem, cost, weighed_system
-from core.calibration.system import Mask, System, posterior, solve
 from core.errors import InputError
+from core.estimation.linear_system import Mask, System, posterior, solve
 
 Array = NDArray[np.float64]
 Columns = tuple[Array, Array]

@@ -76,7 +76,7 @@ def _columns(problem: Problem, rest: Rest) -> dict[str, Array]:
     parameters, observable, readings = problem.parameters, problem.observable, problem.readings
     found = parameters.model(rest.values)
     had = {(t.effect, t.site.joint) for t in parameters.terms}
-    effects = [e for e, member in CATALOGUE.items() if "position" in member.channels]
+    effects = [e for e, member in CATALOGUE.items() if member.calibratable]
     every = Parameters.every(found, effects)
     J, _ = observable.columns(every, every.begin, readings, rest.nuisance)
     N, k = len(readings), observable.equations

@@ -20,17 +20,15 @@ from core.errors import InputError
 from core.model import Model
 
 Array = NDArray[np.float64]
-DEFAULT = (
-    "tool_frame",
-    "joint_offset",
-    "link_geometry",
-    "axial_compliance",
-    "radial_compliance",
+DEFAULT = tuple(  # what a calibration looks for that names no effects; earlier ones come first
+    sorted(
+        (name for name, effect in CATALOGUE.items() if effect.calibrated),
+        key=lambda name: CATALOGUE[name].calibrated,
+    )
 )
 ORDERS = (1.0, 2.0)  # cycles a turn at which a transmission error is looked for
 PRIOR = 10.0  # usual sizes
 LEAST_LEVER = 0.05  # of the arm's reach, beyond a joint
-NONNEGATIVE = ("axial_compliance", "radial_compliance", "link_flexibility")
 
 
 @dataclass(frozen=True)
@@ -40,7 +38,7 @@ class Parameters:
     nominal: Model
     terms: tuple[Term, ...]  # one a site, all values zero
     place: tuple[tuple[int, int], ...]  # (p) number of the term, number of the value in it
-    names: tuple[str, ...]  # (p) CONTRACT's
+    names: tuple[str, ...]  # (p) as cells and reports name them
     units: tuple[str, ...]
     scales: Array  # (p,) a usual size of each
     lower: Array  # (p,) bounds; the whole flexibility, the nominal model's with it, is 0 or more
@@ -81,9 +79,9 @@ class Parameters:
                 place.append((t, k))
                 names.append(_name(term, effect.label(term.site, parameter), parameter.name))
                 units.append(parameter.unit)
-                low = 0.0 if term.effect in NONNEGATIVE else parameter.lower
+                low = 0.0 if effect.softens else parameter.lower
                 scale = parameter.scale * _smaller(model, term, k)
-                start = scale if term.effect == "stiffness_nonlinearity" else 0.0
+                start = scale if effect.curved else 0.0
                 bounds = low - had[k], parameter.upper - had[k]
                 numbers.append((scale, *bounds, start))
         scales, lower, upper, begin = np.array(numbers).T
@@ -133,6 +131,11 @@ class Parameters:
         """Return 1 sigma (p,) that weakly holds each at the nominal model: ten usual sizes."""
         return PRIOR * self.scales
 
+    def sided(self) -> tuple[int, ...]:
+        """Return the joints (from 1) of which something is to be found that acts by approach."""
+        effects = {term.effect for term in self.terms if CATALOGUE[term.effect].by_approach}
+        return tuple(sorted({j for effect in effects for j in self.joints(effect)}))
+
     def joints(self, effect: str) -> tuple[int, ...]:
         """Return the joints (from 1) at which an effect is to be found."""
         found = {self.terms[t].site.joint for t, _ in self.place if self.terms[t].effect == effect}
@@ -141,17 +144,15 @@ class Parameters:
 
 def _terms(model: Model, effects: Sequence[str]) -> Iterator[Term]:
     """Yield a term of zeros for each site of each effect."""
-    stiffening = {
-        site.joint
+    contained = {
+        (CATALOGUE[effect].contains, site.joint)
         for named in effects
         for effect, site in _sites(model, named)
-        if effect == "stiffness_nonlinearity"
     }
     seen = set()
     for named in effects:
         for effect, site in _sites(model, named):
-            instead = effect == "axial_compliance" and site.joint in stiffening
-            if instead or (effect, site) in seen:
+            if (effect, site.joint) in contained or (effect, site) in seen:
                 continue
             seen.add((effect, site))
             count = len(CATALOGUE[effect].parameters(model.arm, site))
@@ -163,17 +164,17 @@ def _sites(model: Model, named: str) -> list[tuple[str, Site]]:
     stem, _, number = named.rpartition("_")
     joint = int(number) if number.isdigit() and stem in CATALOGUE else None
     effect = effect_named(named if joint is None else stem)
-    if "position" not in effect.channels:
+    if not effect.calibratable:
         raise InputError(
             f"effect: found {named!r}, expected one that measured positions show: "
-            + ", ".join(e for e, member in CATALOGUE.items() if "position" in member.channels)
+            + ", ".join(e for e, member in CATALOGUE.items() if member.calibratable)
         )
     sites = [s for s in effect.sites(model.arm) if joint is None or s.joint == joint]
     if not sites:
         raise InputError(
             f"effect: found {named!r}, expected a joint of this arm of {model.arm.n} joints"
         )
-    if effect.identifier == "transmission_error":
+    if effect.periodic:
         sites = [replace(s, order=order) for s in sites for order in ORDERS]
     return [(effect.identifier, site) for site in sites]
 
@@ -184,7 +185,7 @@ def _smaller(model: Model, term: Term, value: int) -> float:
     Where a curve bends is told by the moment at the joint itself: a wrist's is reached long before
     the moment that the whole arm puts on its first joint.
     """
-    if term.effect != "stiffness_nonlinearity" or term.site.joint is None:
+    if not CATALOGUE[term.effect].curved or term.site.joint is None:
         return 1.0
     arm, i = model.arm, term.site.joint - 1
     length = np.linalg.norm(arm.link_in_link[:, :3, 3], axis=1)

@@ -13,18 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.calibration.result import Estimate
-from core.calibration.robust import weighed
-from core.effects import CATALOGUE, Site, Term
+from core.effects import CATALOGUE, Site, Term, acting, correcting
 from core.errors import ExcitationError, InputError
-from core.log import Log
+from core.estimation.robust import weighed
+from core.log.log import Log
 from core.model import Model
 from core.motion import Motion, motion_of
 
 Array = NDArray[np.float64]
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")
-NAMES = ("payload_mass", *(f"payload_cog_{k}" for k in "xyz"), *(f"ft_bias_{k}" for k in AXES))
+(BIAS,) = correcting("sensor zero")
+NAMES = ("payload_mass", *(f"payload_cog_{k}" for k in "xyz"), *(f"{BIAS}_{k}" for k in AXES))
 UNITS = ("kg", "m", "m", "m", "N", "N", "N", "Nm", "Nm", "Nm")
-SHAPING = ("ft_misalignment", "ft_gain")  # how the sensor turns and scales what it feels
 RANK = 1e-9
 LIGHT = 3.0  # standard deviations of its mass below which a load has no centre to speak of
 FEWEST = 3
@@ -47,8 +47,9 @@ class PayloadCalibration:
 
     def applied(self, model: Model) -> Model:
         """Return the model that carries this load and knows this bias, instead of its own."""
-        kept = tuple(t for t in model.terms if t.effect not in ("payload", "ft_bias"))
-        bias = Term("ft_bias", Site(), tuple(float(v) for v in self.bias))
+        anew = (*correcting("payload"), BIAS)
+        kept = tuple(t for t in model.terms if t.effect not in anew)
+        bias = Term(BIAS, Site(), tuple(float(v) for v in self.bias))
         return replace(
             model, payload_mass=self.mass, payload_cog=self.cog.copy(), terms=(*kept, bias)
         )
@@ -67,7 +68,7 @@ def weight_columns(model: Model, q: Array) -> Array:
     columns[:, :3, 0] = down
     for k in range(3):
         columns[:, 3:, 1 + k] = np.cross(np.eye(3)[k], down)
-    shaping = [t for t in model.terms if t.effect in SHAPING]
+    shaping = [t for t in model.terms if CATALOGUE[t.effect].scales_reading]
     motion = motion_of(Log("readings", {"actual_q": q}, model.arm.n))
     for k in range(4):
         columns[:, :, k] = _sensed(model, shaping, columns[:, :, k], motion)
@@ -76,7 +77,7 @@ def weight_columns(model: Model, q: Array) -> Array:
 
 
 def _sensed(model: Model, shaping: list[Term], wrench: Array, motion: Motion) -> Array:
-    for term in sorted(shaping, key=lambda t: SHAPING.index(t.effect)):
+    for term in acting(shaping, "wrench"):
         wrench = CATALOGUE[term.effect].sense(term, model.arm, wrench, motion)
     return wrench
 
@@ -84,7 +85,7 @@ def _sensed(model: Model, shaping: list[Term], wrench: Array, motion: Motion) ->
 def calibrate_payload(model: Model, q: Array, wrench: Array) -> PayloadCalibration:
     """Return mass, centre of gravity and sensor bias from readings at rest.
 
-    ``q`` (N, n) rad, ``wrench`` (N, 6): ``ft_raw_wrench`` as CONTRACT has it, averaged at each
+    ``q`` (N, n) rad, ``wrench`` (N, 6): ``ft_raw_wrench`` of docs/conventions.md, averaged at each
     pose. Wild readings are weighed down and listed. Raises InputError where the readings do not
     fit together, ExcitationError where the orientations do not tell load from bias.
     """
@@ -158,7 +159,7 @@ def _notes(mass: float, std: float, outliers: NDArray[np.int64]) -> tuple[str, .
         notes.append("nothing that weighs hangs on the sensor: a centre of gravity is not told")
     elif mass < 0:
         notes.append(
-            f"the load weighs {mass:.3f} kg: the sensor's signs or axes are not the contract's "
+            f"the load weighs {mass:.3f} kg: the sensor's signs or axes are not those of a log "
             "(a mass at rest reads its weight, pointing down, in flange axes)"
         )
     if len(outliers):

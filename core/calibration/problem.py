@@ -12,10 +12,11 @@ from core.calibration.observables.nuisance import Nuisance
 from core.calibration.observables.observable import Observable
 from core.calibration.parameters import Parameters
 from core.calibration.readings import Readings
-from core.calibration.robust import scaled_length, weights_of
 from core.calibration.staging import Stages
-from core.calibration.system import Bounds, System
+from core.effects import CATALOGUE
 from core.errors import ExcitationError, InputError
+from core.estimation.linear_system import Bounds, System
+from core.estimation.robust import scaled_length, weights_of
 
 Array = NDArray[np.float64]
 HELD = 10.0  # usual sizes within which a parameter is weakly held at its beginning
@@ -55,9 +56,9 @@ def bounds_of(parameters: Parameters, readings: Readings) -> Bounds:
     declared = readings.loads.payload_mass
     nominal = parameters.nominal
     lightest = nominal.payload_mass if declared is None else float(np.min(declared))
-    had = sum(t.values[0] for t in nominal.terms if t.effect == "payload")
+    had = sum(t.values[0] for t in nominal.terms if CATALOGUE[t.effect].adds_mass)
     for i, (t, _) in enumerate(parameters.place):
-        if parameters.terms[t].effect == "payload":
+        if CATALOGUE[parameters.terms[t].effect].adds_mass:
             lower[i] = max(lower[i], -max(lightest + had, 0.0))
     return Bounds(lower, parameters.upper, held, parameters.begin)
 

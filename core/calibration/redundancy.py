@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.foreseen import foreseen, somewhere
+from core.calibration.observables.foreseen import foreseen, somewhere
 from core.calibration.observables.nuisance import Nuisance
 from core.calibration.observables.observable import Observable
 from core.calibration.readings import Readings
+from core.effects import CATALOGUE
 from core.loads import Loads
 from core.model import Model
 
@@ -31,9 +32,6 @@ VISIBLE = 3e-7  # m, rms: a usual size that changes readings by less shows nothi
 APART = 2e-3  # share of what a parameter changes that the others must leave over
 MEMBER = 0.1  # share from which a parameter is named as one that stands for another
 USUAL_PAYLOAD, CARRIED = 5.0, 0.2  # kg, share of its own mass: where the arm's rating is unknown
-PARTS = {"radial_compliance": "base_compliance"}  # what can be the sum of what
-BENDING = ("payload", "gravity_direction")  # shown by an arm that bends, by no rigid one
-SOFT = ("axial_compliance", "radial_compliance", "link_flexibility", "base_compliance")
 
 
 @dataclass(frozen=True)
@@ -75,10 +73,10 @@ def redundancy(
 def _turns(parameters: Parameters) -> list[int]:
     """Return the parameters' numbers in the order in which they are taken."""
     named = [parameters.terms[t].effect for t, _ in parameters.place]
-    first = [i for i, effect in enumerate(named) if effect in PARTS.values()]
     turns: list[int] = []
     for i, effect in enumerate(named):
-        turns += [k for k in first if k not in turns and named[k] == PARTS.get(effect)]
+        parts = CATALOGUE[effect].sum_of
+        turns += [k for k, other in enumerate(named) if k not in turns and other == parts]
         turns += [] if i in turns else [i]
     return turns
 
@@ -88,9 +86,9 @@ def _columns(
 ) -> tuple[Array, Array]:
     """Return J and F where a fit begins; what only bending shows, for an arm that bends."""
     J, F = observable.columns(parameters, parameters.begin, readings, nuisance)
-    named = [parameters.terms[t].effect for t, _ in parameters.place]
-    only = np.array([effect in BENDING for effect in named], dtype=bool)
-    soft = np.array([effect in SOFT for effect in named], dtype=bool)
+    effects = [CATALOGUE[parameters.terms[t].effect] for t, _ in parameters.place]
+    only = np.array([effect.needs_softness for effect in effects], dtype=bool)
+    soft = np.array([effect.softens and not effect.curved for effect in effects], dtype=bool)
     if only.any() and soft.any():
         bent = np.where(soft, parameters.begin + 0.3 * parameters.scales, parameters.begin)
         J[:, only] = observable.columns(parameters, bent, readings, nuisance)[0][:, only]

@@ -15,7 +15,7 @@ from core.calibration.readings import Readings
 from core.calibration.rest import Rest
 from core.diagnosis.diagnosis import Diagnosis, diagnose
 from core.errors import InputError
-from core.log import Log
+from core.log.log import Log
 from core.metrology import Metrology
 from core.model import Model
 from core.rotation import rotation_matrix, rotation_vector

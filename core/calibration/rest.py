@@ -16,7 +16,7 @@ from core.calibration.parameters import Parameters
 from core.calibration.problem import Problem, bounds_of, cost, require_enough
 from core.calibration.readings import Readings
 from core.calibration.staging import staged_step, stages_of
-from core.calibration.system import Mask, System
+from core.estimation.linear_system import Mask, System
 from core.metrology import Metrology
 
 Array = NDArray[np.float64]

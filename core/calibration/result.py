@@ -10,15 +10,15 @@ from scipy.special import stdtrit
 
 from core.calibration.readings import Readings
 from core.diagnosis.diagnosis import Diagnosis
+from core.estimation.registration import Registration
 from core.model import Model
-from core.registration import Registration
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """One parameter, as it is told (CONTRACT's names and signs)."""
+    """One parameter, as it is reported; names and signs of docs/conventions.md."""
 
     name: str
     value: float

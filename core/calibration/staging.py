@@ -15,15 +15,12 @@ from scipy.stats import chi2
 
 from core.calibration.parameters import Parameters
 from core.calibration.readings import Readings
-from core.calibration.system import Bounds, Mask, System, posterior, solve
-from core.identification import pose_groups
+from core.effects import CATALOGUE
+from core.estimation.identification import pose_groups
+from core.estimation.linear_system import Bounds, Mask, System, posterior, solve
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-OF_LOADS = frozenset({
-    "axial_compliance", "radial_compliance", "link_flexibility", "base_compliance",
-    "stiffness_nonlinearity", "gravity_direction", "payload",
-})  # fmt: skip
 DOUBT = 1e-3  # chance below which differences and everything together count as at odds
 
 
@@ -42,8 +39,8 @@ class Stages:
 
 def stages_of(parameters: Parameters, readings: Readings) -> Stages:
     """Return the stages that these readings allow."""
-    effects = [parameters.terms[t].effect for t, _ in parameters.place]
-    elastic = np.array([effect in OF_LOADS for effect in effects], dtype=bool)
+    effects = [CATALOGUE[parameters.terms[t].effect] for t, _ in parameters.place]
+    elastic = np.array([effect.softens or effect.needs_softness for effect in effects], dtype=bool)
     same = np.column_stack([pose_groups(readings.q), readings.station, readings.target])
     _, group = np.unique(same, axis=0, return_inverse=True)
     group = group.reshape(-1).astype(np.int64)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from core.calibration.result import Errors, Estimate
+from core.effects import CATALOGUE
 
 if TYPE_CHECKING:
     from core.calibration.verify import Suspect
@@ -24,12 +25,9 @@ def moved_words(moved: Suspect | None, suspects: Sequence[Suspect]) -> str:
     kind, _, number = moved.name.rpartition("_")
     if kind == "reading":
         return f"reading {number} alone does not fit: measure it again"
-    if kind == "joint_offset":
-        return f"the zero of joint {number} moved by {_size(moved.estimates)}"
-    if moved.name == "tool_frame":
-        return f"the tool moved by {_size(moved.estimates)}: run the short session for the tool"
-    if moved.name == "payload":
-        return f"the load differs from what was declared by {_size(moved.estimates)}"
+    effect = CATALOGUE.get(moved.name) or CATALOGUE.get(kind)
+    if effect is not None:
+        return effect.moved.format(joint=number, size=_size(moved.estimates))
     return f"the instrument stands elsewhere, by {_size(moved.estimates)}: register it again"
 
 

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.calibration.result import Estimate
-from core.calibration.robust import Weighed, weighed
+from core.effects import correcting
 from core.errors import ExcitationError, InputError
+from core.estimation.robust import Weighed, weighed
 from core.loads import Loads
 from core.model import Model
 
@@ -43,7 +44,7 @@ class ToolCalibration:
 
     def applied(self, model: Model) -> Model:
         """Return the model with this tool centre point; the tool's axes stay as they are."""
-        kept = tuple(t for t in model.terms if t.effect != "tool_frame")
+        kept = tuple(t for t in model.terms if t.effect not in correcting("tool"))
         tool = model.tool_in_flange.copy()
         tool[:3, :3] = model.chain().tool_rotation
         tool[:3, 3] = self.tcp

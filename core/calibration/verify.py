@@ -25,10 +25,11 @@ from core.calibration.promise import Promise, promise_in
 from core.calibration.readings import Readings
 from core.calibration.result import Errors, Estimate
 from core.calibration.telling_moved import moved_words, verdict_words
+from core.effects import CATALOGUE
 from core.errors import ExcitationError
+from core.estimation.registration import Registration
 from core.metrology import Metrology
 from core.model import Model
-from core.registration import Registration
 
 Array = NDArray[np.float64]
 BROKEN = 1e-3  # chance below which a promise counts as broken
@@ -179,12 +180,15 @@ def _suspects(
 
 
 def _stories(model: Model, readings: Readings) -> list[tuple[str, tuple[str, ...]]]:
-    stories: list[tuple[str, tuple[str, ...]]] = [("tool_frame", ("tool_frame",))]
-    zeros = [f"joint_offset_{joint}" for joint in range(1, model.arm.n + 1)]
-    stories += [(name, (name,)) for name in zeros]
     mass = readings.loads.payload_mass
-    if model.payload_mass > 0 if mass is None else bool((mass > 0).any()):
-        stories.append(("payload", ("payload",)))
+    loaded = model.payload_mass > 0 if mass is None else bool((mass > 0).any())
+    stories: list[tuple[str, tuple[str, ...]]] = []
+    for identifier, effect in CATALOGUE.items():
+        if not effect.moved or (effect.adds_mass and not loaded):
+            continue
+        for site in effect.sites(model.arm):
+            name = identifier if site.joint is None else f"{identifier}_{site.joint}"
+            stories.append((name, (name,)))
     return stories
 
 

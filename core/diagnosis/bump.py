@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.candidate import joint_quantity
-from core.diagnosis.leftover import basis_of
-from core.diagnosis.selection import Selection
-from core.diagnosis.space import SMOOTH_PRICE
+from core.diagnosis.residual_structure import basis_of
+from core.diagnosis.selection.candidate import joint_quantity
+from core.diagnosis.selection.problem import SMOOTH_PRICE
+from core.diagnosis.selection.selection import Selection
 
 Array = NDArray[np.float64]
 PLACES, WIDTHS = 13, (0.05, 0.1, 0.2)  # where a bump is first looked for, in shares of the range
-LINE, OFFSET = "transmission_error", "joint_offset"
 
 
 def bumps(selection: Selection) -> set[int]:
@@ -27,10 +26,10 @@ def bumps(selection: Selection) -> set[int]:
     found: set[int] = set()
     for i in range(observation.joint_columns.shape[2]):
         here = [c for c in chosen if space.candidates[c].site.joint == i + 1]
-        lines = [c for c in here if space.candidates[c].family == LINE]
+        lines = [c for c in here if space.candidates[c].periodic]
         if len(lines) < 2:
             continue
-        group = lines + [c for c in here if space.candidates[c].family == OFFSET]
+        group = [c for c in here if space.candidates[c].turns_its_joint]
         rest = basis_of(space.columns([c for c in chosen if c not in group]))
         y = space.y - rest @ (rest.T @ space.y)
         basis = basis_of(space.columns(group) - rest @ (rest.T @ space.columns(group)))

@@ -10,23 +10,30 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from core.diagnosis import position, torque, tracking, wrench
-from core.diagnosis.cause import Cause, Considered, causes_of, considered_of
+from core.diagnosis.carrying import Carried, carried
+from core.diagnosis.channels import position, torque, tracking, wrench
+from core.diagnosis.channels.simulation import joined, predicted_by
+from core.diagnosis.every_row import on_every_row, still_accused
+from core.diagnosis.generalisation import NOWHERE, Generalisation, generalisation
 from core.diagnosis.held_out import HeldOut
-from core.diagnosis.judgement import Judgement, judge, pure_error, with_stand_ins
+from core.diagnosis.judgement import Judgement, judge, with_stand_ins
 from core.diagnosis.location import Where, locate
+from core.diagnosis.log_checks.units_and_clocks import check_units, findings
+from core.diagnosis.noise_floor import Floor, noise_floor, own_coordinates, whiteness
 from core.diagnosis.observation import NotObservable, Observation, thinned
+from core.diagnosis.residual_structure import dependence
+from core.diagnosis.result import Cause, Considered, causes_of, considered_of
 from core.diagnosis.rigid_suspicion import softness_findings
-from core.diagnosis.selection import Selection, select, standing
+from core.diagnosis.selection.selection import Selection, select, standing
 from core.diagnosis.separation import Measurement, next_measurements
-from core.diagnosis.simulation import joined, predicted_by
-from core.diagnosis.suspicion import check_units, findings
-from core.effects import Term
+from core.effects import CATALOGUE, Term, flexibility_effects
 from core.errors import LogError
-from core.log import Log
-from core.log_columns import COLUMNS, misspelt
+from core.log.columns import COLUMNS, misspelt
+from core.log.log import Log
 from core.metrology import Metrology
 from core.model import Model
+from core.ranges import outside_findings
+from core.sessions import session_of, sessions_in, with_sessions
 
 Array = NDArray[np.float64]
 Observe = Callable[[Model, Log, Metrology], Observation | NotObservable]
@@ -39,7 +46,6 @@ CHANNELS: Mapping[str, Observe] = {
 }
 
 
-SOFTNESS = ("axial_compliance", "radial_compliance")
 # samples that a diagnosis looks at: more cost time and tell hardly more
 MOST = {"position": 1200, "wrench": 300, "tracking": 300, "torque": 300}
 
@@ -71,6 +77,9 @@ class ChannelDiagnosis:
     held_out: Array | None = field(repr=False)  # (kept,) rms of each held-out sample
     stand_ins: tuple[Cause, ...] = ()  # not proved, but useful where nothing was fitted
     along: tuple[Term, ...] = ()  # causes and stand-ins, fitted together
+    elsewhere: Generalisation = NOWHERE  # new region, new session
+    noise_floor_source: str = "unknown"  # what measured it
+    carried: tuple[Carried, ...] = ()  # of causes, where several sessions show them
 
 
 @dataclass(frozen=True)
@@ -84,6 +93,8 @@ class Diagnosis:
     findings: tuple[str, ...]
     model: Model = field(repr=False)  # with the causes in it
     with_stand_ins: Model = field(repr=False)  # with the stand-ins too, fitted along
+    sessions: tuple[str, ...] = ()  # names, where there are several
+    one_clock: bool = True  # False: the sessions' timestamps overlap
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -110,6 +121,7 @@ def diagnose(
     # matrices of this size gain nothing from threads, which wait for each other on a busy machine
     with threadpool_limits(1, "blas"):
         metrology = metrology or Metrology()
+        log = with_sessions(log, model)
         return _diagnose(model, log, metrology, tuple(withhold), progress, observers, simulated)
 
 
@@ -119,7 +131,7 @@ def _diagnose(
     simulated: Log | None,
 ) -> Diagnosis:  # fmt: skip
     check_units(model, log)
-    told = findings(log, model, metrology)
+    told = _log_findings(model, log, metrology)
     observed: list[ChannelDiagnosis] = []
     hidden: list[NotObservable] = []
     if simulated is not None:
@@ -130,9 +142,11 @@ def _diagnose(
         if isinstance(seen, NotObservable):
             hidden.append(seen)
             continue
+        whole = seen
         if len(seen.rows) > MOST[seen.channel]:
             told.append(
-                f"{seen.channel}: {MOST[seen.channel]} of {len(seen.rows)} rows were taken, evenly"
+                f"{seen.channel}: causes were searched on {MOST[seen.channel]} of "
+                f"{len(seen.rows)} rows, evenly taken; fitted and judged on all of them"
             )
             seen = _thinned(seen, model, log, metrology, observe)
         enough = _enough(seen)
@@ -140,22 +154,44 @@ def _diagnose(
             told.append(enough)
             hidden.append(NotObservable(seen.channel, ("more rows",)))
             continue
-        observed.append(_channel(seen, model, withhold, progress))
+        observed.append(_channel(seen, whole, model, withhold, progress))
     if not observed:
         needs = "; ".join(f"{h.channel}: {', '.join(h.needs)}" for h in hidden)
         lacking = [need for h in hidden for need in h.needs if need in COLUMNS]
         hint = misspelt(log.unknown, lacking, log.n)
         raise LogError(f"{log.path}: found no channel to diagnose, expected one of: {needs}{hint}")
     for channel in observed:
-        told += _channel_findings(channel)
-        if simulated is None and not {*withhold} & {*SOFTNESS} and _lacks_much(channel):
+        told += _channel_findings(channel, log)
+        soft = {*flexibility_effects().values()} - {*withhold}
+        if simulated is None and len(soft) == 2 and _lacks_much(channel):
             told += softness_findings(model, log, metrology)
     terms = _for_the_model(observed)
+    if not log.one_clock:
+        terms = [_slipped(term, log) for term in terms]
     return Diagnosis(
         _overall(observed), tuple(observed), tuple(hidden),
         next_measurements(model, log, observed), tuple(told), with_found(model, terms),
-        with_found(model, _for_the_model([_stood(c) for c in observed])),
+        with_found(model, _and_stand_ins(observed, terms)),
+        log.session_names, log.one_clock,
     )  # fmt: skip
+
+
+def _log_findings(model: Model, log: Log, metrology: Metrology) -> list[str]:
+    """Return what is suspicious about the log; of several sessions each by itself."""
+    if len(log.session_names) < 2:
+        return findings(log, model, metrology)
+    found: dict[str, list[str]] = {}
+    for name, part in zip(log.session_names, sessions_in(log), strict=True):
+        own = position.session_model(model, part, metrology)
+        for text in findings(part, own, metrology):
+            found.setdefault(text, []).append(name)
+    told = [f"session {', '.join(names)}: {text}" for text, names in found.items()]
+    if not log.one_clock:
+        told.append(
+            "the sessions' timestamps overlap: each has a clock of its own, so nothing is said of "
+            "the time between them"
+        )
+    return told + outside_findings(log)
 
 
 def _thinned(
@@ -190,17 +226,19 @@ def _for_the_model(channels: Sequence[ChannelDiagnosis]) -> list[Term]:
     return [term for _, term in best.values()]
 
 
-def _stood(channel: ChannelDiagnosis) -> ChannelDiagnosis:
-    """Return the channel with its stand-ins as causes, marked."""
-    if not channel.stand_ins:
-        return channel
-    fitted = {(t.effect, t.site): t for t in channel.along}
-    causes = [
-        replace(c, terms=tuple(
-            replace(fitted[t.effect, t.site], stand_in=c in channel.stand_ins) for t in c.terms))
-        for c in (*channel.causes, *channel.stand_ins)
-    ]  # fmt: skip
-    return replace(channel, causes=tuple(causes))
+def _and_stand_ins(channels: Sequence[ChannelDiagnosis], proved: Sequence[Term]) -> list[Term]:
+    """Return the proved terms and the stand-ins, with the values that they have together."""
+    terms = {(t.effect, t.site): t for t in proved}
+    for channel in channels:
+        terms |= {(t.effect, t.site): t for t in channel.along}
+    return list(terms.values())
+
+
+def _slipped(term: Term, log: Log) -> Term:
+    """Return a term that steps once as it stands today: clocks that overlap hold no moment."""
+    if not CATALOGUE[term.effect].at_moment:
+        return term
+    return replace(term, values=(*term.values[:-1], float(log.times()[0]) - 1.0))
 
 
 def _lacks_much(channel: ChannelDiagnosis) -> bool:
@@ -217,40 +255,69 @@ def _enough(seen: Observation) -> str | None:
 
 
 def _channel(
-    seen: Observation, model: Model, withhold: tuple[str, ...],
+    seen: Observation, whole: Observation, model: Model, withhold: tuple[str, ...],
     progress: Callable[[str], None] | None,
 ) -> ChannelDiagnosis:  # fmt: skip
-    selection = select(seen, model, withhold, progress)
-    held = HeldOut(selection)
-    verdict = with_stand_ins(selection, judge(selection, held))
-    stood_in = _stood_in(selection, verdict, held, model)
-    selection = standing(selection, model.arm, verdict.accused, verdict.beside)
-    chosen = [selection.term_index[p] for p in verdict.accused]
+    searched = select(seen, model, withhold, progress)
+    held = HeldOut(searched)
+    verdict = with_stand_ins(searched, judge(searched, held))
+    stood_in = _stood_in(searched, verdict, held, model)
+    searched = standing(searched, model.arm, verdict.accused, verdict.beside)
+    considered = considered_of(searched, verdict, held, model.arm, withhold)
+    chosen = [searched.term_index[p] for p in verdict.accused]
+    where = locate(searched, gaps(searched, chosen)[0][searched.kept], chosen)
+    selection = searched
+    if whole is not seen:
+        if progress:
+            progress(f"{seen.channel}: all {len(whole.rows)} rows")
+        selection = on_every_row(searched, verdict.accused, whole, model)
+        held = HeldOut(selection)
+        selection, verdict = still_accused(selection, verdict, held, model)
+        chosen = [selection.term_index[p] for p in verdict.accused]
     gap, remaining = gaps(selection, chosen)
-    k = 3 if seen.channel in ("position", "wrench") else gap.shape[1]
+    k = own_coordinates(seen)
     kept = selection.kept
     causes = causes_of(selection, verdict, held, model.arm)
     left = float(np.sqrt(np.mean(remaining[kept][:, :k] ** 2)))
+    verdict, floor = _with_whiteness(verdict, selection, searched)
     held_rms = held.rms(chosen) if held.possible else None
+    gap_rms = float(np.sqrt(np.mean(gap[kept][:, :k] ** 2)))
+    if not causes:  # nothing was fitted but the frame, before as well as after
+        held_rms = gap_rms
     structured = verdict.structured
-    floor = noise_floor(selection, structured)
-    some_gap = bool(causes) or structured
-    word = "no_gap" if not some_gap else "explained"
+    word = "explained" if causes else "no_gap"
     if structured:
         word = "partly_explained" if causes else "unexplained"
     return ChannelDiagnosis(
-        channel=seen.channel, unit=seen.unit, samples=len(gap),
-        gap_rms=float(np.sqrt(np.mean(gap[kept][:, :k] ** 2))),
+        channel=seen.channel, unit=seen.unit, samples=len(gap), gap_rms=gap_rms,
         gap_max=float(np.linalg.norm(gap[kept][:, :k], axis=1).max()),
-        noise_floor_rms=floor, remaining_rms=left, remaining_rms_held_out=held_rms,
-        where=locate(selection, gap[kept], chosen), causes=causes,
-        considered=considered_of(selection, verdict, held, model.arm, withhold),
-        unexplained_rms=_beyond(left, floor, structured), structured=structured,
+        noise_floor_rms=floor.rms, remaining_rms=left, remaining_rms_held_out=held_rms,
+        where=where, causes=causes, considered=considered,
+        unexplained_rms=_beyond(left, floor.rms, structured), structured=structured,
         p_value=verdict.p_value, depends_on=verdict.depends_on, verdict=word,
         selection=selection, judgement=verdict, gap=gap, remaining=remaining,
         held_out=np.sqrt(held.squares(chosen)) if held.possible else None,
-        **stood_in,
+        elsewhere=generalisation(selection, chosen), carried=carried(selection, chosen, model.arm),
+        noise_floor_source=floor.source, **stood_in,
     )  # fmt: skip
+
+
+def _with_whiteness(
+    verdict: Judgement, selection: Selection, searched: Selection
+) -> tuple[Judgement, Floor]:
+    """Return the judgement with what all rows of a recording say of its residual, and the floor."""
+    floor = noise_floor(selection, verdict.structured)
+    test = whiteness(selection, floor.rms)
+    if test is None or test.white:
+        return verdict, floor
+    p_value = test.p_value if verdict.p_value is None else min(verdict.p_value, test.p_value)
+    depends = verdict.depends_on
+    if not depends:
+        fitted = [searched.term_index[p] for p in verdict.accused]
+        space, nuisance = searched.space, searched.nuisance_basis
+        depends = tuple(dependence(space, nuisance, fitted, searched.groups))
+    verdict = replace(verdict, structured=True, p_value=p_value, depends_on=depends)
+    return verdict, noise_floor(selection, True)
 
 
 def _stood_in(
@@ -261,12 +328,11 @@ def _stood_in(
         return {}
     both = (*verdict.accused, *verdict.stand_ins)
     along = standing(selection, model.arm, both)
-    told = causes_of(along, replace(verdict, accused=both, ties={}), held, model.arm)
-    own = {along.terms[p] for p in verdict.stand_ins}
-    shown = [replace(c, terms=tuple(t for t in c.terms if t in own)) for c in told]
+    told = replace(verdict, accused=both, ties={})
+    marked = [replace(along.terms[p], stand_in=p in verdict.stand_ins) for p in both]
     return {
-        "stand_ins": tuple(c for c in shown if c.terms),
-        "along": tuple(along.terms[p] for p in both),
+        "stand_ins": causes_of(along, told, held, model.arm, verdict.stand_ins),
+        "along": tuple(marked),
     }
 
 
@@ -287,21 +353,6 @@ def gaps(selection: Selection, chosen: Sequence[int]) -> tuple[Array, Array]:
     return found[0], found[1]
 
 
-def noise_floor(selection: Selection, structured: bool) -> float | None:
-    """Return 1 sigma of one coordinate: instrument and repeatability, as stated or estimated."""
-    observation = selection.observation
-    if observation.sigma_is_whole:
-        return observation.sigma
-    k = 3 if observation.channel in ("position", "wrench") else observation.measured.shape[1]
-    left = selection.residual[selection.kept][:, :k]
-    pure, freedom = pure_error(left, observation.groups[selection.kept])
-    if structured and freedom >= 30:
-        return float(np.sqrt(max(pure, observation.sigma**2)))
-    covariance = np.linalg.inv(selection.noise.whitener)
-    variance = np.einsum("nij,nij->ni", covariance, covariance)[:, :k]
-    return float(np.sqrt(np.mean(variance)))
-
-
 def _beyond(left: float, floor: float | None, structured: bool) -> float:
     if not structured or floor is None:
         return 0.0
@@ -319,11 +370,18 @@ def _overall(channels: Sequence[ChannelDiagnosis]) -> str:
     return "unexplained"
 
 
-def _channel_findings(channel: ChannelDiagnosis) -> list[str]:
+def _line_of(log: Log, row: int) -> str:
+    """Return the line of a row in its file; of several sessions with the session's name."""
+    if not log.session_names:
+        return str(log.line(row))
+    return f"{log.line(row)} of {log.session_names[int(session_of(log)[row])]}"
+
+
+def _channel_findings(channel: ChannelDiagnosis, log: Log) -> list[str]:
     told = []
     wild = channel.selection.observation.rows[~channel.selection.kept]
     if len(wild):
-        rows = ", ".join(str(int(r) + 2) for r in wild[:8])
+        rows = ", ".join(_line_of(log, int(r)) for r in wild[:8])
         told.append(
             f"{channel.channel}: {len(wild)} wild reading(s) set aside (row {rows}"
             f"{', ...' if len(wild) > 8 else ''} of the file)"

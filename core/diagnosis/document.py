@@ -1,12 +1,14 @@
-"""The diagnosis as the contract's JSON (schema ``gapbridge.diagnosis/1``)."""
+"""The diagnosis as JSON (schema ``gapbridge.diagnosis/1``)."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
-from core.diagnosis.cause import Cause
+from core.diagnosis.carrying import Carried
 from core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
+from core.diagnosis.result import Cause
+from core.effects import CATALOGUE
 
 SCHEMA = "gapbridge.diagnosis/1"
 
@@ -16,7 +18,7 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
     told: dict[str, Any] = {
         "schema": SCHEMA,
         "verdict": diagnosis.verdict,
-        "channels": [_channel(c) for c in diagnosis.channels],
+        "channels": [_channel(c, diagnosis) for c in diagnosis.channels],
         "not_observable": [
             {"channel": h.channel, "needs": list(h.needs)} for h in diagnosis.not_observable
         ],
@@ -33,12 +35,13 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
             for m in diagnosis.next_measurements
         ],
         "findings": list(diagnosis.findings),
+        "sessions": list(diagnosis.sessions),
     }
     cleaned: dict[str, Any] = _finite(told)
     return cleaned
 
 
-def _channel(c: ChannelDiagnosis) -> dict[str, Any]:
+def _channel(c: ChannelDiagnosis, diagnosis: Diagnosis) -> dict[str, Any]:
     frame = {"position": "base", "wrench": "flange"}.get(c.channel, "joints")
     return {
         "channel": c.channel,
@@ -48,15 +51,22 @@ def _channel(c: ChannelDiagnosis) -> dict[str, Any]:
         "gap_rms": c.gap_rms,
         "gap_max": c.gap_max,
         "noise_floor_rms": c.noise_floor_rms,
+        "noise_floor_source": c.noise_floor_source,
         "remaining_rms": c.remaining_rms,
         "remaining_rms_held_out": c.remaining_rms_held_out,
+        "remaining_rms_new_region": c.elsewhere.new_region,
+        "remaining_rms_new_session": c.elsewhere.new_session,
+        "sessions": [
+            {"session": diagnosis.sessions[s], "remaining_rms_left_out": rms}
+            for s, rms in c.elsewhere.by_session
+        ],
         "where": {
             "joints": [{"joint": j, "share": s} for j, s in c.where.joints],
             "axes": {"frame": frame, "share": list(c.where.axes)},
             "depends_on": _quantities(c.where.depends_on),
         },
-        "causes": [_cause(cause) for cause in c.causes],
-        "stand_ins": [_cause(stand_in) for stand_in in c.stand_ins],
+        "causes": [_cause(cause, c, diagnosis) for cause in c.causes],
+        "stand_ins": [_cause(stand_in, c, diagnosis) for stand_in in c.stand_ins],
         "considered": [
             {
                 "effect": k.effect,
@@ -80,15 +90,13 @@ def _quantities(pairs: tuple[tuple[str, float], ...]) -> list[dict[str, Any]]:
     return [{"quantity": name, "held_out_r2": share} for name, share in pairs]
 
 
-def _cause(cause: Cause) -> dict[str, Any]:
+def _cause(cause: Cause, channel: ChannelDiagnosis, diagnosis: Diagnosis) -> dict[str, Any]:
     shrink = cause.shrink
+    across = next((c for c in channel.carried if c.effect == cause.effect), None)
     return {
         "effect": cause.effect,
         "joints": list(cause.joints),
-        "parameters": [
-            {"name": p.name, "value": p.value, "std": p.std, "unit": p.unit}
-            for p in cause.parameters
-        ],
+        "parameters": _parameters(cause, channel, diagnosis),
         "gap_without": shrink.gap_without if shrink else None,
         "gap_with": shrink.gap_with if shrink else None,
         "shrink": shrink.shrink if shrink else None,
@@ -96,6 +104,54 @@ def _cause(cause: Cause) -> dict[str, Any]:
         "shrink_alone": cause.shrink_alone,
         "probability": cause.probability,
         "indistinguishable_from": list(cause.indistinguishable_from),
+        **({"across_sessions": _across(across, diagnosis.sessions)} if across else {}),
+    }
+
+
+def _parameters(
+    cause: Cause, channel: ChannelDiagnosis, diagnosis: Diagnosis
+) -> list[dict[str, Any]]:
+    """Return a cause's parameters; a moment on clocks that overlap as the first session after it.
+
+    That time is no time of any of the sessions' clocks.
+    """
+    moment = CATALOGUE[cause.effect].at_moment and not diagnosis.one_clock
+    found: list[dict[str, Any]] = []
+    for p in cause.parameters:
+        entry = {"name": p.name, "value": p.value, "std": p.std, "unit": p.unit}
+        if moment and p.name.endswith("_time"):
+            first = diagnosis.sessions[_first_session(channel, p.value)]
+            found.append({**entry, "value": None, "std": None})
+            name = p.name.removesuffix("_time") + "_session"
+            found.append({"name": name, "value": first, "std": None, "unit": ""})
+        else:
+            found.append(entry)
+    return found
+
+
+def _first_session(channel: ChannelDiagnosis, moment: float) -> int:
+    """Return the first session with rows after a moment of the joined clock."""
+    observation = channel.selection.observation
+    assert observation.times is not None
+    assert observation.session is not None
+    after = observation.times > moment
+    return int(observation.session[after].min() if after.any() else observation.session.max())
+
+
+def _across(carried: Carried, sessions: tuple[str, ...]) -> dict[str, Any]:
+    return {
+        "carries": carried.carries,
+        "p_value": carried.p_value,
+        "values": [
+            {
+                "session": sessions[s],
+                "parameters": [
+                    {"name": p.name, "value": p.value, "std": p.std, "unit": p.unit}
+                    for p in parameters
+                ],
+            }
+            for s, parameters in carried.values
+        ],
     }
 
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.selection import Selection
+from core.diagnosis.selection.selection import Selection
 
 Array = NDArray[np.float64]
 FOLDS = 10
 RESAMPLES = 400
-RANK = 1e-13  # eigenvalue of unit columns below which a direction is none
+TINY = 1e-13  # eigenvalue of unit columns below which a direction is none
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class HeldOut:
         self._folds = int(parts.max()) + 1
         self.possible = self._folds >= 2 and len(self._target) > self._nuisance.shape[1] + 3
         self._fold = np.repeat(parts, k)
-        self._prior = selection.prior
+        self._pull = selection.pull
         self._seed = seed
         self._known: dict[tuple[int, ...], Array] = {}
 
@@ -73,23 +73,15 @@ class HeldOut:
             return self._target
         unit = 1 / np.sqrt(np.einsum("ij,ij->j", A, A) + 1e-300)
         A = A * unit
-        whole, g = A.T @ A + np.diag((self._pull(chosen) * unit) ** 2), A.T @ self._target
+        pull = np.concatenate([self._pull(chosen), np.zeros(self._nuisance.shape[1])])
+        whole, g = A.T @ A + np.diag((pull * unit) ** 2), A.T @ self._target
         left = np.empty_like(self._target)
         for k in range(self._folds):
             out = self._fold == k
             own, y = A[out], self._target[out]
-            inverse = np.linalg.pinv(whole - own.T @ own, rcond=RANK, hermitian=True)
+            inverse = np.linalg.pinv(whole - own.T @ own, rcond=TINY, hermitian=True)
             left[out] = y - own @ (inverse @ (g - own.T @ y))
         return left
-
-    def _pull(self, chosen: tuple[int, ...]) -> Array:
-        """Return what pulls each number to nominal, nuisances included (0: nothing does)."""
-        parts = [
-            1 / self._prior[c] if c in self._prior
-            else np.zeros(int(self._space.start[c + 1] - self._space.start[c]))
-            for c in chosen
-        ]  # fmt: skip
-        return np.concatenate([*parts, np.zeros(self._nuisance.shape[1])])
 
     def shrink(self, with_set: Sequence[int], without_set: Sequence[int]) -> Shrink:
         """Return how far the gap shrinks from one set to another, with its interval."""

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincc
 
-from core.diagnosis.bent import not_bent
 from core.diagnosis.bump import bumps
 from core.diagnosis.criteria import (
     ENOUGH_REPEATS,
@@ -30,15 +29,15 @@ from core.diagnosis.criteria import (
     USUAL,
 )
 from core.diagnosis.held_out import HeldOut
-from core.diagnosis.leftover import dependence, structure_p_value
-from core.diagnosis.neighbours import rivals
 from core.diagnosis.regions import parts
 from core.diagnosis.remainder import links_withstand, withstanding
-from core.diagnosis.selection import Selection
-from core.diagnosis.space import Found, Space
+from core.diagnosis.residual_structure import dependence, structure_p_value
+from core.diagnosis.selection.bent import not_bent
+from core.diagnosis.selection.local_search import rivals
+from core.diagnosis.selection.problem import Found, Space
+from core.diagnosis.selection.selection import Selection
 
 Array = NDArray[np.float64]
-NESTED = ("axial_compliance", "stiffness_nonlinearity")
 BESIDE = "it does not keep its value beside the unknown that is left"
 
 
@@ -231,8 +230,9 @@ def _ties(space: Space, found: Found, accused: Sequence[int]) -> dict[int, tuple
         names: list[str] = []
         for _, other in rivals(space, found, c, TIE):
             family = space.candidates[other].family
-            nested = (own, family) == NESTED  # the curve holds the line: no rival
-            if space.candidates[other].named and family not in (own, *names) and not nested:
+            if not space.candidates[other].named or family in (own, *names):
+                continue
+            if space.candidates[other].effect.contains != own:  # a curve holds its line: no rival
                 names.append(family)
         told[c] = tuple(names)
     return told

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.leftover import basis_of, dependence
-from core.diagnosis.selection import Selection
+from core.diagnosis.residual_structure import basis_of, dependence
+from core.diagnosis.selection.selection import Selection
 
 Array = NDArray[np.float64]
 

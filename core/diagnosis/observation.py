@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from core.effects import Term
 
 Array = NDArray[np.float64]
+HELD = "held_torque"  # Nm that a joint holds at rest: a quantity beside the columns of the log
 Rivals = tuple[tuple[str, Array], ...]
 Predict = Callable[[Sequence[Term]], Array]
 
@@ -49,8 +50,13 @@ class Observation:
     friction: Array | None = None  # (N, k) sign of each joint's motion, where friction shows
     tool_axes: Array | None = None  # (N, 3, 3) axes of the TCP in base, as columns
     axial_moment: Array | None = None  # (N, n) Nm about each joint's axis, where it is known
+    times: Array | None = None  # (N,) s or numbers of rows, where something may have stepped
     order_in_time: bool = False  # True: neighbours in time are correlated (a moving log)
     rebase: Callable[[Array], Observation] | None = None  # the same with the nuisance moved (p,)
+    instrument: Array | None = None  # (k,) 1 sigma measured by neighbouring samples of a recording
+    fewer: Callable[[NDArray[np.int64]], Observation] | None = None  # of some samples only
+    session: NDArray[np.int64] | None = None  # (N,) session of each sample; None: there is one
+    nuisance_session: tuple[int, ...] = ()  # (p,) session of each nuisance column, where several
 
     def axial_columns(self) -> Array:
         """Return d prediction / d axial compliance (N, k, n), to first order."""
@@ -67,6 +73,8 @@ def thinned(observation: Observation, most: int) -> Observation:
     if count <= most:
         return observation
     take = np.unique(np.linspace(0, count - 1, most).astype(int))
+    if observation.fewer is not None:
+        return observation.fewer(take)
     whole, unnamed = observation.predict, observation.unnamed
 
     def some(columns: Array | None) -> Array | None:
@@ -83,7 +91,69 @@ def thinned(observation: Observation, most: int) -> Observation:
         joint_columns=some(observation.joint_columns),
         unnamed=lambda: tuple((target, columns[take]) for target, columns in unnamed()),
         friction=some(observation.friction),
+        times=some(observation.times),
         tool_axes=some(observation.tool_axes),
         axial_moment=some(observation.axial_moment),
+        session=None if observation.session is None else observation.session[take],
         rebase=None,
     )
+
+
+def stacked(parts: Sequence[Observation], quantities: Mapping[str, Array]) -> Observation:
+    """Return the observations of several sessions as one; each keeps a nuisance of its own.
+
+    ``quantities`` are those of all samples together, ``rows`` of the parts the rows in one log.
+    """
+    size = [len(part.rows) for part in parts]
+    width = [part.nuisance.shape[2] for part in parts]
+    ends, columns = np.cumsum([0, *size]), np.cumsum([0, *width])
+    nuisance = np.zeros((int(ends[-1]), parts[0].nuisance.shape[1], int(columns[-1])))
+    for i, part in enumerate(parts):
+        nuisance[ends[i] : ends[i + 1], :, columns[i] : columns[i + 1]] = part.nuisance
+    group_ends = np.cumsum([0, *(int(part.groups.max()) + 1 for part in parts)])
+
+    def together(name: str) -> Array | None:
+        found = [getattr(part, name) for part in parts]
+        return None if any(f is None for f in found) else np.concatenate(found)
+
+    def predict(terms: Sequence[Term]) -> Array:
+        return np.concatenate([part.predict(terms) for part in parts])
+
+    def unnamed() -> Rivals:
+        each = [dict(part.unnamed()) for part in parts]
+        return tuple(
+            (target, np.concatenate([rivals[target] for rivals in each]))
+            for target in each[0]
+            if all(target in rivals for rivals in each)
+        )
+
+    def rebase(step: Array) -> Observation:
+        moved = [
+            part if part.rebase is None else part.rebase(step[columns[i] : columns[i + 1]])
+            for i, part in enumerate(parts)
+        ]
+        changed = {n: z for n, z in quantities.items() if not n.startswith("measured_position")}
+        for k in range(3):
+            name = f"measured_position_{k}"
+            if name in quantities:
+                changed[name] = np.concatenate([m.measured[:, k] for m in moved])
+        return stacked(moved, changed)
+
+    return replace(
+        parts[0],
+        measured=np.concatenate([part.measured for part in parts]),
+        predict=predict,
+        nuisance=nuisance,
+        quantities=quantities,
+        groups=np.concatenate([p.groups + g for p, g in zip(parts, group_ends, strict=False)]),
+        rows=np.concatenate([part.rows for part in parts]),
+        joint_columns=together("joint_columns"),
+        unnamed=unnamed,
+        tool_axes=together("tool_axes"),
+        axial_moment=together("axial_moment"),
+        times=together("times"),
+        rebase=rebase if columns[-1] else None,
+        session=np.repeat([int(p.session[0]) if p.session is not None else 0 for p in parts], size),
+        nuisance_session=tuple(int(s) for s in np.repeat(
+            [int(p.session[0]) if p.session is not None else 0 for p in parts], width)),
+    )  # fmt: skip

@@ -13,15 +13,15 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.candidate import Candidate
 from core.diagnosis.criteria import DRIFT, SIBLING, SIGMAS, STAND_IN_GAIN, UNKNOWNS
 from core.diagnosis.held_out import HeldOut
-from core.diagnosis.leftover import basis_of
 from core.diagnosis.observation import Observation
 from core.diagnosis.regions import parts
-from core.diagnosis.selection import Selection
-from core.diagnosis.smooth import targets
-from core.diagnosis.space import gains
+from core.diagnosis.residual_structure import basis_of
+from core.diagnosis.selection.candidate import Candidate, carrying
+from core.diagnosis.selection.problem import gains
+from core.diagnosis.selection.selection import Selection
+from core.diagnosis.selection.smooth import targets
 
 Array = NDArray[np.float64]
 TAKEN = 1e-5  # eigenvalue of unit columns below which a direction is the unnamed functions' own
@@ -162,7 +162,7 @@ class _Remainder:
         families = [self.space.candidates[c].family for c in accused]
         first = np.minimum(sigmas / SIGMAS, steady)
         stays = {f for f, s in zip(families, first, strict=True) if s >= 1}
-        stays -= {"transmission_error"}
+        stays -= {k.family for k in self.space.candidates if k.periodic}
         sibling = np.array([f in stays for f in families])
         return np.asarray(np.where(sibling, np.minimum(sigmas / SIBLING, steady), first))
 
@@ -171,12 +171,13 @@ def _unnamed(candidate: Candidate, observation: Observation) -> bool:
     """Return whether a candidate stands for an unknown, and not for a named effect's own form.
 
     A function of a joint's own last motion that moves it is play. Of joints that are measured one
-    by one, a function of a joint's own speed is friction or delay.
+    by one, a function of a joint's own speed or torque is friction, delay or droop.
     """
     if candidate.named:
         return False
     stem, _, index = candidate.quantity.rpartition("_")
     own = index.isdigit() and candidate.target.endswith(f"_{int(index) + 1}")
     if observation.channel in ("torque", "tracking"):
-        return not (own and stem in ("actual_qd", "target_qd"))
+        held = candidate.target == carrying(candidate.quantity)
+        return not (held or (own and stem in ("actual_qd", "target_qd")))
     return not (own and stem == "approach")

@@ -6,10 +6,10 @@ a fit that asks for the softness alone does not.
 
 from __future__ import annotations
 
-from core.compliance_fit import flexibilities
 from core.errors import GapbridgeError
-from core.identification import identify_compliance
-from core.log import Log
+from core.estimation.compliance_fit import flexibilities
+from core.estimation.identification import identify_compliance
+from core.log.log import Log
 from core.metrology import Metrology
 from core.model import Model
 

@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.neighbours import rivals
-from core.diagnosis.space import Found, Space, fit
-from core.diagnosis.trials import PREDICTED, Predict, Trials, draw_trials
+from core.diagnosis.next_measurements import PREDICTED, Predict, Trials, draw_trials
+from core.diagnosis.selection.local_search import rivals
+from core.diagnosis.selection.problem import Found, Space, fit
 from core.effects import CATALOGUE, Site, Term
 from core.errors import InputError
-from core.log import Log
+from core.estimation.registration import frame_columns
+from core.log.log import Log
 from core.model import Model
-from core.registration import frame_columns
 
 if TYPE_CHECKING:
     from core.diagnosis.diagnosis import ChannelDiagnosis
@@ -127,7 +127,7 @@ def _usual(model: Model, effect: str) -> Iterator[Term]:
     """Yield an effect of usual size at each of its sites."""
     member = CATALOGUE[effect]
     for site in member.sites(model.arm):
-        place = Site(site.joint, 1.0 if effect == "transmission_error" else None)
+        place = Site(site.joint, 1.0 if member.periodic else None)
         yield Term(effect, place, tuple(p.scale for p in member.parameters(model.arm, place)))
 
 
@@ -138,7 +138,7 @@ def _difference(
     observation = channel.selection.observation
     try:
         apart = predict(question.one) - predict(question.other)
-        if observation.nuisance.shape[2]:
+        if observation.nuisance.shape[2] >= 6:
             seen = observation.predict(question.one) - observation.predict(question.other)
             apart = apart - _framed(observation.nuisance, seen, predict(question.other))
     except InputError:  # the arm would buckle under one of them
@@ -151,7 +151,8 @@ def _difference(
 def _framed(nuisance: Array, seen: Array, position: Array) -> Array:
     """Return how the frame that takes up the log's difference moves the readings of trials."""
     A = nuisance[:, :3].reshape(-1, nuisance.shape[2])
-    x = np.linalg.lstsq(A, seen[:, :3].ravel(), rcond=1e-9)[0]
+    # of several sessions the trials go on with the first one's frame
+    x = np.linalg.lstsq(A, seen[:, :3].ravel(), rcond=1e-9)[0][:6]
     return np.asarray(-frame_columns(position)[:, :3] @ x)
 
 
@@ -163,7 +164,8 @@ def _best(moving: bool, trials: Trials, names: tuple[str, ...], gain: Array) -> 
         if gain[r] < VISIBLE or len(told) == EACH:
             break
         if all(np.abs(q[r] - np.array(m.q)).max() > APART for m in told):
-            approach = tuple(int(v) for v in loads.approach[r]) if "backlash" in names else None
+            sided = any(CATALOGUE[name].by_approach for name in names)
+            approach = tuple(int(v) for v in loads.approach[r]) if sided else None
             told.append(Measurement(
                 _floats(q[r]), float(loads.payload_mass[r]), names, float(gain[r]), approach,
                 velocity=_floats(trials.qd[r]) if moving else None,

@@ -1,13 +1,15 @@
-"""The catalogue of effects: one table, in the order of CONTRACT."""
+"""The catalogue of effects: one table, by channel."""
 
 from __future__ import annotations
 
 import difflib
+from collections.abc import Iterable
 
 from core.effects.axial_compliance import AxialCompliance
 from core.effects.backlash import Backlash
 from core.effects.base_compliance import BaseCompliance
 from core.effects.coulomb_friction import CoulombFriction
+from core.effects.dead_band import DeadBand
 from core.effects.effect import CHANNELS, Effect, Parameter, Reported, Site, Term
 from core.effects.ft_bias import FtBias
 from core.effects.ft_drift import FtDrift
@@ -15,17 +17,25 @@ from core.effects.ft_gain import FtGain
 from core.effects.ft_misalignment import FtMisalignment
 from core.effects.gravity_direction import GravityDirection
 from core.effects.joint_offset import JointOffset
+from core.effects.joint_slip import JointSlip
 from core.effects.latency import Latency
+from core.effects.link_cog import LinkCog
 from core.effects.link_flexibility import LinkFlexibility
 from core.effects.link_geometry import LinkGeometry
 from core.effects.link_inertia import LinkInertia
+from core.effects.load_friction import LoadFriction
 from core.effects.payload import Payload
+from core.effects.payload_cog import PayloadCog
 from core.effects.radial_compliance import RadialCompliance
 from core.effects.rotor_inertia import RotorInertia
+from core.effects.servo_droop import ServoDroop
 from core.effects.stiffness_nonlinearity import StiffnessNonlinearity
+from core.effects.stribeck_friction import StribeckFriction
+from core.effects.target_slip import TargetSlip
 from core.effects.thermal_drift import ThermalDrift
 from core.effects.tool_frame import ToolFrame
 from core.effects.torque_constant import TorqueConstant
+from core.effects.torque_offset import TorqueOffset
 from core.effects.tracking_lag import TrackingLag
 from core.effects.transmission_error import TransmissionError
 from core.effects.viscous_friction import ViscousFriction
@@ -35,8 +45,10 @@ CATALOGUE: dict[str, Effect] = {
     effect.identifier: effect
     for effect in (
         JointOffset(),
+        JointSlip(),
         LinkGeometry(),
         ToolFrame(),
+        TargetSlip(),
         TransmissionError(),
         AxialCompliance(),
         RadialCompliance(),
@@ -45,6 +57,7 @@ CATALOGUE: dict[str, Effect] = {
         BaseCompliance(),
         GravityDirection(),
         Payload(),
+        PayloadCog(),
         Backlash(),
         ThermalDrift(),
         FtBias(),
@@ -53,13 +66,44 @@ CATALOGUE: dict[str, Effect] = {
         FtMisalignment(),
         Latency(),
         TrackingLag(),
+        ServoDroop(),
+        DeadBand(),
         CoulombFriction(),
         ViscousFriction(),
+        StribeckFriction(),
+        LoadFriction(),
+        TorqueOffset(),
         RotorInertia(),
         LinkInertia(),
+        LinkCog(),
         TorqueConstant(),
     )
 }
+
+
+def flexibility_effects() -> dict[str, str]:
+    """Return the effect behind each key of a cell's compliance section: axial, radial."""
+    return {e.flexibility: name for name, e in CATALOGUE.items() if e.flexibility}
+
+
+def correcting(what: str) -> tuple[str, ...]:
+    """Return the effects that correct one thing a cell declares: "payload", "tool", ..."""
+    return tuple(name for name, effect in CATALOGUE.items() if effect.corrects == what)
+
+
+def acting(terms: Iterable[Term], channel: str) -> list[Term]:
+    """Return the terms that show in a channel, in the order in which they act there.
+
+    On the way from load to reading: whatever order they were found in.
+    """
+    own = [t for t in terms if channel in CATALOGUE[t.effect].channels]
+    return sorted(own, key=lambda term: CATALOGUE[term.effect].order)
+
+
+def settling(terms: Iterable[Term]) -> list[Term]:
+    """Return the terms by which encoders rest elsewhere than commanded, in order of action."""
+    own = Effect.settle
+    return [t for t in acting(terms, "tracking") if type(CATALOGUE[t.effect]).settle is not own]
 
 
 def effect_named(identifier: str) -> Effect:
@@ -79,5 +123,9 @@ __all__ = [
     "Reported",
     "Site",
     "Term",
+    "acting",
+    "correcting",
     "effect_named",
+    "flexibility_effects",
+    "settling",
 ]

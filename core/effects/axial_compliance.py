@@ -8,8 +8,8 @@ from core.effects.effect import JointEffect, Parameter, Site, Term, typical_mome
 
 if TYPE_CHECKING:
     from core.arm import Arm
-    from core.kernel import Chain
     from core.kernels.rates import ChainRate
+    from core.kernels.reference import Chain
 
 
 class AxialCompliance(JointEffect):
@@ -21,8 +21,14 @@ class AxialCompliance(JointEffect):
     """
 
     identifier = "axial_compliance"
+    title = "joint twists under load"
+    label_words = "twist of joint {joint} per torque"
+    calibrated = 4
+    softens = True
+    flexibility = "axial"
     channels = ("position",)
     motion = "payloads or pulls that change the torque about the joint's axis"
+    instead = "add a joint with the spring 1/c about the same axis"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the flexibility beyond the model's."""

@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from core.effects.effect import JointEffect, Parameter, Site, Term
+from core.effects.simulator import Kind, SimulatorChange
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from core.arm import Arm
-    from core.kernel import Rows
+    from core.kernels.reference import Rows
     from core.loads import Loads
 
 
@@ -20,16 +21,24 @@ class Backlash(JointEffect):
 
     Comes from worn gears and belts. Needs poses that are reached from both sides; without reversals
     nothing can be said.
-    Source: CONTRACT; He et al. 2024 on joint hysteresis (SMART5 NJ220).
+    Source: He et al. 2024 on joint hysteresis (SMART5 NJ220).
     """
 
     identifier = "backlash"
+    title = "play in the joint"
+    label_words = "play of joint {joint}"
+    by_approach = True
     channels = ("position",)
     motion = "poses reached from both sides of the joint"
+    instead = "add a joint about the same axis, limited to half the clearance on each side"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the whole clearance."""
         return (Parameter("", "rad", 3e-4, 0.0, 0.1),)
+
+    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
+        """Return it in a simulator's terms."""
+        return (SimulatorChange(Kind.PLAY, term.site.joint, term.values[0]),)
 
     def condition(
         self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]

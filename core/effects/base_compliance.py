@@ -8,8 +8,8 @@ from core.effects.effect import Effect, Parameter, Site, Term, typical_moment
 
 if TYPE_CHECKING:
     from core.arm import Arm
-    from core.kernel import Chain
     from core.kernels.rates import ChainRate
+    from core.kernels.reference import Chain
 
 
 class BaseCompliance(Effect):
@@ -22,8 +22,12 @@ class BaseCompliance(Effect):
     """
 
     identifier = "base_compliance"
+    title = "foundation gives way"
+    label_words = "yielding of the foundation about {part}"
+    softens = True
     channels = ("position",)
     motion = "poses and payloads that change the moment on the base, in all directions around it"
+    instead = "put the base on springs about x and y"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the flexibilities about x and y of base."""

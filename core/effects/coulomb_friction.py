@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from core.effects.effect import JointEffect, Parameter, Site, Term, typical_moment
+from core.effects.simulator import Kind, SimulatorChange
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,12 +27,18 @@ class CoulombFriction(JointEffect):
     """
 
     identifier = "coulomb_friction"
+    title = "constant friction"
+    order = 52
     channels = ("torque",)
     motion = "the joint moved both ways"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the torque."""
         return (Parameter("", "Nm", 0.03 * joint_scale(arm, site), 0.0, np.inf),)
+
+    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
+        """Return it in a simulator's terms."""
+        return (SimulatorChange(Kind.FRICTION, term.site.joint, term.values[0]),)
 
     def drive(
         self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion

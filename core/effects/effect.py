@@ -12,15 +12,16 @@ from __future__ import annotations
 
 from abc import ABC
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from core.arm import Arm
-    from core.kernel import Chain, Rows
+    from core.effects.simulator import SimulatorChange
     from core.kernels.rates import ChainRate
+    from core.kernels.reference import Chain, Rows
     from core.loads import Loads
     from core.motion import Motion
 
@@ -37,6 +38,7 @@ class Parameter:
     scale: float  # a usual size, for steps, priors and scaling
     lower: float = -np.inf
     upper: float = np.inf
+    of_rotation: bool = False  # True: shows only where the instrument measures rotations too
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class Term:
 
 @dataclass(frozen=True)
 class Reported:
-    """A parameter as it is told: in the unit and form of CONTRACT's signs."""
+    """A parameter as it is reported: in the unit and sign of docs/conventions.md."""
 
     name: str
     value: float
@@ -72,12 +74,49 @@ class Reported:
 
 
 class Effect(ABC):
-    """One member of the catalogue; its docstring is what ``gapbridge explain`` prints."""
+    """One member of the catalogue; its docstring is what ``gapbridge explain`` prints.
+
+    What the program needs to know of an effect is asked of its attributes, never of its name.
+    """
 
     identifier: ClassVar[str]
     channels: ClassVar[tuple[str, ...]]
     needs: ClassVar[tuple[str, ...]] = ()  # log columns beyond those of its channel
     motion: ClassVar[str] = ""  # what a log must contain so that the effect shows
+    instead: ClassVar[str] = ""  # what people do where a simulator's model cannot hold it
+
+    # how people read it
+    title: ClassVar[str] = ""  # in plain words; left out: the identifier without underscores
+    label_words: ClassVar[str] = ""  # of one parameter, with {joint} and {part}
+    moved: ClassVar[str] = ""  # report of a verification that found it alone; '': not looked for
+
+    # how it acts
+    order: ClassVar[int] = 50  # place on the way from load to reading, in its channel
+    periodic: ClassVar[bool] = False  # True: sites have an order, and values are sine and cosine
+    delays: ClassVar[bool] = False  # True: its only value is a time that the joint comes late
+    at_moment: ClassVar[bool] = False  # True: steps once; the last value is when
+    by_approach: ClassVar[bool] = False  # True: acts by the joint's last motion
+    softens: ClassVar[bool] = False  # True: a flexibility, never below zero with the model's own
+    flexibility: ClassVar[str] = ""  # which of a joint's linear flexibilities: axial, radial
+    needs_softness: ClassVar[bool] = False  # True: positions show it by what bends alone
+    carried: ClassVar[bool] = False  # True: a load on the joints, which friction may grow with
+    adds_mass: ClassVar[bool] = False  # True: kg beyond the declared payload
+    scales_reading: ClassVar[bool] = False  # True: the sensor reads zero where nothing acts
+    together: ClassVar[bool] = False  # True: small at all places of a real arm, found as a whole
+    felt_by_all: ClassVar[bool] = False  # True: one cause moves coordinates of many joints
+
+    # how it is found
+    shapes: ClassVar[tuple[float, ...]] = ()  # last values that a search begins with
+    curved: ClassVar[bool] = False  # True: first value a slope, second what bends the line
+    contains: ClassVar[str] = ""  # the effect of the same joint that it stands instead of
+    sum_of: ClassVar[str] = ""  # the effect whose parameters together can be the same as this
+    calibrated: ClassVar[int] = 0  # turn in a calibration that names no effects; 0: none
+    corrects: ClassVar[str] = ""  # what of the cell a session measures anew instead
+
+    @property
+    def calibratable(self) -> bool:
+        """Return whether a calibration can look for it: measured positions show it all the time."""
+        return "position" in self.channels and not self.at_moment
 
     def sites(self, arm: Arm) -> tuple[Site, ...]:
         """Return where the effect can sit on this arm."""
@@ -86,6 +125,13 @@ class Effect(ABC):
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the parameters of one occurrence."""
         raise NotImplementedError
+
+    def angle_columns(self, site: Site, q: Array) -> Array | None:
+        """Return d joint angle / d parameter (N, d) at encoder angles ``q`` (N,) of its joint.
+
+        For effects that turn the joint by its own angle alone; None for all others.
+        """
+        return None
 
     def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
         """Change the chain in place: what holds for all rows (position channel)."""
@@ -100,17 +146,39 @@ class Effect(ABC):
     def condition(self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: Array) -> None:
         """Change the rows in place; ``q`` (N, n) are the encoder angles (position channel)."""
 
+    def before(
+        self, term: Term, chain: Chain, position: Array, rotation: Array, loads: Loads
+    ) -> None:
+        """Put predicted TCP poses (N, 3), (N, 3, 3) back in rows before the term's moment.
+
+        For effects whose ``shape`` holds from a moment on.
+        """
+
     def sense(self, term: Term, arm: Arm, wrench: Array, motion: Motion) -> Array:
         """Return what the flange sensor would read instead of ``wrench`` (N, 6)."""
         return wrench
 
     def track(self, term: Term, arm: Arm, q: Array, motion: Motion) -> Array:
         """Return where the encoders would stand instead of ``q`` (N, n)."""
+        assert motion.held is not None
+        return self.settle(term, arm, q, motion.held, motion.loads.approach)
+
+    def settle(self, term: Term, arm: Arm, q: Array, held: Array, approach: Array | None) -> Array:
+        """Return where the encoders come to rest for commands ``q`` (N, n), rad.
+
+        ``held`` (N, n) is the torque that each joint holds there, Nm about its axis, positive where
+        the motor pushes towards positive q; ``approach`` (N, n) the sign of its last motion. What
+        differs from ``q`` is made up for in live setpoints.
+        """
         return q
 
     def drive(self, term: Term, arm: Arm, torque: Array, motion: Motion) -> Array:
         """Return the joint torques that would be measured instead of ``torque`` (N, n)."""
         return torque
+
+    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
+        """Return what to change in a simulator's model, beside what ``shape`` changes."""
+        return ()
 
     def reported(self, arm: Arm, term: Term, covariance: Array | None) -> tuple[Reported, ...]:
         """Return the term's parameters as they are told; ``covariance`` is (k, k) or None."""
@@ -136,6 +204,14 @@ class JointEffect(Effect):
     def sites(self, arm: Arm) -> tuple[Site, ...]:
         """Return one site a joint."""
         return tuple(Site(joint=i + 1) for i in range(arm.n))
+
+
+def rows_after(term: Term, loads: Loads) -> Any:
+    """Return an index of the rows that are later than a term's moment; all where time is unknown.
+
+    The moment is the term's last value.
+    """
+    return slice(None) if loads.time is None else loads.time > term.values[-1]
 
 
 def typical_moment(arm: Arm) -> float:

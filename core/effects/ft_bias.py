@@ -24,13 +24,18 @@ class FtBias(Effect):
     Comes from mounting strain, temperature, an old zero. Shows the same at every pose, while the
     weight of a payload turns with the flange: poses that turn the flange separate it from a
     payload; sessions of some length from a drift.
-    Source: CONTRACT; Hollerbach, Khalil, Gautier, "Model Identification", Springer Handbook of
+    Source: Hollerbach, Khalil, Gautier, "Model Identification", Springer Handbook of
     Robotics (2016), ch. 6.
     """
 
     identifier = "ft_bias"
+    title = "force sensor zero is off"
+    label_words = "sensor zero of {part}"
+    order = 80
+    corrects = "sensor zero"
     channels = ("wrench",)
     motion = "poses that turn the flange by tens of degrees against gravity"
+    instead = "subtract the bias from the sensor's readings"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return force (N) and torque (Nm) along the flange axes."""

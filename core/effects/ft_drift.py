@@ -24,13 +24,16 @@ class FtDrift(Effect):
     Comes from warming up. Zero at the first timestamp of the log: what is wrong there already is
     ``ft_bias``. Needs timestamps over minutes, and poses that come back in another order or
     several payloads, so that time and load do not change together.
-    Source: CONTRACT; data sheets of strain-gauge sensors, which give the zero's drift per kelvin.
+    Source: data sheets of strain-gauge sensors, which give the zero's drift per kelvin.
     """
 
     identifier = "ft_drift"
+    title = "force sensor zero drifts"
+    order = 70
     channels = ("wrench",)
     needs = ("timestamp",)
     motion = "a session long enough for the zero to move, with poses that come back"
+    instead = "subtract the drift from the sensor's readings"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the rates along the flange axes."""

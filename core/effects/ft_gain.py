@@ -24,13 +24,17 @@ class FtGain(Effect):
     Comes from a wrong calibration matrix, an amplifier, an overload. An axis whose wrench stays
     zero tells nothing of its gain. With one payload for the whole log, six equal gains are the
     same as another payload; other payloads or pulls separate them.
-    Source: CONTRACT; Hollerbach, Khalil, Gautier, "Model Identification", Springer Handbook of
+    Source: Hollerbach, Khalil, Gautier, "Model Identification", Springer Handbook of
     Robotics (2016), ch. 6.
     """
 
     identifier = "ft_gain"
+    title = "force sensor scale is off"
+    order = 60
+    scales_reading = True
     channels = ("wrench",)
     motion = "a load on every axis: the flange turned every way, with pulls or several payloads"
+    instead = "divide the sensor's readings by 1 + gain"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the relative errors along the flange axes."""

@@ -22,13 +22,17 @@ class FtMisalignment(Effect):
     r is the rotation vector of the sensor's axes in flange axes; force and torque turn alike,
     about the flange origin. Comes from a wrong bolt pattern or adapter. About z it looks like a
     joint offset of the last joint, which the encoders and a pose measurement tell apart.
-    Source: CONTRACT; Hollerbach, Khalil, Gautier, "Model Identification", Springer Handbook of
+    Source: Hollerbach, Khalil, Gautier, "Model Identification", Springer Handbook of
     Robotics (2016), ch. 6.
     """
 
     identifier = "ft_misalignment"
+    title = "force sensor is turned"
+    order = 55
+    scales_reading = True
     channels = ("wrench",)
     motion = "loads along at least two directions of the flange"
+    instead = "turn the sensor's frame, or its readings"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the rotation vector of the sensor in the flange."""

@@ -11,8 +11,8 @@ from core.rotation import left_jacobian, rotation_matrix
 
 if TYPE_CHECKING:
     from core.arm import Arm
-    from core.kernel import Chain
     from core.kernels.rates import ChainRate
+    from core.kernels.reference import Chain
 
 
 class GravityDirection(Effect):
@@ -23,8 +23,12 @@ class GravityDirection(Effect):
     """
 
     identifier = "gravity_direction"
+    title = "base is not level"
+    label_words = "tilt of the base about {part}"
+    needs_softness = True
     channels = ("position",)
     motion = "a compliant model and poses all around the base"
+    instead = "turn the base, or gravity in the world"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the rotation vector's x and y, base axes."""

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from core.effects.effect import JointEffect, Parameter, Site, Term
+from core.effects.simulator import Kind, SimulatorChange
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from core.arm import Arm
-    from core.kernel import Rows
+    from core.kernels.reference import Rows
     from core.loads import Loads
 
 
@@ -26,12 +28,24 @@ class JointOffset(JointEffect):
     """
 
     identifier = "joint_offset"
+    title = "joint zero is off"
+    label_words = "zero of joint {joint}"
+    calibrated = 2
+    moved = "the zero of joint {joint} moved by {size}"
     channels = ("position",)
     motion = "poses that differ in the other joints"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the offset."""
         return (Parameter("", "rad", 1e-3, -0.5, 0.5),)
+
+    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
+        """Return it in a simulator's terms."""
+        return (SimulatorChange(Kind.JOINT_ZERO, term.site.joint, term.values[0]),)
+
+    def angle_columns(self, site: Site, q: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return ones: the same turn at every angle."""
+        return np.ones((len(q), 1))
 
     def condition(
         self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from core.effects.effect import JointEffect, Parameter, Site, Term
+from core.effects.simulator import Kind, SimulatorChange
 from core.interpolation import interpolate, stretches
 
 if TYPE_CHECKING:
@@ -24,17 +25,25 @@ class Latency(JointEffect):
     fast changes of the command separate the two, slow motion gives their sum.
     Exact: the command is interpolated by a cubic spline at t - latency. Rows
     right after the start of a recording, or after a gap, hold the first command.
-    Source: CONTRACT; Astrom, Wittenmark, "Computer-Controlled Systems" (1997), ch. 2.
+    Source: Astrom, Wittenmark, "Computer-Controlled Systems" (1997), ch. 2.
     """
 
     identifier = "latency"
+    title = "joint reacts late"
+    order = 20
+    delays = True
     channels = ("tracking",)
     needs = ("timestamp",)
     motion = "a recording of changing speeds of the joint"
+    instead = "delay the command in the control loop"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the delay."""
         return (Parameter("", "s", 5e-3, 0.0, 2.0),)
+
+    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
+        """Return it in a simulator's terms."""
+        return (SimulatorChange(Kind.DELAY, term.site.joint, term.values[0]),)
 
     def track(
         self, term: Term, arm: Arm, q: NDArray[np.float64], motion: Motion

@@ -10,7 +10,7 @@ from core.effects.effect import Effect, Parameter, Site, Term, typical_moment
 
 if TYPE_CHECKING:
     from core.arm import Arm
-    from core.kernel import Chain
+    from core.kernels.reference import Chain
 
 
 class LinkFlexibility(Effect):
@@ -23,8 +23,12 @@ class LinkFlexibility(Effect):
     """
 
     identifier = "link_flexibility"
+    title = "link bends under load"
+    label_words = "bending of link {joint}"
+    softens = True
     channels = ("position",)
     motion = "payloads or pulls in several directions, so that force and moment on the link differ"
+    instead = "add a pair of springs across the link at a third of its length, 4 EI / 3 L each"
 
     def sites(self, arm: Arm) -> tuple[Site, ...]:
         """Return the links between two joints that have a length."""

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from core.arm import Arm
-    from core.kernel import Chain
     from core.kernels.rates import ChainRate
+    from core.kernels.reference import Chain
 
 PARALLEL = 1e-6  # sine of the angle below which two axes count as parallel
 
@@ -68,6 +68,10 @@ class LinkGeometry(Effect):
     """
 
     identifier = "link_geometry"
+    together = True
+    title = "link measures differ"
+    label_words = "{part} of link {joint}"
+    calibrated = 3
     channels = ("position",)
     motion = "poses that differ in the joint before the link"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from core.effects.effect import JointEffect, Parameter, Site, Term
+from core.effects.simulator import Kind, SimulatorChange
 
 if TYPE_CHECKING:
     import numpy as np
@@ -21,16 +22,24 @@ class LinkInertia(JointEffect):
     as in accelerations, on its own joint and on those before. Links beyond joint 1 need poses
     that change how they pull; link 1 turns about the vertical and shows in accelerations only.
     Links that keep their direction to each other (the last ones, with a payload) look alike.
-    Source: CONTRACT; Swevers, Verdonck, De Schutter, IEEE Control Systems 27 (2007) 58.
+    Source: Swevers, Verdonck, De Schutter, IEEE Control Systems 27 (2007) 58.
     """
 
     identifier = "link_inertia"
+    title = "link weighs more or less"
+    order = 20
+    felt_by_all = True
+    carried = True
     channels = ("torque",)
     motion = "many poses, and accelerations of all joints up to the link"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the relative increase; joint i stands for link i, which it turns."""
         return (Parameter("", "", 0.05, -1.0, 20.0),)
+
+    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
+        """Return it in a simulator's terms."""
+        return (SimulatorChange(Kind.LINK_SCALE, term.site.joint, term.values[0]),)
 
     def drive(
         self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion

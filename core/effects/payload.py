@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from core.effects.effect import Effect, Parameter, Site, Term
+from core.effects.simulator import Kind, SimulatorChange
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from core.arm import Arm
-    from core.kernel import Rows
+    from core.kernels.reference import Rows
     from core.loads import Loads
     from core.motion import Motion
 
@@ -24,12 +25,26 @@ class Payload(Effect):
     """
 
     identifier = "payload"
+    title = "load weighs more or less than declared"
+    label_words = "mass of the load beyond the declared one"
+    order = 10
+    needs_softness = True
+    adds_mass = True
+    carried = True
+    felt_by_all = True
+    corrects = "payload"
+    moved = "the load differs from what was declared by {size}"
     channels = ("position", "wrench", "torque")
     motion = "poses that change how the load pulls"
+    instead = "change the load's mass where it is modelled"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the extra mass."""
         return (Parameter("", "kg", 1.0),)
+
+    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
+        """Return it in a simulator's terms."""
+        return (SimulatorChange(Kind.PAYLOAD, term.site.joint, term.values[0]),)
 
     def condition(
         self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]

@@ -8,8 +8,8 @@ from core.effects.effect import JointEffect, Parameter, Site, Term, typical_mome
 
 if TYPE_CHECKING:
     from core.arm import Arm
-    from core.kernel import Chain
     from core.kernels.rates import ChainRate
+    from core.kernels.reference import Chain
 
 
 class RadialCompliance(JointEffect):
@@ -20,8 +20,15 @@ class RadialCompliance(JointEffect):
     """
 
     identifier = "radial_compliance"
+    title = "joint tilts under load"
+    label_words = "tilt of joint {joint} per moment"
+    calibrated = 5
+    softens = True
+    flexibility = "radial"
+    sum_of = "base_compliance"
     channels = ("position",)
     motion = "payloads or pulls that change the moment across the joint's axis"
+    instead = "add two joints with the spring 1/c across the axis"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the flexibility beyond the model's."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from core.effects.coulomb_friction import joint_scale
 from core.effects.effect import JointEffect, Parameter, Site, Term
+from core.effects.simulator import Kind, SimulatorChange
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,13 +27,20 @@ class RotorInertia(JointEffect):
     """
 
     identifier = "rotor_inertia"
+    title = "motor inertia is missing"
+    order = 30
     channels = ("torque",)
     motion = "accelerations of the joint, at several poses of those beyond"
+    instead = "set the joint's armature where the simulator has it"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the inertia at the joint's side of the gear."""
         scale = max(1e-2 * joint_scale(arm, site), 1e-3)
         return (Parameter("", "kg m2", scale, 0.0, np.inf),)
+
+    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
+        """Return it in a simulator's terms."""
+        return (SimulatorChange(Kind.ARMATURE, term.site.joint, term.values[0]),)
 
     def drive(
         self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion

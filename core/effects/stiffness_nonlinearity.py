@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from core.arm import Arm
-    from core.kernel import Chain
     from core.kernels.rates import ChainRate
+    from core.kernels.reference import Chain
 
 
 class StiffnessNonlinearity(JointEffect):
@@ -22,12 +22,18 @@ class StiffnessNonlinearity(JointEffect):
     Comes from strain-wave gears, whose teeth engage further under torque. It holds the linear part
     too, so it stands instead of the joint's ``axial_compliance``. Needs several loads: with one, it
     looks like a linear compliance.
-    Source: CONTRACT; stiffening curves of harmonic drives in makers' catalogues (K1 < K2 < K3).
+    Source: stiffening curves of harmonic drives in makers' catalogues (K1 < K2 < K3).
     """
 
     identifier = "stiffness_nonlinearity"
+    title = "joint stiffens under load"
+    label_words = "stiffening of joint {joint} ({part})"
+    softens = True
+    curved = True
+    contains = "axial_compliance"
     channels = ("position",)
     motion = "at least three well separated torques about the joint's axis"
+    instead = "add a joint with the spring 1/c + theta^2 / (2 c^3 M0^2)"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return c and the softening 1/M0^2, in which the curve starts linear."""

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from core.arm import Arm
-    from core.kernel import Rows
+    from core.kernels.reference import Rows
     from core.loads import Loads
 
 
@@ -20,13 +20,16 @@ class ThermalDrift(Effect):
 
     One coefficient of expansion for the arm; base, tool and centres of gravity do not grow. Needs
     joint temperatures that change over the session. Steel 12e-6, aluminium 23e-6 per kelvin.
-    Source: CONTRACT; VSB Ostrava 2021 on IRB1200 thermal drift.
+    Source: VSB Ostrava 2021 on IRB1200 thermal drift.
     """
 
     identifier = "thermal_drift"
+    title = "links grow as they warm up"
+    label_words = "growth of link {joint} with warmth"
     channels = ("position",)
     needs = ("joint_temperatures",)
     motion = "joint temperatures that change by several degrees"
+    instead = "scale the links' lengths for one temperature"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the coefficient of expansion."""

@@ -11,8 +11,8 @@ from core.rotation import left_jacobian, one_rotation_matrix
 
 if TYPE_CHECKING:
     from core.arm import Arm
-    from core.kernel import Chain
     from core.kernels.rates import ChainRate
+    from core.kernels.reference import Chain
 
 
 class ToolFrame(Effect):
@@ -23,13 +23,20 @@ class ToolFrame(Effect):
     """
 
     identifier = "tool_frame"
+    title = "tool (TCP) sits elsewhere"
+    label_words = "tool {part}"
+    calibrated = 1
+    corrects = "tool"
+    moved = "the tool moved by {size}: run the short session for the tool"
     channels = ("position",)
     motion = "poses that differ in the orientation of the flange"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the shift (m) and the rotation vector (rad), flange axes."""
         shift = tuple(Parameter(k, "m", 1e-3, -0.5, 0.5) for k in "xyz")
-        return shift + tuple(Parameter(k, "rad", 3e-3, -0.5, 0.5) for k in ("rx", "ry", "rz"))
+        return shift + tuple(
+            Parameter(k, "rad", 3e-3, -0.5, 0.5, of_rotation=True) for k in ("rx", "ry", "rz")
+        )
 
     def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
         """Move the TCP."""

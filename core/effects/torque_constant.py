@@ -23,8 +23,12 @@ class TorqueConstant(JointEffect):
     """
 
     identifier = "torque_constant"
+    title = "torque reading is scaled"
+    order = 90
+    felt_by_all = True
     channels = ("torque",)
     motion = "a joint that carries torque, the more changing the better"
+    instead = "scale the measured torque by 1 / (1 + value) before it is compared"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the relative increase."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from core.effects.effect import JointEffect, Parameter, Site, Term
+from core.effects.simulator import Kind, SimulatorChange
 from core.interpolation import lagged, stretches
 
 if TYPE_CHECKING:
@@ -22,17 +23,25 @@ class TrackingLag(JointEffect):
     which is what separates it from pure latency. Exact: the lag's response to the command, which
     runs from row to row as a ramp (finer than the log where that is coarse), from where the
     encoder stood at first. A negative T, which only steps of a solver ask for, is continued oddly.
-    Source: CONTRACT; Astrom, Wittenmark, "Computer-Controlled Systems" (1997), ch. 2.
+    Source: Astrom, Wittenmark, "Computer-Controlled Systems" (1997), ch. 2.
     """
 
     identifier = "tracking_lag"
+    title = "joint lags behind"
+    order = 30
+    delays = True
     channels = ("tracking",)
     needs = ("timestamp",)
     motion = "a recording of the joint with accelerations, the sharper the better"
+    instead = "filter the command in the control loop"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the time constant."""
         return (Parameter("", "s", 5e-3, 0.0, 2.0),)
+
+    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
+        """Return it in a simulator's terms."""
+        return (SimulatorChange(Kind.LAG, term.site.joint, term.values[0]),)
 
     def track(
         self, term: Term, arm: Arm, q: NDArray[np.float64], motion: Motion

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from core.arm import Arm
-    from core.kernel import Rows
+    from core.kernels.reference import Rows
     from core.loads import Loads
 
 
@@ -28,8 +28,12 @@ class TransmissionError(JointEffect):
     """
 
     identifier = "transmission_error"
+    title = "periodic gear error"
+    label_words = "gear error of joint {joint} ({part})"
+    periodic = True
     channels = ("position",)
     motion = "many different angles of the joint"
+    instead = "add amplitude sin(order q + phase) to the commanded angle in the control loop"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the coefficients of sine and cosine, in which the effect is linear."""
@@ -38,14 +42,18 @@ class TransmissionError(JointEffect):
             Parameter("cosine", "rad", 3e-4, -0.1, 0.1),
         )
 
+    def angle_columns(self, site: Site, q: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return sine and cosine of the angle times the order."""
+        assert site.order is not None
+        return np.stack([np.sin(site.order * q), np.cos(site.order * q)], axis=-1)
+
     def condition(
         self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]
     ) -> None:
         """Turn the joint by the wave at its encoder angle."""
         assert term.site.joint is not None and term.site.order is not None
         i = term.site.joint - 1
-        phase = term.site.order * q[:, i]
-        rows.q[:, i] += term.values[0] * np.sin(phase) + term.values[1] * np.cos(phase)
+        rows.q[:, i] += self.angle_columns(term.site, q[:, i]) @ term.values
 
     def reported(
         self, arm: Arm, term: Term, covariance: NDArray[np.float64] | None

@@ -8,6 +8,7 @@ import numpy as np
 
 from core.effects.coulomb_friction import joint_scale
 from core.effects.effect import JointEffect, Parameter, Site, Term
+from core.effects.simulator import Kind, SimulatorChange
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -25,12 +26,18 @@ class ViscousFriction(JointEffect):
     """
 
     identifier = "viscous_friction"
+    title = "friction grows with speed"
+    order = 51
     channels = ("torque",)
     motion = "the joint moved at several speeds"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the coefficient."""
         return (Parameter("", "Nm s/rad", 0.03 * joint_scale(arm, site), 0.0, np.inf),)
+
+    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
+        """Return it in a simulator's terms."""
+        return (SimulatorChange(Kind.DAMPING, term.site.joint, term.values[0]),)
 
     def drive(
         self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion

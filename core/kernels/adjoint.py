@@ -4,7 +4,7 @@ The bending x of all joints is what their moments make of it: x = C M(x, p). The
 then changes by dy/dp = y_p + a C M_p with a = y_x + a C M_x, which is solved by iteration (it
 contracts as fast as the equilibrium itself). All perturbations are twists of everything beyond a
 place of the chain, so that one sweep out and one back give the derivatives for every place.
-Source: implicit differentiation; statics as in core.kernel (paper eqs. 6-8).
+Source: implicit differentiation; statics as in core.kernels.reference (paper eqs. 6-8).
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from core.kernel import JIT
 from core.kernels.layout import (
     BEND,
     COG,
@@ -28,6 +27,7 @@ from core.kernels.layout import (
     WRENCH,
     U,
 )
+from core.kernels.reference import JIT
 
 # slots of a record of this workspace; records as in layout
 SWING, GIVE, BODY, PULL, PUSH, SHIFT, TWIST = 0, 9, 12, 15, 18, 21, 24

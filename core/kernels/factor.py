@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from core.kernel import JIT
 from core.kernels.lanes import bends, gather, lanes_of, settle
 from core.kernels.layout import (
     FAST,
@@ -18,6 +17,7 @@ from core.kernels.layout import (
     TCP_ROTATION,
     U,
 )
+from core.kernels.reference import JIT
 from core.kernels.sums import add_products, fold
 
 NUISANCES = 9  # instrument's frame (6), tool point (3)
@@ -130,7 +130,7 @@ def factor_blocks(chain, rows, gap, per_cell, nuisances, first, last, R):  # typ
     """Fold rows first..last of [nuisances | flexibilities | gap], weighed, into R.
 
     ``gap`` and ``per_cell`` (N, 3 or 6); ``nuisances`` 0 or 9 columns; R (k, k) with
-    k = nuisances + 2n + 1. Returns the first row of a block that core.kernel must solve
+    k = nuisances + 2n + 1. Returns the first row of a block that core.kernels.reference must solve
     (a load that bends too far, angles that are no numbers), or -1; R then lacks what follows.
     """
     n, width = chain.mass.shape[0], gap.shape[1]
@@ -179,7 +179,7 @@ def normal_blocks(chain, rows, gap, first, last, G):  # type: ignore[no-untyped-
 def regressor_blocks(chain, rows, first, last, A):  # type: ignore[no-untyped-def]
     """Write the regressor of rows first..last into A (2n, width, N): column after column.
 
-    Returns the first row of a block that core.kernel must solve, or -1.
+    Returns the first row of a block that core.kernels.reference must solve, or -1.
     """
     n, width = chain.mass.shape[0], A.shape[1]
     w, v = lanes_of(n)

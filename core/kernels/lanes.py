@@ -1,10 +1,10 @@
 """Many rows side by side: the exact equilibrium of a block of rows, in loops that vectorise.
 
-The same mechanics as core.kernel, which stays the reference (tests hold both together to 1e-12).
+The same mechanics as reference.py, which stays the reference (tests hold both together to 1e-12).
 LANES rows lie side by side in one workspace, a slot of LANES numbers per quantity, so that each
 loop over the lanes is straight arithmetic at compile-time distances: what a compiler turns into
 vector instructions by itself. Sines come from polynomials for the same reason. Links that bend
-themselves are left to core.kernel.
+themselves are left to core.kernels.reference.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from core.kernel import JIT, TOLERANCE
 from core.kernels.layout import (
     ANGLE,
     BEND,
@@ -42,6 +41,7 @@ from core.kernels.mechanics import (
     sines,
     turn_joint,
 )
+from core.kernels.reference import JIT, TOLERANCE
 
 
 @njit(**JIT)
@@ -179,5 +179,5 @@ def _settled(w, v, n):  # type: ignore[no-untyped-def]
 
 @njit(**JIT)
 def bends(chain):  # type: ignore[no-untyped-def]
-    """Return whether anything in the chain bends; links that do are core.kernel's."""
+    """Return whether anything in the chain bends; links that do are core.kernels.reference's."""
     return np.any(chain.compliance != 0.0) or np.any(chain.base_compliance != 0.0)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.kernel import JIT
+from core.kernels.reference import JIT
 
 FAST = {**JIT, "fastmath": {"contract", "nsz"}}  # nothing that reorders sums
 SUMS = {**JIT, "fastmath": {"contract", "nsz", "reassoc"}}  # sums over lanes, in any order
@@ -23,6 +23,6 @@ RECORD = 31
 # slots of the block beside the records
 MASS, COG, WRENCH, TCP, TCP_ROTATION, TILT, CHANGE = 0, 1, 4, 10, 13, 22, 25
 ROW = 26
-MOST_ROUNDS = 40  # what takes longer is near to buckling, and left to core.kernel
+MOST_ROUNDS = 40  # what takes longer is near to buckling, and left to core.kernels.reference
 STEEPEST = 0.09  # rad2: squared bending up to which the series below are exact to rounding
 FARTHEST = 1e4  # rad: beyond, the reduction to a quarter turn loses digits

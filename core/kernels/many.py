@@ -6,9 +6,9 @@ import numpy as np
 from numba import config
 from numpy.typing import NDArray
 
-from core import kernel
-from core.kernel import Chain, Rows
+from core.kernels import reference as kernel
 from core.kernels.predict import linear_blocks, predict_blocks
+from core.kernels.reference import Chain, Rows
 from core.kernels.threads import in_ranges
 
 Array = NDArray[np.float64]

@@ -1,8 +1,8 @@
 """One row at a time for the loop: the exact equilibrium without a view or a buffer.
 
-The same mechanics as core.kernel, which stays the reference, for arms whose links are stiff. All
-lives in one block per arm (core.packed: chain, row, then a workspace), reached by plain indices: in
-core.kernel most of a row's time goes into views of arrays, not into arithmetic.
+The same mechanics as reference.py, which stays the reference, for arms whose links are stiff. All
+lives in one block per arm (packed.py: chain, row, then a workspace), reached by plain indices: in
+core.kernels.reference most of a row's time goes into views of arrays, not into arithmetic.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from core.kernel import MAX_ITERATIONS, TOLERANCE
 from core.kernels.layout import FAST, U
-from core.packed import sizes_of
+from core.kernels.packed import sizes_of
+from core.kernels.reference import MAX_ITERATIONS, TOLERANCE
 
 # the workspace: a record per joint, the flange's record with the TCP, the Jacobian's columns
 ROTATION, ORIGIN, AXIS, MOMENT, BEND = 0, 9, 12, 15, 18

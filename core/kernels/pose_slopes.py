@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from core.kernel import JIT
 from core.kernels.adjoint import (
     BESIDE,
     BODY,
@@ -36,6 +35,7 @@ from core.kernels.layout import (
     U,
 )
 from core.kernels.rates import slots
+from core.kernels.reference import JIT
 
 _L = LANES
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from core import kernel
-from core.kernel import JIT, Shape
+from core.kernels import reference as kernel
 from core.kernels.factor import flexibility_columns
 from core.kernels.lanes import bends, gather, lanes_of, settle
 from core.kernels.layout import AXIS, LANES, MOMENT, ORIGIN, RECORD, TCP, TCP_ROTATION
+from core.kernels.reference import JIT, Shape
 
 
 @njit(**JIT)
@@ -17,7 +17,7 @@ def predict_blocks(chain, rows, first, last, position, rotation):  # type: ignor
     """Write the TCP poses of rows first..last; returns the first without equilibrium, or -1.
 
     The arm's links must not bend themselves. A block that does not settle at once goes through
-    core.kernel, which says which of its rows it is.
+    core.kernels.reference, which says which of its rows it is.
     """
     n = chain.mass.shape[0]
     w, v = lanes_of(n)
@@ -40,7 +40,7 @@ def predict_blocks(chain, rows, first, last, position, rotation):  # type: ignor
 def linear_blocks(chain, rows, first, last, A, jacobians, moments):  # type: ignore[no-untyped-def]
     """Write what ``kernel.regressor_rows`` does, for rows first..last of links that are stiff.
 
-    Returns -1, or the first row of a block that does not settle at once: core.kernel's from there.
+    Returns -1, or the first row of a block that does not settle at once: reference.py's from there.
     """
     n = chain.mass.shape[0]
     w, v = lanes_of(n)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from core.kernel import JIT
 from core.kernels.layout import FAST, U
+from core.kernels.least_offset import LARGEST_OFFSET, REGULAR, smallest_offset
 from core.kernels.one_row import (
     AXIS,
     FLANGE,
@@ -18,8 +18,8 @@ from core.kernels.one_row import (
     place,
     turn,
 )
-from core.least_offset import LARGEST_OFFSET, REGULAR, smallest_offset
-from core.packed import sizes_of
+from core.kernels.packed import sizes_of
+from core.kernels.reference import JIT
 
 LEVER = 0.5  # m: weighs a rotation against a shift
 TOLERANCE = 1e-9  # m, and rad times the lever: where the pose counts as reached
@@ -117,7 +117,7 @@ def _shortest(b, n, J, e0, e1, e2, e3, e4, e5):  # type: ignore[no-untyped-def]
 
 @njit(**JIT)
 def _damped(b, n, J, e0, e1, e2, e3, e4, e5):  # type: ignore[no-untyped-def]
-    """Write the offset by core.least_offset: singular poses, more than six joints."""
+    """Write the offset by core.kernels.least_offset: singular poses, more than six joints."""
     whole, wanted, found = np.empty((6, n)), np.array([e0, e1, e2, e3, e4, e5]), np.empty(n)
     for i in range(n):
         for k in range(6):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from core.kernel import JIT
 from core.kernels.layout import SUMS, U
+from core.kernels.reference import JIT
 
 
 @njit(**SUMS)

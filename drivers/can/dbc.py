@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drivers.can.document import ProfileError
+from core.files import read_text
+from drivers.profile_file import ProfileError
 
 _MESSAGE = re.compile(r"^\s*BO_\s+\d+\s+(\w+)\s*:")
 _SIGNAL = re.compile(r"^\s+SG_\s+(\w+)\b")
@@ -48,7 +49,7 @@ def read_dbc(path: Path) -> Dbc:
     import cantools
 
     try:
-        text = path.read_text(encoding="cp1252")
+        text = read_text(path, "cp1252")
     except FileNotFoundError:
         raise ProfileError(f"{path}: file not found, expected a DBC") from None
     except (OSError, UnicodeDecodeError) as error:

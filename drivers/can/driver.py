@@ -18,9 +18,9 @@ from core.errors import (
 from core.model import Model
 from core.setpoint import Setpoint
 from core.state import RobotState
+from drivers.can.assembler import Sample
 from drivers.can.loading import read_profile
 from drivers.can.reader import FrameReader
-from drivers.can.sample import Sample
 from drivers.can.settings import CanSettings
 from drivers.can.state import StateBuilder
 from drivers.can.writer import FrameWriter
@@ -41,7 +41,7 @@ class CanDriver(Driver):
 
     def __init__(self, settings: CanSettings, model: Model) -> None:
         profile = read_profile(settings.profile_path, settings.installation)
-        super().__init__(min(settings.rate, profile.rate), profile.n)
+        super().__init__(min(settings.rate, profile.rate), model)
         if model.arm.n != profile.n:
             raise LinkError(
                 f"link.profile: found {profile.n} joints in {profile.name}, the cell's arm has "
@@ -192,7 +192,7 @@ class CanDriver(Driver):
 
     # -- writing ----------------------------------------------------------------------------------
 
-    def arm(self, state: RobotState) -> None:
+    def _make_ready(self, state: RobotState) -> None:
         """Enable the motors where they stand. Raises WriteError, and then nothing is enabled."""
         if not self.profile.writes:
             raise WriteError(f"{self.profile.name}: this profile is read only")
@@ -250,7 +250,7 @@ class CanDriver(Driver):
             f"{time.monotonic() - foreign.seen:.2f} s ago: found two masters, expected one"
         )
 
-    def write_setpoint(self, setpoint: Setpoint) -> None:
+    def _send(self, setpoint: Setpoint) -> None:
         """Send one setpoint whole; needs ``arm`` before. Raises WriteError."""
         if self._armed_at is None:
             raise WriteError(f"{self.profile.name}: found a setpoint, expected arm() first")
@@ -259,7 +259,7 @@ class CanDriver(Driver):
             raise self._commanded_by_another()
         self.writer.write(setpoint.q)
 
-    def release(self) -> None:
+    def _let_go(self) -> None:
         """Let the arm rest where it was last sent, and give the control back."""
         if self._armed_at is None:
             return

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from drivers.can.dbc import Dbc
-from drivers.can.document import ProfileDocument, ProfileError
 from drivers.can.profile import Key
 from drivers.can.schema import ProfileFile
+from drivers.profile_file import ProfileDocument, ProfileError
 
 Keys = tuple[str | int, ...]
 

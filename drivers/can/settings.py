@@ -8,7 +8,7 @@ from typing import Literal, Self
 from pydantic import Field
 
 from core.errors import InputError
-from drivers.can.bus import BusSettings
+from drivers.can_bus.bus import BusSettings
 from drivers.driver import DriverSettings
 
 SHIPPED = Path(__file__).with_name("profiles")
@@ -66,6 +66,12 @@ class CanSettings(DriverSettings, BusSettings):
     def profile_path(self) -> Path:
         """Return the file of the map."""
         return Path(self.profile) if self.names_file else SHIPPED / f"{self.profile}.yaml"
+
+    def read_files(self) -> None:
+        """Read profile and DBC; see DriverSettings."""
+        from drivers.can.loading import read_profile
+
+        read_profile(self.profile_path, self.installation)
 
     def located(self, folder: Path) -> Self:
         """Return the settings with the profile's path seen from ``folder``; see DriverSettings."""

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from core.arm import Arm
 from core.errors import InvalidStateError
-from core.kernel import JIT
+from core.kernels.reference import JIT
 from core.state import RobotState
-from drivers.can.plan import ORDER
+from drivers.can.assembler import Sample
+from drivers.can.codec import ORDER
 from drivers.can.profile import CanProfile
-from drivers.can.sample import Sample
 
 Vector = NDArray[np.float64]
 FASTEST = 20.0  # rad/s: joints that move faster between two samples are a mistake

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import PartialWriteError, WriteError
-from drivers.can.bus import first_line
-from drivers.can.plan import Writing
+from drivers.can.codec import Writing
 from drivers.can.profile import Action, CanProfile, Key, Outgoing
 from drivers.can.settings import CanSettings
+from drivers.can_bus.bus import first_line
 
 Vector = NDArray[np.float64]
 Frames = list[tuple[Key, bytes]]

@@ -40,7 +40,7 @@ class CanopenDriver(Driver):
 
     def __init__(self, settings: CanopenSettings, model: Model) -> None:
         self.profile = read_profile(settings.profile_path, model.arm.n)
-        super().__init__(settings.rate, model.arm.n)
+        super().__init__(settings.rate, model)
         fastest = 1.0 / self.profile.file.sync_period
         if settings.rate > fastest * (1.0 + 1e-9):
             raise InputError(
@@ -182,7 +182,7 @@ class CanopenDriver(Driver):
             f"{time.monotonic() - foreign.seen:.2f} s ago: found two masters, expected one"
         )
 
-    def arm(self, state: RobotState) -> None:
+    def _make_ready(self, state: RobotState) -> None:
         """Enable the drives where they stand. Raises WriteError, and then none is enabled."""
         if self._armed_at is not None:
             return
@@ -234,7 +234,7 @@ class CanopenDriver(Driver):
         self._armed_at = self._moved_at = self._fresh_at = time.monotonic()
         self._builder.forget()
 
-    def write_setpoint(self, setpoint: Setpoint) -> None:
+    def _send(self, setpoint: Setpoint) -> None:
         """Send one setpoint, which counts at the next SYNC; needs ``arm`` before."""
         sample = self.rhythm.sample
         if self._armed_at is None or sample is None:
@@ -251,7 +251,7 @@ class CanopenDriver(Driver):
             )
         self.writer.send([self.power.following] * self.n, setpoint.q)
 
-    def release(self) -> None:
+    def _let_go(self) -> None:
         """Quick stop, then switch the drives off and give them back their mode."""
         if self._armed_at is None:
             return

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from drivers.can.bus import first_line
-from drivers.can.document import ProfileError
+from core.files import read_text
+from drivers.can_bus.bus import first_line
 from drivers.canopen.objects import Address
+from drivers.profile_file import ProfileError
 
 SUFFIXES = (".eds", ".dcf")
 
@@ -65,7 +67,9 @@ def _import(path: Path, node: int) -> Any:
     import canopen
 
     try:
-        return canopen.import_od(str(path), node)
+        text = io.StringIO(read_text(path))
+        text.name = str(path)  # the library tells the kind of file by it
+        return canopen.import_od(text, node)
     except FileNotFoundError:
         raise ProfileError(f"{path}: file not found, expected an EDS") from None
     except OSError as error:

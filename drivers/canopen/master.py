@@ -14,7 +14,7 @@ from typing import Any
 import canopen
 
 from core.errors import LinkError
-from drivers.can.bus import close_bus, first_line, open_bus
+from drivers.can_bus.bus import close_bus, first_line, open_bus
 from drivers.canopen.allowed import AllowedFrames
 from drivers.canopen.listening import BusListener, Life
 from drivers.canopen.objects import HEARTBEAT_BASE, SYNC, Address

@@ -8,7 +8,8 @@ from typing import Literal, Self
 from pydantic import Field
 
 from core.errors import InputError
-from drivers.can.bus import BusSettings
+from core.files import read_bytes
+from drivers.can_bus.bus import BusSettings
 from drivers.driver import DriverSettings
 
 SHIPPED = Path(__file__).with_name("profiles")
@@ -59,6 +60,12 @@ class CanopenSettings(DriverSettings, BusSettings):
     def profile_path(self) -> Path:
         """Return the file of the profile."""
         return Path(self.profile) if self.names_file else SHIPPED / f"{self.profile}.yaml"
+
+    def read_files(self) -> None:
+        """Read profile and EDS; see DriverSettings."""
+        from drivers.canopen.profile import read_profile
+
+        read_bytes(read_profile(self.profile_path).eds.path)
 
     def located(self, folder: Path) -> Self:
         """Return the settings with the profile's path seen from ``folder``; see DriverSettings."""

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import LinkError
-from drivers.can.bus import close_bus, first_line, open_bus
+from drivers.can_bus.bus import close_bus, first_line, open_bus
 from drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
 from drivers.ft_sensor.settings import AtiSettings
 

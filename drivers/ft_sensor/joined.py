@@ -28,7 +28,8 @@ class DriverWithSensor(Driver):
     """
 
     def __init__(self, arm: Driver, settings: FtSensorSettings, model: Model) -> None:
-        super().__init__(arm.rate, arm.n, arm.moves_arm)
+        super().__init__(arm.rate, model, arm.moves_arm)
+        self.gate = arm.gate
         self.settings = settings
         self._arm = arm
         self._reader = SensorReader(make_sensor(settings), settings)
@@ -72,7 +73,15 @@ class DriverWithSensor(Driver):
         """See Driver.keep_alive."""
         self._arm.keep_alive()
 
-    def write_setpoint(self, setpoint: Setpoint) -> None:
+    def round_trip(self) -> float | None:
+        """See Driver.round_trip."""
+        return self._arm.round_trip()
+
+    def mismatch(self) -> str | None:
+        """See Driver.mismatch."""
+        return self._arm.mismatch()
+
+    def _send(self, setpoint: Setpoint) -> None:
         """Send one setpoint to the arm."""
         self._arm.write_setpoint(setpoint)
 
@@ -83,7 +92,7 @@ class DriverWithSensor(Driver):
         finally:
             self._reader.stop()
 
-    def arm(self, state: RobotState) -> None:
+    def _make_ready(self, state: RobotState) -> None:
         """Make the arm ready, and see that the sensor has not been held up by it."""
         self._arm.arm(state)
         if not self._reader.wait(self.settings.connect_timeout):
@@ -92,7 +101,7 @@ class DriverWithSensor(Driver):
                 "arming (ft_sensor.connect_timeout)"
             )
 
-    def release(self) -> None:
+    def _let_go(self) -> None:
         """Stop writing to the arm."""
         self._arm.release()
 

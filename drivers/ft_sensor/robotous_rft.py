@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from core.errors import LinkError
-from drivers.can.bus import close_bus, first_line, open_bus
+from drivers.can_bus.bus import close_bus, first_line, open_bus
 from drivers.ft_sensor.clock_offset import ClockOffset
 from drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
 from drivers.ft_sensor.settings import RobotousSettings

@@ -17,7 +17,7 @@ Vector = NDArray[np.float64]
 class Reading:
     """One sample of a sensor: what the load does to it.
 
-    A tool that hangs on the sensor at rest reads its weight, pointing down (CONTRACT,
+    A tool that hangs on the sensor at rest reads its weight, pointing down (docs/conventions.md,
     ``ft_raw_wrench``); ``settings.sign`` turns sensors around that report the reaction.
     """
 

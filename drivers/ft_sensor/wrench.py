@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core import kernel
-from core.dynamics import SENSING
-from core.effects import CATALOGUE
+from core.effects import CATALOGUE, acting
+from core.kernels import reference as kernel
 from core.loads import Loads
 from core.model import Model
 from core.motion import Motion
@@ -16,7 +15,6 @@ from core.state import RobotState
 from drivers.ft_sensor.settings import SensorFrame
 
 Array = NDArray[np.float64]
-UNDONE = ("ft_misalignment", "ft_gain", "ft_bias")  # a drift needs the time of its log
 
 
 def sensor_to_flange(frame: SensorFrame) -> Array:
@@ -82,10 +80,11 @@ def _cross(a: Array, b: Array) -> Array:
 def _undoing(model: Model) -> tuple[Array, Array]:
     """Return matrix (6, 6) and bias (6,): what acts = matrix (reading - bias)."""
     probes = np.vstack([np.zeros((1, 6)), np.eye(6)])
-    for effect in SENSING:
-        if effect in UNDONE:
-            for term in (t for t in model.terms if t.effect == effect):
-                probes = CATALOGUE[effect].sense(term, model.arm, probes, _standing(model))
+    for term in acting(model.terms, "wrench"):
+        effect = CATALOGUE[term.effect]
+        # the sensor's own; a drift needs the time of its log
+        if effect.channels == ("wrench",) and "timestamp" not in effect.needs:
+            probes = effect.sense(term, model.arm, probes, _standing(model))
     bias = probes[0]
     return np.linalg.inv((probes[1:] - bias).T), bias
 

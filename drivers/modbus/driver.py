@@ -21,7 +21,7 @@ from drivers.modbus.registers import UNITS
 from drivers.modbus.settings import ModbusSettings
 from drivers.modbus.transport import Transport
 from drivers.modbus.write import make_writer
-from drivers.ur_rtde.nominal import Nominal
+from drivers.offset_inverse import Nominal
 
 Vector = NDArray[np.float64]
 SLOW_EVERY = 0.2  # s between two readings of conditions that lie apart
@@ -37,7 +37,7 @@ class ModbusDriver(Driver):
 
     def __init__(self, settings: ModbusSettings, model: Model) -> None:
         self.profile = profile = read_profile(settings.profile_path, model.arm.n)
-        super().__init__(settings.rate, model.arm.n, profile.write.mode != "mailbox")
+        super().__init__(settings.rate, model, profile.write.mode != "mailbox")
         self.settings = settings
         self.map = compile_map(profile)
         device = profile.device_id if settings.device_id is None else settings.device_id
@@ -46,7 +46,9 @@ class ModbusDriver(Driver):
         self._model = model
         self._decoder = Decoder(profile, self.map)
         self._freshness = Freshness(profile)
-        self._writer = make_writer(profile, self.transport, model)
+        self._writer = make_writer(
+            profile, self.transport, self._rates, 0.5 * settings.connect_timeout
+        )
         self._nominal = None if self.moves_arm else Nominal(model)
         self._first_block, *self._other_blocks = self.map.fast
         self._slow: list[bytes] = []
@@ -61,6 +63,7 @@ class ModbusDriver(Driver):
         self._longest_answer = max(LONGEST_ANSWER / self.rate, LEAST_ANSWER)  # s
         self._given = 0.0  # s, monotonic: when the last setpoint was given
         self._connected = False
+        self._answer: float | None = None  # s that the last question and its answer took
 
     # -- reading ----------------------------------------------------------------------------------
 
@@ -132,7 +135,8 @@ class ModbusDriver(Driver):
             sample = self._decoder.decode(self._read_blocks())
         except StaleStateError:
             return None
-        return None if time.monotonic() - asked > self._longest_answer else sample
+        self._answer = time.monotonic() - asked
+        return None if self._answer > self._longest_answer else sample
 
     def _read_blocks(self) -> list[bytes]:
         """Return the registers of one cycle: one block, where the profile's map allows it."""
@@ -205,9 +209,13 @@ class ModbusDriver(Driver):
             return state.target_q
         return self._nominal.without(state.target_q, self._sample.vectors["echo"])
 
+    def round_trip(self) -> float | None:
+        """Return how long the last reading took, s; see Driver.round_trip."""
+        return self._answer
+
     # -- writing ----------------------------------------------------------------------------------
 
-    def arm(self, state: RobotState) -> None:
+    def _make_ready(self, state: RobotState) -> None:
         """Check robot and resolution, and make ready for writing; moves nothing."""
         name = self.transport.name
         if self.profile.write.mode != "read_only":
@@ -216,6 +224,10 @@ class ModbusDriver(Driver):
                 raise WriteError(f"{name}: the robot is not ready: {words}")
             self._check_resolution(state.actual_q)
         self._writer.arm(state, self._look)
+
+    def _rates(self) -> tuple[float, float]:
+        """Return the cell's rates of the offset, m/s and rad/s."""
+        return self.gate.bounds.offset_rate, self.gate.bounds.offset_rotation_rate
 
     def _look(self) -> Sample:
         try:
@@ -252,7 +264,7 @@ class ModbusDriver(Driver):
         tool = self._model.tool_in_flange[:3, 3]
         return float(np.linalg.norm(links, axis=1).sum() + np.linalg.norm(tool))
 
-    def write_setpoint(self, setpoint: Setpoint) -> None:
+    def _send(self, setpoint: Setpoint) -> None:
         """Send one setpoint; needs ``arm`` before.
 
         With a mailbox and function 23 it leaves together with the next reading.
@@ -267,8 +279,8 @@ class ModbusDriver(Driver):
         except LinkError as error:
             raise WriteError(str(error)) from None
 
-    def release(self) -> None:
-        """Stop writing: an offset of zero, or the controller's stop."""
+    def _let_go(self) -> None:
+        """Stop writing: no heartbeat any more, or the controller's stop."""
         try:
             self._writer.release()
         except WriteError:

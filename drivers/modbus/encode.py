@@ -1,4 +1,4 @@
-"""Numbers -> registers: joint targets, the mailbox's nine registers, and a vector's whole row."""
+"""Numbers -> registers: joint targets, the mailbox's eleven registers, and a vector's whole row."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ SEQUENCES = 0x8000  # sequence numbers and heartbeats run from 1 to this less on
 MODULUS, SEED = 65521, 0x4742  # of the checksum: the largest prime below 65536
 
 LARGEST = 0x7FFF  # counts
+RATE_COUNTS = 2.0e-5, 1.0e-4  # m/s and rad/s per count of the cell's rates
 
 ABSENT, RUNNING, EXPIRED, REJECTED = 0, 1, 2, 3  # what the robot's program says of itself
 
@@ -50,9 +51,26 @@ def units_of(box: Mailbox) -> tuple[float, ...]:
     return (box.length_count,) * 3 + (box.angle_count,) * 3
 
 
-def mailbox_words(sequence: int, counts: Sequence[int], heartbeat: int) -> list[int]:
-    """Return the nine registers of a mailbox: sequence, offset, heartbeat, checksum."""
-    words = [sequence, *[c & 0xFFFF for c in counts], heartbeat]
+def rate_counts(rates: Sequence[float]) -> list[int]:
+    """Return the cell's rates, m/s and rad/s, in counts, rounded down: the program is no faster.
+
+    Raises ValueError for what rounds down to nothing.
+    """
+    found: list[int] = []
+    for name, rate, count in zip(
+        ("offset_rate", "offset_rotation_rate"), rates, RATE_COUNTS, strict=True
+    ):
+        found.append(min(int(rate / count * (1.0 + 1e-9)), 0xFFFF))
+        if found[-1] < 1:
+            raise ValueError(f"{name}: found {rate:g}, expected {count:g} at least")
+    return found
+
+
+def mailbox_words(
+    sequence: int, counts: Sequence[int], heartbeat: int, rates: Sequence[int]
+) -> list[int]:
+    """Return the eleven registers of a mailbox: sequence, offset, heartbeat, rates, checksum."""
+    words = [sequence, *[c & 0xFFFF for c in counts], heartbeat, *rates]
     return [*words, checksum(words)]
 
 

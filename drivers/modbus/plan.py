@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.kernel import JIT
+from core.kernels.reference import JIT
 from drivers.modbus.registers import Coding
 
 Array = NDArray[np.float64]

@@ -11,12 +11,12 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from drivers.can.document import ProfileDocument, ProfileError, read_profile_document
 from drivers.modbus.registers import BIT_TABLES, LAST_ADDRESS, UNITS, Table
 from drivers.modbus.schema import Condition, Order, Place, ProfileFile, Turns, Vector
+from drivers.profile_file import ProfileDocument, ProfileError, read_profile_document
 
 Keys = tuple[str | int, ...]
-MAILBOX_WORDS, ECHO_WORDS = 9, 8
+MAILBOX_WORDS, ECHO_WORDS = 11, 8
 KINDS = {
     "position": "angle", "velocity": "speed", "target": "angle", "joint_torque": "torque",
     "temperature": "temperature", "force": "force", "moment": "torque",

@@ -101,7 +101,7 @@ class Mailbox(Section):
 
     mode: Literal["mailbox"]
     table: Literal["holding"] = "holding"
-    address: Address = Field(description="of the first of 9 registers")
+    address: Address = Field(description="of the first of 11 registers")
     echo_table: Literal["holding", "input"] = "holding"
     echo_address: Address = Field(description="of the first of 8 registers of the robot's answer")
     length_count: Positive = Field(default=1.0e-6, description="m per count")

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import ForeignCommandError, IneffectiveWriteError, StaleStateError, WriteError
-from core.model import Model
 from core.setpoint import Setpoint
 from core.state import RobotState
 from drivers.modbus import encode
@@ -24,6 +23,7 @@ from drivers.modbus.schema import Mailbox, Order, ProfileFile, ReadOnly, TargetT
 from drivers.modbus.transport import Transport
 
 Array = NDArray[np.float64]
+Rates = Callable[[], tuple[float, float]]
 ANNOUNCE = 0.02  # s between two heartbeats while arming
 NEAR = 2.0  # counts: how near a target must be come to
 
@@ -47,11 +47,17 @@ class Writer(Protocol):
         """Return the joints (n,) rad sent last, None where there are none."""
 
 
-def make_writer(profile: ProfileFile, transport: Transport, model: Model) -> Writer:
-    """Return the writer of a profile."""
+def make_writer(
+    profile: ProfileFile, transport: Transport, rates: Rates, patience: float
+) -> Writer:
+    """Return the writer of a profile.
+
+    ``rates`` gives the cell's, m/s and rad/s; ``patience``: s until what an owner before has left
+    must be out of the arm.
+    """
     write = profile.write
     if isinstance(write, Mailbox):
-        return MailboxWriter(write, transport, profile.function_23)
+        return MailboxWriter(write, transport, profile.function_23, rates, patience)
     if isinstance(write, TargetTrigger):
         return TargetWriter(write, transport)
     return ReadOnlyWriter(profile, write, transport)
@@ -85,10 +91,18 @@ class ReadOnlyWriter:
 
 
 class MailboxWriter:
-    """Offsets in nine registers; a program on the robot checks, applies and answers them."""
+    """Offsets in eleven registers; a program on the robot checks, applies and answers them.
 
-    def __init__(self, box: Mailbox, transport: Transport, together: bool) -> None:
+    The cell's rates go with them: the program takes offsets in and out no faster, also when nobody
+    sends any more.
+    """
+
+    def __init__(
+        self, box: Mailbox, transport: Transport, together: bool, rates: Rates, patience: float
+    ) -> None:
         self._box, self._transport, self._together = box, transport, together
+        self._patience = patience
+        self._cell_rates, self._rates = rates, [0, 0]
         self._units = encode.units_of(box)
         self._armed = False
         self._sequence = self._heartbeat = 0
@@ -99,7 +113,14 @@ class MailboxWriter:
         self._pending: list[int] | None = None
 
     def arm(self, state: RobotState, look: Callable[[], Sample]) -> None:
-        """Send offsets of zero until the robot's program answers them. Raises WriteError."""
+        """Send offsets of zero until the robot's program answers them. Raises WriteError.
+
+        Before, wait until the program has taken out what was left of an offset.
+        """
+        try:
+            self._rates = encode.rate_counts(self._cell_rates())
+        except ValueError as error:
+            raise WriteError(f"limits.{error}: what the robot's program can be told") from None
         number, says = look().answer or (0, 0)
         if says == encode.ABSENT:
             raise WriteError(
@@ -107,6 +128,7 @@ class MailboxWriter:
                 f"found {says}, expected a running mailbox program on the robot "
                 "(docs/porting.md)"
             )
+        number = self._wait_bare(look)
         # a number that the program cannot take for the one it has seen last
         self._sequence = (number + encode.SEQUENCES // 4) % (encode.SEQUENCES - 1) + 1
         self._counts = [0] * 6
@@ -120,6 +142,25 @@ class MailboxWriter:
                 raise WriteError(self._silence(*answer))
             time.sleep(ANNOUNCE)
         self._awaited, self._sent, self._armed = 0, 0, True
+
+    def _wait_bare(self, look: Callable[[], Sample]) -> int:
+        """Wait for the end of an offset that somebody left; returns the number of the echo.
+
+        Raises WriteError.
+        """
+        until = time.monotonic() + self._patience
+        while True:
+            sample = look()
+            length = float(np.abs(sample.vectors["echo"]).max())
+            if length == 0.0:
+                return (sample.answer or (0, 0))[0]
+            if time.monotonic() > until:
+                raise WriteError(
+                    f"{self._transport.name}: the robot's program still applies an offset of "
+                    f"{1e3 * length:.3f} mm or mrad, expected none before arming: it takes it out "
+                    "by itself, at the rates it was last told"
+                )
+            time.sleep(ANNOUNCE)
 
     def write(self, setpoint: Setpoint, sample: Sample) -> None:
         """Send one offset. Raises WriteError where the program does not take them."""
@@ -149,7 +190,7 @@ class MailboxWriter:
 
     def _words(self) -> list[int]:
         self._heartbeat = encode.next_number(self._heartbeat)
-        return encode.mailbox_words(self._sequence, self._counts, self._heartbeat)
+        return encode.mailbox_words(self._sequence, self._counts, self._heartbeat, self._rates)
 
     def _send(self, words: list[int]) -> None:
         """Write a mailbox of zeros; a lost one once more."""
@@ -191,13 +232,14 @@ class MailboxWriter:
         return None if words is None else (self._box.address, words)
 
     def release(self) -> None:
-        """Leave a zero offset behind; without a heartbeat the program keeps to zero by itself."""
-        if not self._armed:
-            return
-        self._armed, self._pending = False, None
-        self._counts = [0] * 6
-        self._sequence = encode.next_number(self._sequence)
-        self._send(self._words())
+        """Send nothing more: without a heartbeat the program takes out what is left of an offset.
+
+        At the rates it was told; a zero from here would be a step.
+        """
+        self._armed, pending, self._pending = False, self._pending, None
+        if pending is not None and not any(self._counts):
+            # the last setpoint of a ramp, which would have left with the next reading
+            self._transport.write("holding", self._box.address, pending)
 
     def target(self) -> Array | None:
         """Return None: the joints are the robot's own."""

@@ -11,9 +11,9 @@ import threading
 from dataclasses import replace
 
 from core.errors import GapbridgeError
-from drivers.simulated import settings as defaults
-from drivers.simulated.server import serve
-from drivers.simulated.settings import ServerSettings, from_json, simulated_cell
+from drivers.simulated.ur import settings as defaults
+from drivers.simulated.ur.server import serve
+from drivers.simulated.ur.settings import ServerSettings, from_json, simulated_cell
 
 
 def _parser() -> argparse.ArgumentParser:

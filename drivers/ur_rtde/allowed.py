@@ -18,7 +18,13 @@ CONTROL = (
 )  # fmt: skip
 DOUBLES = frozenset(registers.OFFSET_DOUBLES)
 INTEGERS = frozenset(
-    (registers.OFFSET_RZ, registers.SEQUENCE, registers.CHECKSUM, registers.HEARTBEAT)
+    (
+        registers.OFFSET_RZ,
+        registers.SEQUENCE,
+        registers.CHECKSUM,
+        registers.HEARTBEAT,
+        registers.RATES,
+    )
 )
 
 

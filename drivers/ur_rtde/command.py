@@ -8,6 +8,7 @@ follow a setpoint, the sequence number that comes back.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -26,14 +27,15 @@ SAFE = (1, 2)  # safety_mode: normal, reduced
 NO_REMOTE_CHECK = 0x80  # FLAG_DISABLE_REMOTE_CONTROL_CHECK
 KICK = 0.02  # s between kicks of the watchdog
 FOLLOWING = 0.02  # rad: how near the controller's target must come to a setpoint
+LOOKS, ANNOUNCED = 8, 0.3  # samples in which a first offset comes back; s until it is given up
 DECIMATION, KEPT = 5, 64  # setpoints between two remembered ones; how many are remembered
 
 
 class Writer(Protocol):
     """The writing half of a link."""
 
-    def arm(self, state: RobotState) -> None:
-        """Make ready; moves nothing. Raises WriteError."""
+    def arm(self, state: RobotState, look: Callable[[], None]) -> None:
+        """Make ready; moves nothing. ``look`` reads a sample. Raises WriteError."""
 
     def keep_alive(self) -> None:
         """Feed the robot's watchdog, which may wait for the robot. Raises WriteError."""
@@ -77,7 +79,7 @@ class ServoWriter:
         self._sent_at = np.zeros(KEPT)
         self._count = 0
 
-    def arm(self, state: RobotState) -> None:
+    def arm(self, state: RobotState, look: Callable[[], None]) -> None:
         """Upload the control script and start the robot's watchdog. Raises WriteError."""
         host = self._settings.host
         check_ready(host, state)
@@ -203,20 +205,25 @@ class OffsetWriter:
     """Offsets in RTDE input registers, applied by the robot's own program.
 
     One call sends one register, so an offset arrives in nine packets; the sequence number goes
-    last, and the checksum tells the program whether they belong together.
+    last, and the checksum tells the program whether they belong together. ``rates`` (m/s, rad/s)
+    are the cell's: the program takes offsets in and out no faster, also when nobody sends any more.
     """
 
-    def __init__(self, settings: UrRtdeSettings) -> None:
-        self._settings = settings
+    def __init__(self, settings: UrRtdeSettings, rates: Callable[[], tuple[float, float]]) -> None:
+        self._settings, self._cell_rates = settings, rates
         self._io: Any = None
-        self._sequence = 0
+        self._sequence = self._rates = 0
         self._awaited = 0  # a sequence number that has not come back yet
         self._awaited_since = 0.0
         self.echo = 0
         self.program = 0
+        self.applied: Sequence[float] | np.ndarray = ()
 
-    def arm(self, state: RobotState) -> None:
-        """Open the registers. Raises WriteError where the robot's program is not there."""
+    def arm(self, state: RobotState, look: Callable[[], None]) -> None:
+        """Open the registers and tell the rates. Raises WriteError where the program is not there.
+
+        Waits until the program has taken out what was left of an offset, and sends one of zero.
+        """
         host = self._settings.host
         check_ready(host, state)
         if self.program == Program.ABSENT or state.runtime_state != PLAYING:
@@ -225,18 +232,61 @@ class OffsetWriter:
                 f"runtime_state {state.runtime_state}, expected a running robot program that holds "
                 "gapbridge_offset.script"
             )
+        try:
+            self._rates = registers.rates(*self._cell_rates())
+        except ValueError as error:
+            raise WriteError(f"limits.{error}: what the robot's program can be told") from None
+        self._wait_bare(look)
         if self._io is None:
-            try:
-                from rtde_io import RTDEIOInterface
-
-                self._io = AllowedInputs(host, RTDEIOInterface(host))
-                send_at_once()
-            except Exception as error:
-                words = str(error).strip().splitlines() or [type(error).__name__]
-                raise WriteError(f"{host}: {words[0].strip()}") from None
+            self._io = self._open()
         # a number that the program cannot take for the one it has seen last
         self._sequence = (self.echo + registers.LAST_SEQUENCE // 4) % registers.LAST_SEQUENCE
         self._awaited = 0
+        self._announce(look)
+
+    def _open(self) -> AllowedInputs:
+        host = self._settings.host
+        try:
+            from rtde_io import RTDEIOInterface
+
+            io = AllowedInputs(host, RTDEIOInterface(host))
+            send_at_once()
+        except Exception as error:
+            words = str(error).strip().splitlines() or [type(error).__name__]
+            raise WriteError(f"{host}: {words[0].strip()}") from None
+        return io
+
+    def _wait_bare(self, look: Callable[[], None]) -> None:
+        """Wait for the program to take out the offset of whoever ended before, at that one's rates.
+
+        Raises WriteError.
+        """
+        until = time.monotonic() + 0.5 * self._settings.connect_timeout
+        while (length := float(np.abs(self.applied).max(initial=0.0))) > registers.UNIT:
+            if time.monotonic() > until:
+                raise WriteError(
+                    f"{self._settings.host}: the robot's program still applies an offset of "
+                    f"{1e3 * length:.3f} mm or mrad, expected none before arming: it takes it out "
+                    "by itself, at the rates it was last told"
+                )
+            look()
+
+    def _announce(self, look: Callable[[], None]) -> None:
+        """Send rates and an offset of zero until the program answers. Raises WriteError."""
+        self._set(lambda io: io.setInputIntRegister(registers.RATES, self._rates))
+        until = time.monotonic() + max(self._settings.echo, ANNOUNCED)
+        while True:
+            self._sequence = registers.next_sequence(self._sequence)
+            first = self._sequence
+            self._send([0] * 6)
+            for _ in range(LOOKS):
+                look()
+                if registers.reached(self.echo, first):
+                    return
+            if time.monotonic() > until:
+                raise WriteError(
+                    f"{self._silence()}: is it the gapbridge_offset.script of this version?"
+                )
 
     def keep_alive(self) -> None:
         """Do nothing: the sequence number of each offset is the heartbeat."""
@@ -252,15 +302,22 @@ class OffsetWriter:
         self._send(registers.counts(setpoint.offset_in_base.tolist()))
 
     def _send(self, units: list[int]) -> None:
-        io, sequence = self._io, self._sequence
-        fine = True
+        self._set(lambda io: self._fill(io, units))
+
+    def _fill(self, io: Any, units: list[int]) -> bool:
+        sequence, fine = self._sequence, True
+        total = registers.checksum(units, sequence, self._rates)
+        for register, count in zip(registers.OFFSET_DOUBLES, units[:5], strict=True):
+            fine &= io.setInputDoubleRegister(register, count * registers.UNIT)
+        fine &= io.setInputIntRegister(registers.OFFSET_RZ, units[5])
+        fine &= io.setInputIntRegister(registers.CHECKSUM, total)
+        fine &= io.setInputIntRegister(registers.HEARTBEAT, sequence)
+        fine &= io.setInputIntRegister(registers.SEQUENCE, sequence)
+        return bool(fine)
+
+    def _set(self, fill: Callable[[Any], bool]) -> None:
         try:
-            for register, count in zip(registers.OFFSET_DOUBLES, units[:5], strict=True):
-                fine &= io.setInputDoubleRegister(register, count * registers.UNIT)
-            fine &= io.setInputIntRegister(registers.OFFSET_RZ, units[5])
-            fine &= io.setInputIntRegister(registers.CHECKSUM, registers.checksum(units, sequence))
-            fine &= io.setInputIntRegister(registers.HEARTBEAT, sequence)
-            fine &= io.setInputIntRegister(registers.SEQUENCE, sequence)
+            fine = fill(self._io)
         except Exception as error:
             raise WriteError(f"{self._settings.host}: registers: {error}") from None
         if not fine:
@@ -275,18 +332,21 @@ class OffsetWriter:
             return
         late = time.monotonic() - self._awaited_since
         if late > self._settings.echo:
-            reason = Program(self.program).name if self.program in (0, 1, 2, 3) else self.program
-            raise WriteError(
-                f"{self._settings.host}: offsets do not arrive: number {self._awaited} was sent "
-                f"{late:.3f} s ago, {self.echo} came back last, the robot's program says {reason}"
-            )
+            raise WriteError(f"{self._silence()} (sent {late:.3f} s ago)")
+
+    def _silence(self) -> str:
+        reason = Program(self.program).name if self.program in (0, 1, 2, 3) else self.program
+        return (
+            f"{self._settings.host}: offsets do not arrive: number "
+            f"{self._awaited or self._sequence} was sent, {self.echo} came back last, the robot's "
+            f"program says {reason}"
+        )
 
     def release(self) -> None:
-        """Leave a zero offset behind; without a heartbeat the program keeps to zero by itself."""
-        if self._io is None:
-            return
-        self._sequence = registers.next_sequence(self._sequence)
-        self._send([0] * 6)
+        """Send nothing more: without a heartbeat the program takes out what is left of an offset.
+
+        At the rates it was told; a zero from here would be a step.
+        """
 
     def abandon(self) -> None:
         """Let go of the library's object, whose destruction on a dead link aborts the process."""

@@ -18,7 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from core.errors import InvalidStateError, LinkError, StaleStateError
-from core.kernel import JIT
+from core.kernels.reference import JIT
 from core.state import RobotState
 from drivers.ur_rtde.registers import APPLIED, ECHO, PROGRAM
 from drivers.ur_rtde.settings import UrRtdeSettings
@@ -248,7 +248,22 @@ class StateReader:
 
     def tcp_pose(self) -> Vector | None:
         """Return the controller's own TCP pose (6,) in base, m and rotation vector, or None."""
-        return np.array(self._receive.getActualTCPPose()) if self._has_pose else None
+        found = self.joints_and_tcp()
+        return None if found is None else found[1]
+
+    def joints_and_tcp(self) -> tuple[Vector, Vector] | None:
+        """Return joints (6,) and the controller's own TCP pose (6,) of one sample, or None.
+
+        The pose is in base, m and rotation vector. None where the controller does not tell it, or
+        a new sample came between the two each time.
+        """
+        receive = self._receive
+        for _ in range(ATTEMPTS if self._has_pose else 0):
+            before = receive.getTimestamp()
+            found = receive.getActualQ(), receive.getActualTCPPose()
+            if receive.getTimestamp() == before:
+                return np.array(found[0]), np.array(found[1])
+        return None
 
 
 def _is_optional(name: str) -> bool:

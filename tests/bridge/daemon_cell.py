@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.cell import load_cell
-from bridge.daemon import Daemon, settings_of
-from bridge.summary import RunSummary
-from bridge.supervisor import State
-from core.recording.reading import read_columns
-from drivers.simulated.process import SimulatedController
-from drivers.simulated.settings import BENCH_PORT, ServerSettings, simulated_cell
+from bridge.daemon.daemon import Daemon, settings_of
+from bridge.daemon.summary import RunSummary
+from bridge.loop.supervisor import State
+from core.log.mcap_reading import read_columns
+from drivers.simulated.ur.process import SimulatedController
+from drivers.simulated.ur.settings import BENCH_PORT, ServerSettings, simulated_cell
 from drivers.ur_rtde.driver import OFFSET_SCRIPT
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ import numpy as np
 from core.arm import builtin_arm
 from core.diagnosis.diagnosis import Diagnosis, diagnose
 from core.effects import Site, Term
-from core.log import Log
+from core.log.log import Log
 from core.metrology import Metrology
 from core.model import Model
 

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.cell import load_cell
-from bridge.daemon_settings import DaemonSettings
-from bridge.shared_page import Page, Phase
-from bridge.side_process import SideProcess
-from bridge.supervisor import State
+from bridge.cell.daemon_settings import DaemonSettings
+from bridge.ipc.shared_memory import Page, Phase
+from bridge.ipc.side_process import SideProcess
+from bridge.loop.supervisor import State
 
 Array = NDArray[np.float64]
 N, RATE = 6, 125.0

@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from core.arm import Arm
 from core.effects import CATALOGUE
-from core.log import Log
+from core.log.log import Log
 from core.model import Model
 from core.urdf import arm_from_urdf
 

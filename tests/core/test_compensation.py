@@ -20,7 +20,7 @@ from core.compensation import (
     wanted_pose,
 )
 from core.effects import Site, Term
-from core.least_offset import smallest_offset
+from core.kernels.least_offset import smallest_offset
 from core.loads import Loads
 from core.model import Model
 from core.rotation import rotation_matrix, rotation_vector

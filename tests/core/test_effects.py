@@ -8,11 +8,16 @@ import pytest
 from test_equilibrium import SEVEN
 
 from core.arm import arm_from_dh, builtin_rows
+from core.dynamics import predict_torque, predict_tracking, predict_wrench, with_pieces
 from core.effects import CATALOGUE, CHANNELS, Site, Term, effect_named
 from core.errors import InputError
+from core.loads import Loads
+from core.log.log import Log
+from core.model import Model
+from core.motion import motion_of
 
 DH = {"ur10e": builtin_rows("ur10e")["dh"], "seven": SEVEN}
-WITHOUT_UNIT = ("ft_gain", "link_inertia", "torque_constant")  # shares of what is there
+WITHOUT_UNIT = ("ft_gain", "link_inertia", "load_friction", "torque_constant")  # shares
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
@@ -75,3 +80,47 @@ def test_an_unknown_effect_names_the_nearest():
     assert effect_named("backlash") is CATALOGUE["backlash"]
     with pytest.raises(InputError, match="known: joint_offset"):
         effect_named("zzzz")
+
+
+def _moving_rows(arm):
+    """Return the motion of a log in which every joint moves both ways under a load."""
+    t = np.arange(0, 4, 0.01)
+    q = 0.8 * np.sin(t[:, None] * (1 + 0.2 * np.arange(arm.n)) + np.arange(arm.n))
+    columns = {"timestamp": t, "actual_q": q, "target_q": q}
+    return motion_of(Log("moving.csv", columns, arm.n))
+
+
+def _at_rest(arm):
+    rng = np.random.default_rng(0)
+    loads = Loads(
+        payload_mass=rng.uniform(1, 4, 20), payload_cog=rng.normal(0, 0.05, (20, 3)),
+        wrench=rng.normal(0, 20, (20, 6)), temperature=rng.uniform(15, 45, (20, arm.n)),
+        approach=rng.choice([-1.0, 1.0], (20, arm.n)),
+    )  # fmt: skip
+    return rng.uniform(-2, 2, (20, arm.n)), loads
+
+
+def _predicted(channel, model, terms):
+    if channel == "position":
+        return model.with_terms(terms).predict(*_at_rest(model.arm)).position
+    how = {"wrench": predict_wrench, "tracking": predict_tracking, "torque": predict_torque}
+    return how[channel](model, with_pieces(model, _moving_rows(model.arm)), terms)
+
+
+@pytest.mark.parametrize(
+    ("name", "channel"), [(e, c) for e, member in CATALOGUE.items() for c in member.channels]
+)
+def test_every_member_changes_every_channel_that_it_declares(name, channel):
+    member, arm = CATALOGUE[name], arm_from_dh(DH["ur10e"])
+    tool = np.eye(4)
+    tool[:3, 3] = [0.05, 0.02, 0.15]
+    tilted = np.array([2.0, 1.0, -9.5])  # joint 1 holds something too
+    cog = np.array([0.02, 0.0, 0.1])
+    model = Model(arm, tool, payload_mass=3.0, payload_cog=cog, gravity=tilted)
+    model = model.with_compliance([1e-5] * 6, [5e-6] * 6)
+    plain = _predicted(channel, model, ())
+    for site in member.sites(arm):
+        place = Site(site.joint, 2.0 if member.periodic else None)
+        values = tuple(p.scale for p in member.parameters(arm, place))
+        moved = _predicted(channel, model, [Term(name, place, values)])
+        assert np.abs(moved - plain).max() > 1e-8, (name, channel, site.joint)

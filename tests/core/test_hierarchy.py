@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from core.arm import builtin_arm
 from core.errors import ExcitationError
-from core.hierarchy import TypeFit, fit_type
-from core.hierarchy_evidence import Evidence, evidence
+from core.estimation.hierarchical import TypeFit, fit_type
+from core.estimation.hierarchical_evidence import Evidence, evidence
 from core.loads import Loads
-from core.log import Log
+from core.log.log import Log
 from core.metrology import Metrology
 from core.model import Model
 from core.rotation import rotation_matrix, rotation_vector

@@ -8,9 +8,9 @@ import pytest
 from pyarrow import parquet
 
 from core.arm import builtin_arm
-from core.diagnosis.suspicion import check_units
+from core.diagnosis.log_checks.units_and_clocks import check_units
 from core.errors import LogError
-from core.log import last_motion, read_log
+from core.log.log import last_motion, read_log
 from core.model import Model
 
 RECORDING = Path(__file__).parents[2] / ".." / "shared" / "data" / "rad_ur3e_rtde" / "log.csv"
@@ -128,7 +128,7 @@ UNUSABLE = {
                         "column measured_position_2: not found, expected 3"),
     "double vector": (table([*JOINTS, "actual_q_3"], [[1] * 7]), "actual_q_3: found twice"),
     "double scalar": (table(["payload", "payload"], [[1, 2]]), "column payload: found twice"),
-    "nothing known": (table(["x", "y"], [[1, 2]]), "found none that the contract names"),
+    "nothing known": (table(["x", "y"], [[1, 2]]), "found none that a log may hold"),
     "misspelt": (table(["mesured_position_0"], [[1]]),
                  "found 'mesured_position_0', did you mean 'measured_position'?"),
 }  # fmt: skip

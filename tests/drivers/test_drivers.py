@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from bridge.settings import link_settings
+from bridge.cell.sections import link_settings
 from core.arm import Arm, builtin_arm
 from core.errors import LinkError
 from core.model import Model
@@ -97,7 +97,7 @@ def _grown(values: Any) -> Any:
 
 def test_a_robots_library_is_loaded_only_when_its_driver_connects() -> None:
     code = (
-        "import sys, drivers, bridge.settings\n"
+        "import sys, drivers, bridge.cell.sections\n"
         "import drivers.ur_rtde.driver\n"
         "assert not {'rtde_receive', 'rtde_control', 'rtde_io'} & set(sys.modules)\n"
     )

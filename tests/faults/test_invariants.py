@@ -16,9 +16,9 @@ from benchmarks.faults.wire.modbus import ModbusDecoder
 from benchmarks.faults.wire.rtde import RtdeDecoder
 from benchmarks.faults.wire.seen import Fresh, Write
 from benchmarks.faults.wire.socketcand import PiperDecoder
-from drivers.simulated.kinematics import frame_of
-from drivers.simulated.plant_arm import plant_arm
-from drivers.simulated.settings import START_Q
+from drivers.simulated.plant.kinematics import frame_of
+from drivers.simulated.plant.plant_arm import plant_arm
+from drivers.simulated.ur.settings import START_Q
 
 CYCLE = 0.008
 BOUNDS = Bounds(
@@ -110,9 +110,50 @@ def test_a_write_behind_an_old_state_is_found(checker: Checker) -> None:
     assert "after the last fresh state" in violations(checker)
 
 
-def test_an_offset_taken_out_behind_an_old_state_is_letting_go(checker: Checker) -> None:
-    write(checker, 20, 0.0, late=0.3)
-    assert not checker.found.violations
+def test_a_zero_is_a_step_as_any_other(checker: Checker) -> None:
+    state(checker, 20)
+    write(checker, 20, 0.0)
+    assert "at once" in violations(checker)
+
+
+@pytest.mark.parametrize("supervisor", [1, 2, 5])
+def test_a_zero_that_drops_an_offset_is_found_in_whatever_state(
+    checker: Checker, supervisor: int
+) -> None:
+    """What letting go did once: 20 steps' worth at once, after the writing had ended."""
+    for i in range(20, 30):
+        state(checker, i, supervisor=supervisor)
+    write(checker, 30, 0.0, supervisor=supervisor)
+    assert "at once" in violations(checker)
+
+
+def test_a_zero_is_no_step_where_the_robots_program_has_withdrawn_the_offset() -> None:
+    bounds = replace(BOUNDS, withdraws=0.2)
+    needed = 0.2 + 20 * STEP / bounds.offset_rate / 0.98
+    for late, fine in ((needed + CYCLE, True), (0.5 * needed, False)):
+        checker = Checker(bounds)
+        stream(checker, 20)
+        i = 20 + round(late / CYCLE)
+        for k in range(20, i + 1):
+            state(checker, k, supervisor=1 if k < i else 2)
+        write(checker, i, 0.0, supervisor=2)
+        assert bool(checker.found.violations) != fine, late
+
+
+def test_joints_that_begin_where_a_fault_left_them_count_from_where_they_began_before() -> None:
+    """Three streams of 1 mm each, with an envelope of 2 mm: no new beginning makes a new zero."""
+    checker = Checker(BOUNDS)
+    q, i = list(START_Q), 0
+    for _ in range(3):
+        for _ in range(60):
+            i += 1
+            state(checker, i)
+            q[0] += 2.2e-5  # 0.7 m from the first joint's axis: 16 um
+            checker.take([Write(i * CYCLE + 0.001, "joints", tuple(q), "servoJ", 3)])
+        for _ in range(10):  # a fault
+            i += 1
+            state(checker, i, supervisor=5)
+    assert "allowed 2" in violations(checker)
 
 
 def test_many_writes_behind_one_state_are_found(checker: Checker) -> None:
@@ -152,7 +193,7 @@ def test_joints_beyond_their_limits_are_found() -> None:
     assert "joint 1" in violations(checker)
 
 
-def mailbox(words: list[int], address: int = 236) -> bytes:
+def mailbox(words: list[int], address: int = 234) -> bytes:
     body = struct.pack(">BBHHB", 1, 16, address, len(words), 2 * len(words))
     body += struct.pack(f">{len(words)}H", *words)
     return struct.pack(">HHH", 1, 0, len(body)) + body
@@ -160,7 +201,7 @@ def mailbox(words: list[int], address: int = 236) -> bytes:
 
 def test_a_mailbox_is_read_with_its_checksum_and_nothing_else_may_be_written() -> None:
     decoder = ModbusDecoder()
-    words = [5, 100, 0xFFFF, 0, 0, 0, 0, 9]
+    words = [5, 100, 0xFFFF, 0, 0, 0, 0, 9, 400, 800]
     words.append((18242 + sum(k * w for k, w in enumerate(words, 1))) % 65521)
     (fine,) = decoder.feed(0.0, 1, "modbus", True, mailbox(words), 3)
     assert isinstance(fine, Write)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import resource
+import shutil
 import socket
+import tempfile
 import threading
 import time
 from dataclasses import replace
@@ -19,7 +21,7 @@ from benchmarks.faults.links import LIMITS, Link, own_address
 from benchmarks.faults.rig import Rig
 from benchmarks.faults.row import Row, cycles, seconds
 from bridge.cell import load_cell
-from drivers.can.bus import BusSettings
+from drivers.can_bus.bus import BusSettings
 from drivers.simulated.can.hub import Hub
 from drivers.simulated.ft_sensor.robotous_node import RobotousNode
 
@@ -36,12 +38,12 @@ class PlannedRig(Rig):
     goal: list[float]
 
     def __init__(self, link: Link, folder: Path) -> None:
-        with socket.create_server(("127.0.0.1", 0)) as free:
-            port = int(free.getsockname()[1])
+        self._socket = Path(tempfile.mkdtemp()) / "planner.sock"  # a short path, as sockets need
         arm_q, self.joint, self.way, margin, self._fastest = self._nearest_limit(link, folder)
         limits = LIMITS.replace("ramp_time", f"joint_margin: {margin:.4f}\n  ramp_time")
-        super().__init__(link, folder, f"{limits}setpoints: {{source: tcp, port: {port}}}\n")
-        self.goal, self._port, self._over = arm_q, port, threading.Event()
+        setpoints = f"setpoints: {{source: planner, socket: {self._socket}}}\n"
+        super().__init__(link, folder, limits + setpoints)
+        self.goal, self._over = arm_q, threading.Event()
         self._planner = threading.Thread(target=self._plan, daemon=True, name="planner")
 
     @staticmethod
@@ -69,11 +71,14 @@ class PlannedRig(Rig):
     ) -> None:  # fmt: skip
         self._over.set()
         super().__exit__(kind, error, trace)
+        shutil.rmtree(self._socket.parent, ignore_errors=True)
 
     def _plan(self) -> None:
         while not self._over.wait(0.1):
             try:
-                with socket.create_connection(("127.0.0.1", self._port), timeout=1.0) as link:
+                with socket.socket(socket.AF_UNIX) as link:
+                    link.settimeout(1.0)
+                    link.connect(str(self._socket))
                     while not self._over.wait(LINE):
                         link.sendall((json.dumps({"q": self.goal}) + "\n").encode())
             except OSError:

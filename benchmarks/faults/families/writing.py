@@ -62,9 +62,9 @@ def _another_in_the_mailbox(rig: Rig) -> None:
     def command() -> None:
         with socket.create_connection((rig.back, 15020), timeout=5.0) as link:
             for number in range(10):
-                words = [20000 + number, 0, 0, 0, 0, 0, 0, 7 + number]
+                words = [20000 + number, 0, 0, 0, 0, 0, 0, 7 + number, 400, 800]
                 words.append((18242 + sum(k * w for k, w in enumerate(words, 1))) % 65521)
-                body = struct.pack(">BBHHB9H", 1, 16, 236, 9, 18, *words)
+                body = struct.pack(">BBHHB11H", 1, 16, 234, 11, 22, *words)
                 link.sendall(struct.pack(">HHH", number, 0, len(body)) + body)
                 time.sleep(0.03)
 

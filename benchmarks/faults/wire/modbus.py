@@ -11,7 +11,7 @@ import struct
 from benchmarks.faults.wire.seen import Change, Decoder, Fresh, Write
 
 READS, WRITES = (3, 4), (5, 6, 15, 16, 22, 23)
-MAILBOX, WORDS = 236, 9  # sequence, six counts, heartbeat, checksum
+MAILBOX, WORDS = 234, 11  # sequence, six counts, heartbeat, two rates, checksum
 COUNT = 1e-6  # m and rad
 GOOD = {258: 7, 260: 1, 261: 0, 262: 0}  # mode running, power on, no stop, no emergency
 

@@ -20,7 +20,7 @@ SERVOJ, SERVO_STOP, STOP_SCRIPT = 11, 16, 255
 HARMLESS = {0, 35, SERVO_STOP, STOP_SCRIPT}  # nothing, setWatchdog, servoStop, stopScript
 FIELDS = {"q": "actual_q", "qd": "actual_qd", "clock": "timestamp"}
 RUNNING, SAFE = 7, (1, 2)
-SEQUENCE = "input_int_register_19"
+SEQUENCE, RATES = "input_int_register_19", "input_int_register_22"
 UNIT, MODULUS = 1e-9, 2**31
 OTHER = 1.0  # s that connections of one controller may lie apart; a clock begins anew by more
 LIBRARY = "23"  # the register in which ur_rtde says what kind of register it has written
@@ -180,7 +180,7 @@ class RtdeDecoder(Decoder):
         values = [get(f"input_double_register_{i}", 0.0) for i in range(18, 23)]
         rz = get("input_int_register_18", 0)
         units = [round(v / UNIT) for v in values] + [int(rz)]
-        total = (sum(units) + 31 * int(get(SEQUENCE, 0))) % MODULUS
+        total = (sum(units) + int(get(RATES, 0)) + 31 * int(get(SEQUENCE, 0))) % MODULUS
         kind = "offset" if total == get("input_int_register_20", -1) else "broken"
         return Write(time, kind, (*values, rz * UNIT), "registers", state)  # type: ignore[arg-type]
 
@@ -190,4 +190,4 @@ def _ours(name: str) -> bool:
     kind, _, number = name.rpartition("_")
     if kind == "input_double_register":
         return number in ("18", "19", "20", "21", "22")
-    return kind == "input_int_register" and number in ("18", "19", "20", "21", LIBRARY)
+    return kind == "input_int_register" and number in ("18", "19", "20", "21", "22", LIBRARY)

@@ -9,7 +9,7 @@ import pinocchio
 from numba import njit
 from numpy.typing import NDArray
 
-from core.kernel import Chain, Rows
+from core.kernels.reference import Chain, Rows
 
 Array = NDArray[np.float64]
 

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import math
 
-from bridge.calibration.report.blocks import (
+from bridge.calibration.report.figures import fine, mm
+from bridge.calibration.report.material import Material
+from bridge.calibration.report.names import parameter_words
+from bridge.document.blocks import (
     Bar,
     Block,
     Bullets,
@@ -14,13 +17,10 @@ from bridge.calibration.report.blocks import (
     Strong,
     Table,
 )
-from bridge.calibration.report.figures import fine, mm
-from bridge.calibration.report.material import Material
-from bridge.calibration.report.names import parameter_words
-from bridge.calibration.report.section import Section
+from bridge.document.section import Section
 from bridge.report.words import number, percent, told, unit_of
-from core.calibration.budget import Budget, Input
-from core.calibration.sensitivity import Sensitivities, Sensitivity
+from core.calibration.budget.budget import Budget, Input
+from core.calibration.budget.sensitivity import Sensitivities, Sensitivity
 
 OUTSIDE = (
     "where the robot's base stands in the hall: everything here is seen from the base",

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from bridge.calibration.report.axes import Chart, logarithmic, named, scale, visible
-from bridge.calibration.report.blocks import Block, Paragraph, Pictures, Table
-from bridge.calibration.report.drawing import AFTER, BEFORE, Drawing
 from bridge.calibration.report.figures import fixed, mm
 from bridge.calibration.report.material import Material
-from bridge.calibration.report.section import Section
+from bridge.document.axes import Chart, logarithmic, named, scale, visible
+from bridge.document.blocks import Block, Paragraph, Pictures, Table
+from bridge.document.drawing import AFTER, BEFORE, Drawing
+from bridge.document.section import Section
 from core.calibration.result import Errors
 
 LEGEND = (("before", BEFORE), ("after", AFTER))

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import re
 
-from bridge.calibration.report.blocks import (
+from bridge.calibration.report.figures import degrees
+from bridge.calibration.report.material import Material
+from bridge.calibration.report.names import sentence
+from bridge.document.axes import plain
+from bridge.document.blocks import (
     DOUBTFUL,
     GOOD,
     QUIET,
@@ -16,10 +20,7 @@ from bridge.calibration.report.blocks import (
     Table,
     Verdict,
 )
-from bridge.calibration.report.figures import degrees, plain
-from bridge.calibration.report.material import Material
-from bridge.calibration.report.names import sentence
-from bridge.calibration.report.section import Section
+from bridge.document.section import Section
 from bridge.report.answer import one_line, sentences
 from bridge.report.material import chosen_channel
 from bridge.report.words import CHANNELS, effect_words, listed

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.calibration.report.facts import SessionFacts
-from core.calibration.budget import Budget, Stated, budget, wild_readings
+from core.calibration.budget.budget import Budget, Stated, budget, wild_readings
+from core.calibration.budget.pose_accuracy import KINDS, PoseAccuracy, pose_accuracies
 from core.calibration.plan import Plan
-from core.calibration.pose_accuracy import KINDS, PoseAccuracy, pose_accuracies
 from core.calibration.result import Calibration, Errors
 
 Array = NDArray[np.float64]

@@ -7,24 +7,10 @@ import re
 from bridge.report.words import effect_words
 from core.effects import CATALOGUE
 
-PATTERNS = {
-    "joint_offset": "zero of joint {joint}",
-    "axial_compliance": "twist of joint {joint} per torque",
-    "radial_compliance": "tilt of joint {joint} per moment",
-    "link_flexibility": "bending of link {joint}",
-    "link_geometry": "{part} of link {joint}",
-    "tool_frame": "tool {part}",
-    "backlash": "play of joint {joint}",
-    "base_compliance": "yielding of the foundation about {part}",
-    "transmission_error": "gear error of joint {joint} ({part})",
-    "stiffness_nonlinearity": "stiffening of joint {joint} ({part})",
-    "gravity_direction": "tilt of the base about {part}",
-    "thermal_drift": "growth of link {joint} with warmth",
-    "payload": "mass of the load beyond the declared one",
+OF_SESSIONS = {  # what sessions find that is no effect
     "tool_tcp": "tool centre {part}",
     "payload_mass": "mass of the load",
     "payload_cog": "centre of gravity {part}",
-    "ft_bias": "sensor zero of {part}",
 }
 PARTS = {
     "a": "length a", "d": "offset d", "alpha": "twist alpha", "beta": "twist beta",
@@ -34,22 +20,27 @@ PARTS = {
 }  # fmt: skip
 
 
+def patterns() -> dict[str, str]:
+    """Return how parameters are named in words, by the beginning of their public name."""
+    return {name: e.label_words for name, e in CATALOGUE.items() if e.label_words} | OF_SESSIONS
+
+
 def effect_of(name: str) -> str:
     """Return the effect that a parameter's public name begins with; empty for none."""
-    return max((e for e in (*CATALOGUE, *PATTERNS) if name.startswith(e)), key=len, default="")
+    return max((e for e in (*CATALOGUE, *OF_SESSIONS) if name.startswith(e)), key=len, default="")
 
 
 def parameter_words(name: str) -> str:
     """Return a parameter's public name in words; the name itself where there are none."""
     effect = effect_of(name)
-    if name == effect and effect in CATALOGUE and "{" in PATTERNS.get(effect, "{"):
+    if name == effect and effect in CATALOGUE and "{" in patterns().get(effect, "{"):
         return effect_words(effect)
     match = re.fullmatch(r"(?:_(\d+))?(?:_(.+))?", name.removeprefix(effect))
     if not effect or match is None:
         return name
     joint, rest = match[1] or "", match[2] or ""
     part = PARTS.get(rest, re.sub(r"^order(\S+?)_", r"\1 a turn, ", rest).replace("_", " "))
-    pattern = PATTERNS.get(effect)
+    pattern = patterns().get(effect)
     if pattern is None:
         where = f", joint {joint}" if joint else ""
         return f"{effect_words(effect)}{where}{', ' + part if part else ''}"
@@ -58,7 +49,7 @@ def parameter_words(name: str) -> str:
 
 def spoken(text: str) -> str:
     """Return a text with public names of parameters and effects in words instead."""
-    names = "|".join(sorted((*CATALOGUE, *PATTERNS), key=len, reverse=True))
+    names = "|".join(sorted((*CATALOGUE, *OF_SESSIONS), key=len, reverse=True))
     return re.sub(rf"\b(?:{names})(?:_[A-Za-z0-9_.]*\w)?\b", _in_words, text)
 
 

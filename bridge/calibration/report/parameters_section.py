@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from bridge.calibration.report.blocks import Block, Bullets, Cell, Heading, Paragraph, Table
 from bridge.calibration.report.figures import decimals_of, estimate_words, fixed
 from bridge.calibration.report.material import Material
 from bridge.calibration.report.names import parameter_words, spoken
-from bridge.calibration.report.section import Section
+from bridge.document.blocks import Block, Bullets, Cell, Heading, Paragraph, Table
+from bridge.document.section import Section
 from bridge.report.words import unit_of
 from core.calibration.result import Estimate
 

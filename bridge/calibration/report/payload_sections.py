@@ -6,8 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bridge.calibration.report.axes import Chart, named, scale
-from bridge.calibration.report.blocks import (
+from bridge.calibration.report.facts import SessionFacts
+from bridge.calibration.report.figures import fixed
+from bridge.calibration.report.names import sentence
+from bridge.calibration.report.parameters_section import estimates_table
+from bridge.calibration.report.session_section import facts_blocks
+from bridge.document.axes import Chart, named, scale
+from bridge.document.blocks import (
     DOUBTFUL,
     GOOD,
     Badge,
@@ -19,13 +24,8 @@ from bridge.calibration.report.blocks import (
     Tiles,
     Verdict,
 )
-from bridge.calibration.report.drawing import AFTER, BAD_DOT, Drawing
-from bridge.calibration.report.facts import SessionFacts
-from bridge.calibration.report.figures import fixed
-from bridge.calibration.report.names import sentence
-from bridge.calibration.report.parameters_section import estimates_table
-from bridge.calibration.report.section import Section
-from bridge.calibration.report.session_section import facts_blocks
+from bridge.document.drawing import AFTER, BAD_DOT, Drawing
+from bridge.document.section import Section
 from core.calibration.payload_session import PayloadCalibration
 from core.model import Model
 

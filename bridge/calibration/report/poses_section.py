@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from bridge.calibration.report.axes import Chart, scale
-from bridge.calibration.report.blocks import Block, Paragraph, Pictures
-from bridge.calibration.report.drawing import AFTER, EDGE, INK, LIMIT, Circle, Drawing
 from bridge.calibration.report.figures import mm
 from bridge.calibration.report.material import Material
-from bridge.calibration.report.section import Section
+from bridge.document.axes import Chart, scale
+from bridge.document.blocks import Block, Paragraph, Pictures
+from bridge.document.drawing import AFTER, EDGE, INK, LIMIT, Circle, Drawing
+from bridge.document.section import Section
 from bridge.report.arm_view import joint_origins
 from core.calibration.plan import Plan
 

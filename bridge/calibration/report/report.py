@@ -6,16 +6,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from bridge.calibration.report.blocks import Document
 from bridge.calibration.report.facts import SessionFacts
-from bridge.calibration.report.html import html
 from bridge.calibration.report.material import Material
 from bridge.calibration.report.payload_sections import PAYLOAD, PayloadMaterial
-from bridge.calibration.report.section import Section
 from bridge.calibration.report.sections import CALIBRATION
 from bridge.calibration.report.tool_sections import TOOL, ToolMaterial
 from bridge.calibration.report.verification_sections import VERIFICATION, VerificationMaterial
-from bridge.output_file import replacing_bytes, write_text
+from bridge.document.blocks import Document
+from bridge.document.html import html
+from bridge.document.output_file import replacing_bytes, write_text
+from bridge.document.section import Section
 from core.calibration.payload_session import PayloadCalibration
 from core.calibration.plan import Plan
 from core.calibration.readings import Readings
@@ -87,7 +87,7 @@ def _document(
 
 
 def _written(document: Document, out: Path, name: str) -> tuple[Path, Path]:
-    from bridge.calibration.report.pdf import pdf
+    from bridge.document.pdf import pdf
 
     page, paper = out / f"{name}.html", out / f"{name}.pdf"
     write_text(page, html(document))

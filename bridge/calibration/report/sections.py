@@ -11,10 +11,10 @@ from bridge.calibration.report.material import Material
 from bridge.calibration.report.parameters_section import ParametersSection
 from bridge.calibration.report.poses_section import PosesSection
 from bridge.calibration.report.repeats_section import RepeatsSection
-from bridge.calibration.report.section import Section
 from bridge.calibration.report.session_section import SessionSection
 from bridge.calibration.report.summary import Summary
 from bridge.calibration.report.workspace_section import WorkspaceSection
+from bridge.document.section import Section
 
 CALIBRATION: tuple[Section[Material], ...] = (
     Summary(),

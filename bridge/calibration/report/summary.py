@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from bridge.calibration.report.blocks import (
+from bridge.calibration.report.figures import mm
+from bridge.calibration.report.material import Material
+from bridge.calibration.report.names import sentence
+from bridge.document.blocks import (
     BAD,
     DOUBTFUL,
     GOOD,
@@ -13,10 +16,7 @@ from bridge.calibration.report.blocks import (
     Tiles,
     Verdict,
 )
-from bridge.calibration.report.figures import mm
-from bridge.calibration.report.material import Material
-from bridge.calibration.report.names import sentence
-from bridge.calibration.report.section import Section
+from bridge.document.section import Section
 from bridge.report.words import listed
 
 

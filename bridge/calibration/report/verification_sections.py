@@ -6,8 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bridge.calibration.report.axes import Chart, named, scale
-from bridge.calibration.report.blocks import (
+from bridge.calibration.report.facts import SessionFacts
+from bridge.calibration.report.figures import degrees, fixed, mm
+from bridge.calibration.report.names import parameter_words, sentence
+from bridge.calibration.report.parameters_section import estimates_table
+from bridge.calibration.report.session_section import facts_blocks
+from bridge.document.axes import Chart, named, scale
+from bridge.document.blocks import (
     BAD,
     GOOD,
     Badge,
@@ -21,16 +26,12 @@ from bridge.calibration.report.blocks import (
     Tiles,
     Verdict,
 )
-from bridge.calibration.report.drawing import AFTER, EDGE, Drawing
-from bridge.calibration.report.facts import SessionFacts
-from bridge.calibration.report.figures import degrees, fixed, mm
-from bridge.calibration.report.names import parameter_words, sentence
-from bridge.calibration.report.parameters_section import estimates_table
-from bridge.calibration.report.section import Section
-from bridge.calibration.report.session_section import facts_blocks
-from bridge.report.words import likelihood
+from bridge.document.drawing import AFTER, EDGE, Drawing
+from bridge.document.section import Section
+from bridge.report.words import effect_words, likelihood
 from core.calibration.readings import Readings
 from core.calibration.verify import Suspect, Verification
+from core.effects import CATALOGUE
 
 TWICE = 2.0  # promised deviations that an error hardly exceeds
 
@@ -150,9 +151,11 @@ def suspect_words(suspect: Suspect) -> str:
     kind, _, number = suspect.name.rpartition("_")
     if kind == "reading":
         return f"reading {number} alone is wrong"
-    words = {"tool_frame": "the tool sits elsewhere", "payload": "the load is another",
-             "instrument": "the instrument stands elsewhere"}  # fmt: skip
-    return words.get(suspect.name, f"another {parameter_words(suspect.name)}")
+    if suspect.name in CATALOGUE:
+        return effect_words(suspect.name)
+    if suspect.name == "instrument":
+        return "the instrument stands elsewhere"
+    return f"another {parameter_words(suspect.name)}"
 
 
 VERIFICATION: tuple[Section[VerificationMaterial], ...] = (Holds(), Facts(), Poses(), Moved())

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.report.axes import Chart, scale
-from bridge.calibration.report.blocks import Block, Paragraph, Pictures, Table
-from bridge.calibration.report.drawing import AFTER, BEFORE, EDGE, INK, Circle, Drawing
 from bridge.calibration.report.figures import mm
 from bridge.calibration.report.material import Material
-from bridge.calibration.report.section import Section
+from bridge.document.axes import Chart, scale
+from bridge.document.blocks import Block, Paragraph, Pictures, Table
+from bridge.document.drawing import AFTER, BEFORE, EDGE, INK, Circle, Drawing
+from bridge.document.section import Section
 from core.calibration.result import Errors
 
 Array = NDArray[np.float64]

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.cell import Cell, load_cell
-from bridge.daemon import Daemon
+from bridge.daemon.daemon import Daemon
 from bridge.demo.bench import Bench
 from bridge.demo.poses import Load, Scene
 from bridge.demo.rests import SETTLING
 from bridge.demo.result import Resolution
-from bridge.output_file import write_text
+from bridge.document.output_file import write_text
 from core.errors import RunError
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.daemon import Daemon
+from bridge.daemon.daemon import Daemon
 from bridge.demo.links.peer import PeerLink
 from bridge.demo.own_program import LONGEST_VISIT, OwnProgram
 from bridge.demo.poses import UR10E, Load, Workspace
@@ -18,7 +18,7 @@ from drivers.modbus.profile import read_profile
 from drivers.modbus.registers import UNITS
 from drivers.modbus.schema import Mailbox
 from drivers.modbus.settings import ModbusSettings
-from drivers.simulated.settings import BENCH_PORT
+from drivers.simulated.ur.settings import BENCH_PORT
 
 Array = NDArray[np.float64]
 PORT = 15020  # below 1024 only root may listen; a real controller's is 502

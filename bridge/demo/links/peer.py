@@ -16,9 +16,9 @@ from bridge.demo.bench import Bench
 from bridge.demo.links.link import DemoLink
 from bridge.demo.poses import Load
 from bridge.demo.served_cell import ServedCell
-from bridge.output_file import write_text
+from bridge.document.output_file import write_text
 from core.errors import CellError
-from drivers.simulated.settings import BENCH_PORT
+from drivers.simulated.ur.settings import BENCH_PORT
 
 Array = NDArray[np.float64]
 PAYLOAD = re.compile(r"^payload:.*$", re.MULTILINE)

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.cell.simulation import server_settings
-from bridge.daemon import Daemon
+from bridge.daemon.daemon import Daemon
 from bridge.demo.bench import Bench, UrBench
 from bridge.demo.links.link import DemoLink
 from bridge.demo.poses import UR10E
 from bridge.demo.result import Resolution
 from bridge.demo.trajectory import visits, write_trajectory
-from drivers.simulated.process import SimulatedController
-from drivers.simulated.settings import BENCH_PORT, DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT
+from drivers.simulated.ur.process import SimulatedController
+from drivers.simulated.ur.settings import BENCH_PORT, DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT
 
 Array = NDArray[np.float64]
 

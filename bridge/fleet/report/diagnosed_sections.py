@@ -5,10 +5,10 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 
-from bridge.fleet.diagnosed import Diagnosed, Onset, Recurrence
+from bridge.fleet.diagnosis_summary import Diagnosed, Onset, Recurrence
 from bridge.fleet.outcome_words import counted
 from bridge.fleet.report.shared_sections import unbroken
-from bridge.fleet.running import Done
+from bridge.fleet.runner import Done
 from bridge.fleet.session import natural
 from bridge.fleet.task import DONE, Outcome
 from bridge.report.fragment import (

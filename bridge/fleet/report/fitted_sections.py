@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bridge.fleet.fitted import Fitted, FittedArm, FittedSession, FittedType
+from bridge.fleet.fit_summary import Fitted, FittedArm, FittedSession, FittedType
 from bridge.fleet.outcome_words import counted
 from bridge.fleet.report.parameter_words import parameter_words, type_words
 from bridge.fleet.report.shared_sections import MOST, unbroken

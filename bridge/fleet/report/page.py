@@ -10,13 +10,13 @@ from pathlib import Path
 
 from plotly.offline import get_plotlyjs
 
-from bridge.fleet.diagnosed import Diagnosed
-from bridge.fleet.fitted import Fitted
+from bridge.document.output_file import write_text
+from bridge.fleet.diagnosis_summary import Diagnosed
+from bridge.fleet.fit_summary import Fitted
 from bridge.fleet.outcome_words import counted
 from bridge.fleet.report import diagnosed_sections, fitted_sections, shared_sections
-from bridge.fleet.running import Done
+from bridge.fleet.runner import Done
 from bridge.fleet.session import Found
-from bridge.output_file import write_text
 
 FILE = "report.html"
 

@@ -4,29 +4,27 @@ from __future__ import annotations
 
 import re
 
-from bridge.report.words import CHANNELS, EFFECTS
-
-KINDS = {"axial_compliance": "twist of joint", "radial_compliance": "tilt of joint"}
+from bridge.report.words import CHANNELS, effect_words
+from core.effects import CATALOGUE
 
 
 def parameter_words(name: str) -> str:
     """Return a parameter's name in words: the effect, and the joint or what else it is of."""
-    match = re.fullmatch(r"(axial_compliance|radial_compliance)_(\d+)", name)
-    if match:
-        return f"{KINDS[match[1]]} {match[2]} under load"
     for channel, words in CHANNELS.items():
         if name == f"{channel} gap_rms":
             return f"{words.lower()}: gap"
         if name.startswith(f"{channel}: "):
             return f"{words.lower()}: {name.removeprefix(f'{channel}: ')}"
-    effect = next((e for e in sorted(EFFECTS, key=len, reverse=True) if name.startswith(e)), None)
+    effect = next((e for e in sorted(CATALOGUE, key=len, reverse=True) if name.startswith(e)), None)
     if effect is None:
         return name.replace("_", " ")
     rest = name.removeprefix(effect).strip("_").replace("_", " ")
     joint = re.fullmatch(r"(\d+)(.*)", rest)
+    if joint and CATALOGUE[effect].flexibility:
+        return CATALOGUE[effect].label_words.format(joint=joint[1])
     if joint:
         rest = f"joint {joint[1]}{joint[2]}"
-    return f"{EFFECTS[effect]}{': ' + rest if rest else ''}"
+    return f"{effect_words(effect)}{': ' + rest if rest else ''}"
 
 
 def type_words(name: str) -> str:

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from bridge.fleet.drifting import Drift
+from bridge.fleet.drift import Drift
 from bridge.fleet.outlying import Outlier
 from bridge.fleet.report.parameter_words import parameter_words
-from bridge.fleet.running import Done
+from bridge.fleet.runner import Done
 from bridge.fleet.task import DONE, Outcome
 from bridge.report.fragment import (
     AFTER,

@@ -1,8 +1,8 @@
 """The base of the observables: what a reading is, and how it depends on arm and instrument.
 
 A member says what its instrument reads at given poses of the TCP and how a reading differs from
-that; derivatives of the poses come from the effects (core.pose_columns) and are chained with
-those of the reading, so that every effect of the catalogue enters every kind by the same code.
+that; derivatives of the poses come from the effects (core.estimation.pose_jacobian) and are chained
+with those of the reading, so that every effect of the catalogue enters every kind by the same code.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.moved_poses import moved_poses
+from core.calibration.observables.moved_poses import moved_poses
 from core.calibration.observables.nuisance import Layout, Nuisance
 from core.calibration.readings import Readings
 from core.errors import ExcitationError

@@ -18,8 +18,8 @@ from core.calibration.observables.position import (
     with_targets,
 )
 from core.calibration.readings import Readings
+from core.estimation.registration import Registration
 from core.model import Poses
-from core.registration import Registration
 from core.rotation import rotation_matrix, rotation_vector
 
 Array = NDArray[np.float64]

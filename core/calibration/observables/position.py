@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from core.calibration.observables.nuisance import Nuisance
 from core.calibration.observables.observable import Observable
 from core.calibration.readings import Readings
+from core.estimation.registration import Registration, register_robustly
 from core.model import Poses
-from core.registration import Registration, register_robustly
 from core.rotation import skew
 
 Array = NDArray[np.float64]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from core.calibration.observables.nuisance import Nuisance
 from core.calibration.observables.observable import Observable
 from core.calibration.readings import Readings
+from core.estimation.registration import IDENTITY, Registration
 from core.model import Poses
-from core.registration import IDENTITY, Registration
 
 Array = NDArray[np.float64]
 

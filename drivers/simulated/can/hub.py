@@ -15,6 +15,7 @@ import time
 from types import TracebackType
 from typing import Self
 
+from core.addresses import is_loopback
 from drivers.simulated.can.frame import Frame
 from drivers.simulated.can.port import Port, SerialPort, SocketcandPort
 
@@ -25,7 +26,7 @@ class Hub:
     """One simulated bus, served by a thread of its own between ``start`` and ``close``."""
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0) -> None:
-        if not host.startswith("127."):
+        if not is_loopback(host):
             raise ValueError(f"host: found {host!r}, expected a loopback address (127.x.x.x)")
         self.host = host
         self.port = port  # TCP; 0 until start() where the system chooses

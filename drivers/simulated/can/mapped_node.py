@@ -14,7 +14,7 @@ from drivers.can.loading import read_profile
 from drivers.can.profile import Incoming, Outgoing
 from drivers.can.settings import CanSettings
 from drivers.simulated.can.nodes import CanNodes
-from drivers.simulated.peer import Peer
+from drivers.simulated.peer.peer import Peer
 
 HEALTHY_EVERY = 5  # cycles between messages that are no part of a sample
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from drivers.can.settings import CanSettings
 from drivers.simulated.can.nodes import CanNodes
-from drivers.simulated.peer import Peer
+from drivers.simulated.peer.peer import Peer
 
 
 class Ranges(NamedTuple):

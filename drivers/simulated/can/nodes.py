@@ -12,15 +12,15 @@ from typing import Any
 import can
 
 from core.errors import InputError, LinkError
-from drivers.can.bus import BusSettings, close_bus, open_bus
 from drivers.can.settings import CanSettings
-from drivers.simulated.bench import Command
+from drivers.can_bus.bus import BusSettings, close_bus, open_bus
 from drivers.simulated.can.frame import Frame
 from drivers.simulated.can.hub import Hub
 from drivers.simulated.can.port import InnerPort
-from drivers.simulated.kinematics import Joints
-from drivers.simulated.peer import Peer
-from drivers.simulated.peer_server import PeerServer
+from drivers.simulated.peer.bench import Command
+from drivers.simulated.peer.peer import Peer
+from drivers.simulated.peer.peer_server import PeerServer
+from drivers.simulated.plant.kinematics import Joints
 
 BACKLOG = 500  # frames taken in one cycle at most
 TORN = 0.05  # rad that the joints of a torn sample are off

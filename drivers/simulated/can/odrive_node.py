@@ -7,7 +7,7 @@ import struct
 
 from drivers.can.settings import CanSettings
 from drivers.simulated.can.nodes import CanNodes
-from drivers.simulated.peer import Peer
+from drivers.simulated.peer.peer import Peer
 
 TURN = 2.0 * math.pi
 IDLE, CLOSED_LOOP = 1, 8

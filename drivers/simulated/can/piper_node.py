@@ -10,7 +10,7 @@ import struct
 
 from drivers.can.settings import CanSettings
 from drivers.simulated.can.nodes import CanNodes
-from drivers.simulated.peer import Peer
+from drivers.simulated.peer.peer import Peer
 
 UNIT = math.radians(0.001)
 FACTORS = (1.18125, 1.18125, 1.18125, 0.95844, 0.95844, 0.95844)  # Nm per A, as piper_sdk has them

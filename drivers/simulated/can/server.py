@@ -6,8 +6,8 @@ import importlib
 
 from core.errors import InputError
 from drivers.can.settings import CanSettings
-from drivers.simulated.peer import Peer
-from drivers.simulated.peer_server import PeerServer
+from drivers.simulated.peer.peer import Peer
+from drivers.simulated.peer.peer_server import PeerServer
 
 NODES: dict[str, str] = {
     "piper": "drivers.simulated.can.piper_node:PiperNode",

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Protocol
 
 from drivers.canopen.profile import CanopenProfile
-from drivers.simulated.bench import BenchError, Command
+from drivers.simulated.peer.bench import BenchError, Command
 
 
 class Faulty(Protocol):

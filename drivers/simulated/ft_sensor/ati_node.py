@@ -8,7 +8,7 @@ from typing import Any
 import can
 import numpy as np
 
-from drivers.can.bus import BusSettings, close_bus, open_bus
+from drivers.can_bus.bus import BusSettings, close_bus, open_bus
 from drivers.simulated.ft_sensor.mounting import Felt
 from drivers.simulated.ft_sensor.node import SimulatedSensor
 

@@ -7,8 +7,9 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from core.addresses import is_loopback
 from core.errors import InputError, LinkError
-from drivers.can.bus import BusSettings
+from drivers.can_bus.bus import BusSettings
 from drivers.ft_sensor.settings import (
     AtiSettings,
     FtSensorSettings,
@@ -79,7 +80,7 @@ def _same_bus(settings: BusSettings, link: object) -> bool:
 
 
 def _hub(settings: BusSettings) -> Hub:
-    if not settings.host.startswith("127."):
+    if not is_loopback(settings.host):
         raise InputError(
             f"ft_sensor.host: found {settings.host!r}, expected a loopback address (127.x.x.x): "
             "a simulated sensor is never served to others"

@@ -8,7 +8,7 @@ from drivers.modbus.encode import vector_registers
 from drivers.modbus.profile import addresses, spans, turns_of
 from drivers.modbus.registers import BIT_TABLES, UNITS, Table
 from drivers.modbus.schema import Clock, Condition, Place, ProfileFile, Trouble, Vector
-from drivers.simulated.peer import Peer
+from drivers.simulated.peer.peer import Peer
 
 Image = dict[Table, dict[int, int]]
 TABLES: tuple[Table, ...] = ("coil", "discrete", "holding", "input")

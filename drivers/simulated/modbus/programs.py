@@ -10,13 +10,13 @@ from drivers.modbus import encode
 from drivers.modbus.profile import ECHO_WORDS, MAILBOX_WORDS, addresses
 from drivers.modbus.registers import UNITS, Table
 from drivers.modbus.schema import Condition, Mailbox, ProfileFile, TargetTrigger
-from drivers.simulated.bench import BenchError
-from drivers.simulated.kinematics import Joints, offset_frame, solve, tcp_in_base
 from drivers.simulated.modbus.image import bad
-from drivers.simulated.motion import Hold, Stop
-from drivers.simulated.offset_program import NOTHING, approach
-from drivers.simulated.peer import BRAKING, HOLD, Peer
-from drivers.simulated.plant_settings import Vector6
+from drivers.simulated.peer.bench import BenchError
+from drivers.simulated.peer.peer import BRAKING, HOLD, Peer
+from drivers.simulated.plant.kinematics import Joints, offset_frame, solve, tcp_in_base
+from drivers.simulated.plant.motion import Hold, Stop
+from drivers.simulated.plant.plant_settings import Vector6
+from drivers.simulated.ur.offset_program import NOTHING, SHIFT_STEP, TURN_STEP, approach
 
 log = logging.getLogger("drivers.simulated")
 
@@ -56,14 +56,20 @@ class MailboxProgram:
     """Checks offsets (sequence, checksum, heartbeat) and rides them on the robot's own motion.
 
     A checksum that does not fit leaves the offset as it was; a heartbeat that stands still takes
-    it out. ``running`` False is a program that was stopped: nothing is applied or answered.
+    it out, at the rates that came with the last offset. What stands in the registers when the
+    program starts, or after a silence, counts only once the heartbeat has changed: it may be of a
+    client that is dead. ``running`` False is a program that was stopped: nothing is applied or
+    answered.
     """
 
     def __init__(self, box: Mailbox) -> None:
         self._box = box
         self.running = True
-        self._sequence = self._heartbeat = 0
+        self._sequence = 0
+        self._heartbeat: int | None = None  # None: not seen yet
+        self._alive = False  # the heartbeat has changed, and not stood still since
         self._silent = 0.0  # s
+        self._rates = (0.0, 0.0)  # m/s, rad/s
         self._wanted: Vector6 = NOTHING
         self.applied: Vector6 = NOTHING
         self._state = encode.EXPIRED
@@ -79,8 +85,12 @@ class MailboxProgram:
         elif self.running:
             self._take(read(self._box.table, self._box.address, MAILBOX_WORDS), peer.period)
         else:
-            self._wanted = NOTHING
-        self.applied = approach(self.applied, self._wanted)
+            self._wanted, self._alive, self._heartbeat = NOTHING, False, None
+        shift, turn = self._rates
+        self.applied = approach(
+            self.applied, self._wanted,
+            (min(shift * peer.period, SHIFT_STEP), min(turn * peer.period, TURN_STEP)),
+        )  # fmt: skip
         self._apply(peer)
 
     def _take(self, words: list[int], dt: float) -> None:
@@ -89,15 +99,23 @@ class MailboxProgram:
             self._state = encode.REJECTED if any(words) else encode.EXPIRED
             self._silent += dt
         else:
-            self._silent = 0.0 if body[7] != self._heartbeat else self._silent + dt
+            if self._heartbeat is not None and body[7] != self._heartbeat:
+                self._alive, self._silent = True, 0.0
+            else:
+                self._silent += dt
             self._heartbeat = body[7]
-            self._state = encode.RUNNING
-            if body[0] != self._sequence:
+            self._state = encode.RUNNING if self._alive else encode.EXPIRED
+            if self._alive and body[0] != self._sequence:
                 self._sequence = body[0]
                 x, y, z, rx, ry, rz = encode.offset_of(self._box, body[1:7])
                 self._wanted = (x, y, z, rx, ry, rz)
+                shift, turn = (
+                    n * unit for n, unit in zip(body[8:], encode.RATE_COUNTS, strict=True)
+                )
+                self._rates = (shift, turn)
         if self._silent > self._box.watchdog:
             self._state, self._wanted, self._sequence = encode.EXPIRED, NOTHING, 0
+            self._alive = False
 
     def _apply(self, peer: Peer) -> None:
         if self.applied == NOTHING:

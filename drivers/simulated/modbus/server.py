@@ -24,12 +24,12 @@ from drivers.modbus.profile import read_profile
 from drivers.modbus.registers import BIT_TABLES, Table
 from drivers.modbus.schema import ProfileFile, Trouble
 from drivers.modbus.settings import ModbusSettings
-from drivers.simulated.bench import Command
 from drivers.simulated.modbus import image
 from drivers.simulated.modbus.image import Image
 from drivers.simulated.modbus.programs import MailboxProgram, make_program
-from drivers.simulated.peer import Peer
-from drivers.simulated.peer_server import PeerServer
+from drivers.simulated.peer.bench import Command
+from drivers.simulated.peer.peer import Peer
+from drivers.simulated.peer.peer_server import PeerServer
 
 FUNCTIONS: dict[int, Table] = {
     1: "coil", 5: "coil", 15: "coil", 2: "discrete", 4: "input",

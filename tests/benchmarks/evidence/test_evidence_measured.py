@@ -5,8 +5,8 @@ import pytest
 
 from benchmarks.evidence import DATA, measured
 from bridge.cell import load_cell
-from core.identification import identify_compliance
-from core.log import read_log
+from core.estimation.identification import identify_compliance
+from core.log.log import read_log
 
 pytestmark = pytest.mark.skipif(
     not DATA.is_dir(), reason="the measured data sets (../shared/data) are not beside this checkout"

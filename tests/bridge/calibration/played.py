@@ -13,15 +13,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.journal import FILE, read_entries
-from bridge.calibration.plan_document import plan_of
+from bridge.calibration.session.journal import FILE, read_entries
+from bridge.calibration.session.plan_document import plan_of
 from bridge.cli import main
 from core.arm import builtin_arm
 from core.calibration.plan import Plan
 from core.effects import Site, Term
+from core.estimation.registration import Registration
 from core.loads import Loads
 from core.model import Model
-from core.registration import Registration
 from core.rotation import rotation_matrix
 
 Array = NDArray[np.float64]

@@ -17,9 +17,9 @@ import numpy as np
 import pexpect
 from numpy.typing import NDArray
 
-from core.registration import Registration
+from core.estimation.registration import Registration
 from core.rotation import rotation_matrix
-from drivers.simulated.settings import BENCH_PORT, SCRIPT_PORT
+from drivers.simulated.ur.settings import BENCH_PORT, SCRIPT_PORT
 
 Array = NDArray[np.float64]
 JOINT = re.compile(r"J\d ([+-][\d.]+)°")

@@ -11,9 +11,9 @@ from played import FRAME, Played, plan_in, play, script, truth, typed, write_cel
 from bridge.cell import load_cell
 from core.calibration.plan import Plan
 from core.effects import Site, Term
+from core.estimation.registration import register
 from core.loads import Loads
 from core.model import Model
-from core.registration import register
 
 WAVE = Term("transmission_error", Site(2, 2.0), (1.8e-4, -1.2e-4))
 

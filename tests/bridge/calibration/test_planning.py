@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from played import FRAME, plan_in, play, positions, typed, write_cell
 
-from bridge.calibration.journal import FILE, read_entries
-from bridge.calibration.order import Order
+from bridge.calibration.options import Order
 from bridge.calibration.planning import planned, space_of
+from bridge.calibration.session.journal import FILE, read_entries
 from bridge.cell import load_cell
 from core.calibration.plan import Plan
 from core.model import Model

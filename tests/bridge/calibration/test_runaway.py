@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bridge.calibration.whole_job import worse_than_before
+from bridge.calibration.jobs.calibrate import worse_than_before
 from core.calibration.result import Errors
 
 

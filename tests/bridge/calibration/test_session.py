@@ -20,7 +20,7 @@ from played import (
     write_cell,
 )
 
-from bridge.calibration.journal import FILE, read_entries
+from bridge.calibration.session.journal import FILE, read_entries
 from bridge.cell import load_cell
 
 
@@ -39,7 +39,7 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Played]:
 
 def remaining(cell: Path, plan_folder: Path) -> np.ndarray:
     """Return how far a cell's prediction is off at the session's poses (N,), m, rigidly fitted."""
-    from core.registration import register
+    from core.estimation.registration import register
 
     plan = plan_in(plan_folder)
     q = np.array([p.q for p in plan.poses])

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from played import AXIAL, FRAME, Played, plan_in, play, truth, typed, write_cell
 
-from bridge.calibration.journal import FILE, read_entries
 from bridge.calibration.planning import observable_of
+from bridge.calibration.session.journal import FILE, read_entries
 from bridge.cell import load_cell
-from core.calibration.foreseen import foreseen
 from core.calibration.observables import Nuisance, fixed_at
+from core.calibration.observables.foreseen import foreseen
 from core.calibration.plan import Plan
 from core.calibration.promise import promise_in
 from core.calibration.readings import Readings

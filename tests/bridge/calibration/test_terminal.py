@@ -13,10 +13,10 @@ import pytest
 from technician import FRAME, Hands, Terminal, last_pose
 
 from benchmarks.calibration.kills import run as run_kills
-from bridge.calibration.journal import FILE, read_entries
+from bridge.calibration.session.journal import FILE, read_entries
 from bridge.cell import load_cell
 from bridge.demo.served_cell import ServedCell
-from core.registration import Registration
+from core.estimation.registration import Registration
 from core.rotation import rotation_matrix
 
 _hosts = itertools.count(2)

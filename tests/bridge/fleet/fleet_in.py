@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.fleet.cell_source import OneCell
-from bridge.fleet.running import tasks_of
+from bridge.fleet.runner import tasks_of
 from bridge.fleet.session import find_sessions
 from bridge.fleet.task import Task, Work
 from tests.bridge.cli_runs import (

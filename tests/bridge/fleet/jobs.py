@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.cell import Cell
-from core.log import Log
+from core.log.log import Log
 
 
 def count_rows(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bridge.fleet.drifting import DAY, Series, drifts, places
+from bridge.fleet.drift import DAY, Series, drifts, places
 from bridge.fleet.outlying import far_from_median
 
 SESSIONS = 6

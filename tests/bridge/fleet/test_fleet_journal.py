@@ -9,7 +9,7 @@ import pytest
 
 from bridge.fleet.cell_source import OneCell
 from bridge.fleet.journal import Journal
-from bridge.fleet.running import run, tasks_of
+from bridge.fleet.runner import run, tasks_of
 from bridge.fleet.session import find_sessions
 from bridge.fleet.task import BAD, DIED, DONE, Outcome, Task, perform
 from bridge.fleet.workers import Workers

@@ -1,4 +1,4 @@
-"""Export: a recording becomes a log in the contract's columns."""
+"""Export: a recording becomes a log."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from recorded import Desk, N, publish, same_bits
 from bridge.cli.main import gapbridge
 from bridge.recording.export import Span, export, moment
 from core.errors import InputError, LogError
-from core.log import read_log
-from core.recording.reading import read_batches
+from core.log.log import read_log
+from core.log.mcap_reading import read_batches
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from recorded import SESSION, Array, Desk, publish, same_bits
 
 from bridge.recording.folder import new_session, segments
 from core.errors import LogError
-from core.recording.reading import (
+from core.log.mcap_reading import (
     files_of,
     last_batch,
     read_batches,
@@ -24,7 +24,7 @@ from core.recording.reading import (
     read_configuration,
     read_documents,
 )
-from core.recording.records import chunk_offsets, is_whole
+from core.log.mcap_records import chunk_offsets, is_whole
 
 EVENTS: list[dict[str, object]] = [
     {"kind": "transition", "from": "OBSERVING", "to": "FAULT", "cause": "silence", "detail": "-"},
@@ -282,7 +282,7 @@ def test_a_recorder_that_comes_after_a_killed_one_goes_on_behind_it(desk: Desk) 
 
 
 def test_what_the_ring_no_longer_holds_is_told(desk: Desk) -> None:
-    from bridge.shared_page import ROWS
+    from bridge.ipc.shared_memory import ROWS
 
     recorder = desk.recorder()
     publish(desk.page, 10)

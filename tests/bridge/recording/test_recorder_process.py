@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from recorded import SESSION, N
 
-from bridge import side_process
-from bridge.daemon_settings import DaemonSettings
-from bridge.recording.settings import RecordingSettings
-from bridge.shared_page import Page
-from bridge.side_process import SideProcess
-from bridge.supervisor import State
-from core.recording.reading import read_columns, read_configuration, read_documents
-from core.recording.records import is_whole
+from bridge.cell.daemon_settings import DaemonSettings
+from bridge.cell.settings.recording import RecordingSettings
+from bridge.ipc import side_process
+from bridge.ipc.shared_memory import Page
+from bridge.ipc.side_process import SideProcess
+from bridge.loop.supervisor import State
+from core.log.mcap_reading import read_columns, read_configuration, read_documents
+from core.log.mcap_records import is_whole
 
 RATE = 500.0
 CELL = "robot: {model: ur10e}\nweb: {token: squeamish}\n"

@@ -10,7 +10,7 @@ import pytest
 from recorded import Desk
 
 from bridge.cell import load_cell
-from bridge.settings import link_settings
+from bridge.cell.sections import link_settings
 from core.arm import builtin_arm
 from core.errors import LogError
 from core.model import Model

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from core.arm import builtin_arm
 from core.calibration.readings import Readings
 from core.calibration.result import Calibration, Errors, Estimate
+from core.estimation.registration import IDENTITY, Registration
 from core.loads import Loads
 from core.model import Model
-from core.registration import IDENTITY, Registration
 
 Array = NDArray[np.float64]
 

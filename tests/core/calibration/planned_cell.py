@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from core.arm import builtin_arm
-from core.calibration.foreseen import empty_readings
 from core.calibration.observables import make_observable
+from core.calibration.observables.foreseen import empty_readings
 from core.calibration.parameters import Parameters
 from core.calibration.plan import Payload, Plan
 from core.calibration.readings import Readings
-from core.calibration.space import Place, Space
 from core.loads import Loads
 from core.model import Model
+from core.planning.workspace import Place, Space
 
 SIGMA = 3e-5
 LOADS = (Payload(4.0, (0.0, 0.02, 0.06), "plate"), Payload(0.0))

@@ -23,7 +23,7 @@ from core.calibration.observables import make_observable
 from core.calibration.parameters import DEFAULT, Parameters
 from core.calibration.problem import bounds_of
 from core.calibration.readings import Readings
-from core.calibration.system import Bounds, System, solve
+from core.estimation.linear_system import Bounds, System, solve
 from core.metrology import Metrology
 from core.model import Model
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from benchmarks.blind.arms import ARMS
 from benchmarks.blind.mechanics import stand
 from benchmarks.calibration.drawings import model_of, real_arm, session_at
-from core.calibration.payload_plan import plan_payload
 from core.calibration.payload_session import calibrate_payload
 from core.errors import ExcitationError, InputError
 from core.model import Model
+from core.planning.payload_plan import plan_payload
 
 Array = NDArray[np.float64]
 KIND = ARMS["cobot10"]

@@ -16,7 +16,7 @@ from benchmarks.blind.mechanics import RealArm, Session, stand, turn
 from benchmarks.blind.session import Plan, draw_session, play
 from core.arm import JointLimits, arm_from_dh
 from core.diagnosis.diagnosis import Diagnosis, diagnose
-from core.log import Log
+from core.log.log import Log
 from core.metrology import Metrology
 from core.model import Model
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from core.arm import builtin_arm
-from core.diagnosis.candidate import named_candidates
-from core.diagnosis.refit import _step
+from core.diagnosis.selection.candidate import named_candidates
+from core.diagnosis.selection.refit import _step
 
 ARM = builtin_arm("ur5")
 

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.blind.session import Plan
-from core.diagnosis.cause import causes_of, considered_of, probability
 from core.diagnosis.diagnosis import diagnose
 from core.diagnosis.held_out import HeldOut
 from core.diagnosis.judgement import judge, pure_error
+from core.diagnosis.result import causes_of, considered_of, probability
 from core.effects import CATALOGUE
 from core.metrology import Metrology
 

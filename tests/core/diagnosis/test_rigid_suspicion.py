@@ -11,7 +11,7 @@ from benchmarks.fleet.simulating import TYPE, Habits, TrueArm, columns, write_ty
 from bridge.cell import load_cell
 from core.diagnosis.diagnosis import diagnose
 from core.diagnosis.rigid_suspicion import softness_findings
-from core.log import Log
+from core.log.log import Log
 from core.metrology import Metrology
 from core.model import Model
 

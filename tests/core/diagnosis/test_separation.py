@@ -17,7 +17,7 @@ from core.arm import JointLimits
 from core.diagnosis.diagnosis import diagnose
 from core.diagnosis.separation import next_measurements
 from core.effects import CATALOGUE, Site
-from core.log import Log
+from core.log.log import Log
 from core.metrology import Metrology
 
 PLAY = 9e-4  # rad

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from core.diagnosis.candidate import Candidate
-from core.diagnosis.space import Space, prices
+from core.diagnosis.selection.candidate import Candidate
+from core.diagnosis.selection.problem import Space, prices
 from core.effects import Parameter, Site
 
 

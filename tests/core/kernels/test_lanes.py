@@ -1,17 +1,18 @@
-"""Blocks of lanes against core.kernel and against plain numpy, to 1e-12."""
+"""Blocks of lanes against core.kernels.reference and against plain numpy, to 1e-12."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from core import kernel
+from benchmarks.speed.peers import plain
 from core.arm import builtin_arm
-from core.kernel import Chain, Rows
-from core.kernels import many, plain, threads
+from core.kernels import many, threads
+from core.kernels import reference as kernel
 from core.kernels.factor import factor_blocks, normal_blocks, regressor_blocks
 from core.kernels.layout import LANES
 from core.kernels.predict import linear_blocks, predict_blocks
+from core.kernels.reference import Chain, Rows
 from core.loads import Loads
 from core.model import Model
 

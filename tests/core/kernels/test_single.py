@@ -1,4 +1,4 @@
-"""The correction in one call against the one that core.kernel solves step by step, to 1e-12."""
+"""The correction in one call against the one that reference.py solves step by step, to 1e-12."""
 
 from __future__ import annotations
 

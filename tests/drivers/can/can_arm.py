@@ -21,9 +21,9 @@ from drivers.can.driver import CanDriver
 from drivers.can.settings import CanSettings
 from drivers.simulated.can.nodes import CanNodes
 from drivers.simulated.can.server import make_servers
-from drivers.simulated.peer import Peer, make_peer
-from drivers.simulated.peer_server import PeerThread
-from drivers.simulated.settings import simulated_arm
+from drivers.simulated.peer.peer import Peer, make_peer
+from drivers.simulated.peer.peer_server import PeerThread
+from drivers.simulated.ur.settings import simulated_arm
 
 _channels = itertools.count()
 UNIT = math.radians(0.001)

@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from core.errors import LinkError
-from drivers.can.bus import BusSettings, close_bus, open_bus
+from drivers.can_bus.bus import BusSettings, close_bus, open_bus
 from drivers.simulated.can.frame import Frame
 from drivers.simulated.can.hub import Hub
 

@@ -224,7 +224,7 @@ def test_status_that_falls_silent_while_joints_go_on_is_stale(served):
 def test_joints_that_stand_still_though_commanded_away_are_stale(served):
     state = armed(served)
     served.peer.frozen = True  # the same joints again and again
-    goal = state.actual_q + 0.05
+    goal = state.actual_q + 0.04
     served.driver.write_setpoint(setpoint_of(goal))
     with pytest.raises(StaleStateError, match="joints have stood still"):
         read(served.driver, 500)

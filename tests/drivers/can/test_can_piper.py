@@ -16,10 +16,10 @@ from bridge.cell import load_cell
 from drivers.can.driver import CanDriver
 from drivers.can.settings import CanSettings
 from drivers.simulated.can.server import make_servers
-from drivers.simulated.peer import make_peer
-from drivers.simulated.peer_server import PeerThread
-from drivers.simulated.plant_arm import plant_arm
-from drivers.simulated.settings import simulated_arm
+from drivers.simulated.peer.peer import make_peer
+from drivers.simulated.peer.peer_server import PeerThread
+from drivers.simulated.plant.plant_arm import plant_arm
+from drivers.simulated.ur.settings import simulated_arm
 
 CONFIG = Path(__file__).parents[3] / "config"
 CELL = CONFIG / "piper_can_simulated.yaml"

@@ -11,9 +11,9 @@ from drivers.can.driver import CanDriver
 from drivers.can.settings import CanSettings
 from drivers.driver import DriverSettings
 from drivers.simulated.can.server import make_servers
-from drivers.simulated.peer import make_peer
-from drivers.simulated.peer_server import PeerThread
-from drivers.simulated.settings import simulated_arm
+from drivers.simulated.peer.peer import make_peer
+from drivers.simulated.peer.peer_server import PeerThread
+from drivers.simulated.ur.settings import simulated_arm
 
 PAGE = Path(__file__).parents[3] / "docs" / "porting.md"
 HALF = np.radians(0.005)

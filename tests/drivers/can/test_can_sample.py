@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from core.arm import builtin_arm
 from core.errors import InvalidStateError
+from drivers.can.assembler import Assembler
 from drivers.can.loading import load_profile
-from drivers.can.sample import Assembler
 from drivers.can.state import StateBuilder
 
 PIPER = load_profile("piper")

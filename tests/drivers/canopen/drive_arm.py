@@ -19,9 +19,9 @@ from core.state import RobotState
 from drivers.canopen.driver import CanopenDriver
 from drivers.canopen.settings import CanopenSettings
 from drivers.simulated.canopen.server import CanopenServer
-from drivers.simulated.peer import Peer, make_peer
-from drivers.simulated.peer_server import PeerThread
-from drivers.simulated.settings import simulated_arm
+from drivers.simulated.peer.peer import Peer, make_peer
+from drivers.simulated.peer.peer_server import PeerThread
+from drivers.simulated.ur.settings import simulated_arm
 
 HOST = "127.0.0.1"
 _numbers = itertools.count()

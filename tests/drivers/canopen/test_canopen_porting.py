@@ -16,7 +16,7 @@ import yaml
 from drive_arm import follow, served, settled
 
 from core.errors import InputError
-from core.recording.reading import read_columns
+from core.log.mcap_reading import read_columns
 from drivers.canopen.profile import read_profile
 from drivers.canopen.settings import SHIPPED
 

@@ -17,7 +17,7 @@ from drivers.can.settings import CanSettings
 from drivers.driver import Driver
 from drivers.simulated.can.nodes import CanNodes
 from drivers.simulated.can.server import make_servers
-from drivers.simulated.peer_server import PeerServer
+from drivers.simulated.peer.peer_server import PeerServer
 
 INVENTED = Path(__file__).parents[1] / "can" / "invented.yaml"
 _ports = itertools.count(29600)

@@ -13,7 +13,7 @@ from drivers.canopen.driver import CanopenDriver
 from drivers.canopen.settings import CanopenSettings
 from drivers.driver import Driver
 from drivers.simulated.canopen.server import CanopenServer, make_servers
-from drivers.simulated.peer_server import PeerServer
+from drivers.simulated.peer.peer_server import PeerServer
 
 LATE = 0.012  # s that a torn sample's PDO is late: it comes after the next SYNC's slot
 _ports = itertools.count(29900)

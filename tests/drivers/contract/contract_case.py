@@ -15,9 +15,9 @@ from bridge.cell import load_cell
 from core.arm import builtin_arm
 from core.model import Model
 from drivers.driver import Driver
-from drivers.simulated.peer import Peer, make_peer
-from drivers.simulated.peer_server import PeerServer, PeerThread
-from drivers.simulated.settings import simulated_arm
+from drivers.simulated.peer.peer import Peer, make_peer
+from drivers.simulated.peer.peer_server import PeerServer, PeerThread
+from drivers.simulated.ur.settings import simulated_arm
 
 PERIOD = 0.004  # s
 CONFIG = Path(__file__).parents[3] / "config"

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from contract_case import Case, wait_for
 
-from core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
+from core.errors import GateError, InvalidStateError, LinkError, StaleStateError, WriteError
 from core.model import Model
 from core.setpoint import Setpoint
 from core.state import RobotState
 from drivers.driver import Driver
-from drivers.simulated.kinematics import gap, tcp_in_base
+from drivers.simulated.plant.kinematics import gap, tcp_in_base
 
 OFFSET = (4e-4, -3e-4, 5e-4, 1e-3, 0.0, -1e-3)  # m, rad: what a write of offsets moves the TCP by
 STEP = 0.02  # rad: what a write of joints moves each joint by
@@ -152,7 +152,8 @@ def check_joints(case: Case, driver: Driver) -> None:
 
     def setpoint(state: RobotState, _: np.ndarray) -> Setpoint:
         share = min((time.monotonic() - begun) * PACE / STEP, 1.0)
-        return setpoint_of(state, start + share * (goal - start), start, (0.0,) * 6)
+        q = start + share * (goal - start)
+        return setpoint_of(state, q, q, (0.0,) * 6)
 
     stream(
         driver, setpoint, 8.0, lambda: bool(np.abs(goal - peer.q).max() < case.resolution + 1e-4)
@@ -164,6 +165,27 @@ def check_joints(case: Case, driver: Driver) -> None:
     time.sleep(0.2)
     assert np.abs(rest - peer.q).max() < 1e-6
     assert np.abs(goal - peer.q).max() < case.resolution + 1e-3
+
+
+def check_gate(case: Case, driver: Driver) -> None:
+    """What is no number or far off never leaves, and the arm stays where it is."""
+    before = np.array(case.peer.target_q)
+    driver.arm(next_state(driver))
+    state = next_state(driver)
+    q = driver.nominal_q(state)
+    nothing = (0.0,) * 6
+    for bad in (np.nan, np.inf, 50.0):
+        wrong = q.copy()
+        wrong[-1] = bad
+        setpoint = setpoint_of(state, q, q, nothing)._replace(q=wrong)
+        with pytest.raises(GateError):
+            driver.write_setpoint(setpoint)
+    for length in (1.0, math.nan):
+        with pytest.raises(GateError):
+            driver.write_setpoint(setpoint_of(state, q, q, (length, *nothing[1:])))
+    time.sleep(0.1)
+    assert np.abs(before - case.peer.target_q).max() <= 2.0 * case.resolution + 1e-6
+    driver.write_setpoint(setpoint_of(state, q, q, nothing))
 
 
 def check_stall(case: Case, driver: Driver) -> None:

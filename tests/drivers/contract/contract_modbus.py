@@ -17,7 +17,7 @@ from drivers.modbus.registers import UNITS
 from drivers.modbus.schema import Vector
 from drivers.modbus.settings import SHIPPED, ModbusSettings
 from drivers.simulated.modbus.server import ModbusServer, make_servers
-from drivers.simulated.peer_server import PeerServer
+from drivers.simulated.peer.peer_server import PeerServer
 
 INVENTED = Path(__file__).parents[1] / "modbus" / "invented.yaml"
 _ports = itertools.count(15100)

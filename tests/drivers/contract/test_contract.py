@@ -12,6 +12,7 @@ from contract_checks import (
     check_closed,
     check_force,
     check_frozen,
+    check_gate,
     check_joints,
     check_loss,
     check_not_armed,
@@ -67,6 +68,11 @@ def test_without_arming_nothing_leaves(case: Case, driver: Driver) -> None:
     before = np.array(case.peer.q)
     check_not_armed(driver)
     assert np.abs(before - case.peer.q).max() < 1e-9
+
+
+def test_what_the_gate_refuses_never_reaches_the_plant(case: Case, driver: Driver) -> None:
+    if case.writes is not None:
+        check_gate(case, driver)
 
 
 def test_silence_is_stale_in_time(case: Case, driver: Driver) -> None:

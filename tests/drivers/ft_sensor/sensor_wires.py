@@ -15,7 +15,7 @@ from pydantic import TypeAdapter
 
 from core.arm import builtin_arm
 from core.rotation import rpy_matrix
-from drivers.can.bus import BusSettings
+from drivers.can_bus.bus import BusSettings
 from drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
 from drivers.ft_sensor.settings import AnyFtSensor, FtSensorSettings
 from drivers.simulated.ft_sensor.ati_node import AtiNode
@@ -23,9 +23,9 @@ from drivers.simulated.ft_sensor.ft300_device import Ft300Device
 from drivers.simulated.ft_sensor.mounting import felt_by
 from drivers.simulated.ft_sensor.node import SimulatedSensor
 from drivers.simulated.ft_sensor.robotous_node import RobotousNode
-from drivers.simulated.peer import Peer, make_peer
-from drivers.simulated.plant_arm import plant_arm
-from drivers.simulated.plant_settings import draw_plant_settings
+from drivers.simulated.peer.peer import Peer, make_peer
+from drivers.simulated.plant.plant_arm import plant_arm
+from drivers.simulated.plant.plant_settings import draw_plant_settings
 
 Array = NDArray[np.float64]
 KINDS = ("robotous_rft", "ati_netcanoem", "robotiq_ft300", "robotiq_ft300 registers")

@@ -21,7 +21,7 @@ import pytest
 from bridge.cell import load_cell
 from bridge.recording.export import export
 from core.errors import InputError
-from drivers.simulated.settings import BENCH_PORT
+from drivers.simulated.ur.settings import BENCH_PORT
 
 ROOT = Path(__file__).resolve().parents[3]
 _numbers = itertools.count(2)

@@ -32,7 +32,7 @@ from core.setpoint import Setpoint
 from core.state import RobotState
 from drivers.driver import Driver
 from drivers.ft_sensor.joined import DriverWithSensor
-from drivers.simulated.peer import Peer
+from drivers.simulated.peer.peer import Peer
 
 TURNED = (0.3, -1.2, 1.4, -1.1, -1.3, 0.8)  # rad
 MOUNTED = {"sensor_in_flange": {"xyz": XYZ, "rpy": RPY}}
@@ -44,7 +44,7 @@ class PeerDriver(Driver):
     """An arm without a wire of its own: reads a simulated peer's plant, at 500 Hz."""
 
     def __init__(self, peer: Peer, lead: float = 0.0) -> None:
-        super().__init__(1.0 / PERIOD, peer.n)
+        super().__init__(1.0 / PERIOD, Model(builtin_arm("ur10e")))
         self.peer, self.lead = peer, lead  # lead: s of the arm's clock on this machine's
         self.written: list[Setpoint] = []
         self.open = False
@@ -60,7 +60,7 @@ class PeerDriver(Driver):
         q, still = np.array(self.peer.q), np.zeros(self.n)
         return RobotState(now + self.lead, now, q, still, q, np.full(6, 99.0))
 
-    def write_setpoint(self, setpoint: Setpoint) -> None:
+    def _send(self, setpoint: Setpoint) -> None:
         self.written.append(setpoint)
 
     def close(self) -> None:

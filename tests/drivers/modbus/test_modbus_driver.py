@@ -15,11 +15,15 @@ from contract_modbus import INVENTED, ModbusCase
 
 from bridge.cell import load_cell
 from core.errors import LinkError, WriteError
+from core.setpoint import Setpoint
+from core.state import RobotState
+from drivers.gate import GateBounds
 from drivers.modbus import encode
 from drivers.modbus.driver import ModbusDriver
 from drivers.modbus.settings import SHIPPED
 from drivers.simulated.modbus.programs import MailboxProgram
 from drivers.simulated.modbus.server import ModbusServer
+from drivers.simulated.peer.bench import BenchError
 
 
 @pytest.fixture
@@ -63,14 +67,61 @@ def test_a_program_that_ends_while_offsets_flow_is_noticed(ur: ModbusCase) -> No
 def test_a_mailbox_whose_checksum_is_wrong_is_not_applied(ur: ModbusCase) -> None:
     with ur.driver() as driver:
         next_state(driver)
-        words = encode.mailbox_words(5, [400] * 6, 9)
-        driver.transport.write("holding", 236, [*words[:-1], words[-1] ^ 1])
+        words = encode.mailbox_words(5, [400] * 6, 9, [2500, 1000])
+        driver.transport.write("holding", 234, [*words[:-1], words[-1] ^ 1])
         time.sleep(0.1)
         assert not any(program_of(ur).applied)
-        assert driver._look().answer[1] == encode.REJECTED
-        driver.transport.write("holding", 236, words)
-        time.sleep(0.1)
+        # a silence of half a second, since the program's start too, outranks a wrong checksum
+        assert driver._look().answer[1] in (encode.REJECTED, encode.EXPIRED)
+        for beat in (9, 10):
+            words = encode.mailbox_words(5, [400] * 6, beat, [2500, 1000])
+            driver.transport.write("holding", 234, words)
+            time.sleep(0.1)
         assert any(program_of(ur).applied)
+
+
+def test_registers_that_a_dead_client_left_move_nothing(ur: ModbusCase) -> None:
+    """A program that starts, or comes back, waits for a heartbeat that changes."""
+    with ur.driver() as driver:
+        next_state(driver)
+        words = encode.mailbox_words(5, [5000] * 3 + [0] * 3, 9, [50000, 10000])
+        driver.transport.write("holding", 234, words)
+        largest = 0.0
+        for running in (True, False, True):
+            program_of(ur).running = running
+            until = time.monotonic() + 0.3
+            while time.monotonic() < until:
+                largest = max(largest, *map(abs, program_of(ur).applied))
+                time.sleep(0.002)
+        assert largest == 0.0
+        assert driver._look().answer == (0, encode.EXPIRED)
+
+
+def test_a_client_that_dies_is_withdrawn_at_the_rates_of_its_cell(ur: ModbusCase) -> None:
+    rate, turn = 0.002, 0.004  # m/s, rad/s
+    with ur.driver() as driver:
+        driver.gate.hold_to(GateBounds(offset_rate=rate, offset_rotation_rate=turn))
+        driver.arm(next_state(driver))
+        begun = time.monotonic()
+
+        def towards(state: RobotState, q: np.ndarray) -> Setpoint:
+            share = min((time.monotonic() - begun) * 0.8 * rate, 1e-3)
+            return setpoint_of(state, q, q, (share, 0.0, 0.0, 0.0, 0.0, 0.0))
+
+        stream(driver, towards, 1.0)
+        largest = program_of(ur).applied[0]
+        assert largest > 5e-4
+        driver.release()  # as a kill: nothing more is sent
+        path = [(time.monotonic(), largest)]
+        while path[-1][1] > 0.0:
+            path.append((time.monotonic(), program_of(ur).applied[0]))
+            assert path[-1][0] < begun + 10.0
+            time.sleep(0.002)
+        times, lengths = np.array(path).T
+        assert (-np.diff(lengths) <= rate * (np.diff(times) + 0.02)).all()
+        out = [t for t, x in path if x < largest]
+        assert largest / (out[-1] - out[0]) <= rate * 1.1
+        driver.arm(next_state(driver))  # and it can be armed again
 
 
 def test_an_offset_that_registers_cannot_hold_is_refused(ur: ModbusCase) -> None:
@@ -78,6 +129,7 @@ def test_an_offset_that_registers_cannot_hold_is_refused(ur: ModbusCase) -> None
         driver.arm(next_state(driver))
         state = next_state(driver)
         q = driver.nominal_q(state)
+        driver.gate.hold_to(GateBounds(offset=0.1, offset_rate=1.0))
         with pytest.raises(
             WriteError, match=r"found an offset of 0\.04 m, expected at most 0\.0327"
         ):
@@ -86,7 +138,7 @@ def test_an_offset_that_registers_cannot_hold_is_refused(ur: ModbusCase) -> None
 
 def test_a_register_outside_the_allow_list_is_never_written(ur: ModbusCase) -> None:
     with ur.driver() as driver:
-        for address in (128, 235, 245, 270):
+        for address in (128, 233, 245, 270):
             with pytest.raises(WriteError, match="the profile does not allow"):
                 driver.transport.write("holding", address, [1])
         with pytest.raises(WriteError, match="the profile does not allow"):
@@ -131,10 +183,16 @@ def test_registers_too_coarse_for_the_offset_are_told_before_arming(tmp_path: Pa
             driver.arm(next_state(driver))
 
 
-def test_a_target_that_the_robot_refuses_is_told() -> None:
+def test_a_target_that_the_robot_refuses_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     with ModbusCase("niryo") as case, case.driver() as driver:
-        driver.arm(next_state(driver))
-        q = np.array([30.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        state = next_state(driver)
+        driver.arm(state)
+        q = state.actual_q + 0.02
+
+        def refuse(_: object) -> None:
+            raise BenchError("move: outside what this controller allows")
+
+        monkeypatch.setattr(case.peer, "move_own", refuse)
         with pytest.raises(WriteError, match=r"last command .*found 2, expected 0 or 1"):
             stream(driver, lambda state, _: setpoint_of(state, q, q, (0.0,) * 6), 2.0)
 

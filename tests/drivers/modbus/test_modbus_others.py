@@ -96,7 +96,7 @@ def test_our_driver_reads_a_server_that_is_not_pymodbus() -> None:
         while not ended.is_set():
             case.peer.cycle()
             bank = other.data_bank
-            words = bank.get_holding_registers(236, 9)
+            words = bank.get_holding_registers(234, 11)
             server.program.cycle(case.peer, lambda *_, w=words: w)
             found = image.state_registers(case.file, image.readings(case.peer))["holding"]
             spots = image.condition_registers(case.file.status, frozenset())

@@ -41,13 +41,23 @@ def test_the_map_of_the_page_reads_writes_and_is_told_when_wrong(profile: Path) 
 
 
 def test_the_checksum_is_the_one_on_the_page() -> None:
-    words = [7, 100, 65436, 3, 4, 65531, 6, 9]
+    words = [7, 100, 65436, 3, 4, 65531, 6, 9, 2500, 1000]
     said = re.search(r"\((\d+) \+ 1 w0 \+ 2 w1 .*modulo (\d+)", PORTING)
     assert said is not None
     seed, modulus = map(int, said.groups())
     total = seed + sum((i + 1) * word for i, word in enumerate(words))
     assert encode.checksum(words) == total % modulus
-    assert encode.mailbox_words(7, [100, -100, 3, 4, -5, 6], 9) == [*words, total % modulus]
+    assert encode.mailbox_words(7, [100, -100, 3, 4, -5, 6], 9, [2500, 1000]) == [
+        *words,
+        total % modulus,
+    ]
+    assert encode.rate_counts((0.05, 0.1)) == [2500, 1000]
+
+
+def test_rates_are_rounded_down_and_never_to_nothing() -> None:
+    assert encode.rate_counts((0.00005, 0.00199)) == [2, 19]
+    with pytest.raises(ValueError, match="offset_rate: found 1e-05"):
+        encode.rate_counts((1e-5, 0.1))
 
 
 @pytest.mark.slow

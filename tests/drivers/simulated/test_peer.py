@@ -10,10 +10,10 @@ import pytest
 
 from core.arm import Arm, builtin_arm
 from core.errors import ArmError, LinkError
-from drivers.simulated.bench import BenchError
-from drivers.simulated.peer import Peer, make_peer
-from drivers.simulated.peer_server import PeerServer, PeerThread
-from drivers.simulated.settings import simulated_arm
+from drivers.simulated.peer.bench import BenchError
+from drivers.simulated.peer.peer import Peer, make_peer
+from drivers.simulated.peer.peer_server import PeerServer, PeerThread
+from drivers.simulated.ur.settings import simulated_arm
 
 PERIOD = 0.004
 

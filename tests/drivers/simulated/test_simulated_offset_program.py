@@ -11,8 +11,8 @@ import pytest
 from rtde_client import RtdeClient
 from simulated_cell import Bench
 
-from drivers.simulated.offset_program import checksum
-from drivers.simulated.process import SimulatedController
+from drivers.simulated.ur.offset_program import checksum
+from drivers.simulated.ur.process import SimulatedController
 
 OUT = ",".join(
     ["timestamp", "output_int_register_12", "output_int_register_13"]
@@ -21,8 +21,9 @@ OUT = ",".join(
 )
 IN = ",".join(
     [f"input_double_register_{i}" for i in range(18, 23)]
-    + [f"input_int_register_{i}" for i in range(18, 22)]
+    + [f"input_int_register_{i}" for i in range(18, 23)]
 )
+RATES = 1250 << 16 | 1000  # 50 mm/s, 0.1 rad/s
 OFFSET = (1.0e-3, -5.0e-4, 2.0e-3, 1.0e-3, 0.0, -2.0e-3)
 
 
@@ -37,13 +38,15 @@ class Stream:
         self.sequence = 0
         self.beat = 0
 
-    def send(self, offset: tuple[float, ...], spoil: int = 0, beat: bool = True) -> None:
+    def send(
+        self, offset: tuple[float, ...], spoil: int = 0, beat: bool = True, rates: int = RATES
+    ) -> None:
         self.sequence += 1
         self.beat += beat
         rz = round(offset[5] * 1e9)
-        total = checksum((*offset[:5], rz * 1e-9), self.sequence)
+        total = checksum((*offset[:5], rz * 1e-9), self.sequence, rates)
         self.client.write(
-            self.recipe, "5d4i", *offset[:5], rz, self.sequence, total + spoil, self.beat
+            self.recipe, "5d5i", *offset[:5], rz, self.sequence, total + spoil, self.beat, rates
         )
 
     def hold(self, offset: tuple[float, ...], cycles: int) -> dict[str, Any]:
@@ -114,7 +117,9 @@ def test_a_wrong_checksum_is_rejected_until_a_good_one_comes(stream: Stream) -> 
 
 def test_an_offset_that_is_no_number_is_rejected(stream: Stream) -> None:
     stream.sequence += 1
-    stream.client.write(stream.recipe, "5d4i", math.nan, 0, 0, 0, 0, 0, stream.sequence, 0, 5)
+    stream.client.write(
+        stream.recipe, "5d5i", math.nan, 0, 0, 0, 0, 0, stream.sequence, 0, 5, RATES
+    )
     assert stream.wait(10)["output_int_register_13"] == 3
 
 

@@ -10,11 +10,11 @@ from core.arm import builtin_arm
 from core.errors import ArmError
 from core.loads import Loads
 from core.model import Model
-from drivers.simulated import rotations as rot
-from drivers.simulated.kinematics import frame_of, gap, pose_of, solve, tcp_in_base
-from drivers.simulated.plant import Load, Plant
-from drivers.simulated.plant_arm import plant_arm
-from drivers.simulated.plant_settings import draw_plant_settings
+from drivers.simulated.plant import rotations as rot
+from drivers.simulated.plant.kinematics import frame_of, gap, pose_of, solve, tcp_in_base
+from drivers.simulated.plant.plant import Load, Plant
+from drivers.simulated.plant.plant_arm import plant_arm
+from drivers.simulated.plant.plant_settings import draw_plant_settings
 
 START = (0.3, -1.4, 1.2, -1.3, -1.5, 0.4)
 TCP = (0.02, -0.01, 0.18, 0.1, -0.2, 0.3)

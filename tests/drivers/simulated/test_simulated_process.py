@@ -15,8 +15,8 @@ from rtde_client import RtdeClient
 from simulated_cell import cell_settings, own_address
 
 from core.errors import LinkError
-from drivers.simulated.process import SimulatedController
-from drivers.simulated.settings import from_json, to_json
+from drivers.simulated.ur.process import SimulatedController
+from drivers.simulated.ur.settings import from_json, to_json
 
 ROOT = Path(__file__).parents[3]
 
@@ -71,8 +71,8 @@ def test_the_server_ends_with_its_parent() -> None:
     settings = cell_settings()
     code = (
         "import json, sys, os\n"
-        "from drivers.simulated.process import SimulatedController\n"
-        "from drivers.simulated.settings import from_json\n"
+        "from drivers.simulated.ur.process import SimulatedController\n"
+        "from drivers.simulated.ur.settings import from_json\n"
         "c = SimulatedController(from_json(json.loads(sys.stdin.read())))\n"
         "c.start()\nprint(c.pid, flush=True)\nos.kill(os.getpid(), 9)\n"
     )

@@ -9,7 +9,7 @@ from core.arm import builtin_arm
 from core.errors import InvalidStateError
 from core.model import Model
 from core.rotation import rotation_matrix, rotation_vector
-from drivers.ur_rtde.nominal import Nominal
+from drivers.offset_inverse import Nominal
 
 REGULAR = np.array([0.1, -1.2, 1.3, -0.5, 1.5, 0.2])  # elbow bent, wrist far from singular
 MODEL = Model(builtin_arm("ur10e"))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from textwrap import dedent
 
+import numpy as np
 import pytest
 from driver_runs import Bench, offset_program, run_driver
 
-from drivers.simulated.process import SimulatedController
+from drivers.simulated.ur.process import SimulatedController
 from drivers.ur_rtde import registers
 
 OFFSET = [1.0e-3, -5.0e-4, 2.0e-3, 1.0e-3, -4.0e-4, -2.0e-3]
@@ -16,10 +17,14 @@ driver.connect()
 state = read_for(20)
 driver.arm(state)
 nominal = driver.nominal_q(state).copy()
+sent = np.zeros(6)
+def write(state, offset):
+    sent[:] += np.clip(np.array(offset) - sent, -1e-4, 1e-4)
+    driver.write_setpoint(setpoint(state, nominal, nominal, sent.copy()))
 def stream(cycles, offset):
     for _ in range(cycles):
         state = driver.read_state()
-        driver.write_setpoint(setpoint(state, state.target_q, nominal, np.array(offset)))
+        write(state, offset)
     return state
 """
 
@@ -73,7 +78,7 @@ def test_the_nominal_joints_are_the_robots_own_while_it_moves(
         for _ in range(700):
             state = driver.read_state()
             seen.append(driver.nominal_q(state).copy())
-            driver.write_setpoint(setpoint(state, state.target_q, nominal, np.array({OFFSET})))
+            write(state, {OFFSET})
         way = (np.array(seen) - nominal) / (goal - nominal)
         out["end"] = (seen[-1] - goal).tolist()
         # a straight joint move: all joints are the same share of their way
@@ -103,6 +108,65 @@ def test_without_a_heartbeat_the_robots_program_goes_to_zero_and_on(
     assert out["runtime"] == 2
 
 
+def test_whoever_is_killed_is_withdrawn_at_the_rates_of_the_cell(
+    offset_robot: SimulatedController,
+) -> None:
+    """Slower than the program's own limit: the rates came with the offsets."""
+    out = run_driver(
+        offset_robot.host,
+        """
+        from drivers.gate import GateBounds
+        driver.gate.hold_to(GateBounds(offset_rate=0.0005, offset_rotation_rate=0.001))
+        driver.connect()
+        driver.arm(read_for(20))
+        nominal = driver.nominal_q(driver.read_state()).copy()
+        for k in range(250):
+            state = driver.read_state()
+            offset = np.array([9e-7 * k, 0, 0, 1.8e-6 * k, 0, 0])
+            driver.write_setpoint(setpoint(state, nominal, nominal, offset))
+        driver.release()
+        seen = []
+        for _ in range(600):
+            state = driver.read_state()
+            seen.append((state.timestamp, *driver.reader.applied))
+        out["seen"] = seen
+        before = driver.reader.applied[0]
+        driver.arm(state)
+        out["armed"] = (before, driver.reader.applied[0])
+        """,
+        mode="offset",
+    )
+    rows = np.array(out["seen"])
+    assert rows[0, 1] > 1.5e-4
+    assert rows[-1, 1] < rows[0, 1]
+    gaps = np.diff(rows[:, 0])
+    assert (-np.diff(rows[:, 1]) <= 0.0005 * gaps * 1.001 + 1e-12).all()
+    assert (-np.diff(rows[:, 4]) <= 0.001 * gaps * 1.001 + 1e-12).all()
+    assert out["armed"][1] == 0.0
+
+
+def test_rates_that_are_too_small_to_be_told_are_refused() -> None:
+    assert registers.rates(0.05, 0.1) == 1250 << 16 | 1000
+    with pytest.raises(ValueError, match="offset_rate: found 1e-05"):
+        registers.rates(1e-5, 0.1)
+
+
+def test_a_program_that_takes_no_rates_is_refused_when_arming(
+    offset_robot: SimulatedController,
+) -> None:
+    out = run_driver(
+        offset_robot.host,
+        """
+        from drivers.ur_rtde import registers
+        right, registers.checksum = registers.checksum, lambda u, s, r: right(u, s, r + 1)
+        driver.connect()
+        out["error"] = error_of(driver.arm, read_for(20))
+        """,
+        mode="offset",
+    )
+    assert "gapbridge_offset.script of this version" in out["error"]
+
+
 def test_a_wrong_checksum_moves_nothing_and_is_told(offset_robot: SimulatedController) -> None:
     out = run(
         offset_robot.host,
@@ -112,9 +176,7 @@ def test_a_wrong_checksum_moves_nothing_and_is_told(offset_robot: SimulatedContr
         error, count = "", 0
         while not error and count < 400:
             state, count = driver.read_state(), count + 1
-            error = error_of(
-                driver.write_setpoint, setpoint(state, state.target_q, nominal, np.array({OFFSET}))
-            )
+            error = error_of(write, state, {OFFSET})
         out["error"] = error
         out["applied"] = driver.reader.applied.tolist()
         """,
@@ -137,9 +199,7 @@ def test_a_stopped_program_is_noticed(offset_robot: SimulatedController) -> None
         error, count = "", 0
         while not error and count < 400:
             state, count = driver.read_state(), count + 1
-            error = error_of(
-                driver.write_setpoint, setpoint(state, state.target_q, nominal, np.zeros(6))
-            )
+            error = error_of(write, state, [0.0] * 6)
         out["error"] = error
         """,
     )
@@ -171,16 +231,16 @@ def test_another_tcp_in_the_controller_is_refused(offset_robot: SimulatedControl
         out["error"] = error_of(other.arm, other.read_state())
         """,
     )
-    assert "180.0 mm from the cell's" in out["error"]
+    assert "the controller's TCP is 180.0 mm" in out["error"]
 
 
 def test_the_checksum_is_what_both_sides_compute() -> None:
-    from drivers.simulated.offset_program import checksum
+    from drivers.simulated.ur.offset_program import checksum
 
     for sequence in (1, 77, registers.LAST_SEQUENCE):
         units = registers.counts(OFFSET)
-        assert registers.checksum(units, sequence) == checksum(OFFSET, sequence)
-    assert registers.checksum([-5, 0, 0, 0, 0, 0], 0) == 2**31 - 5
+        assert registers.checksum(units, sequence, 7) == checksum(OFFSET, sequence, 7)
+    assert registers.checksum([-5, 0, 0, 0, 0, 0], 0, 0) == 2**31 - 5
 
 
 def test_sequence_numbers_go_round() -> None:
@@ -197,13 +257,13 @@ def test_the_shipped_program_is_whole() -> None:
     words = [line[0].rstrip(":") for line in code if line]
     opened = sum(word in ("def", "if", "while", "thread") for word in words)
     assert opened == words.count("end")
-    for number in (18, 19, 20, 21):
+    for number in (18, 19, 20, 21, 22):
         assert str(number) in text
     for name in ("path_offset_enable", "path_offset_set(", "path_offset_disable", "sync()"):
         assert name in text
     # one cycle's steps: those of the simulator, and no more than the limiter's rates need
-    assert "gb_shift_step = 0.0001" in text
-    assert "gb_turn_step = 0.0002" in text
+    assert "gb_shift_step_most = 0.0001" in text
+    assert "gb_turn_step_most = 0.0002" in text
 
 
 def test_registers_that_another_client_holds_are_refused_in_one_line(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from driver_runs import Bench, run_driver
 
-from drivers.simulated.process import SimulatedController
+from drivers.simulated.ur.process import SimulatedController
 
 ARMED = """
 driver.connect()
@@ -16,7 +16,8 @@ def stream(cycles, goal):
     for k in range(cycles):
         state = driver.read_state()
         share = min((k + 1) / cycles, 1.0)
-        driver.write_setpoint(setpoint(state, start + share * (goal - start), start))
+        q = start + share * (goal - start)
+        driver.write_setpoint(setpoint(state, q, q))
     return state
 """
 
@@ -162,7 +163,7 @@ def test_writing_needs_arming_and_reading_first(controller: SimulatedController)
         driver.close()
         """,
     )
-    assert "expected read_state() first" in out["unread"]
+    assert "expected arm() first" in out["unread"]
     assert "expected arm() first" in out["unarmed"]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from driver_runs import run_driver
 
-from drivers.simulated.process import SimulatedController
+from drivers.simulated.ur.process import SimulatedController
 from drivers.ur_rtde.settings import UrRtdeSettings
 
 

@@ -18,10 +18,10 @@ from core.calibration.plan import Expectation, Payload, Plan, PlannedPose
 from core.calibration.readings import Readings
 from core.calibration.result import Calibration
 from core.effects import Site, Term
+from core.estimation.registration import Registration
 from core.loads import Loads
 from core.metrology import Metrology
 from core.model import Model
-from core.registration import Registration
 from core.rotation import rotation_matrix
 
 LOADS = (Payload(1.0, (0.0, 0.0, 0.03), "gripper alone"), Payload(8.0, (0.02, 0.0, 0.09), "8 kg"))

@@ -9,8 +9,8 @@ import numpy as np
 
 from core.arm import builtin_arm
 from core.calibration.fit import calibrate
-from core.calibration.foreseen import empty_readings, foreseen, somewhere
 from core.calibration.observables import make_observable
+from core.calibration.observables.foreseen import empty_readings, foreseen, somewhere
 from core.calibration.parameters import Parameters
 from core.calibration.result import Calibration
 from core.effects import Site, Term

@@ -1,0 +1,107 @@
+"""The diagnosis on real logs beside plain least squares: ``python -m benchmarks.real``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.real.judging import Outcome, Program, judge_carried, judge_log
+from benchmarks.real.sets import CARRIED, SPLIT
+
+OWN = Path("../shared/data")
+SCALE = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "N": (1.0, "N"), "Nm": (1.0, "Nm")}
+
+
+@click.command()
+@click.option("--data", "folders", multiple=True, type=click.Path(path_type=Path),
+              default=(OWN,), show_default=True,
+              help="Folder of logs, one folder each; may be given several times.")  # fmt: skip
+@click.option("--only", "names", default=None, help="Logs by name, by commas.")
+@click.option("--split", type=click.Choice(["tune", "held back"]), default=None,
+              help="Only this half.")  # fmt: skip
+@click.option("--carried/--no-carried", default=True, help="Also carry answers to later logs.")
+@click.option("--command", default="gapbridge", show_default=True, help="The program to judge.")
+@click.option("--json", "file", type=click.Path(path_type=Path), default=None,
+              help="Write the outcomes.")  # fmt: skip
+def main(
+    folders: tuple[Path, ...],
+    names: str | None,
+    split: str | None,
+    carried: bool,
+    command: str,
+    file: Path | None,
+) -> None:
+    """Judge the diagnosis on rows that its fit did not see, beside plain least squares.
+
+    Public sets are converted by ``python -m benchmarks.real.convert``.
+    """
+    console = Console()
+    if not console.is_terminal:
+        console.width = 190
+    found = {}
+    for folder in folders:
+        if not folder.is_dir():
+            console.print(f"{folder}: skipped, there is no such folder")
+            continue
+        found |= {p.parent.name: p.parent for p in sorted(folder.glob("*/log.csv"))}
+    wanted = set(names.split(",")) if names else None
+    program, outcomes = Program(command), []
+    jobs: list[tuple[str, Path, Path | None]] = [(n, p, None) for n, p in found.items()]
+    if carried:
+        jobs += [(f"{a} > {b}", found[a], found[b]) for a, b in CARRIED if {a, b} <= set(found)]
+    for name, first, second in jobs:
+        own = SPLIT.get(name.rpartition(" > ")[2], "held back")
+        if (wanted is not None and name not in wanted) or (split is not None and own != split):
+            continue
+        try:
+            new = judge_carried(first, second, program) if second else judge_log(first, program)
+        except (RuntimeError, ValueError) as error:
+            console.print(f"{name}: skipped, {error}")
+            continue
+        for outcome in new:
+            console.print(_line(outcome))
+        outcomes += new
+    console.print(_table(outcomes))
+    if file is not None:
+        document = json.dumps([o.document() for o in outcomes], indent=1)
+        file.write_text(document, encoding="utf-8")
+
+
+def _line(o: Outcome) -> str:
+    ratio = "–" if o.ratio is None else f"{o.ratio:.3f}"
+    return f"{o.log} {o.channel}: judged {_size(o, o.judged)}, rival {_size(o, o.rival)}, {ratio}"
+
+
+def _size(o: Outcome, value: float | None) -> str:
+    if value is None:
+        return "–"
+    factor, unit = SCALE.get(o.unit, (1.0, o.unit))
+    return f"{factor * value:.4g} {unit}"
+
+
+def _table(outcomes: list[Outcome]) -> Table:
+    table = Table(title="real logs: what is left of rows that the fit did not see")
+    for head in ("log", "channel", "half", "rows", "gap", "told held out", "judged",
+                 "least squares", "published", "ratio", "verdict", "accused", "absurd",
+                 "s"):  # fmt: skip
+        table.add_column(head, overflow="fold")
+    for o in outcomes:
+        theirs = "–"
+        if o.published is not None:
+            ours, other, what = o.published
+            theirs = f"{1e3 * other:.3g} mm ({what}); ours {1e3 * ours:.3g}"
+        table.add_row(
+            o.log, o.channel, o.split, str(o.rows), _size(o, o.gap), _size(o, o.told),
+            _size(o, o.judged), _size(o, o.rival), theirs,
+            "–" if o.ratio is None else f"{o.ratio:.2f}", o.verdict, " ".join(o.accused) or "–",
+            "; ".join(o.absurd) or "–", f"{o.seconds:.1f}",
+        )  # fmt: skip
+    return table
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,355 @@
+"""Public data sets of real arms as logs and cells of the contract's columns.
+
+``python -m benchmarks.real.convert CHECKOUTS --out DIR``: CHECKOUTS holds clones of the sources
+under their own names (``git clone https://github.com/OWNER/NAME``); what is not there is skipped.
+None of these sets is part of this repository.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from benchmarks.real import arms
+from benchmarks.real.geometry import rough_tool
+
+Array = NDArray[np.float64]
+Columns = dict[str, Array]
+GAINS = np.array([14.87, 13.26, 11.13, 10.62, 11.03, 11.47])  # Nm/A of the UR10e's drives, as told
+
+
+@dataclass(frozen=True)
+class Converted:
+    """One log with its cell, and what is known of both."""
+
+    columns: Columns
+    cell: dict[str, Any]
+    about: dict[str, Any]
+    urdf: str | None = None
+
+
+@dataclass(frozen=True)
+class Source:
+    """A data set: where it comes from and how it becomes a log."""
+
+    repository: str  # owner/name on GitHub
+    commit: str  # the one that was converted here
+    make: Callable[[Path], Converted]
+
+    @property
+    def folder(self) -> str:
+        """Return the name of a plain clone."""
+        return self.repository.partition("/")[2]
+
+
+def _cell(links: tuple[arms.Link, ...], **more: Any) -> dict[str, Any]:
+    return {"robot": {"dh": [link.document() for link in links]}} | more
+
+
+def _tracker(sigma: float) -> dict[str, Any]:
+    return {"registered": False, "sigma": sigma}
+
+
+def _tool(point: Array) -> dict[str, Any]:
+    return {"tcp": {"xyz": [float(x) for x in point], "rpy": [0, 0, 0]}}
+
+
+# -- UR10e, currents ---------------------------------------------------------------------------
+
+
+def _ur10e(name: str, first: int, last: int) -> Callable[[Path], Converted]:
+    def make(folder: Path) -> Converted:
+        (path,) = folder.glob(f"dataset_ur10e/*/{name}")
+        raw = np.loadtxt(path, delimiter=",")[first - 1 : last]
+        columns = {
+            "timestamp": raw[:, 0] - raw[0, 0],
+            "actual_q": raw[:, 1:7],
+            "actual_qd": raw[:, 7:13],
+            "actual_current_as_torque": raw[:, 13:19] * GAINS,
+        }
+        about = {
+            "robot": "Universal Robots UR10e",
+            "instrument": "motor currents of its controller, 100 Hz, times its drives' gains as "
+            "the data set's authors quote them (14.87 13.26 11.13 10.62 11.03 11.47 Nm/A)",
+            "file": str(path.relative_to(folder)), "rows": f"{first} to {last}: the motion",
+            "payload": "none",
+        }  # fmt: skip
+        return Converted(columns, _cell(arms.UR10E), about)
+
+    return make
+
+
+# -- force sensor ------------------------------------------------------------------------------
+
+
+def _force_sensor(folder: Path) -> Converted:
+    pose = np.loadtxt(folder / "datas/recorded_messages_pose_100.txt", delimiter=",")
+    wrench = np.loadtxt(folder / "datas/recorded_messages_wrench_100.txt", delimiter=",")
+    rotation = Rotation.from_quat(pose[:, 3:7]).as_matrix()
+    inside = np.einsum("nji,nkj->nki", rotation, wrench.reshape(-1, 2, 3)).reshape(-1, 6)
+    columns = {
+        "timestamp": np.arange(len(pose)) * 10.0,
+        "actual_q": arms.attitude_joints(rotation),
+        "ft_raw_wrench": inside,
+    }
+    about = {
+        "instrument": "ATI Axia80 flange sensor, 100 poses; recorded in base axes, turned back "
+        "into the sensor's by the recorded attitude",
+        "joints": "not recorded: three axes in one point that give the recorded attitude",
+        "timestamps": "not recorded: 10 s steps were put in",
+        "payload": "a gripper of unknown mass: declared as none",
+    }
+    return Converted(columns, _cell(arms.WRIST), about)
+
+
+# -- KUKA iiwa, laser tracker ------------------------------------------------------------------
+
+IIWA = {0.0: "0kg/20161216_run1_0kg.csv", 1.25: "1.25kg/20161216_run2_1.25kg.csv",
+        2.5: "2.5kg/20161216_run3_2.5kg.csv"}  # fmt: skip
+
+
+def _iiwa(*loads: float) -> Callable[[Path], Converted]:
+    def make(folder: Path) -> Converted:
+        parts = [(load, _iiwa_rows(folder / IIWA[load])) for load in loads]
+        raw = np.vstack([rows for _, rows in parts])
+        mass = np.concatenate([np.full(len(rows), load) for load, rows in parts])
+        about = {
+            "payload": f"{', '.join(f'{x:g}' for x in loads)} kg at the flange, centre of gravity "
+            "put at (0, 0, 0.05) m; the reflector was mounted anew for each load",
+        }
+        session = np.repeat(np.arange(len(parts)), [len(rows) for _, rows in parts]).astype(float)
+        more = {"session": session} if len(parts) > 1 else {}
+        return _iiwa_log(raw, mass, about, more)
+
+    return make
+
+
+def _iiwa_rows(path: Path) -> Array:
+    return np.genfromtxt(path, delimiter=",", skip_header=2)  # as its authors: without the candle
+
+
+def _iiwa_log(raw: Array, mass: Array, about: dict[str, Any], more: Columns) -> Converted:
+    q, frame = raw[:, 1:8], raw[:, 15:31].reshape(-1, 4, 4)
+    position = frame[:, :3, 3] * 1e-3
+    first = slice(None) if "session" not in more else more["session"] == 0
+    point = rough_tool(arms.IIWA7, q[first], position[first])
+    columns = {
+        "timestamp": np.arange(len(q)) * 30.0,
+        "actual_q": q,
+        "payload": mass,
+        "payload_cog": np.tile([0.0, 0.0, 0.05], (len(q), 1)),
+        "measured_position": position,
+        "measured_rotation": Rotation.from_matrix(frame[:, :3, :3]).as_rotvec(),
+    } | more
+    about = {
+        "robot": "KUKA iiwa 7 R800", "instrument": "laser tracker with a six-dof probe",
+        "timestamps": "only the order is known: 30 s steps were put in",
+        "tool": "the tool point is the best for the nominal arm, rounded to 1 mm",
+    } | about  # fmt: skip
+    cell = _cell(arms.IIWA7, tool=_tool(point), metrology=_tracker(2e-5))
+    return Converted(columns, cell, about)
+
+
+def _iiwa_month_before(folder: Path) -> Converted:
+    raw = np.genfromtxt(folder / "20161118_run_1.csv", delimiter=",", skip_header=2)
+    return _iiwa_log(raw, np.zeros(len(raw)), {"payload": "not told, put as 0 kg"}, {})
+
+
+# -- Motoman, IRB 120, UR10: laser trackers ----------------------------------------------------
+
+MOTOMAN = "UserData/Robots/Motoman/Dataset/leica_dataset/"
+
+
+def _motoman(name: str, tool: tuple[float, float, float] | None) -> Callable[[Path], Converted]:
+    def make(folder: Path) -> Converted:
+        from scipy.io import loadmat
+
+        raw = np.asarray(loadmat(folder / MOTOMAN / name)["dataset"], dtype=float)
+        raw = raw[~np.isnan(raw[:, 19:22]).any(axis=1)]
+        raw = raw[np.unique(raw[:, 0], return_index=True)[1]]  # as its authors: one row a pose
+        q, position = raw[:, 7:13], raw[:, 19:22]
+        point = np.array(tool) if tool else rough_tool(arms.MA1400, q, position)
+        torso = (arms.Link(0, 15 * np.pi / 180, -0.263, -np.pi / 2),)
+        down = arms.flange(torso, np.zeros((1, 1)))[1][0].T @ [0, 0, -9.80665]
+        cell = _cell(
+            arms.MA1400,
+            tool=_tool(point),
+            gravity=[float(x) for x in down],
+            metrology=_tracker(1e-5),
+        )
+        about = {
+            "robot": "Yaskawa Motoman MA1400, right arm of a pair on one torso", "file": name,
+            "instrument": "Leica AT403 laser tracker", "masses": "not known, left out",
+            "timestamps": "only the order is known: 30 s steps were put in",
+            "tool": "as its authors give it" if tool else
+            "the tool point is the best for the nominal arm, rounded to 1 mm",
+        }  # fmt: skip
+        columns = {
+            "timestamp": np.arange(len(q)) * 30.0,
+            "actual_q": q,
+            "measured_position": position,
+        }
+        return Converted(columns, cell, about)
+
+    return make
+
+
+def _irb120(folder: Path) -> Converted:
+    place = folder / "4-DataProcess/Output"
+    q = np.deg2rad(np.loadtxt(place / "processed_joints.txt"))
+    position = np.loadtxt(place / "processed_SMR_1.txt") * 1e-3
+    point = rough_tool(arms.IRB120, q, position)
+    about = {
+        "robot": "ABB IRB 120", "instrument": "FARO laser tracker, first of three reflectors",
+        "masses": "not known, left out", "rows": "those that its authors kept",
+        "timestamps": "only the order is known: 30 s steps were put in",
+        "tool": "the tool point is the best for the nominal arm, rounded to 1 mm",
+    }  # fmt: skip
+    columns = {"timestamp": np.arange(len(q)) * 30.0, "actual_q": q, "measured_position": position}
+    cell = _cell(arms.IRB120, tool=_tool(point), metrology=_tracker(3e-5))
+    return Converted(columns, cell, about)
+
+
+def _ur10(name: str) -> Callable[[Path], Converted]:
+    def make(folder: Path) -> Converted:
+        lines = (folder / name).read_text(encoding="utf-8-sig").splitlines()
+        head = lines[0].split(";")
+        rows = [line.replace(",", ".").split(";") for line in lines[1:] if line.strip()]
+
+        def column(title: str) -> Array:
+            return np.array([float(r[head.index(title)]) for r in rows])
+
+        q = np.column_stack([column(head[k]) for k in range(7, 13)])
+        position = np.column_stack([column(f"measurement_{x}") for x in "xyz"]) * 1e-3
+        about = {
+            "robot": "Universal Robots UR10 (CB series), the arm of series A and B",
+            "instrument": "Leica laser tracker with T-Mac, position of the T-Mac's origin",
+            "file": name, "joints": "commanded (the controller is at rest)",
+            "timestamps": "only the order is known: 30 s steps were put in",
+        }  # fmt: skip
+        columns = {
+            "timestamp": np.arange(len(q)) * 30.0,
+            "actual_q": q,
+            "measured_position": position,
+        }
+        cell = _cell(arms.UR10, tool=_tool(np.array([0, 0, 0.109])), metrology=_tracker(2e-5))
+        return Converted(columns, cell, about)
+
+    return make
+
+
+# -- Panda, torques and tracking ---------------------------------------------------------------
+
+
+def _panda(folder: Path) -> Converted:
+    place = folder / "matlab/data/Exciting_Traj/Trajectory_1"
+
+    def column(name: str) -> Array:
+        return np.loadtxt(place / name).reshape(-1, 7)
+
+    log = {
+        k: column(f"rbt_log/exciting_traj_{k}.txt") for k in ("positions", "velocity", "torques")
+    }
+    count = len(log["positions"])
+    time = np.loadtxt(place / "rbt_log/exciting_traj_time.txt")[:count]
+    steps = np.loadtxt(place / "gen_time.txt")[:count]
+    speed, start = column("gen_dq.txt")[:count], np.loadtxt(place / "gen_q0.txt")
+    middle = (speed[1:] + speed[:-1]) / 2 * np.diff(steps)[:, None]
+    wanted = start + np.vstack([np.zeros((1, 7)), np.cumsum(middle, axis=0)])
+    keep = np.arange(0, count, 2)
+    columns = {
+        "timestamp": time[keep] - time[0],
+        "target_q": wanted[keep],
+        "actual_q": log["positions"][keep],
+        "actual_qd": log["velocity"][keep],
+        "actual_current_as_torque": log["torques"][keep],
+    }
+    about = {
+        "robot": "Franka Emika Panda", "instrument": "its own joint torque sensors, 1 kHz; every "
+        "second row", "targets": "the generated speeds, integrated from the first angles",
+        "model": "kinematics and inertials of the public description of the arm",
+    }  # fmt: skip
+    return Converted(columns, {"robot": {"urdf": "robot.urdf", "tip": "flange"}}, about,
+                     arms.panda_urdf())  # fmt: skip
+
+
+UR10E_SET = ("shamilmamedov/dynamic_calibration", "11af40e7deb758ec080a175fed8fcdd6c99aca29")
+IIWA_SET = ("Zhangzhongqiu/robot-calibration", "be44742b3b312bde09d87d9d40e89d8a634ac83b")
+MOTOMAN_SET = ("ctu-vras/multirobot-calibration", "a20f0454732bc36f1d980ff08c3d30536b8b1b19")
+UR10_SET = ("christianlandgraf/ipa-robot-accuracy", "507fba69bdaf6c43c2faf306e70a7e37c5e39b89")
+SOURCES: dict[str, Source] = {
+    "ur10e_12harmonics": Source(*UR10E_SET, _ur10e("ur-20_02_10-30sec_12harm.csv", 635, 3510)),
+    "ur10e_8harmonics": Source(*UR10E_SET, _ur10e("ur-20_02_05-20sec_8harm.csv", 320, 2310)),
+    "ur10e_50s": Source(*UR10E_SET, _ur10e("ur-20_02_12-50sec_12harm.csv", 355, 5090)),
+    "ur10e_point_to_point": Source(*UR10E_SET, _ur10e("ur-20_01_17-ptp_10_points.csv", 700, 4200)),
+    "force_sensor_100": Source(
+        "leledeyuan00/Gravity-Compensation-F-T-sensor",
+        "139efe1841f97391002655ef370911d0417feaed", _force_sensor),
+    "iiwa_three_loads": Source(*IIWA_SET, _iiwa(0.0, 1.25, 2.5)),
+    "iiwa_0kg": Source(*IIWA_SET, _iiwa(0.0)),
+    "iiwa_month_before": Source(*IIWA_SET, _iiwa_month_before),
+    "motoman_cube": Source(*MOTOMAN_SET, _motoman(
+        "leica_right_hand_6x6x6_dataset.mat", (0.0418, -0.0167, 0.245))),
+    "motoman_wide": Source(*MOTOMAN_SET, _motoman("updated_leica_dataset.mat", None)),
+    "irb120": Source(
+        "icelinker/Robot-Calibration-LaserTracker",
+        "188abd2d773b26dd32bafe50943c3ab0044a72d8", _irb120),
+    "ur10_c": Source(*UR10_SET, _ur10("Series_C/measurements_random_poses.csv")),
+    "ur10_d": Source(*UR10_SET, _ur10("Series_D/measurements_iso_cubes.csv")),
+    "panda": Source(
+        "marcocognetti/FrankaEmikaPandaDynModel",
+        "24d85ce4e648e2e894c832bfeee9b16711eb1a1a", _panda),
+}  # fmt: skip
+
+
+def write(folder: Path, source: Source, made: Converted) -> None:
+    """Write log.csv, cell.yaml, ABOUT.yaml (and robot.urdf) into a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    names, values = [], []
+    for name, column in made.columns.items():
+        wide = column.reshape(len(column), -1)
+        names += [name] if column.ndim == 1 else [f"{name}_{k}" for k in range(wide.shape[1])]
+        values.append(wide)
+    np.savetxt(folder / "log.csv", np.hstack(values), delimiter=",", fmt="%.9g",
+               header=",".join(names), comments="")  # fmt: skip
+    about = {"source": f"github.com/{source.repository}, commit {source.commit[:7]}"} | made.about
+    for name, document in (("cell.yaml", made.cell), ("ABOUT.yaml", about)):
+        text = yaml.safe_dump(document, sort_keys=False, width=100)
+        (folder / name).write_text(text, encoding="utf-8")
+    if made.urdf is not None:
+        (folder / "robot.urdf").write_text(made.urdf, encoding="utf-8")
+
+
+@click.command()
+@click.argument("checkouts", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), required=True,
+              help="Folder for one folder a log.")  # fmt: skip
+@click.option("--only", "names", default=None, help="Sets by name, by commas.")
+def main(checkouts: Path, out: Path, names: str | None) -> None:
+    """Convert the data sets whose clones lie in CHECKOUTS."""
+    for name in names.split(",") if names else SOURCES:
+        if name not in SOURCES:
+            raise click.UsageError(f"set: found {name!r}, expected one of {', '.join(SOURCES)}")
+        source = SOURCES[name]
+        if not (checkouts / source.folder).is_dir():
+            click.echo(f"{name}: skipped, no clone of github.com/{source.repository} there")
+            continue
+        try:
+            made = source.make(checkouts / source.folder)
+        except (OSError, ValueError) as error:
+            click.echo(f"{name}: skipped, {error}")
+            continue
+        write(out / name, source, made)
+        click.echo(f"{name}: {len(made.columns['timestamp'])} rows")
+
+
+if __name__ == "__main__":
+    main()

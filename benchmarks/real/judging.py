@@ -1,0 +1,205 @@
+"""One log, one judgement: the diagnosis and plain least squares on rows that neither has seen.
+
+The diagnosis is a program of its own (``gapbridge diagnose``). It sees the rows to fit and writes
+a cell; what that cell leaves of the other rows is measured here for positions (``gapbridge
+predict``, frame fitted) and by the program's own gap for the other channels.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.real import rivals
+from benchmarks.real.absurd import absurdities
+from benchmarks.real.sets import HELD_BACK, PUBLISHED, REMOUNTED, SPLIT
+from benchmarks.real.table import Mask, Table, copy_cell, halves, read_cell, read_table
+
+LIMIT = 900.0  # s, of one diagnosis
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One channel of one log; figures in the channel's unit, rms per coordinate."""
+
+    log: str
+    channel: str
+    split: str
+    rows: int
+    gap: float
+    told: float | None  # the diagnosis' own held-out figure
+    told_new_region: float | None
+    judged: float  # what its cell leaves of rows that it did not see
+    rival: float | None  # what plain least squares leave of the same rows
+    published: tuple[float, float, str] | None  # ours and theirs, mean length (m), and what
+    verdict: str
+    accused: tuple[str, ...]
+    absurd: tuple[str, ...]
+    seconds: float
+    unit: str = field(default="")
+
+    @property
+    def ratio(self) -> float | None:
+        """Return judged over the best rival there is."""
+        ratios = [self.judged / self.rival] if self.rival else []
+        if self.published is not None:
+            ratios.append(self.published[0] / self.published[1])
+        return max(ratios) if ratios else None
+
+    def document(self) -> dict[str, Any]:
+        """Return the outcome for JSON."""
+        return asdict(self) | {"ratio": self.ratio}
+
+
+class Program:
+    """``gapbridge`` as a command line; raises RuntimeError with what it said."""
+
+    def __init__(self, command: str = "gapbridge") -> None:
+        """Take the program beside the running interpreter, where it is a bare name."""
+        first, *others = shlex.split(command)
+        own = Path(sys.executable).with_name(first)
+        self.words = (str(own) if own.is_file() and "/" not in first else first, *others)
+
+    def __call__(self, *words: object) -> None:
+        """Run one command."""
+        try:
+            done = subprocess.run([*self.words, *map(str, words)], capture_output=True, text=True,
+                                  timeout=LIMIT, check=False)  # fmt: skip
+        except subprocess.TimeoutExpired:
+            raise RuntimeError(f"no answer in {LIMIT:g} s") from None
+        if done.returncode:
+            said = (done.stderr.strip() or done.stdout.strip()).splitlines()
+            raise RuntimeError(f"exit {done.returncode}: {said[-1] if said else 'silent'}")
+
+    def diagnosis(self, log: Path, cell: Path, *words: object) -> dict[str, dict[str, Any]]:
+        """Return the channels of a diagnosis by name."""
+        file = log.with_suffix(".json")
+        self("diagnose", log, "--cell", cell, "--json", file, *words)
+        document = json.loads(file.read_text(encoding="utf-8"))
+        return {c["channel"]: c for c in document["channels"]}
+
+
+def judge_log(folder: Path, program: Program) -> list[Outcome]:
+    """Return the outcomes of one log: four fifths fitted, one fifth judged."""
+    table = read_table(folder / "log.csv")
+    fitted, judged = halves(table)
+    return _judge(folder.name, folder / "cell.yaml", (table, fitted), (table, judged), program)
+
+
+def judge_carried(fitted: Path, judged: Path, program: Program) -> list[Outcome]:
+    """Return the outcomes of one log's answer carried to another of the same arm."""
+    a, b = (read_table(f / "log.csv") for f in (fitted, judged))
+    whole = tuple((t, np.ones(len(t), dtype=bool)) for t in (a, b))
+    return _judge(f"{fitted.name} > {judged.name}", fitted / "cell.yaml", *whole, program)
+
+
+def _judge(
+    name: str, cell_file: Path, fitted: tuple[Table, Mask], judged: tuple[Table, Mask],
+    program: Program,
+) -> list[Outcome]:  # fmt: skip
+    cell = read_cell(cell_file)
+    train, test = fitted[0].rows(fitted[1]), judged[0].rows(judged[1])
+    with tempfile.TemporaryDirectory(prefix="real-") as scratch:
+        place = Path(scratch)
+        nominal = copy_cell(cell_file, place)
+        train.write(place / "train.csv")
+        test.write(place / "test.csv")
+        better = place / "better.yaml"
+        words: list[object] = ["--remounted"] if name in REMOUNTED and _knows(program) else []
+        start = time.perf_counter()
+        told = program.diagnosis(place / "train.csv", nominal, "--apply", better, *words)
+        seconds = time.perf_counter() - start
+        channels = [c for c in train.channels() if c in told]
+        after: dict[str, dict[str, Any]] = {}
+        if set(channels) - {"position"}:
+            after = program.diagnosis(place / "test.csv", better)
+        out = []
+        for channel in channels:
+            left, published = _judged(name, channel, program, place, test, after)
+            rival = _rival(channel, cell, cell_file.parent, train, test, place, program)
+            out.append(_outcome(name, told[channel], train, left, rival, published, seconds))
+    return out
+
+
+def _knows(program: Program) -> bool:
+    said = subprocess.run([*program.words, "diagnose", "--help"], capture_output=True, text=True,
+                          timeout=60, check=False).stdout  # fmt: skip
+    return "--remounted" in said
+
+
+def _judged(
+    name: str, channel: str, program: Program, place: Path, test: Table,
+    after: dict[str, dict[str, Any]],
+) -> tuple[float, tuple[float, float, str] | None]:  # fmt: skip
+    if channel != "position":
+        return float(after[channel]["gap_rms"]) if channel in after else float("nan"), None
+    program("predict", place / "test.csv", "--cell", place / "better.yaml",
+            "--out", place / "predicted.csv")  # fmt: skip
+    predicted = read_table(place / "predicted.csv").get("predicted_position")
+    assert predicted is not None
+    left = rivals.left_of(predicted, test)
+    theirs = PUBLISHED.get(name)
+    if theirs is None:
+        return _rms(left), None
+    length = float(np.linalg.norm(left, axis=1).mean())
+    return _rms(left), (length, theirs.mean_length, theirs.what)
+
+
+def _rival(
+    channel: str, cell: dict[str, Any], folder: Path, train: Table, test: Table, place: Path,
+    program: Program,
+) -> float | None:  # fmt: skip
+    if channel == "position":
+        return _rms(rivals.position_left(cell, train, test))
+    if channel == "tracking":
+        return _rms(rivals.tracking_left(train, test))
+    if channel == "torque":
+        return _rms(rivals.torque_left(cell, folder, train, test))
+    rivals.wrench_corrected(cell, train, test).write(place / "corrected.csv")
+    seen = program.diagnosis(place / "corrected.csv", place / "cell.yaml")
+    return float(seen["wrench"]["gap_rms"])
+
+
+def _outcome(
+    name: str, told: dict[str, Any], train: Table, left: float, rival: float | None,
+    published: tuple[float, float, str] | None, seconds: float,
+) -> Outcome:  # fmt: skip
+    mass = train.get("payload")
+    least, largest = (
+        (float(np.nanmin(mass)), float(np.nanmax(mass))) if mass is not None else (0, 0)
+    )
+    return Outcome(
+        log=name,
+        channel=told["channel"],
+        split=SPLIT.get(name.rpartition(" > ")[2], HELD_BACK),
+        rows=len(train),
+        gap=float(told["gap_rms"]),
+        told=told.get("remaining_rms_held_out"),
+        told_new_region=told.get("remaining_rms_new_region"),
+        judged=left,
+        rival=rival,
+        published=published,
+        verdict=str(told["verdict"]),
+        accused=tuple(_accused(c) for c in told["causes"]),
+        absurd=tuple(absurdities(told["causes"], least, largest)),
+        seconds=seconds,
+        unit=str(told["unit"]),
+    )
+
+
+def _accused(cause: dict[str, Any]) -> str:
+    joints = ",".join(str(j) for j in cause.get("joints") or [])
+    return f"{cause['effect']}({joints})" if joints else str(cause["effect"])
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))

@@ -1,0 +1,151 @@
+"""A whole calibration: from an unknown arm to a cell that compensates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.calibration.format import duration, load_text, millimetres, parameter
+from bridge.calibration.jobs.fitting import fitted, tell_calibration
+from bridge.calibration.jobs.job import Job, write_document
+from bridge.calibration.jobs.log_of import write_log
+from bridge.calibration.planning import metrology_of, planned
+from bridge.calibration.session.pace import seconds_left
+from core.calibration.plan import Plan
+from core.calibration.promise import document_of
+from core.calibration.result import Calibration, Errors
+
+Array = NDArray[np.float64]
+REFITS = 3  # times at most that the readings may ask for more
+WORSE = 1.1  # times the error on unseen poses above which a further fit is not taken
+
+
+def promise_beside(cell: Path) -> Path:
+    """Return where a calibrated cell's promise is kept."""
+    return cell.with_name(f"{cell.stem}.promise.json")
+
+
+class WholeJob(Job):
+    """Plan, measure, fit, verify, report, and a new cell."""
+
+    def plan(self, begin: Array | None, tell: Callable[[str, float], None]) -> Plan:
+        """Return the poses that tell most."""
+        return planned(self.cell, self.order, tell)
+
+    def tell_plan(self, plan: Plan) -> None:
+        """Say how many stops there are, and what n poses buy."""
+        talk, minutes = self.talk, self.cell.calibration.minutes_per_load
+        fit = sum(not p.held_out and not p.repeat for p in plan.poses)
+        held = sum(p.held_out for p in plan.poses)
+        again = sum(p.repeat > 0 for p in plan.poses)
+        talk.say(
+            f"plan: {fit} poses to fit, {held} to verify, {again} once more for the repeatability: "
+            f"{len(plan.poses)} stops, {duration(seconds_left(self.book, minutes) + plan.travel)}"
+        )
+        self._tell_places(plan)
+        used = {p.load for p in plan.poses}
+        for i, load in enumerate(plan.loads):
+            needless = "" if i in used else " (not needed: it would tell nothing more)"
+            talk.say(f"  load {i + 1}: {load_text(load)}{needless}")
+        talk.say(
+            f"expected: the predicted TCP known to {millimetres(plan.expected.tcp_std)} (1 sigma "
+            f"over workspace and loads; {millimetres(plan.expected.tcp_std_worst)} at worst)"
+        )
+        told = ", ".join(f"{n}: {millimetres(s)}" for n, s in plan.bought)
+        talk.say(f"  what n poses buy: {told}")
+        weak = _hardly_told(plan)
+        if weak:
+            talk.say(f"  these poses hardly tell: {', '.join(weak)}")
+        for note in plan.notes:
+            talk.say(f"  note: {note}")
+
+    def _tell_places(self, plan: Plan) -> None:
+        """Say where the instrument stands in turn, where it is carried about."""
+        given = self.cell.calibration
+        for i, at in enumerate(
+            given.further_places and [given.instrument_at, *given.further_places]
+        ):
+            count = sum(p.station == i for p in plan.poses)
+            place = ", ".join(f"{v:g}" for v in at or ())
+            needless = "" if count else " (not needed: nothing more is seen from there)"
+            self.talk.say(f"  place {i + 1}: ({place}) m in base, {count} stops{needless}")
+
+    def _wanted(self, lacking: tuple[str, ...]) -> bool:
+        """Return whether effects that the readings ask for are to be fitted as well."""
+        question = f"The readings ask for {', '.join(lacking)} as well. Fit again with it?"
+        return self.order.yes or self.talk.confirm(question)
+
+    def _completed(self, found: Calibration) -> Calibration:
+        """Return the fit with what the readings ask for as well, as long as a person wants it.
+
+        One that is worse on poses that no fit saw is told and not taken.
+        """
+        asked: tuple[str, ...] = ()
+        for _ in range(REFITS):
+            new = tuple(name for name in found.lacking if name not in asked)
+            if not new or not self._wanted(new):
+                break
+            asked += new
+            further = fitted(self.cell, self.order, self.talk, self.book, asked)
+            tell_calibration(self.talk, further)
+            if further.held_out_after.rms > WORSE * found.held_out_after.rms:
+                self.talk.warn(
+                    f"with {', '.join(new)} unseen poses are "
+                    f"{further.held_out_after.rms / found.held_out_after.rms:.1f} times as far "
+                    "off: the fit without stays"
+                )
+                break
+            found = further
+        return found
+
+    def finish(self) -> None:
+        """Fit, tell, report, and write the new cell once a person says yes."""
+        talk, folder, order = self.talk, self.folder, self.order
+        talk.say()
+        found = fitted(self.cell, order, talk, self.book)
+        tell_calibration(talk, found)
+        found = self._completed(found)
+        metrology = metrology_of(self.cell, order.instrument, self.book.places)
+        write_log(found.readings, metrology.registered, folder / "readings.csv")
+        promise = document_of(found, sigma=metrology.sigma)
+        write_document(folder / "promise.json", promise)
+        from bridge.calibration.jobs.facts import session_facts  # pictures take their time
+        from bridge.calibration.report import write_report
+
+        facts = session_facts(self.cell, order, self.book)
+        for file in write_report(found, self.book.plan, facts, folder):
+            talk.say(f"{file}: written")
+        if not found.complete:
+            talk.warn("something is left that these effects do not explain: see the report")
+        if (why := worse_than_before(found.held_out_before, found.held_out_after)) is not None:
+            self.book.add("ended", applied=None)
+            talk.warn(why)
+            return
+        target = self.hand_over(found.model, "the calibrated cell")
+        if target is not None:
+            write_document(promise_beside(target), promise)
+            talk.say(f"  months later: gapbridge calibrate {target} --verify")
+
+
+def worse_than_before(before: Errors, after: Errors) -> str | None:
+    """Return why a fit is not written: it ran away on unseen poses; None: it did not."""
+    if not after.rms > before.rms:  # without held-out poses both are nan
+        return None
+    return (
+        f"on poses that the fit never saw the error rises from {1e3 * before.rms:.3f} to "
+        f"{1e3 * after.rms:.3f} mm rms: nothing is applied; fit fewer effects, or more poses"
+    )
+
+
+def _hardly_told(plan: Plan) -> list[str]:
+    """Return the parameters whose expected spread is no less than their usual size."""
+    expected = plan.expected
+    rows = zip(expected.names, expected.units, expected.std, expected.prior, strict=True)
+    return [
+        f"{name} (±{parameter(std, unit)})"
+        for name, unit, std, prior in rows
+        if not np.isfinite(std) or std > prior
+    ]

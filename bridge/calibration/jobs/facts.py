@@ -1,0 +1,72 @@
+"""What the report tells of a session beside its figures."""
+
+from __future__ import annotations
+
+from datetime import datetime
+
+import numpy as np
+
+from bridge.calibration.options import Order
+from bridge.calibration.report import InstrumentFacts, SessionFacts
+from bridge.calibration.session.session import Book
+from bridge.cell import Cell
+
+NAMES = {
+    "typed": "readings typed at the terminal",
+    "file": "readings from a file",
+    "folder": "files exported by the instrument's software",
+    "line_feed": "lines sent by the instrument's software",
+    "dial_gauge": "dial gauge or ballbar, read by a person",
+    "two_balls": "two balls, read by a person",
+    "sphere": "probe on a fixed sphere",
+    "point": "tip on a fixed point",
+    "simulated_tracker": "simulated laser tracker",
+}
+
+
+def session_facts(
+    cell: Cell, order: Order, book: Book, what: tuple[str, str] | None = None
+) -> SessionFacts:
+    """Return who, where, when and with what.
+
+    ``what`` is name and kind of what measured, where it is not the ordered instrument.
+    """
+    given, instrument = cell.calibration, order.instrument
+    name, kind = what or (NAMES[instrument.kind], instrument.measures)
+    times = [t.time for t in book.taken] or [float(book.begun["time"])]
+    wide = {"position": 3, "pose": 3, "distance": 1}.get(kind, 0)  # the others look from nowhere
+    distances = [np.linalg.norm(t.value[:wide]) for t in book.taken if wide]
+    return SessionFacts(
+        cell=cell.path.stem,
+        arm=cell.arm.name,
+        serial=given.serial,
+        operator=given.operator,
+        environment=given.environment,
+        instrument=InstrumentFacts(
+            name=name, kind=kind, serial="" if what else instrument.serial,
+            sigma=instrument.sigma or cell.metrology.sigma,
+            distance=float(np.median(distances)) if distances else 0.0,
+        ),
+        folder=book.journal.path.parent,
+        started=datetime.fromtimestamp(float(book.begun["time"])),
+        ended=datetime.fromtimestamp(max(times)),
+        readings=len(book.taken),
+        undone=book.undone,
+        remarks=tuple(_remarks(book)),
+    )  # fmt: skip
+
+
+def _remarks(book: Book) -> list[str]:
+    """Return what happened on the way, in words."""
+    found = list(book.notes)
+    if book.places > 1:
+        found.append(f"the instrument stood at {book.places} places")
+    if book.target:
+        found.append(f"the target had {book.target + 1} places on the tool")
+    if book.skipped:
+        stops = ", ".join(str(s + 1) for s in sorted(book.skipped))
+        found.append(f"left out: stop {stops}")
+    doubted = [t.stop + 1 for t in book.taken if t.doubted]
+    if doubted:
+        found.append(f"kept though doubtful: stop {', '.join(map(str, doubted))}")
+    return found

@@ -1,0 +1,90 @@
+"""What a session's readings come to: the fit, and how it is told."""
+
+from __future__ import annotations
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from bridge.calibration.format import TOLD_IN, figure, millimetres
+from bridge.calibration.options import Order
+from bridge.calibration.planning import effects_of, metrology_of, observable_of
+from bridge.calibration.session.prompt import Talk
+from bridge.calibration.session.session import Book
+from bridge.cell import Cell
+from core.calibration.fit import calibrate
+from core.calibration.parameters import Parameters
+from core.calibration.result import Calibration, Errors
+
+LEAST_TOLD = 2e-6  # m: a repeatability below this is none that was seen
+DIAGNOSED = ("position", "pose")  # kinds whose remainder the diagnosis can judge
+
+
+def fitted(
+    cell: Cell, order: Order, talk: Talk, book: Book, more: tuple[str, ...] = ()
+) -> Calibration:
+    """Return the fit of a session's readings, with ``more`` effects than the cell names.
+
+    Raises InputError where the readings are too few.
+    """
+    assert book.plan is not None
+    kind, places = order.instrument.measures, book.places
+    observable = observable_of(cell, order.instrument, places)
+    metrology = metrology_of(cell, order.instrument, places)
+    with talk.waiting("fitting") as tell:
+        parameters = Parameters.of(cell.model, (*effects_of(cell), *more), observable=observable)
+        return calibrate(
+            cell.model, book.all_readings(kind), parameters, metrology, observable=observable,
+            expected=book.plan.expected, diagnose=kind in DIAGNOSED,
+            progress=lambda text: tell(f"fitting: {text}"),
+        )  # fmt: skip
+
+
+def tell_calibration(talk: Talk, found: Calibration) -> None:
+    """Say what a fit has found, how far it carries, and what stays unknown."""
+    talk.say(found.verdict, "bold green" if found.complete else "bold yellow")
+    pairs = (
+        ("fitted poses", found.before, found.after),
+        ("poses to verify", found.held_out_before, found.held_out_after),
+    )
+    for name, before, after in pairs:
+        if len(after.vector):
+            talk.say(f"  {name}: {_errors(before)} before, {_errors(after)} after")
+    noise = f"  noise {millimetres(found.noise)} a coordinate"
+    if np.isfinite(found.repeatability):
+        small = found.repeatability < LEAST_TOLD
+        noise += ", the arm repeats " + (
+            "better than the instrument tells" if small
+            else f"to {millimetres(found.repeatability)}"
+        )  # fmt: skip
+    talk.say(noise)
+    talk.console.print(_table(found))
+    for row in found.outliers:
+        talk.say(f"  weighed down as wild: reading {int(row) + 1}")
+    for line in found.notes:
+        talk.say(f"  note: {line}")
+    if found.combinations:
+        talk.say(f"  {len(found.combinations)} parameters cannot be told from others; the report "
+                 "names them")  # fmt: skip
+
+
+def _errors(errors: Errors) -> str:
+    return f"{millimetres(errors.mean)} in the mean, {millimetres(errors.max)} at most"
+
+
+def _table(found: Calibration) -> Table:
+    table = Table(
+        title="what the arm has beyond the cell's model (± 1 sigma)", title_justify="left",
+        box=SIMPLE_HEAD, padding=(0, 1),
+    )  # fmt: skip
+    table.add_column("parameter", no_wrap=True)
+    for name in ("value", "±", "planned ±"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("", no_wrap=True)
+    for e in found.estimates:
+        unit, factor = TOLD_IN.get(e.unit, (e.unit, 1.0))
+        planned = "" if e.expected_std is None else figure(e.expected_std * factor)
+        spread = figure(e.std * factor) if e.shown else "not shown"
+        bound = " (bound)" if e.on_bound else ""
+        table.add_row(e.name, figure(e.value * factor), spread, planned, unit + bound)
+    return table

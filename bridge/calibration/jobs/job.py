@@ -1,0 +1,112 @@
+"""What differs between a whole calibration, a verification and the short sessions."""
+
+from __future__ import annotations
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.calibration.instruments import make_instrument
+from bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
+from bridge.calibration.options import Order
+from bridge.calibration.planning import effects_of, loads_of, metrology_of
+from bridge.calibration.session.prompt import Talk
+from bridge.calibration.session.reading_check import Foresight
+from bridge.calibration.session.session import Book
+from bridge.cell import Cell, save_cell
+from bridge.document.output_file import require_writable, write_text
+from core.calibration.plan import Expectation, Payload, Plan, PlannedPose
+from core.model import Model
+
+Array = NDArray[np.float64]
+NO_EXPECTATION = Expectation((), (), np.zeros(0), np.zeros(0), float("nan"), float("nan"))
+
+
+class Job(ABC):
+    """One session's purpose: what is planned, what measures, and what becomes of it."""
+
+    from_here = False  # the plan begins where the arm stands now
+    suffix = "calibrated"  # of the new cell's name, where none is given
+
+    def __init__(self, cell: Cell, order: Order, talk: Talk, book: Book) -> None:
+        self.cell, self.order, self.talk, self.book = cell, order, talk, book
+
+    @property
+    def folder(self) -> Path:
+        """Return the session's folder."""
+        return self.book.journal.path.parent
+
+    @abstractmethod
+    def plan(self, begin: Array | None, tell: Callable[[str, float], None]) -> Plan:
+        """Return the plan. Raises InputError where there can be none."""
+
+    @abstractmethod
+    def tell_plan(self, plan: Plan) -> None:
+        """Say what is planned, and what it will tell."""
+
+    def instrument(self, around: Surroundings) -> AnyInstrument:
+        """Return what measures, not yet open."""
+        return make_instrument(self.order.instrument, around)
+
+    def foresight(self) -> Foresight | None:
+        """Return who judges the readings; None: nobody can."""
+        metrology = metrology_of(self.cell, self.order.instrument)
+        return Foresight(
+            self.cell.model, metrology, self.order.instrument.measures, metrology.sigma,
+            effects_of(self.cell), loads_of(self.cell), self.order.instrument.options,
+        )  # fmt: skip
+
+    @abstractmethod
+    def finish(self) -> None:
+        """Work out what the readings tell, report it, and apply it where a person says so."""
+
+    def hand_over(
+        self, model: Model, what: str, sections: dict[str, Any] | None = None
+    ) -> Path | None:
+        """Ask, and write the new cell; the old one stays. Returns where it was written."""
+        cell, talk = self.cell, self.talk
+        stem = cell.path.with_name(f"{cell.path.stem}_{self.suffix}{cell.path.suffix}")
+        target = self.order.new_cell or _free(stem)
+        known = f", replacing the one there of {_since(target)}" if target.exists() else ""
+        talk.say()
+        question = f"Write {what} to {target}{known}? {cell.path} stays as it is."
+        if not self.order.yes and not talk.confirm(question):
+            self.book.add("ended", applied=None)
+            talk.say(f"nothing is applied; fit and report stay in {self.folder}")
+            return None
+        require_writable(target, cell.path)
+        save_cell(cell, target, model, sections)
+        self.book.add("ended", applied=str(target.resolve()))
+        talk.say(f"{target}: written", "bold")
+        return target
+
+
+def bare_plan(
+    loads: tuple[Payload, ...],
+    poses: list[PlannedPose],
+    bought: Sequence[tuple[int, float]] = (),
+    expected: Expectation = NO_EXPECTATION,
+) -> Plan:
+    """Return a plan of a short session, of which no parameters of the arm are expected."""
+    return Plan(loads, tuple(poses), expected, tuple(bought), 0.0)
+
+
+def write_document(path: Path, document: dict[str, Any]) -> None:
+    """Write a document as JSON."""
+    write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+
+def _since(path: Path) -> str:
+    return datetime.fromtimestamp(path.stat().st_mtime).strftime("%Y-%m-%d %H:%M")
+
+
+def _free(path: Path) -> Path:
+    """Return the path, or the first numbered one beside it that is free."""
+    names = [path, *(path.with_name(f"{path.stem}_{i}{path.suffix}") for i in range(2, 1000))]
+    return next(p for p in names if not p.exists())

@@ -1,0 +1,95 @@
+"""`--payload-only`: what hangs on the flange, from the force sensor in a few orientations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.calibration.format import figure
+from bridge.calibration.instruments.flange_sensor import FlangeSensor
+from bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
+from bridge.calibration.jobs.job import Job, bare_plan
+from bridge.calibration.options import Order
+from bridge.calibration.session.prompt import Talk
+from bridge.calibration.session.reading_check import Foresight
+from bridge.calibration.session.session import Book
+from bridge.cell import Cell
+from core.calibration.payload_session import calibrate_payload
+from core.calibration.plan import Expectation, Payload, Plan, PlannedPose
+from core.errors import CellError
+from core.planning.payload_plan import plan_payload
+
+Array = NDArray[np.float64]
+
+
+class PayloadJob(Job):
+    """Mass, centre of gravity and the sensor's bias; the wrist turns where the arm stands."""
+
+    from_here = True
+    suffix = "loaded"
+
+    def __init__(self, cell: Cell, order: Order, talk: Talk, book: Book) -> None:
+        if cell.link is None or cell.calibration.joints not in (None, "link"):
+            raise CellError(
+                f"{cell.path}: link: found nothing to read ft_raw_wrench from, expected a "
+                "controller, and calibration.joints: link"
+            )
+        super().__init__(cell, order, talk, book)
+
+    def plan(self, begin: Array | None, tell: Callable[[str, float], None]) -> Plan:
+        """Return orientations of the flange around where the arm stands."""
+        assert begin is not None
+        own = self.cell.file.payload
+        load = Payload(own.mass, (own.cog[0], own.cog[1], own.cog[2]), "to be weighed; so far")
+        found = plan_payload(self.cell.model, begin, poses=self.order.poses, seed=self.order.seed)
+        free = np.zeros(len(begin))
+        poses = [PlannedPose(i, q, 0, free) for i, q in enumerate(found.poses)]
+        expected = Expectation(
+            found.names, found.units, found.std, np.full(len(found.std), np.nan), np.nan, np.nan
+        )
+        return bare_plan((load,), poses, expected=expected)
+
+    def tell_plan(self, plan: Plan) -> None:
+        """Say how many orientations there are, and how well they will tell the load."""
+        rows = zip(plan.expected.names, plan.expected.units, plan.expected.std, strict=True)
+        told = ", ".join(f"{n} ±{figure(s)} {u}" for n, u, s in list(rows)[:4])
+        self.talk.say(f"plan: {len(plan.poses)} orientations; expected {told}")
+
+    def instrument(self, around: Surroundings) -> AnyInstrument:
+        """Return the flange's own sensor."""
+        return FlangeSensor.here(around)
+
+    def foresight(self) -> Foresight | None:
+        """Return nobody: ten unknowns of a few orientations are judged at the end."""
+        return None
+
+    def finish(self) -> None:
+        """Tell mass, centre of gravity and bias, and write them into a new cell after a yes."""
+        talk, taken = self.talk, self.book.taken
+        q = np.array([t.q for t in taken])
+        wrench = np.array([t.raw_wrench for t in taken])
+        found = calibrate_payload(self.cell.model, q, wrench)
+        talk.say()
+        talk.say(found.verdict, "bold")
+        for e in found.estimates:
+            low, high = e.interval
+            talk.say(
+                f"  {e.name:<14} {figure(e.value)} {e.unit}  "
+                f"(95 %: {figure(low)} to {figure(high)})"
+            )
+        for note in found.notes:
+            talk.say(f"  note: {note}")
+        from bridge.calibration.jobs.facts import session_facts
+        from bridge.calibration.report import write_payload
+
+        facts = session_facts(
+            self.cell, self.order, self.book, ("the force sensor of the flange", "wrench")
+        )
+        for file in write_payload(found, facts, self.folder, self.cell.model):
+            talk.say(f"{file}: written")
+        payload = {"mass": found.mass, "cog": [float(v) for v in found.cog]}
+        self.hand_over(
+            found.applied(self.cell.model), "the cell with this load", {"payload": payload}
+        )

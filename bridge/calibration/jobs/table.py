@@ -1,0 +1,28 @@
+"""What a session can be for; an explicit table of jobs."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, cast
+
+if TYPE_CHECKING:
+    from bridge.calibration.jobs.job import Job
+    from bridge.calibration.options import Order
+    from bridge.calibration.session.prompt import Talk
+    from bridge.calibration.session.session import Book
+    from bridge.cell import Cell
+
+JOBS: dict[str, str] = {
+    "whole": "bridge.calibration.jobs.calibrate:WholeJob",
+    "verify": "bridge.calibration.jobs.verify:VerifyJob",
+    "payload": "bridge.calibration.jobs.payload:PayloadJob",
+    "tool": "bridge.calibration.jobs.tool:ToolJob",
+}
+"""Order.kind -> ``module:Class``, imported on use."""
+
+
+def make_job(cell: Cell, order: Order, talk: Talk, book: Book) -> Job:
+    """Return the job that was ordered. Raises InputError where the cell does not allow it."""
+    module, kind = JOBS[order.kind].split(":")
+    found = getattr(importlib.import_module(module), kind)
+    return cast("Job", found(cell, order, talk, book))

@@ -1,0 +1,99 @@
+"""`--tool-only`: the tip of a new tool, brought onto one fixed point from several orientations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bridge.calibration.format import millimetres
+from bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
+from bridge.calibration.instruments.point import TipOnPoint
+from bridge.calibration.jobs.job import Job, bare_plan
+from bridge.calibration.options import Order
+from bridge.calibration.planning import loads_of
+from bridge.calibration.session.prompt import Talk
+from bridge.calibration.session.reading_check import Foresight
+from bridge.calibration.session.session import Book
+from bridge.cell import Cell
+from bridge.cell.settings.instruments import PointSettings
+from core.calibration.plan import Plan, PlannedPose
+from core.calibration.tool_session import calibrate_tool
+from core.errors import CellError
+from core.planning.tool_plan import plan_tool
+
+Array = NDArray[np.float64]
+POSES = 6
+
+
+class ToolJob(Job):
+    """The tool centre point from joint angles alone."""
+
+    from_here = True
+    suffix = "tool"
+
+    def __init__(self, cell: Cell, order: Order, talk: Talk, book: Book) -> None:
+        if cell.calibration.joints == "planned":
+            raise CellError(
+                f"{cell.path}: calibration.joints: found 'planned', expected 'link' or 'typed': "
+                "the tip is brought onto the point by hand"
+            )
+        super().__init__(cell, order, talk, book)
+
+    def plan(self, begin: Array | None, tell: Callable[[str, float], None]) -> Plan:
+        """Return orientations about where the tip is now."""
+        assert begin is not None
+        found = plan_tool(
+            self.cell.model, begin, poses=self.order.poses or POSES, seed=self.order.seed
+        )
+        free = np.zeros(len(begin))
+        poses = [PlannedPose(i, q, 0, free) for i, q in enumerate(found.poses)]
+        return bare_plan(loads_of(self.cell)[:1], poses, found.bought)
+
+    def tell_plan(self, plan: Plan) -> None:
+        """Say how many touches there are, and how well they will tell the tip."""
+        told = f"; expected ±{millimetres(plan.bought[-1][1])}" if plan.bought else ""
+        self.talk.say(f"plan: the tip onto one fixed point {len(plan.poses)} times{told}")
+
+    def instrument(self, around: Surroundings) -> AnyInstrument:
+        """Return the fixed point."""
+        return TipOnPoint(PointSettings(kind="point"), around)
+
+    def foresight(self) -> Foresight | None:
+        """Return nobody: the touches are judged at the end."""
+        return None
+
+    def finish(self) -> None:
+        """Tell where the tip is, and write it into a new cell after a yes."""
+        talk, model = self.talk, self.cell.model
+        readings = self.book.readings("point")
+        found = calibrate_tool(model, readings.q, readings.loads)
+        talk.say()
+        talk.say(found.verdict, "bold")
+        for e in found.estimates:
+            low, high = e.interval
+            talk.say(
+                f"  {e.name:<11} {millimetres(e.value)}  "
+                f"(95 %: {millimetres(low)} to {millimetres(high)})"
+            )
+        for note in found.notes:
+            talk.say(f"  note: {note}")
+        from bridge.calibration.jobs.facts import session_facts
+        from bridge.calibration.report import write_tool
+
+        facts = session_facts(self.cell, self.order, self.book, ("tip on a fixed point", "touch"))
+        for file in write_tool(found, facts, self.folder, model):
+            talk.say(f"{file}: written")
+        applied = found.applied(model)
+        tcp = {
+            "xyz": [float(v) for v in applied.tool_in_flange[:3, 3]],
+            "rpy": [float(v) for v in _rpy(applied.tool_in_flange[:3, :3])],
+        }
+        self.hand_over(applied, "the cell with this tool", {"tool": {"tcp": tcp}})
+
+
+def _rpy(matrix: Array) -> Array:
+    """Return roll, pitch and yaw (3,), rad, as URDF has them."""
+    return np.asarray(Rotation.from_matrix(matrix).as_euler("xyz"), dtype=float)

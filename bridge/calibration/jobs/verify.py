@@ -1,0 +1,136 @@
+"""Months later: a few poses measured again tell whether the calibration still holds."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.calibration.format import duration, millimetres, parameter
+from bridge.calibration.jobs.calibrate import promise_beside
+from bridge.calibration.jobs.job import Job, bare_plan
+from bridge.calibration.jobs.log_of import write_log
+from bridge.calibration.planning import (
+    loads_of,
+    metrology_of,
+    observable_of,
+    space_of,
+    with_loads,
+)
+from bridge.calibration.session.pace import seconds_left
+from core.calibration.plan import Plan, PlannedPose
+from core.calibration.promise import promise_in
+from core.calibration.verify import Verification, verify
+from core.errors import InputError
+from core.planning.candidates import candidates_of
+from core.planning.travel import joint_speed, leg_times, shortest_way
+
+Array = NDArray[np.float64]
+POSES = 10
+
+
+class VerifyJob(Job):
+    """Poses all over the workspace, under each load; nothing is fitted but the instrument."""
+
+    def _promise(self) -> dict[str, Any]:
+        """Return what the calibration has promised. Raises InputError where nobody knows."""
+        path = promise_beside(self.cell.path)
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            why = (
+                "no such file" if isinstance(error, FileNotFoundError) else "none that can be read"
+            )
+            raise InputError(
+                f"{path}: found {why}, expected the promise that `gapbridge calibrate` writes "
+                "beside a calibrated cell"
+            ) from None
+        if not isinstance(found, dict):
+            raise InputError(f"{path}: found no mapping, expected a calibration's promise")
+        return found
+
+    def plan(self, begin: Array | None, tell: Callable[[str, float], None]) -> Plan:
+        """Return poses far from each other."""
+        promise = promise_in(self._promise())
+        if promise.kind != self.order.instrument.measures:
+            raise InputError(
+                f"{promise_beside(self.cell.path)}: found a calibration by {promise.kind}, "
+                f"expected one by {self.order.instrument.measures}: verify it as it was made"
+            )
+        loads = tuple(sorted(loads_of(self.cell), key=lambda load: load.mass))
+        space = with_loads(space_of(self.cell, promise.kind), loads)
+        space = replace(space, places=space.places[:1])  # a few poses from one place
+        observable = observable_of(self.cell, self.order.instrument)
+        tell("looking for poses", 0.2)
+        found = candidates_of(
+            promise.parameters(self.cell.model), observable, loads, space, self.order.seed
+        )
+        count = min(self.order.poses or POSES, len(found.q))
+        chosen = _far_apart(self.cell.model.rigid_pose(found.q).position, count)
+        speed = joint_speed(self.cell.arm.limits.velocity)
+        poses: list[PlannedPose] = []
+        for load, part in enumerate(np.array_split(chosen, len(loads))):
+            q = found.q[part]
+            way = shortest_way(leg_times(q, q, speed), np.zeros(len(q)))
+            free = np.zeros(q.shape[1])
+            poses += [
+                PlannedPose(len(poses) + i, q[k], load, free, held_out=True)
+                for i, k in enumerate(way)
+            ]
+        return bare_plan(loads, poses)
+
+    def tell_plan(self, plan: Plan) -> None:
+        """Say how many stops there are."""
+        left = seconds_left(self.book, self.cell.calibration.minutes_per_load)
+        self.talk.say(f"plan: {len(plan.poses)} poses, {duration(left)}")
+
+    def finish(self) -> None:
+        """Say whether the calibration holds, and report it."""
+        talk, order, folder = self.talk, self.order, self.folder
+        places = self.book.places
+        metrology = metrology_of(self.cell, order.instrument, places)
+        readings = self.book.all_readings(order.instrument.measures)
+        with talk.waiting("comparing"):
+            found = verify(
+                self.cell.model, readings, self._promise(), metrology,
+                observable=observable_of(self.cell, order.instrument, places),
+            )  # fmt: skip
+        talk.say()
+        self._tell(found)
+        write_log(readings, metrology.registered, folder / "readings.csv")
+        from bridge.calibration.jobs.facts import session_facts
+        from bridge.calibration.report import write_verification
+
+        facts = session_facts(self.cell, order, self.book)
+        for file in write_verification(found, facts, folder, readings):
+            talk.say(f"{file}: written")
+        self.book.add("ended", holds=found.holds)
+
+    def _tell(self, found: Verification) -> None:
+        talk = self.talk
+        talk.say(found.verdict, "bold green" if found.holds else "bold red")
+        talk.say(
+            f"  errors {millimetres(found.errors.mean)} in the mean, "
+            f"{millimetres(found.errors.max)} at most; {found.ratio:.2f} times what was promised"
+        )
+        for estimate in () if found.moved is None else found.moved.estimates:
+            talk.say(
+                f"  {estimate.name} {parameter(estimate.value, estimate.unit)} "
+                f"± {parameter(estimate.std, estimate.unit)}"
+            )
+        for note in found.notes:
+            talk.say(f"  note: {note}")
+
+
+def _far_apart(position: Array, count: int) -> NDArray[np.int64]:
+    """Return rows (count,) of positions (N, 3), each far from those before it."""
+    chosen = [int(np.argmax(np.linalg.norm(position - position.mean(axis=0), axis=1)))]
+    nearest = np.linalg.norm(position - position[chosen[0]], axis=1)
+    while len(chosen) < count:
+        chosen.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, np.linalg.norm(position - position[chosen[-1]], axis=1))
+    return np.array(chosen, dtype=np.int64)

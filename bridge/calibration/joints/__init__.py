@@ -1,0 +1,1 @@
+"""Where the joint angles of a reading come from."""

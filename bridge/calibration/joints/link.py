@@ -1,0 +1,207 @@
+"""The arm through the daemon: it is watched all the time, and moved only by ``drive``.
+
+Every run of the daemon that writes follows one trajectory, from where the arm stands to the next
+pose, through the one limiter, without corrections; once it rests there the daemon only observes.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.calibration.instruments.instrument import ReadingError
+from bridge.calibration.joints.joint_source import JointSource, Stand
+from bridge.calibration.joints.move import write_move
+from bridge.calibration.joints.watched_run import WatchedRun
+from bridge.cell import Cell, load_cell
+from bridge.cell.daemon_settings import DaemonSettings
+from bridge.cell.sections import SetpointSettings
+from bridge.cell.settings.recording import RecordingSettings
+from bridge.daemon.daemon import settings_of
+from bridge.ipc.shared_memory import Phase
+from bridge.loop.supervisor import State
+from core.calibration.plan import PlannedPose
+from core.errors import LinkError, RunError
+
+Array = NDArray[np.float64]
+STILL = 0.003  # rad/s: slower than this, the arm stands
+NEAR = 0.05  # rad: an arm that rests this near to the pose has arrived
+MOVED = 2e-4  # rad: farther than this from where it stood, it has moved
+STEADY = 1.0  # N: the force may drift by this over the time of settling, beside its noise
+PATIENCE = 30.0  # s for a connection, on top of the link's own
+STARTING = 180.0  # s that the loop's process may take to start
+SLOWEST = 4.0  # a move may take this many times as long as planned
+
+
+def uncorrected(path: Path) -> Cell:
+    """Return a cell whose model has no effects: poses of a session are written as planned."""
+    cell = load_cell(path)
+    return replace(cell, model=cell.model.without_terms())
+
+
+class LinkedJoints(JointSource):
+    """Reads the arm over the cell's link; drives it where ``move`` allows."""
+
+    watches = True
+
+    def __init__(self, cell: Cell, settle: float, speed: float, folder: Path, move: bool) -> None:
+        self._settle, self._speed, self._folder = settle, speed, folder
+        self.drives = move
+        self._settings = settings_of(cell).model_copy(
+            update={
+                "recording": RecordingSettings(folder=None), "web": None, "metrics": None,
+                "setpoints": SetpointSettings(source="target"),
+                "model_source": "bridge.calibration.joints.link:uncorrected",
+            }
+        )  # fmt: skip
+        self._run: WatchedRun | None = None
+
+    def open(self) -> None:
+        """Watch the arm. Raises LinkError where it cannot be reached."""
+        self._start(self._settings, write=False)
+
+    def close(self) -> None:
+        """Leave the link."""
+        run, self._run = self._run, None
+        if run is not None:
+            run.end()
+
+    def now(self) -> Array | None:
+        """Return the joints (n,) of the newest cycle."""
+        rows = self._rows(0.1)
+        return None if not len(rows) else np.asarray(rows[-1, self._part("actual_q")])
+
+    def arrived(self, pose: PlannedPose) -> Stand | None:
+        """Return where the arm rests, once it does so near the pose."""
+        now = self.now()
+        if now is None or np.abs(now - pose.q).max() > NEAR or not self._rests():
+            return None
+        return self._standing()
+
+    def stand(self, pose: PlannedPose) -> Stand:
+        """Return where the arm rests. Raises ReadingError where it moves or is pulled at."""
+        until = time.monotonic() + max(5.0, 4.0 * self._settle)
+        while time.monotonic() < until:
+            if self._rests() and self._steady():
+                return self._standing()
+            time.sleep(0.02)
+        why = "the force at the tool is not steady" if self._rests() else "the arm moves"
+        raise ReadingError(f"{why}, expected it at rest for {self._settle:g} s")
+
+    def still(self, stand: Stand) -> bool:
+        """Return whether the arm stands where it stood."""
+        rows = self._rows(0.1)
+        here = rows[:, self._part("actual_q")].mean(axis=0)
+        return bool(np.abs(here - stand.q).max() < MOVED)
+
+    def drive(self, pose: PlannedPose, via: Sequence[Array] = ()) -> None:
+        """Move the arm to a pose, slowly, and wait until it rests there. Raises RunError."""
+        if not self.drives:
+            return super().drive(pose, via)
+        begin = self.now()
+        if begin is None:
+            raise LinkError("the arm tells no joints, expected where it stands before a move")
+        file = self._folder / "move.csv"
+        length = write_move(file, [begin, *via, pose.q], self._speed)
+        moving = SetpointSettings(source="trajectory", file=file.resolve())
+        self.close()
+        self._start(self._settings.model_copy(update={"setpoints": moving}), write=True)
+        self._follow(pose, length)
+        return None
+
+    def _follow(self, pose: PlannedPose, length: float) -> None:
+        """Wait until the arm rests at the pose, then have the daemon observe."""
+        run = self._require()
+        until = time.monotonic() + SLOWEST * length + PATIENCE
+        begun = False
+        while True:
+            state = run.daemon.state
+            begun |= state == State.COMPENSATING
+            if begun and not state.writes:
+                raise RunError(f"the move broke off: {run.words() or state.name.lower()}")
+            now = self.now()
+            there = now is not None and np.abs(now - pose.q).max() < NEAR / 10
+            if begun and there and run.daemon.page.ended and self._rests():
+                break
+            if time.monotonic() > until:
+                run.end()
+                raise RunError(f"the arm did not arrive within {SLOWEST * length + PATIENCE:.0f} s")
+            time.sleep(0.02)
+        run.daemon.disarm()
+        while run.daemon.state.writes and time.monotonic() < until:
+            time.sleep(0.02)
+
+    # -- the watched arm --------------------------------------------------------------------------
+
+    def _start(self, settings: DaemonSettings, write: bool) -> None:
+        self._run = run = WatchedRun(settings, write)
+        begun = time.monotonic()
+        limit = settings.link.connect_timeout + PATIENCE
+        until = begun + limit
+        while not len(self._rows(1.0)):
+            if run.daemon.phase == Phase.STARTING and time.monotonic() < begun + STARTING:
+                until = time.monotonic() + limit  # imports, on a busy machine
+            if time.monotonic() > until:
+                raise LinkError("the arm tells nothing, expected its joints")
+            time.sleep(0.02)
+        run.ready = True
+
+    def _require(self) -> WatchedRun:
+        if self._run is None:
+            raise LinkError("the link to the arm is closed")
+        self._run.check()
+        return self._run
+
+    def _part(self, name: str) -> slice:
+        return self._require().slices[name]
+
+    def _rows(self, span: float) -> Array:
+        """Return the cycles (M, width) of the last ``span`` s."""
+        run = self._require()
+        run.take()
+        rows = run.rows
+        if not len(rows):
+            return rows
+        time_at = rows[:, run.slices["timestamp"].start]
+        return np.asarray(rows[time_at >= time_at[-1] - span])
+
+    def _rests(self) -> bool:
+        """Return whether the arm has stood still for the time of settling."""
+        rows, at = self._rows(self._settle), self._part("timestamp").start
+        whole = self._require().rows
+        if whole[-1, at] - whole[0, at] < self._settle:
+            return False
+        return bool(np.abs(rows[:, self._part("actual_qd")]).max() < STILL)
+
+    def _steady(self) -> bool:
+        """Return whether the force at the tool does not drift; True where there is none."""
+        force = self._rows(self._settle)[:, self._part("actual_TCP_force")][:, :3]
+        if not np.isfinite(force).all() or len(force) < 8:
+            return True
+        first, last = np.array_split(force, 2)
+        noise = force.std(axis=0) * np.sqrt(4.0 / len(force))
+        drift = np.abs(last.mean(axis=0) - first.mean(axis=0))
+        return bool((drift < STEADY + 3.0 * noise).all())
+
+    def _standing(self) -> Stand:
+        rows, run = self._rows(self._settle), self._require()
+
+        def mean(name: str) -> Array | None:
+            found = rows[:, run.slices[name]].mean(axis=0)
+            return found if np.isfinite(found).all() else None
+
+        q, payload = mean("actual_q"), mean("payload")
+        assert q is not None
+        return Stand(
+            q=q,
+            temperature=mean("joint_temperatures"),
+            wrench=mean("actual_TCP_force"),
+            raw_wrench=mean("ft_raw_wrench"),
+            payload=None if payload is None else float(payload[0]),
+            approach=run.approach.copy(),
+        )

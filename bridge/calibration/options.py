@@ -1,0 +1,23 @@
+"""What a person has asked of a session on the command line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from bridge.cell.settings.instruments import InstrumentSettings
+
+
+@dataclass(frozen=True)
+class Order:
+    """One call of the command."""
+
+    kind: str  # whole, verify, payload or tool
+    folder: Path | None  # of the session
+    instrument: InstrumentSettings
+    poses: int | None = None
+    plan_only: bool = False
+    move: bool = False
+    new_cell: Path | None = None
+    yes: bool = False
+    seed: int = 0

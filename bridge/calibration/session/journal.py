@@ -1,0 +1,142 @@
+"""The session on disk: one append-only file of JSON lines, each of them there before the next step.
+
+A power cut may tear the last line, and no other: it is cut off when the session goes on.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import math
+import os
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from bridge.document.output_file import FOLDER_MODE, MODE
+from core.errors import InputError, RunError
+
+FILE = "journal.jsonl"
+VERSION = 1
+
+Entry = dict[str, Any]
+
+
+class Journal:
+    """The one writer of a session's journal; ``entries`` are those that were there before."""
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / FILE
+        self.entries: list[Entry] = []
+        self.torn = False  # the last line had been torn by a power cut or a kill
+        self._fd = -1
+
+    def open(self) -> None:
+        """Take the journal, and read what stands in it.
+
+        Raises InputError where another session has it or a line is damaged, RunError where it
+        cannot be written.
+        """
+        try:
+            self.path.parent.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
+            self._fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, MODE)
+            _sync_folder(self.path.parent)
+        except OSError as error:
+            raise RunError(f"{self.path}: cannot be written: {error.strerror}") from None
+        try:
+            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self.close()
+            raise InputError(
+                f"{self.path}: found a session that is going on in another terminal, expected none"
+            ) from None
+        self._read()
+
+    def _read(self) -> None:
+        text = self.path.read_bytes()
+        whole = text.rfind(b"\n") + 1
+        if whole < len(text):
+            os.ftruncate(self._fd, whole)
+            os.fsync(self._fd)
+            self.torn = True
+        self.entries = read_entries(self.path)
+
+    def add(self, kind: str, **told: Any) -> Entry:
+        """Write an entry and have it on disk; returns it. Raises RunError."""
+        entry = {"kind": kind, "time": time.time(), **told}
+        line = json.dumps(plain(entry), allow_nan=False, separators=(",", ":")) + "\n"
+        try:
+            data = line.encode()
+            if os.write(self._fd, data) != len(data):
+                raise OSError(0, "the disk is full")
+            os.fsync(self._fd)
+        except OSError as error:
+            raise RunError(f"{self.path}: cannot be written: {error.strerror}") from None
+        return entry
+
+    def close(self) -> None:
+        """Let go of the file. May be repeated."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def read_entries(path: Path) -> list[Entry]:
+    """Return the whole lines of a journal; raises InputError where one is damaged."""
+    try:
+        lines = path.read_bytes().split(b"\n")[:-1]
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    entries = []
+    for number, line in enumerate(lines, 1):
+        try:
+            entry = json.loads(line)
+            if not isinstance(entry, dict) or not isinstance(entry.get("kind"), str):
+                raise ValueError
+        except ValueError:
+            raise InputError(
+                f"{path}: row {number}: found {line[:40].decode('utf-8', 'replace')!r}, expected "
+                "an entry of a calibration session"
+            ) from None
+        entries.append(entry)
+    return entries
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON knows it; what is no finite number becomes its name, ``float`` reads.
+
+    Arrays become lists.
+    """
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray | list | tuple):
+        return [plain(v) for v in (value.tolist() if isinstance(value, np.ndarray) else value)]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return repr(value)
+    return str(value) if isinstance(value, Path) else value
+
+
+def _sync_folder(folder: Path) -> None:
+    """Have the folder's entry of a new file on disk as well."""
+    fd = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)

@@ -1,0 +1,38 @@
+"""How far a session has come, and how long it will still take."""
+
+from __future__ import annotations
+
+from statistics import median
+
+from bridge.calibration.format import duration
+from bridge.calibration.session.session import Book
+
+FIRST = 60.0  # s a stop, before anyone knows
+PAUSE = 600.0  # s: a longer time between two readings was a pause
+WIDTH = 16  # characters of the whole bar
+
+
+def seconds_left(book: Book, minutes_per_load: float) -> float:
+    """Return s until the last stop, by the pace so far."""
+    paces = [s for s in book.seconds if s < PAUSE][-20:]
+    done = {t.stop for t in book.taken} | book.skipped
+    blocks = {(p.station, p.load) for i, p in enumerate(book.stops) if i not in done}
+    changes = len(blocks - {(book.place, book.mounted)})
+    return book.left * (median(paces) if paces else FIRST) + changes * 60.0 * minutes_per_load
+
+
+def header(book: Book, stop: int, minutes_per_load: float) -> str:
+    """Return the line above a stop."""
+    count, done = len(book.stops), len(book.stops) - book.left
+    pose = book.stops[stop]
+    drawn = "█" * round(done / count * WIDTH)
+    more = [f"place {pose.station + 1}"] if any(p.station for p in book.stops) else []
+    if pose.repeat:
+        first = next(i for i, p in enumerate(book.stops) if p.number == pose.number)
+        more.append(f"stop {first + 1} once more")
+    if pose.held_out:
+        more.append("to verify, not fitted")
+    return " · ".join(
+        [f"{drawn:░<{WIDTH}} stop {stop + 1} of {count}", f"load {pose.load + 1}", *more,
+         f"{duration(seconds_left(book, minutes_per_load))} left"]
+    )  # fmt: skip

@@ -1,0 +1,171 @@
+"""What the next reading should be, from those so far, and what could be wrong with one that is off.
+
+Model and instrument are fitted to the readings so far, every parameter held at the cell's model by
+its usual size. A reading that is farther off than that allows is doubted, and what could have gone
+wrong is tried: another unit, exchanged axes, one mistyped coordinate, another load, a joint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.calibration.session.fitted_so_far import AXES, FittedSoFar, here
+from core.calibration.observables import make_observable
+from core.calibration.parameters import Parameters
+from core.calibration.plan import Payload
+from core.calibration.readings import Readings
+from core.errors import GapbridgeError
+from core.metrology import Metrology
+from core.model import Model, Poses
+
+Array = NDArray[np.float64]
+REPEATABILITY = 1e-4  # m, 1 sigma of one coordinate: of an arm of which nobody knows it
+UNMODELLED = 1e-4  # m, 1 sigma: what a session cannot fit and still is no mistake
+UNITS = {
+    1e-3: "a thousand times too large: millimetres taken for metres?",
+    1e3: "a thousand times too small: metres taken for millimetres?",
+    1 / 25.4: "25.4 times too large: millimetres taken for inches?",
+    25.4: "25.4 times too small: inches taken for millimetres?",
+}
+SPARE = {"distance": 4, "relative": 9}
+"""Numbers beyond the unknowns, by kind: with fewer the instrument may be told in a wrong place."""
+EXCHANGED = ((1, 0, 2), (2, 1, 0), (0, 2, 1), (1, 2, 0), (2, 0, 1))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a reading looks like beside those before it."""
+
+    off: float  # m, distance from where it was expected; nan: nothing to compare with yet
+    allowed: float  # m, how far a good one would be off at most
+    doubted: bool
+    reasons: tuple[str, ...] = ()  # what could have gone wrong, likeliest first
+    instead: Array | None = None  # (k,) the reading, put right, where that is plain
+
+
+NOTHING = Verdict(float("nan"), float("nan"), False)
+
+
+class Foresight:
+    """Judges readings of one session; cheap enough to be asked after each."""
+
+    def __init__(
+        self, model: Model, metrology: Metrology, kind: str, sigma: float,
+        effects: tuple[str, ...], loads: tuple[Payload, ...], options: dict[str, Any] | None = None,
+    ) -> None:  # fmt: skip
+        self._model, self._metrology, self._kind, self._loads = model, metrology, kind, loads
+        self._effects, self._options = effects, options or {}
+        arm = metrology.repeatability or REPEATABILITY
+        self._sigma = float(np.hypot(np.hypot(sigma, arm), UNMODELLED))
+        self._parameters: dict[bool, Parameters] = {}
+
+    @property
+    def compares(self) -> bool:
+        """Return whether two readings of one pose can be held against each other."""
+        return not make_observable(self._kind, **self._options).closes
+
+    def judge(self, before: Readings, new: Readings, typed: bool, joints: bool) -> Verdict:
+        """Judge one new reading (a Readings of one row) by those before it.
+
+        ``typed``: a person has typed it; ``joints``: the joint angles were typed.
+        """
+        same = before[(before.station == new.station[0]) & (before.target == new.target[0])]
+        try:
+            state = self._fitted(same, new)
+        except GapbridgeError:
+            return NOTHING  # too few readings yet to know where the instrument stands
+        if state is None:
+            return NOTHING
+        off, allowed, doubted = state.compare(new)
+        if not doubted:
+            return Verdict(off, allowed, False)
+        reasons, instead = self._reasons(state, new, typed, joints)
+        return Verdict(off, allowed, True, tuple(reasons), instead)
+
+    def shift(self, old: Readings, new: Readings, before: Readings) -> Array:
+        """Return how far a pose's reading has gone (k,), m, base axes where they are known.
+
+        The way that the arm itself has gone between the two is taken off.
+        """
+        same = before[(before.station == old.station[0]) & (before.target == old.target[0])]
+        try:
+            state = self._fitted(same, old)
+        except GapbridgeError:
+            state = None
+        if state is None:
+            return np.asarray((new.value - old.value)[0, :3])
+        return state.gap(new)[:3] - state.gap(old)[:3]
+
+    def poses(self, readings: Readings) -> Poses:
+        """Return where the cell's model has the TCP at some readings."""
+        return self._model.predict(readings.q, readings.loads)
+
+    def _fitted(self, before: Readings, new: Readings) -> FittedSoFar | None:
+        registered = self._metrology.registered and int(new.station[0]) == 0
+        before, new = here(before), here(new)
+        observable = make_observable(self._kind, registered=registered, **self._options)
+        layout = observable.layout(before if len(before) else new)
+        needed = layout.size + SPARE.get(self._kind, 0)
+        few = len(before) * observable.equations <= needed
+        if observable.closes or (few and layout.size):
+            return None
+        if registered not in self._parameters:
+            self._parameters[registered] = Parameters.every(self._model, self._effects)
+        return FittedSoFar.to(before, new, self._parameters[registered], observable, self._sigma)
+
+    def _reasons(
+        self, state: FittedSoFar, new: Readings, typed: bool, joints: bool
+    ) -> tuple[list[str], Array | None]:
+        reasons: list[str] = []
+        instead: Array | None = None
+        value = new.value[0]
+        for factor, words in UNITS.items():
+            changed = value.copy()
+            changed[:3] *= factor
+            if self._fits(state, new, changed):
+                reasons.append(words)
+                instead = changed
+        for other, words in self._others(value) if typed or len(value) >= 3 else ():
+            if self._fits(state, new, other):
+                reasons.append(words)
+        if typed and not reasons:
+            reasons += state.alone(new)
+        reasons += self._other_loads(state, new)
+        if joints and not reasons:
+            reasons += state.one_joint(new)
+        return reasons, instead
+
+    def _fits(self, state: FittedSoFar, new: Readings, value: Array) -> bool:
+        return not state.compare(replace(new, value=value[None]))[2]
+
+    @staticmethod
+    def _others(value: Array) -> Iterator[tuple[Array, str]]:
+        """Yield the reading with axes exchanged, or a sign turned round."""
+        if len(value) < 3:
+            return
+        for order in EXCHANGED:
+            changed = value.copy()
+            changed[:3] = value[list(order)]
+            yield changed, f"it fits with its axes in the order {' '.join(AXES[i] for i in order)}"
+        for i in range(3):
+            changed = value.copy()
+            changed[i] *= -1
+            yield changed, f"it fits with the sign of {AXES[i]} turned round"
+
+    def _other_loads(self, state: FittedSoFar, new: Readings) -> list[str]:
+        found = []
+        for number, load in enumerate((*self._loads, Payload(0.0, name="nothing at all"))):
+            if number == int(new.load[0]):
+                continue
+            loads = replace(
+                new.loads, payload_mass=np.array([load.mass]), payload_cog=np.array([load.cog])
+            )
+            if not state.compare(replace(new, loads=loads))[2]:
+                name = load.name or f"{load.mass:g} kg"
+                found.append(f"it fits if {name} hangs on the flange")
+        return found

@@ -1,0 +1,162 @@
+"""Where a session stands: what its journal tells, entry by entry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.calibration.session.journal import Entry, Journal
+from bridge.calibration.session.plan_document import plan_entry, plan_of
+from bridge.calibration.session.reading import Taken
+from core.calibration.plan import Plan, PlannedPose
+from core.calibration.readings import Readings
+from core.loads import Loads
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Book:
+    """A session in memory; everything that changes it goes through its journal first."""
+
+    journal: Journal
+    begun: Entry = field(default_factory=dict)  # the first entry
+    plan: Plan | None = None
+    taken: list[Taken] = field(default_factory=list)
+    undone: int = 0
+    skipped: set[int] = field(default_factory=set)
+    mounted: int | None = None  # load that hangs on the flange
+    station: int = 0
+    place: int = 0  # of the plan's, at which the instrument stands
+    target: int = 0
+    notes: list[str] = field(default_factory=list)
+    used: set[str] = field(default_factory=set)
+    ended: Entry | None = None  # the fit was made and what to do with it decided
+    seconds: list[float] = field(default_factory=list)  # between a reading and the one before
+
+    @classmethod
+    def of(cls, journal: Journal) -> Book:
+        """Return where the session of an open journal stands."""
+        book = cls(journal)
+        for entry in journal.entries:
+            book.apply(entry)
+        return book
+
+    def add(self, kind: str, **told: Any) -> None:
+        """Write an entry, then act on it."""
+        self.apply(self.journal.add(kind, **told))
+
+    def apply(self, entry: Entry) -> None:
+        """Act on an entry of the journal; one of a kind that is not known means nothing here."""
+        action = getattr(self, f"_{entry['kind']}", None)
+        if action is not None:
+            action(entry)
+
+    # -- entries, by their kind -------------------------------------------------------------------
+
+    def _begun(self, entry: Entry) -> None:
+        self.begun = entry
+
+    def _plan(self, entry: Entry) -> None:
+        self.plan = plan_of(entry["plan"])
+
+    def _reading(self, entry: Entry) -> None:
+        found = Taken.of(entry)
+        if self.taken and found.time - self.taken[-1].time > 0.0:
+            self.seconds.append(found.time - self.taken[-1].time)
+        self.taken.append(found)
+        if found.source:
+            self.used.add(found.source)
+
+    def _rejected(self, entry: Entry) -> None:
+        if entry.get("source"):
+            self.used.add(entry["source"])
+
+    def _undo(self, entry: Entry) -> None:
+        self.undone += 1
+        self.taken.pop()
+
+    def _skip(self, entry: Entry) -> None:
+        self.skipped.add(int(entry["stop"]))
+
+    def _mounted(self, entry: Entry) -> None:
+        self.mounted = int(entry["load"])
+
+    def _moved(self, entry: Entry) -> None:
+        self.station = int(entry["station"])
+        self.target = int(entry["target"])
+        self.place = int(entry.get("place", self.place))
+        since = entry.get("since")  # readings from this one on were of the new place already
+        if since is not None:
+            for i in range(int(since), len(self.taken)):
+                self.taken[i] = replace(self.taken[i], station=self.station, target=self.target)
+
+    def _note(self, entry: Entry) -> None:
+        self.notes.append(str(entry["text"]))
+
+    def _ended(self, entry: Entry) -> None:
+        self.ended = entry
+
+    # -- what follows -----------------------------------------------------------------------------
+
+    @property
+    def stops(self) -> tuple[PlannedPose, ...]:
+        """Return the planned stops in the order of travel."""
+        return () if self.plan is None else self.plan.poses
+
+    @property
+    def next(self) -> int | None:
+        """Return the number of the next stop, None after the last."""
+        done = {t.stop for t in self.taken} | self.skipped
+        return next((i for i in range(len(self.stops)) if i not in done), None)
+
+    @property
+    def left(self) -> int:
+        """Return how many stops are left."""
+        done = {t.stop for t in self.taken} | self.skipped
+        return sum(i not in done for i in range(len(self.stops)))
+
+    @property
+    def places(self) -> int:
+        """Return how many places the instrument has had; 1 means that it was never moved."""
+        return max((t.station for t in self.taken), default=0) + 1
+
+    def all_readings(self, kind: str) -> Readings:
+        """Return all readings, the instrument's places numbered without holes."""
+        found = self.readings(kind)
+        return replace(found, station=np.unique(found.station, return_inverse=True)[1])
+
+    def readings(self, kind: str, taken: list[Taken] | None = None) -> Readings:
+        """Return readings (default: all that stand) as the calibration takes them."""
+        assert self.plan is not None
+        rows = self.taken if taken is None else taken
+        loads, stops = self.plan.loads, self.stops
+        n = len(stops[0].q) if stops else 0
+        temperature = [t.temperature for t in rows]
+        return Readings(
+            kind=kind,
+            q=np.array([t.q for t in rows]).reshape(-1, n),
+            value=np.array([t.value for t in rows]).reshape(len(rows), -1 if rows else 3),
+            scatter=np.array([t.scatter for t in rows]),
+            loads=Loads(
+                payload_mass=np.array([loads[t.load].mass for t in rows]),
+                payload_cog=np.array([loads[t.load].cog for t in rows]).reshape(-1, 3),
+                temperature=(
+                    None if any(v is None for v in temperature) or not rows
+                    else np.array(temperature, dtype=float)
+                ),
+                approach=np.array([t.approach for t in rows]).reshape(-1, n),
+            ),
+            load=np.array([t.load for t in rows], dtype=np.int64),
+            station=np.array([t.station for t in rows], dtype=np.int64),
+            target=np.array([t.target for t in rows], dtype=np.int64),
+            held_out=np.array([stops[t.stop].held_out for t in rows], dtype=bool),
+            pose=np.array([stops[t.stop].number for t in rows], dtype=np.int64),
+        )  # fmt: skip
+
+    def keep_plan(self, plan: Plan) -> None:
+        """Write the plan that the session follows."""
+        self.add("plan", plan=plan_entry(plan))

@@ -1,0 +1,49 @@
+"""A side process takes a changed cell file, once the daemon tells that it has taken it."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+from bridge.cell.daemon_settings import DaemonSettings
+from bridge.cell.run_settings import read_configuration
+from core.errors import GapbridgeError
+
+KEPT = ("web", "metrics", "recording", "model_source")  # belongs to this run's processes
+
+
+class RereadSettings:
+    """The settings that a run has by now, from those that it began with.
+
+    ``text`` is the cell file that those were read from. A process that was started anew hears of a
+    later file by the daemon's status.
+    """
+
+    def __init__(self, settings: DaemonSettings, text: str | None) -> None:
+        self.settings = settings
+        self._hash = None if text is None else hashlib.sha256(text.encode()).hexdigest()
+
+    def hear(self, event: dict[str, Any]) -> bool:
+        """Take note of an event; returns whether the settings are others now."""
+        if event.get("kind") == "configuration" and event.get("ok"):
+            told = event.get("hash")
+        elif event.get("kind") == "status":
+            told = event.get("configuration_hash")
+        else:
+            return False
+        if not told or told == self._hash:
+            return False
+        first, self._hash = self._hash is None, str(told)
+        return not (first and event["kind"] == "status") and self._read(str(told))
+
+    def _read(self, told: str) -> bool:
+        """Read the file; one that has changed again meanwhile does not count."""
+        try:
+            found = read_configuration(self.settings.cell)
+        except GapbridgeError:
+            return False
+        if found.hash != told:
+            return False
+        kept = {name: getattr(self.settings, name) for name in KEPT}
+        self.settings = found.settings.model_copy(update=kept)
+        return True

@@ -1,0 +1,102 @@
+"""From a cell to what a run of the daemon is made of."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from bridge.cell import Cell, load_cell
+from bridge.cell.daemon_settings import DaemonSettings
+from bridge.cell.runtime_folder import cell_key, runtime_folder
+from bridge.cell.sections import SetpointSettings
+from bridge.served.credentials import check_credentials, read_token
+from core.errors import CellError, InputError
+from core.files import read_bytes, recorded
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """A cell file as it was read: what runs, and how to know it again."""
+
+    settings: DaemonSettings
+    n: int  # joints
+    text: str
+    files: Mapping[str, bytes]  # all that was read for it, by absolute path
+
+    @property
+    def hash(self) -> str:
+        """Return the SHA-256 of the file."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+
+def configuration_for(settings: DaemonSettings) -> Configuration:
+    """Return the configuration of settings, whose cell file is read for it. Raises InputError."""
+    with recorded() as files:
+        cell = load_cell(settings.cell)
+        _read_named(settings)
+    return Configuration(settings, cell.arm.n, cell.document.text, files)
+
+
+def read_configuration(path: Path) -> Configuration:
+    """Return the configuration of a cell file, all of it checked. Raises InputError."""
+    with recorded() as files:
+        cell = load_cell(path)
+        settings = settings_of(cell)
+        _read_named(settings)
+    return Configuration(settings, cell.arm.n, cell.document.text, files)
+
+
+def _read_named(settings: DaemonSettings) -> None:
+    """Read the files that the sections of a run name. Raises InputError."""
+    settings.link.read_files()
+    setpoints = settings.setpoints
+    if setpoints.source == "trajectory" and setpoints.file is not None:
+        with contextlib.suppress(OSError):  # the loop's process names what is wrong with it
+            read_bytes(setpoints.file)
+    if setpoints.source == "tcp" and setpoints.token_file is not None:
+        read_token(setpoints.token_file, "setpoints.token_file")
+
+
+def settings_of(cell: Cell) -> DaemonSettings:
+    """Return what a run of this cell is made of. Raises InputError where sections do not fit."""
+    if cell.link is None:
+        raise CellError(f"{cell.path}: link: found nothing, expected the robot's address for a run")
+    for section, served in (("web", cell.web), ("metrics", cell.metrics)):
+        if served is not None:
+            try:
+                check_credentials(served, section)
+            except InputError as error:
+                raise CellError(f"{cell.path}: {error}") from None
+    setpoints = _setpoints_of(cell)
+    try:
+        return DaemonSettings(
+            cell=cell.path.resolve(), link=cell.link, limits=cell.limits, setpoints=setpoints,
+            recording=cell.recording, ft_sensor=cell.ft_sensor,
+            web=cell.web, metrics=cell.metrics,
+        )  # fmt: skip
+    except ValidationError as error:
+        words = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
+        raise CellError(f"{cell.path}: {words}") from None
+
+
+def _setpoints_of(cell: Cell) -> SetpointSettings:
+    """Return section ``setpoints`` with whole paths, its token checked. Raises CellError."""
+    given = cell.setpoints
+    update = {
+        name: path.resolve()
+        for name in ("file", "socket", "token_file")
+        if (path := getattr(given, name)) is not None
+    }
+    if given.source == "planner" and given.socket is None:
+        update["socket"] = runtime_folder() / f"{cell_key(cell.path)}.planner.sock"
+    if given.source == "tcp" and given.token_file is not None:
+        try:
+            read_token(given.token_file, "setpoints.token_file")
+        except InputError as error:
+            raise CellError(f"{cell.path}: {error}") from None
+    return given.model_copy(update=update)

@@ -1,0 +1,139 @@
+"""Sections of the cell file that the daemon runs by: link, limits, setpoints, recording.
+
+Small pydantic models without a robot library behind them, so that a cell is read without one.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    TypeAdapter,
+    field_validator,
+    model_validator,
+)
+
+from bridge.cell.settings.recording import RecordingSettings as RecordingSettings
+from core.addresses import is_loopback
+from drivers.can.settings import CanSettings
+from drivers.canopen.settings import CanopenSettings
+from drivers.modbus.settings import ModbusSettings
+from drivers.replay import ReplaySettings
+from drivers.ur_rtde.settings import UrRtdeSettings
+
+DEFAULT_DRIVER = "ur_rtde"
+
+
+def _driver_of(link: Any) -> Any:
+    """Return the name of the driver in a link's keys or settings."""
+    if isinstance(link, dict):
+        return link.get("driver", DEFAULT_DRIVER)
+    return getattr(link, "driver", DEFAULT_DRIVER)
+
+
+LinkSettings = Annotated[
+    Annotated[UrRtdeSettings, Tag("ur_rtde")]
+    | Annotated[ModbusSettings, Tag("modbus")]
+    | Annotated[CanSettings, Tag("can")]
+    | Annotated[CanopenSettings, Tag("canopen")]
+    | Annotated[ReplaySettings, Tag("replay")],
+    Discriminator(_driver_of),
+]
+"""Section ``link``: the settings of the driver that it names (left out: ur_rtde)."""
+
+_LINK: TypeAdapter[LinkSettings] = TypeAdapter(LinkSettings)
+
+
+def link_settings(**keys: Any) -> LinkSettings:
+    """Return the settings of a link from its keys, as a cell file has them.
+
+    Raises pydantic's ValidationError.
+    """
+    return _LINK.validate_python(keys)
+
+
+_FROZEN = ConfigDict(extra="forbid", frozen=True)
+
+
+class LimitSettings(BaseModel):
+    """Section ``limits``: what no setpoint passes, whatever computed it."""
+
+    model_config = _FROZEN
+
+    offset: float = Field(0.010, gt=0.0, le=0.1, description="longest TCP offset, m")
+    offset_rotation: float = Field(0.02, gt=0.0, le=0.5, description="largest TCP rotation, rad")
+    offset_rate: float = Field(0.05, gt=0.0, le=1.0, description="change of the offset, m/s")
+    offset_rotation_rate: float = Field(
+        0.1, gt=0.0, le=5.0, description="change of the offset's rotation, rad/s"
+    )
+    joint_offset: float = Field(0.05, gt=0.0, le=0.5, description="correction of any joint, rad")
+    joint_velocity: float | None = Field(
+        None, gt=0.0, description="of any joint, rad/s; left out: the arm's own limits"
+    )
+    velocity_share: float = Field(
+        1.0, gt=0.0, le=1.0, description="share of the arm's own velocity limits that may be used"
+    )
+    joint_margin: float = Field(
+        0.0, ge=0.0, description="distance kept from the arm's joint limits, rad"
+    )
+    following: float = Field(
+        0.1, gt=0.0, le=0.5, description="farthest a command may be from the actual joint, rad"
+    )
+    ramp_time: float = Field(
+        0.5, gt=0.0, le=10.0, description="s in which offsets ramp in and out at least"
+    )
+
+
+class SetpointSettings(BaseModel):
+    """Section ``setpoints``: where nominal setpoints come from, and whether they are written."""
+
+    model_config = _FROZEN
+
+    source: Literal["target", "trajectory", "planner", "tcp", "modbus"] = "target"
+    arm: bool = Field(False, description="true: `run` writes setpoints; false: it only observes")
+    file: Path | None = Field(None, description="trajectory: CSV of timestamp, target_q_i")
+    socket: Path | None = Field(
+        None, description="planner: the Unix socket; left out: one in the daemon's runtime folder"
+    )
+    token_file: Path | None = Field(
+        None, description="tcp: a file that only its owner reads (mode 0600), with the token"
+    )
+    host: str = Field("127.0.0.1", description="tcp, modbus: address to listen on, loopback only")
+    port: int = Field(30310, ge=0, le=65535, description="tcp, modbus: port to listen on")
+    timeout: float = Field(
+        0.2,
+        gt=0.0,
+        le=5.0,
+        description="planner, tcp, modbus: s without a setpoint after which the source is dry",
+    )
+    start_tolerance: float = Field(
+        0.02, gt=0.0, le=0.2, description="farthest the first setpoint may be from the arm, rad"
+    )
+    use_force: bool = Field(True, description="whether the measured TCP force bends the model")
+    force_filter: float = Field(
+        0.05, ge=0.0, le=5.0, description="time constant of the low-pass on the TCP force, s"
+    )
+
+    @field_validator("host")
+    @classmethod
+    def _loopback(cls, value: str) -> str:
+        """Refuse to listen where others could reach it: anyone who can write here moves the arm."""
+        if not is_loopback(value):
+            raise ValueError("expected a loopback address (127.x.x.x, ::1)")
+        return value
+
+    @model_validator(mode="after")
+    def _tcp_is_guarded(self) -> Self:
+        """Refuse a TCP port that anything on this machine, web pages too, could write to."""
+        if self.source == "tcp" and self.token_file is None:
+            raise ValueError(
+                "setpoints.token_file: found nothing with source: tcp, expected a file of mode "
+                "0600 with a token (openssl rand -hex 32), or source: planner, a Unix socket"
+            )
+        return self

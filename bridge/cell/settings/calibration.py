@@ -1,0 +1,111 @@
+"""Section ``calibration`` of the cell file: what a session measures, with what, and where."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from bridge.cell.settings.instruments import InstrumentSettings, TypedSettings
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+NotNegative = Annotated[Number, Field(ge=0)]
+Positive = Annotated[Number, Field(gt=0)]
+Vector3 = Annotated[list[Number], Field(min_length=3, max_length=3)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class LoadEntry(_Section):
+    """A load that people hang on the flange, the tool's own weight included."""
+
+    name: str = Field(default="", description="as people call it")
+    mass: NotNegative = Field(description="kg")
+    cog: Vector3 = Field(default=[0.0, 0.0, 0.0], description="m, in the flange frame")
+
+
+class BoxEntry(_Section):
+    """A box, edges along base axes, that the arm stays out of."""
+
+    lower: Vector3 = Field(description="m, in base")
+    upper: Vector3 = Field(description="m, in base")
+
+
+class JointRange(_Section):
+    """Narrower joint limits for the session."""
+
+    lower: list[Number] = Field(description="rad, one value per joint")
+    upper: list[Number] = Field(description="rad, one value per joint")
+
+
+class RangeEntry(_Section):
+    """How far the instrument reaches."""
+
+    nearest: NotNegative = Field(default=0.0, description="m")
+    farthest: Positive | None = Field(default=None, description="m; default: as far as it sees")
+
+
+class ReflectorEntry(_Section):
+    """Which way the reflector on the tool looks, and from how far aside it is still seen."""
+
+    looks: Vector3 = Field(description="direction in the tool's axes")
+    acceptance: Annotated[Number, Field(gt=0, le=3.1416)] = Field(
+        description="rad, half the cone in which it is seen"
+    )
+
+
+class CalibrationSettings(_Section):
+    """The whole section. Everything has a default but what hangs on the flange."""
+
+    instrument: InstrumentSettings = Field(
+        default=TypedSettings(unit="mm"), description="kind, unit, ...: what measures"
+    )
+    loads: list[LoadEntry] = Field(
+        default=[], description="lightest first; default: the cell's payload alone"
+    )
+    poses: int = Field(default=30, ge=6, le=1000, strict=True, description="poses to fit")
+    held_out: int = Field(
+        default=8, ge=0, le=200, strict=True, description="poses to verify, never fitted"
+    )
+    repeats: int = Field(
+        default=4, ge=0, le=50, strict=True, description="further visits: the arm's repeatability"
+    )
+    effects: list[str] | None = Field(
+        default=None, description="what is to be found, effects of the catalogue"
+    )
+    instrument_at: Vector3 | None = Field(
+        default=None, description="m, in base, about: poses that it cannot see are left out"
+    )
+    further_places: list[Vector3] = Field(
+        default=[], description="m, in base, about: where it is carried to afterwards, in turn"
+    )
+    instrument_range: RangeEntry | None = Field(
+        default=None, description="m: poses out of it are left out"
+    )
+    reflector: ReflectorEntry | None = Field(
+        default=None, description="poses that turn it away from the instrument are left out"
+    )
+    keep_out: list[BoxEntry] = Field(default=[], description="boxes that the arm stays out of")
+    floor: Number | None = Field(default=0.0, description="m, in base: nothing comes below")
+    joint_range: JointRange | None = Field(default=None, description="narrower joint limits")
+    joints: Literal["link", "typed", "planned"] | None = Field(
+        default=None,
+        description="where joint angles come from; default: link where there is one, else typed",
+    )
+    speed: Annotated[Number, Field(gt=0, le=2.0)] = Field(
+        default=0.4, description="rad/s, fastest joint, where --move drives the arm"
+    )
+    settle: Annotated[Number, Field(ge=0, le=60.0)] = Field(
+        default=0.5, description="s at rest before the instrument is read"
+    )
+    samples: int = Field(
+        default=10, ge=1, le=10000, strict=True, description="readings averaged at a pose"
+    )
+    minutes_per_load: NotNegative = Field(default=5.0, description="min to change the load")
+    folder: Path = Field(default=Path("calibration"), description="of the sessions")
+    operator: str = Field(default="", description="who measures, for the report")
+    serial: str = Field(default="", description="of the arm, for the report")
+    environment: str = Field(default="", description="temperature, place, ..., for the report")

@@ -1,0 +1,105 @@
+"""``gapbridge convert``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from bridge.cell.opened_log import joint_names
+from bridge.cli.options import open_cell
+from bridge.document.output_file import PARQUET, require_writable, write_table
+from core.errors import InputError, LogError
+from core.log.sources import SOURCES, SourceOptions, source_of
+from core.log.sources.ros_bag import TYPES, WRENCHES
+
+ROLES = tuple(TYPES)
+
+
+@click.command()
+@click.argument("source", type=click.Path(path_type=Path))
+@click.option(
+    "--out",
+    required=True,
+    type=click.Path(path_type=Path),
+    metavar="LOG",
+    help="The log to write, .csv or .parquet.",
+)
+@click.option(
+    "--cell", type=click.Path(path_type=Path), help="The cell whose arm's joints are meant."
+)
+@click.option(
+    "--joints", metavar="A,B,...", help="The source's joint names, in the order of the arm's."
+)
+@click.option(
+    "--topic",
+    "topics",
+    multiple=True,
+    metavar="ROLE=TOPIC",
+    help=f"Name a topic of a bag; ROLE is {', '.join(ROLES)}. May be given several times.",
+)
+@click.option("--wrench", type=click.Choice(WRENCHES), help="Which column a bag's wrench topic is.")
+@click.option("--effort-is-torque", is_flag=True, help="JointState.effort is joint torque in Nm.")
+@click.option(
+    "--calibration",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="LeRobot's calibration file of the arm.",
+)
+@click.option(
+    "--units", type=click.Choice(("degrees", "rad")), help="What a LeRobot dataset's angles are in."
+)
+@click.option("--episode", type=click.IntRange(0), help="One episode of a LeRobot dataset.")
+def convert(source: Path, out: Path, cell: Path | None, **given: Any) -> None:
+    """Turn a recording of another program into a log.
+
+    SOURCE is a ROS 1 or ROS 2 bag (JointState, JointTrajectoryControllerState, WrenchStamped,
+    PoseStamped or TransformStamped of a tracker; topics found by their type), an MCAP file with
+    ROS 2 messages, a LeRobot dataset, libfranka's CSV, the file of UR's RTDE recorder, or a
+    recording of `gapbridge run`. Joints are ordered by name, never by position; times are those of
+    the headers. What the source does not say is reported.
+
+    Example: gapbridge convert bag/ --cell cell.yaml --out log.csv
+    """
+    kind = source_of(source)
+    if kind is None:
+        if not source.exists():
+            raise LogError(f"{source}: not found, expected a file or folder")
+        listed = "; ".join(one.title for one in SOURCES)
+        raise LogError(f"{source}: found no known kind of recording, expected one of: {listed}")
+    if out.suffix.lower() not in (".csv", *PARQUET):
+        raise InputError(
+            f"--out {out}: found {out.suffix or 'no suffix'}, expected .csv or .parquet"
+        )
+    require_writable(out, *([source] if source.is_file() else []), *([cell] if cell else []))
+    options = _options(**given)
+    for_cell = open_cell(cell) if cell else None
+    converted = kind.read(source, joint_names(for_cell) if for_cell else (), options)
+    if for_cell is not None:
+        converted.log(source, for_cell.arm.n)  # the arm's number of joints
+    names, table = converted.table()
+    write_table(out, names, table)
+    order = ", ".join(f"{i + 1} {name}" for i, name in enumerate(converted.joints))
+    click.echo(f"{out}: {len(converted)} rows; joints {order}")
+    for note in converted.notes:
+        click.echo(f"note: {note}")
+
+
+def _options(
+    joints: str | None, topics: tuple[str, ...], wrench: str | None, units: str | None, **same: Any
+) -> SourceOptions:
+    names = tuple(name.strip() for name in joints.split(",")) if joints else ()
+    return SourceOptions(names, _by_role(topics), wrench or "", units=units or "", **same)
+
+
+def _by_role(topics: tuple[str, ...]) -> dict[str, str]:
+    found = {}
+    for given in topics:
+        role, equals, topic = given.partition("=")
+        if not equals or role not in ROLES or not topic:
+            raise InputError(
+                f"--topic: found {given!r}, expected ROLE=TOPIC with ROLE one of {', '.join(ROLES)}"
+            )
+        found[role] = topic
+    return found

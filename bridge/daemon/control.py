@@ -1,0 +1,153 @@
+"""What the daemon answers over its local socket; every request leaves an event behind."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from bridge.ipc.control_socket import Peer, refusal
+from bridge.ipc.events import Event
+from bridge.ipc.shared_memory import Phase
+from bridge.loop.supervisor import Cause, State
+
+LONGEST_ARMING = 25.0  # s: uploads a program to the robot
+LONGEST_RAMP = 20.0  # s
+LONGEST_TAKING = 20.0  # s: a new process of the loop may have to start first
+SOURCE_SILENT = 1.0  # s without a first setpoint after which arming is told to be waiting
+LOOK = 0.02  # s
+
+
+class Controlled(Protocol):
+    """The part of the daemon that is asked; called from other threads than its own."""
+
+    @property
+    def state(self) -> State:
+        """Return what the loop is doing."""
+
+    @property
+    def phase(self) -> Phase:
+        """Return what the loop's process is at."""
+
+    @property
+    def latched(self) -> str:
+        """Return the fault that waits for being acknowledged; empty: none."""
+
+    @property
+    def may_write(self) -> bool:
+        """Return whether arming is possible at all."""
+
+    @property
+    def sequence(self) -> int:
+        """Return the number of the last event."""
+
+    def events_since(self, sequence: int) -> list[Event]:
+        """Return the events after a number."""
+
+    def status(self) -> dict[str, Any]:
+        """Return the status document."""
+
+    @property
+    def taken(self) -> int:
+        """Return the number of the newest request that a loop has taken."""
+
+    def arm(self, by: str) -> int:
+        """Ask the loop to write; returns the request's number, 0 where none is made."""
+
+    def disarm(self, by: str) -> int:
+        """Ask this loop or the next one to ramp out, or acknowledge a fault; returns its number."""
+
+    def note(self, event: Event) -> None:
+        """Have an event told."""
+
+
+class Control:
+    """Answers requests; ``answer`` may take as long as the arm does."""
+
+    def __init__(self, daemon: Controlled) -> None:
+        self._daemon = daemon
+
+    def answer(self, command: str, peer: Peer) -> dict[str, Any]:
+        """Return the answer to a command of COMMANDS."""
+        if command == "status":
+            return {"ok": True, "answer": self._daemon.status()}
+        by = f"uid {peer.uid}, pid {peer.pid}"
+        reply = self._arm(by) if command == "arm" else self._disarm(by)
+        self._daemon.note(
+            {"kind": "control", "command": command, "uid": peer.uid, "pid": peer.pid,
+             "ok": reply["ok"],
+             "detail": f"{command} by {by}: {reply.get('answer') or reply.get('error')}"}
+        )  # fmt: skip
+        return reply
+
+    def _arm(self, by: str) -> dict[str, Any]:
+        daemon = self._daemon
+        if not daemon.may_write:
+            return refusal("found a daemon that only observes (--observe), expected one that may")
+        if daemon.state in (State.ARMED, State.COMPENSATING):
+            return _done(f"is {daemon.state.name.lower()} already")
+        if daemon.latched:
+            return refusal(
+                f"a fault is latched: {daemon.latched}; acknowledge it first: gapbridge disarm"
+            )
+        if daemon.state != State.OBSERVING:
+            return refusal(f"found state {daemon.state.name.lower()}, expected observing")
+        mark = daemon.sequence
+        if not daemon.arm(by):
+            return refusal("the loop has ended, expected one that observes")
+        return self._await_armed(mark)
+
+    def _await_armed(self, mark: int) -> dict[str, Any]:
+        daemon, begun, waiting = self._daemon, time.monotonic(), None
+        while time.monotonic() - begun < LONGEST_ARMING:
+            for event in daemon.events_since(mark):
+                if event["kind"] == "refused" or event.get("cause") == Cause.START_REFUSED:
+                    return refusal(f"refused: {event['detail']}")
+                if event.get("to") in (State.FAULT.name, State.DISCONNECTED.name):
+                    return refusal(f"{event['cause']}: {event['detail']}")
+                if event.get("to") == State.COMPENSATING.name:
+                    return _done("compensating")
+            if daemon.state == State.DISCONNECTED:
+                return refusal("the loop has ended before it was armed")
+            idle = daemon.state == State.ARMED and daemon.phase == Phase.RUNNING
+            waiting = (waiting or time.monotonic()) if idle else None
+            if waiting is not None and time.monotonic() - waiting > SOURCE_SILENT:
+                return _done("armed; waits for the first setpoint of its source")
+            time.sleep(LOOK)
+        return refusal(f"no answer of the loop within {LONGEST_ARMING:g} s")
+
+    def _disarm(self, by: str) -> dict[str, Any]:
+        """Ask, always; what is answered is what a loop has taken, never what was hoped for."""
+        daemon = self._daemon
+        observed = daemon.state == State.OBSERVING and not daemon.latched
+        fault = daemon.latched
+        number = daemon.disarm(by)
+        if not self._comes(lambda: daemon.taken >= number, LONGEST_TAKING):
+            return refusal(
+                f"no loop has taken it within {LONGEST_TAKING:g} s (the state is "
+                f"{daemon.state.name.lower()}); it is kept for the next one"
+            )
+
+        def observes() -> bool:
+            return daemon.state == State.OBSERVING and not daemon.latched
+
+        if self._comes(observes, SOURCE_SILENT if fault else LONGEST_RAMP):
+            if observed:
+                return _done("is observing already")
+            return _done(f"acknowledged ({fault}); observing" if fault else "observing")
+        if fault:
+            return _done(f"acknowledged ({fault}); observing as soon as the robot is fine")
+        return refusal(f"still {daemon.state.name.lower()} after {LONGEST_RAMP:g} s")
+
+    @staticmethod
+    def _comes(what: Callable[[], bool], limit: float) -> bool:
+        until = time.monotonic() + limit
+        while not what():
+            if time.monotonic() > until:
+                return False
+            time.sleep(LOOK)
+        return True
+
+
+def _done(words: str) -> dict[str, Any]:
+    return {"ok": True, "answer": words}

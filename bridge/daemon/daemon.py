@@ -1,0 +1,375 @@
+"""The daemon: the parent that survives its loop.
+
+It starts the loop in a process of its own, watches the heartbeat, ends what hangs, starts anew what
+died (observing, never writing), looks after the processes that record and show, and says at the end
+how it went.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import subprocess
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import IO, Any
+
+from bridge.cell.daemon_settings import DaemonSettings
+from bridge.cell.run_settings import Configuration, configuration_for, settings_of
+from bridge.daemon.control import Control
+from bridge.daemon.opening import open_all
+from bridge.daemon.processes import LoopProcess
+from bridge.daemon.reload import Reload
+from bridge.daemon.service_manager import ServiceManager
+from bridge.daemon.sides import Sides
+from bridge.daemon.status import DaemonStatus
+from bridge.daemon.summary import RunSummary, Tally
+from bridge.ipc.command_page import Command, CommandPage
+from bridge.ipc.control_socket import ControlSocket
+from bridge.ipc.events import Event, EventBook
+from bridge.ipc.shared_memory import Phase, RunPage
+from bridge.loop.loop import LONGEST_STOP, Exit
+from bridge.loop.setpoint_stream import longest_withdrawal
+from bridge.loop.supervisor import State
+from core.errors import InputError, LinkError
+
+__all__ = ["Daemon", "Say", "settings_of"]
+
+TICK = 0.02  # s between two looks at the loop
+HEALTHY = 10.0  # s after which a restart counts as the first again
+STOP_MARGIN = 0.4  # s on top of the loop's own time: then it is ended by force
+STATUS_EVERY = 0.5  # s
+PROGRAM = f"the daemon's own program (pid {os.getpid()})"
+
+Say = Callable[[str], None]
+
+
+class Daemon:
+    """One run. ``stop``, ``reload``, ``arm`` and ``disarm`` may be called from other threads."""
+
+    def __init__(
+        self,
+        given: DaemonSettings | Configuration,
+        may_write: bool,
+        say: Say = lambda _: None,
+        log: Callable[[Event], None] | None = None,
+    ) -> None:
+        if not isinstance(given, Configuration):
+            given = configuration_for(given)
+        self.configuration = given  # read once; loops get these very bytes
+        settings = given.settings
+        self.may_write, self._say = may_write, say
+        n = self.configuration.n
+        self.page = RunPage(n)  # of the loop's process, one after the other
+        self._commands = CommandPage()  # one for the whole run; nobody else can write to it
+        self._requests: queue.SimpleQueue[tuple[int, Command, str]] = queue.SimpleQueue()
+        self._taken = 0
+        self._request_lock = threading.RLock()
+        self._reader = self.page.reader()
+        self.output: IO[bytes] | int = subprocess.DEVNULL  # of all processes of the run
+        self.sides = Sides()
+        self.tally = Tally(n, settings.link.rate)
+        listeners = [self._hear, self.sides.tell]
+        self.book = EventBook(*listeners, *([log] if log else []))
+        self._posted: queue.SimpleQueue[Event] = queue.SimpleQueue()  # by other threads
+        self.manager = ServiceManager()
+        self.session = ""
+        self._status = DaemonStatus(self)
+        self._status_at = 0.0
+        self._reload = Reload(self)
+        self.control = Control(self)
+        self.socket: ControlSocket | None = None
+        self.loop: LoopProcess | None = None
+        self._failure: Event = {}
+        self._faults: list[str] = []
+        self._lost_rows = 0
+        self._refused = False  # writing was asked for and could not begin
+        self._seen = False  # a state has been read, by this or a former loop
+        self.restarts = 0
+        self._loops = 0  # processes of the loop so far, those of a reload among them
+        self._wait = settings.backoff[0]
+        self._last_state = State.DISCONNECTED
+        self._stopping = threading.Event()
+
+    # -- for others -------------------------------------------------------------------------------
+
+    @property
+    def settings(self) -> DaemonSettings:
+        """Return what runs now; a reload changes it."""
+        return self.configuration.settings
+
+    @property
+    def state(self) -> State:
+        """Return what the loop is doing."""
+        return self._last_state
+
+    @property
+    def phase(self) -> Phase:
+        """Return what the loop's process is at."""
+        return self.page.phase
+
+    @property
+    def latched(self) -> str:
+        """Return the fault that waits for being acknowledged; empty: none."""
+        return self._status.latched
+
+    @property
+    def sequence(self) -> int:
+        """Return the number of the last event."""
+        return self.book.sequence
+
+    @property
+    def loop_pid(self) -> int | None:
+        """Return the process id of the loop, None between two of them."""
+        loop = self.loop
+        return None if loop is None else loop.pid
+
+    @property
+    def recording(self) -> Path | None:
+        """Return the run's recording as a whole: its files' name without their numbers."""
+        folder = self.settings.recording.folder
+        return None if folder is None or not self.session else folder / self.session
+
+    @property
+    def lost_rows(self) -> int:
+        """Return how many cycles the recorder says that no file holds."""
+        return self._lost_rows
+
+    def events_since(self, sequence: int) -> list[Event]:
+        """Return the events after a number."""
+        return self.book.since(sequence)
+
+    def status(self) -> dict[str, Any]:
+        """Return the status document."""
+        return self._status.document()
+
+    def note(self, event: Event) -> None:
+        """Have an event told by the daemon's own thread."""
+        self._posted.put(event)
+
+    def close_memory(self) -> None:
+        """Let go of what is shared with the loop and who reads along."""
+        self.page.close()
+        self._commands.close()
+
+    def stop(self) -> None:
+        """Ramp out and end."""
+        self._stopping.set()
+
+    def reload(self) -> None:
+        """Read the cell file again; what is wrong is told, and the old one stays."""
+        self._reload.ask()
+
+    @property
+    def taken(self) -> int:
+        """Return the number of the newest request that a loop has taken."""
+        return self._taken
+
+    def arm(self, by: str = PROGRAM) -> int:
+        """Ask the loop to write setpoints; returns the request's number, 0 where none is made."""
+        if self.loop is None or not self.may_write:
+            return 0
+        return self._request(Command.ARM, by)
+
+    def disarm(self, by: str = PROGRAM) -> int:
+        """Ask the loop, this or the next one, to ramp out and observe; in a fault, acknowledge it.
+
+        Returns the request's number: it counts once ``taken`` has come to it.
+        """
+        return self._request(Command.DISARM, by)
+
+    def ramp_out(self) -> None:
+        """Have the loop ramp out and observe, by nobody's wish; for the daemon's own thread."""
+        self._commands.ask(Command.RAMP_OUT)
+
+    def _request(self, command: Command, by: str) -> int:
+        with self._request_lock:
+            number = self._commands.number()
+            self._requests.put((number, command, by))
+        return number
+
+    def _pass_on(self) -> None:
+        """Write what was asked for, each request behind the event that says who asked.
+
+        There is no other way by which an ARM is written.
+        """
+        while not self._requests.empty():
+            number, command, by = self._requests.get()
+            words = f"{command.name.lower()} asked for by {by}"
+            self.book.add(
+                {"kind": "request", "command": command.name.lower(), "number": number, "by": by,
+                 "detail": words}
+            )  # fmt: skip
+            self._commands.ask(command, number)
+
+    # -- the run ----------------------------------------------------------------------------------
+
+    def run(self, arm: bool = False, duration: float | None = None, by: str = "") -> RunSummary:
+        """Run until stopped; ``by`` says who or what has asked for arming. See run_cell."""
+        with ExitStack() as stack:
+            arm = open_all(self, stack, arm, by)
+            while not self._stopping.is_set():
+                self._run_loop((by or PROGRAM) if arm else "", duration)
+                arm = self._reload.swap()  # else only a person starts the writing again
+                by = "the cell file" if arm else ""
+                if not self._stopping.is_set() and not self._reload.swapped:
+                    self._pause()
+                    self.restarts += 1
+            self._take()
+            return self._summary()
+
+    def _pause(self) -> None:
+        """Wait before the next process of the loop, and go on looking after the rest."""
+        until = time.monotonic() + self._wait
+        self._wait = min(2.0 * self._wait, self.settings.backoff[1])
+        while time.monotonic() < until and not self._stopping.wait(TICK):
+            self._tick()
+
+    def _tick(self) -> None:
+        """Look after everything but the loop."""
+        self._take()
+        self._pass_on()
+        if self.page.promote():
+            self.sides.show(self.page)
+        for event in self.sides.check():
+            self.book.add(event)
+        while not self._posted.empty():
+            self.book.add(self._posted.get())
+        if time.monotonic() >= self._status_at:
+            self._status_at = time.monotonic() + STATUS_EVERY
+            self.sides.tell({"kind": "status", **self.status()})
+        loop = self.loop
+        if loop is None or not loop.hangs:
+            self.manager.kick()
+
+    def _run_loop(self, armed_by: str, duration: float | None) -> None:
+        """Run one process of the loop to its end; ``armed_by``: who has it arm at its start."""
+        self._last_state = State.DISCONNECTED
+        self._failure = {}
+        loop = self.loop = self._start_loop(armed_by)
+        stop_by = first_cycle = None
+        try:
+            while loop.exit_code is None:
+                time.sleep(TICK)
+                self._tick()
+                if self.page.seen and first_cycle is None:
+                    first_cycle, self._seen = time.monotonic(), True
+                    self.manager.ready()
+                over = first_cycle is not None and (
+                    duration is not None and time.monotonic() - first_cycle >= duration
+                )
+                if over or (self.page.ended and duration is None):
+                    self._stopping.set()
+                self._reload.step(self.state, self.phase)
+                if (self._stopping.is_set() or self._reload.wants_end) and stop_by is None:
+                    needed = LONGEST_STOP + longest_withdrawal(self.settings.limits)
+                    stop_by = time.monotonic() + needed + STOP_MARGIN
+                    if self._stopping.is_set():
+                        self.manager.stopping()
+                    loop.ask_to_stop()
+                if loop.hangs or (stop_by is not None and time.monotonic() > stop_by):
+                    words = f"the loop stood still for {self.page.silence:.2f} s and was ended"
+                    loop.kill()  # told when it is over: nothing is written after that
+                    self._fault("hang", words)
+            self._take()
+            self._after(loop)
+            if first_cycle is not None and time.monotonic() - first_cycle > HEALTHY:
+                self._wait = self.settings.backoff[0]
+        finally:
+            self.loop = None
+            loop.close()
+
+    def _start_loop(self, armed_by: str) -> LoopProcess:
+        """Start a process of the loop, for which only requests count that are still to come.
+
+        Beside them, a disarming that no loop has taken: whoever asked for it is owed it.
+        """
+        with self._request_lock:  # none is numbered and not yet written
+            self._pass_on()
+            after = self._commands.number()
+        order = {
+            "may_write": self.may_write, "number": self._loops, "latched": self._status.latched,
+            "after": after,
+        }  # fmt: skip
+        if self._commands.last_of(Command.DISARM) > self.page.taken:
+            self._commands.ask(Command.DISARM)
+        if armed_by and self.may_write:
+            self._request(Command.ARM, armed_by)
+            self._pass_on()
+        self._loops += 1
+        return LoopProcess(self.configuration, self.page, self._commands, order, self.output)
+
+    def _take(self) -> None:
+        """Take cycles and events over from the loop."""
+        taken = self.page.taken
+        # in this order: who has heard of a change finds the state changed, and its rows counted
+        events = [] if self.loop is None else self.loop.events()
+        if self.loop is not None:
+            self._last_state = State(self.page.state)
+        self._taken = taken
+        rows = self._reader.drain()
+        self.tally.add(rows)
+        self._status.take(rows)
+        for event in events:
+            self.book.add(event)
+
+    def _hear(self, event: Event) -> None:
+        """Act on an event, and tell it to the person at the terminal."""
+        kind, detail = event["kind"], str(event.get("detail", ""))
+        self._status.hear(event)
+        if kind == "failure":
+            self._failure = event
+        if kind == "refused":
+            self._refused = True
+        if kind == "recorder":
+            self._lost_rows += int(event.get("lost", 0))
+        if kind == "transition":
+            tail = f": {detail}" if detail else ""
+            text = f"{event['from'].lower()} -> {event['to'].lower()} ({event['cause']}){tail}"
+            self._say(text)
+            self._refused |= event["cause"] == "start refused"
+            if detail:
+                self._faults.append(text)
+        elif detail and kind not in ("granted", "summary", "request"):
+            self._say(detail)
+
+    def _after(self, loop: LoopProcess) -> None:
+        """Judge how the loop's process ended; raises where it is no use to start it again."""
+        code = loop.exit_code
+        if code == Exit.DONE:
+            if not self._reload.wants_end:
+                self._stopping.set()
+            return
+        self._last_state = State.DISCONNECTED
+        self._status.lost_loop()
+        words = str(self._failure.get("detail", "")) or f"the loop's process {loop.describe_end()}"
+        if self._stopping.is_set() and not self._failure:
+            return
+        if code == Exit.INPUT and not self._seen:
+            raise InputError(words)  # later, it is a file that somebody is at: tried again
+        if not self._seen:
+            raise LinkError(words)
+        self._fault("loop", words)
+
+    def _fault(self, cause: str, words: str) -> None:
+        self._faults.append(words)
+        self.book.add({"kind": "fault", "cause": cause, "detail": words})
+
+    def _summary(self) -> RunSummary:
+        state = self._last_state
+        wrong = self._refused and not self.tally.written
+        wrong |= state in (State.FAULT, State.DISCONNECTED)
+        summary = RunSummary(
+            **self.tally.figures(),
+            restarts=self.restarts,
+            lost_rows=self.lost_rows,
+            faults=tuple(self._faults),
+            state=state.name.lower(),
+            exit_code=1 if wrong else 0,
+            recording=self.recording,
+        )
+        self.book.add({"kind": "summary", "summary": summary.to_json()})
+        return summary

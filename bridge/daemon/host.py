@@ -1,0 +1,95 @@
+"""One owner per controller: a lock that is held for a run and never outlives its process."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import json
+import os
+import socket
+import sys
+from pathlib import Path
+from typing import Any, Self
+
+from bridge.cell.runtime_folder import runtime_folder
+from core.errors import InputError
+
+
+class OwnerLock:
+    """The right to talk to one controller, machine-wide; the kernel takes it back at any end.
+
+    ``before`` is what the last owner left behind, empty where it ended in order.
+    """
+
+    def __init__(self, address: str, cell: Path) -> None:
+        self.address = address
+        self._cell = cell
+        self._fd: int | None = None
+        self._name: socket.socket | None = None
+        self.before: dict[str, Any] = {}
+
+    def acquire(self) -> None:
+        """Take the lock. Raises InputError where another daemon has it."""
+        key = hashlib.sha256(self.address.encode()).hexdigest()[:16]
+        path = runtime_folder() / f"{key}.lock"
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._claim_name(key)
+        except OSError:
+            owner = _read(fd)
+            os.close(fd)
+            who = f"process {owner['pid']}, {owner['cell']}" if "pid" in owner else "another user"
+            raise InputError(
+                f"{self._cell}: link: {self.address} is in use by another daemon ({who}), "
+                "expected one owner per controller"
+            ) from None
+        self._fd, self.before = fd, _read(fd)
+        self.note({})
+
+    def _claim_name(self, key: str) -> None:
+        """Take a name that daemons of other users see too, whatever their folder is."""
+        if sys.platform.startswith("linux"):
+            self._name = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            try:
+                self._name.bind(f"\0gapbridge-{key}")
+            except OSError:
+                self._name.close()
+                raise
+
+    def note(self, more: dict[str, Any]) -> None:
+        """Leave word for whoever comes after an end that was not in order."""
+        self._write(json.dumps({"pid": os.getpid(), "cell": str(self._cell), **more}))
+
+    def _write(self, text: str) -> None:
+        if self._fd is not None:
+            data = text.encode()
+            with contextlib.suppress(OSError):  # a full disk is no reason to stop an arm
+                os.pwrite(self._fd, data, 0)
+                os.ftruncate(self._fd, len(data))
+
+    def release(self) -> None:
+        """Give the lock back; the end was in order."""
+        self._write("")
+        if self._fd is not None:
+            os.close(self._fd)
+            self._fd = None
+        if self._name is not None:
+            self._name.close()
+            self._name = None
+
+    def __enter__(self) -> Self:
+        self.acquire()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
+
+def _read(fd: int) -> dict[str, Any]:
+    with contextlib.suppress(OSError, ValueError):
+        found = json.loads(os.pread(fd, 65536, 0))
+        if isinstance(found, dict):
+            return found
+    return {}

@@ -1,0 +1,128 @@
+"""The daemon's view of the loop's process: start it, watch its heartbeat, end it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import pickle
+import signal
+import socket
+import subprocess
+import sys
+import time
+from typing import IO, Any
+
+from bridge.cell.run_settings import Configuration
+from bridge.ipc.command_page import Command, CommandPage
+from bridge.ipc.sealed_memory import sealed_bytes
+from bridge.ipc.shared_memory import Phase, RunPage
+from bridge.ipc.side_process import environment
+from bridge.loop.loop import Exit
+
+STARTING_LIMIT = 180.0  # s: imports and, the first time, compilation
+ENDING_LIMIT = 2.0  # s
+_LONGEST_EVENT = 65536  # bytes
+
+
+class LoopProcess:
+    """One process of the loop, from its start to its end.
+
+    It gets the files of its configuration as the daemon has read them, and reads no others.
+    ``order`` holds ``may_write``, ``number`` (processes counted from 0), ``latched``
+    and ``after`` (number of the last request that is not for it); see loop_main.
+    """
+
+    def __init__(
+        self, configuration: Configuration, page: RunPage, commands: CommandPage,
+        order: dict[str, Any], log: IO[Any] | int,
+    ) -> None:  # fmt: skip
+        page.renew()
+        self.page, self._commands = page, commands
+        self._settings = settings = configuration.settings
+        files = sealed_bytes("gapbridge-files", pickle.dumps(dict(configuration.files)))
+        # sockets, not pipes: nobody can open them a second time through /proc
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        orders, stdin = socket.socketpair()
+        self._events = ours
+        ours.setblocking(False)
+        self.started = time.monotonic()
+        order = {
+            **order, "settings": settings.model_dump(mode="json"), "n": page.n,
+            "page": page.fd, "commands": commands.fd, "events": theirs.fileno(),
+            "files": files, "hash": configuration.hash,
+            "parent": os.getpid(),
+        }  # fmt: skip
+        try:
+            # spawned, never forked: nothing of this process's threads and locks may be inherited;
+            # in a session of its own, so that a Ctrl-C reaches it through the daemon only
+            self._process = subprocess.Popen(
+                [sys.executable, "-X", "faulthandler", "-m", "bridge.loop.main"],
+                stdin=stdin.fileno(), stdout=log, stderr=log, env=environment(),
+                pass_fds=(page.fd, commands.fd, files, theirs.fileno()), start_new_session=True,
+            )  # fmt: skip
+        finally:
+            os.close(files)
+            theirs.close()
+            stdin.close()
+        with orders, contextlib.suppress(OSError):  # it is gone already, which the daemon sees
+            orders.sendall((json.dumps(order) + "\n").encode())
+
+    @property
+    def pid(self) -> int:
+        """Return its process id."""
+        return self._process.pid
+
+    @property
+    def exit_code(self) -> int | None:
+        """Return its exit code, negative for a signal; None while it lives."""
+        return self._process.poll()
+
+    @property
+    def hangs(self) -> bool:
+        """Return whether its heartbeat has stood still for longer than what it is at may take."""
+        page, settings = self.page, self._settings
+        limit = {
+            Phase.STARTING: STARTING_LIMIT,
+            Phase.CONNECTING: settings.link.connect_timeout,
+            Phase.RUNNING: settings.hang_timeout,
+            Phase.ARMING: settings.link.connect_timeout,
+            Phase.ENDING: ENDING_LIMIT,
+        }[page.phase]
+        silence = page.silence or time.monotonic() - self.started
+        return silence > limit
+
+    def events(self) -> list[dict[str, Any]]:
+        """Return the events that have arrived."""
+        found = []
+        with contextlib.suppress(OSError):
+            while data := self._events.recv(_LONGEST_EVENT):
+                found.append(json.loads(data))
+        return found
+
+    def ask_to_stop(self) -> None:
+        """Ask it to ramp out and end."""
+        self._commands.ask(Command.STOP)
+        if self.page.phase in (Phase.STARTING, Phase.CONNECTING):
+            self.kill()  # nothing is written yet, and a constructor cannot be interrupted
+
+    def kill(self) -> None:
+        """End it by force; the robot's own watchdog stops the arm."""
+        if self._process.poll() is None:
+            self._process.send_signal(signal.SIGKILL)
+            self._process.wait()
+
+    def close(self) -> None:
+        """Give everything back; ends the process where it still lives."""
+        self.kill()
+        self._events.close()
+
+    def describe_end(self) -> str:
+        """Return in words how it ended."""
+        code = self.exit_code
+        if code is None:
+            return "is alive"
+        if code < 0:
+            return f"was ended by {signal.Signals(-code).name}"
+        known = {e.value: e.name.lower() for e in Exit}
+        return f"ended with {code} ({known.get(code, 'unknown')})"

@@ -1,0 +1,77 @@
+"""The processes beside the loop: which there are, and looking after them together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import IO, Any
+
+from bridge.cell.daemon_settings import DaemonSettings
+from bridge.ipc.shared_memory import Page
+from bridge.ipc.side_process import SideProcess
+
+SIDES: dict[str, tuple[str, Callable[[DaemonSettings], bool]]] = {
+    "recorder": ("bridge.recording.main", lambda s: s.recording.folder is not None),
+    "web": ("bridge.web.main", lambda s: s.web is not None),
+    "metrics": ("bridge.metrics.main", lambda s: s.metrics is not None),
+}
+"""Name -> (module to run, whether a run's settings want it)."""
+
+PATIENCE = {"recorder": 10.0}  # s to finish in, where it is not LITTLE
+LITTLE = 0.3
+
+
+class Sides:
+    """All side processes of a run."""
+
+    def __init__(self) -> None:
+        self._running: dict[str, SideProcess] = {}
+
+    def start(
+        self, settings: DaemonSettings, order: dict[str, Any], page: Page, log: IO[Any] | int
+    ) -> None:
+        """Start those that the settings want."""
+        for name, (module, wanted) in SIDES.items():
+            if wanted(settings):
+                self._running[name] = SideProcess(module, order, page, log)
+
+    def show(self, page: Page) -> None:
+        """Have all change over to a page that the daemon shows."""
+        for side in self._running.values():
+            side.show(page)
+
+    def tell(self, event: dict[str, Any]) -> None:
+        """Pass an event on to each; never blocks."""
+        for side in self._running.values():
+            side.tell(event)
+
+    def check(self) -> list[dict[str, Any]]:
+        """Look after all; returns what they have told and what became of them, as events."""
+        found = []
+        for name, side in self._running.items():
+            for event in side.events():
+                if event.get("kind") == name:
+                    found.append(event)
+                else:  # states and requests are not a side process's to tell of
+                    words = f"{name} told of {str(event.get('kind'))[:40]!r}, not its to tell of"
+                    found.append({"kind": "side", "side": name, "detail": words})
+            if (wrong := side.check()) is not None:
+                found.append({"kind": "side", "side": name, "detail": wrong})
+        return found
+
+    def status(self) -> dict[str, dict[str, int | None]]:
+        """Return process id, restarts, stalls and events dropped of each."""
+        return {
+            name: {
+                "pid": side.pid, "restarts": side.restarts, "stalls": side.stalls,
+                "dropped": side.dropped,
+            }
+            for name, side in self._running.items()
+        }  # fmt: skip
+
+    def close(self) -> None:
+        """Tell all that the daemon ends, and wait for what they have to finish."""
+        for side in self._running.values():
+            side.begin_close()
+        for name, side in self._running.items():
+            side.close(PATIENCE.get(name, LITTLE))
+        self._running.clear()

@@ -1,0 +1,41 @@
+"""The status document: what ``gapbridge status --json`` prints and every side process is told."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+SCHEMA = "gapbridge.status/1"
+
+
+def lines(status: dict[str, Any]) -> list[str]:
+    """Return a status document as a person reads it."""
+    link, loop = status["link"], status["loop"]
+    since = time.strftime("%H:%M:%S", time.localtime(status["since"]))
+    why = f" ({status['why']})" if status["why"] else ""
+    found = [
+        f"{status['cell']}: {status['state']} since {since}{why}",
+        f"  process {status['pid']}, loop {loop['pid'] or 'none'} (restarts {loop['restarts']}), "
+        f"session {status['session']}",
+        f"  link: {link['rate_hz']:.1f} Hz, last state {_ms(link['age'])} ago, cycles "
+        f"{link['cycles']}, missed {link['missed']}, late {link['late']}, setpoints "
+        f"{link['written']}",
+    ]
+    if status["armed_by"]:
+        found.append(f"  armed by {status['armed_by']}")
+    if status["latched"]:
+        found.append(f"  fault: {status['latched']}; acknowledge with `gapbridge disarm`")
+    if status["correction"]["detail"]:
+        found.append(f"  model: {status['correction']['detail']}")
+    counted = {k: v for k, v in status["counts"].items() if v}
+    if counted:
+        found.append("  counted: " + ", ".join(f"{k} {v}" for k, v in counted.items()))
+    for name, side in status["sides"].items():
+        found.append(f"  {name}: process {side['pid'] or 'none'} (restarts {side['restarts']})")
+    if status["recording"]:
+        found.append(f"  recording {status['recording']}")
+    return found
+
+
+def _ms(age: float | None) -> str:
+    return "never" if age is None else f"{1e3 * age:.0f} ms"

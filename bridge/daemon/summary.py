@@ -1,0 +1,156 @@
+"""How a run went, in numbers and in words."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.ipc.shared_memory import slices_of
+from core.limits import CLAMPS
+
+Array = NDArray[np.float64]
+UNIT = 1e-6  # s: bin of a histogram
+BINS = 50_000  # to 50 ms; what is beyond counts as the last
+
+
+class Histogram:
+    """Counts of durations, exact to 1 us."""
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(BINS, dtype=np.int64)
+        self.largest = 0.0  # s
+
+    def add(self, values: Array) -> None:
+        """Count durations (k,), s."""
+        if len(values):
+            bins = np.clip(values / UNIT, 0, BINS - 1).astype(int)
+            np.add.at(self._counts, bins, 1)
+            self.largest = max(self.largest, float(values.max()))
+
+    def quantile(self, share: float) -> float:
+        """Return the duration (s) that this share stays within; 0 without any."""
+        total = self._counts.sum()
+        if not total:
+            return 0.0
+        at = int(np.searchsorted(np.cumsum(self._counts), share * total))
+        return min((at + 1) * UNIT, self.largest)
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """One run of the daemon. Times in ms and us as the names say."""
+
+    cycles: int  # distinct controller timestamps seen
+    missed: int  # timestamps between them that were not; arming, a break of its own, is left out
+    late: int  # cycles finished later than one period after their state
+    rate_hz: float  # cycles per second of the controller's clock
+    setpoints_written: int
+    age_ms: dict[str, float]  # p50, p99, max: age of the state behind each setpoint
+    loop_us: dict[str, float]  # p50, p99, max: from seeing a state to having written
+    clamped: dict[str, int]  # setpoints that a limit held back, by limit
+    restarts: int  # of the loop's process
+    lost_rows: int  # cycles that could not be recorded
+    faults: tuple[str, ...]
+    state: str  # at the end
+    exit_code: int
+    recording: Path | None = None
+
+    @property
+    def missed_share(self) -> float:
+        """Return missed cycles over all there were."""
+        return self.missed / max(self.cycles + self.missed, 1)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return everything as JSON-able data."""
+        found = asdict(self)
+        found["recording"] = None if self.recording is None else str(self.recording)
+        found["missed_share"] = self.missed_share
+        return found
+
+    def lines(self) -> list[str]:
+        """Return the summary as a person reads it."""
+        found = [
+            f"cycles {self.cycles}, missed {self.missed} ({100 * self.missed_share:.3f} %), "
+            f"late {self.late}, rate {self.rate_hz:.2f} Hz",
+            f"setpoints written {self.setpoints_written}, age of the state p50 "
+            f"{self.age_ms['p50']:.2f} ms, p99 {self.age_ms['p99']:.2f} ms, max "
+            f"{self.age_ms['max']:.2f} ms",
+            f"loop p50 {self.loop_us['p50']:.0f} us, p99 {self.loop_us['p99']:.0f} us, max "
+            f"{self.loop_us['max']:.0f} us",
+        ]
+        clamped = ", ".join(f"{name} {count}" for name, count in self.clamped.items() if count)
+        if clamped:
+            found.append(f"held back by limits: {clamped}")
+        if self.restarts:
+            found.append(f"the loop's process was restarted {self.restarts} times")
+        if self.lost_rows:
+            found.append(f"{self.lost_rows} cycles could not be recorded")
+        if self.recording is not None:
+            found.append(f"recorded in {self.recording}")
+        return found
+
+
+@dataclass
+class Tally:
+    """Counts the cycles of a run as they come in, across restarts of the loop's process."""
+
+    n: int
+    rate: float
+    cycles: int = 0
+    missed: int = 0
+    late: int = 0
+    written: int = 0
+    last_timestamp: float = np.nan  # s, controller's clock
+    steps: int = 0  # between two cycles in a row
+    span: float = 0.0  # s of the controller's clock that they took
+    clamped: Array = field(default_factory=lambda: np.zeros(len(CLAMPS), dtype=np.int64))
+    age: Histogram = field(default_factory=Histogram)
+    age_written: Histogram = field(default_factory=Histogram)
+    work: Histogram = field(default_factory=Histogram)
+
+    def add(self, rows: Array) -> None:
+        """Count rows (k, width) of consecutive cycles."""
+        if not len(rows):
+            return
+        s = slices_of(self.n)
+        written = rows[:, s["written"].start] > 0
+        age, work = rows[:, s["age"].start], rows[:, s["duration"].start]
+        missed = rows[:, s["missed"].start]
+        self.cycles += len(rows)
+        self.missed += int(missed.sum())
+        self.late += int((age > 1.0 / self.rate).sum())
+        self.written += int(written.sum())
+        gaps = np.diff(rows[:, s["timestamp"].start], prepend=self.last_timestamp)
+        # a gap without cycles missed is a break: the loop armed, or was started anew
+        gaps = gaps[np.abs(gaps - (missed + 1.0) / self.rate) < 0.5 / self.rate]
+        self.last_timestamp = float(rows[-1, s["timestamp"].start])
+        self.steps += len(gaps)
+        self.span += float(gaps.sum())
+        bits = rows[:, s["clamped"].start].astype(np.int64)
+        for bit in range(len(CLAMPS)):
+            self.clamped[bit] += int((bits >> bit & 1).sum())
+        self.age.add(age)
+        self.age_written.add(age[written])
+        self.work.add(work)
+
+    def figures(self) -> dict[str, Any]:
+        """Return the fields of RunSummary that are counted here."""
+        quantiles = {"p50": 0.5, "p99": 0.99}
+        # a run that only observes has no setpoints; then every cycle stands for one
+        ages = self.age_written if self.written else self.age
+        age = {k: 1e3 * ages.quantile(v) for k, v in quantiles.items()}
+        work = {k: 1e6 * self.work.quantile(v) for k, v in quantiles.items()}
+        return {
+            "cycles": self.cycles,
+            "missed": self.missed,
+            "late": self.late,
+            "rate_hz": self.steps / self.span if self.span else 0.0,
+            "setpoints_written": self.written,
+            "age_ms": age | {"max": 1e3 * ages.largest},
+            "loop_us": work | {"max": 1e6 * self.work.largest},
+            "clamped": dict(zip(CLAMPS, self.clamped.tolist(), strict=True)),
+        }

@@ -1,0 +1,1 @@
+"""Documents for people: blocks, pictures and tables, written as HTML and as PDF."""

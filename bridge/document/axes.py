@@ -1,0 +1,205 @@
+"""Axes of a chart: scales, ticks, and the way from values to places."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from bridge.document.drawing import (
+    EDGE,
+    GRID,
+    INK,
+    SOFT,
+    Circle,
+    Drawing,
+    Line,
+    Point,
+    Rectangle,
+    Stroke,
+    Text,
+)
+
+WIDTH, HEIGHT = 340.0, 230.0
+LEFT, RIGHT, TOP, BOTTOM = 44.0, 10.0, 30.0, 38.0
+
+
+def plain(value: float) -> str:
+    """Return a number without trailing zeros."""
+    return f"{value:.4g}".replace("-", "−")
+
+
+@dataclass(frozen=True)
+class Scale:
+    """One axis: what it shows, from where to where."""
+
+    title: str
+    low: float
+    high: float
+    ticks: tuple[float, ...] = ()  # none: no grid
+    labels: tuple[str, ...] = ()  # instead of the ticks' numbers
+    log: bool = False
+
+    def share(self, value: float) -> float:
+        """Return how far along the axis a value lies, 0 to 1."""
+        if self.log:
+            low, high = math.log10(self.low), math.log10(self.high)
+            value = math.log10(max(value, self.low))
+            return (value - low) / (high - low)
+        return (value - self.low) / (self.high - self.low)
+
+
+def scale(title: str, values: Sequence[float], *, tight: bool = False, ticks: int = 4) -> Scale:
+    """Return a scale that holds 0 and all values, with round ticks.
+
+    It begins and ends at a tick, or, ``tight``, a little beyond the values.
+    """
+    finite = [float(v) for v in values if math.isfinite(v)] or [0.0]
+    low, high = min(finite), max(finite)
+    low, high = min(low, 0.0), max(high, 0.0)
+    if high - low < 1e-12:
+        high = low + 1.0
+    step = _round_step((high - low) / ticks)
+    first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
+    places = tuple(k * step for k in range(first, last + 1))
+    if tight:
+        low, high = low - 0.04 * (high - low), high + 0.04 * (high - low)
+        return Scale(title, low, high, tuple(v for v in places if low <= v <= high))
+    return Scale(title, places[0], places[-1], places)
+
+
+def logarithmic(title: str, values: Sequence[float]) -> Scale:
+    """Return a scale in powers of ten that holds all values above 0."""
+    positive = [float(v) for v in values if math.isfinite(v) and v > 0] or [1.0]
+    steps = (1.0, 2.0, 5.0)
+    first = math.floor(math.log10(min(positive)))
+    last = math.ceil(math.log10(max(positive)))
+    every = [k * 10.0**e for e in range(first, last + 1) for k in steps]
+    low = max(v for v in every if v <= min(positive) * (1 + 1e-9))
+    high = min((v for v in every if v >= max(positive) and v > low), default=2 * low)
+    kept = tuple(v for v in every if low <= v <= high)
+    if len(kept) > 7:
+        kept = tuple(v for v in kept if abs(math.log10(v) % 1) < 1e-9)
+    return Scale(title, low, high, kept, log=True)
+
+
+def visible(values: Sequence[float]) -> list[float]:
+    """Return values for a scale in powers of ten, the least ones not to stretch it."""
+    least = sorted(values)[len(values) // 4] / 20 if values else 0.0
+    return [max(v, least) for v in values]
+
+
+def named(title: str, labels: Sequence[str]) -> Scale:
+    """Return a scale of named places 0, 1, 2, ..."""
+    count = len(labels)
+    return Scale(title, -0.5, count - 0.5, tuple(float(i) for i in range(count)), tuple(labels))
+
+
+def _round_step(rough: float) -> float:
+    size = 10.0 ** math.floor(math.log10(rough))
+    return next(size * k for k in (1.0, 2.0, 2.5, 5.0, 10.0) if size * k >= rough * (1 - 1e-9))
+
+
+class Chart:
+    """A drawing with axes."""
+
+    def __init__(
+        self, title: str, x: Scale, y: Scale, *, height: float = HEIGHT, left: float = LEFT,
+        width: float = WIDTH, equal: bool = False,
+    ) -> None:  # fmt: skip
+        self.x, self.y = x, y
+        self.left, self.top = left, TOP
+        self.right, self.bottom = width - RIGHT, height - BOTTOM
+        if equal:
+            self._make_equal()
+        self.drawing = Drawing(width, height, title)
+        self.drawing.add(Text(0, 13, title, 12, INK, bold=True))
+        self._axes()
+
+    def at(self, x: float, y: float) -> Point:
+        """Return the place of a value."""
+        return (
+            self.left + self.x.share(x) * (self.right - self.left),
+            self.bottom - self.y.share(y) * (self.bottom - self.top),
+        )
+
+    def points(
+        self, x: Sequence[float], y: Sequence[float], colour: str, *, radius: float = 2.6,
+        opacity: float = 0.75, hints: Sequence[str] = (),
+    ) -> None:  # fmt: skip
+        """Draw a dot for each value."""
+        for i, (a, b) in enumerate(zip(x, y, strict=True)):
+            place = self.at(float(a), float(b))
+            hint = hints[i] if hints else ""
+            self.drawing.add(Circle(*place, radius, colour, opacity=opacity, hint=hint))
+
+    def line(
+        self, x: Sequence[float], y: Sequence[float], colour: str, *, width: float = 1.6,
+        dashed: bool = False,
+    ) -> None:  # fmt: skip
+        """Draw a line through values."""
+        places = [self.at(float(a), float(b)) for a, b in zip(x, y, strict=True)]
+        self.drawing.line(places, Stroke(colour, width, dashed))
+
+    def column(self, x: float, y: float, colour: str, width: float, hint: str = "") -> None:
+        """Draw an upright bar from 0 to a value, centred at ``x``; ``width`` in units of x."""
+        left, top = self.at(x - width / 2, max(y, 0.0))
+        right, bottom = self.at(x + width / 2, min(y, 0.0))
+        self.drawing.add(Rectangle(left, top, right - left, max(bottom - top, 0.5), colour, hint))
+
+    def label(self, x: float, y: float, text: str) -> None:
+        """Write a figure just above a value."""
+        a, b = self.at(x, y)
+        self.drawing.add(Text(a, b - 4, text, 9.5, SOFT, "middle"))
+
+    def square(self, x: float, y: float, colour: str, side: float = 9.0) -> None:
+        """Draw a square of so many pixels around a value."""
+        a, b = self.at(x, y)
+        self.drawing.add(Rectangle(a - side / 2, b - side / 2, side, side, colour))
+
+    def level(self, y: float, text: str, colour: str) -> None:
+        """Draw a dashed line across, with what it means at its right end."""
+        self.line([self.x.low, self.x.high], [y, y], colour, width=1.2, dashed=True)
+        place = self.at(self.x.high, y)
+        self.drawing.add(Text(place[0], place[1] - 4, text, 10, colour, "end"))
+
+    def legend(self, entries: Sequence[tuple[str, str]]) -> None:
+        """Say what the colours mean, at the upper right."""
+        x = self.right
+        for text, colour in reversed(entries):
+            x -= 5.6 * len(text)
+            self.drawing.add(Text(x, 13, text, 10.5, SOFT))
+            self.drawing.add(Circle(x - 7, 9.5, 3.6, colour))
+            x -= 22
+
+    def _make_equal(self) -> None:
+        """Give both axes the same number of units to the pixel."""
+        wide, high = self.right - self.left, self.bottom - self.top
+        unit = max((self.x.high - self.x.low) / wide, (self.y.high - self.y.low) / high)
+        self.x, self.y = _widened(self.x, unit * wide), _widened(self.y, unit * high)
+
+    def _axes(self) -> None:
+        for k, tick in enumerate(self.x.ticks):
+            x, y = self.at(tick, self.y.low)
+            label = self.x.labels[k] if self.x.labels else plain(tick)
+            if not self.x.labels:
+                self.drawing.line([(x, self.top), (x, y)], Stroke(GRID, 0.8))
+            self.drawing.add(Text(x, y + 14, label, 10, SOFT, "middle"))
+        for k, tick in enumerate(self.y.ticks):
+            x, y = self.at(self.x.low, tick)
+            label = self.y.labels[k] if self.y.labels else plain(tick)
+            if not self.y.labels:
+                self.drawing.line([(x, y), (self.right, y)], Stroke(GRID, 0.8))
+            self.drawing.add(Text(x - 5, y + 3.5, label, 10, SOFT, "end"))
+        corners = ((self.left, self.top), (self.left, self.bottom), (self.right, self.bottom))
+        self.drawing.add(Line(corners, Stroke(EDGE, 0.9)))
+        middle = (self.left + self.right) / 2
+        self.drawing.add(Text(middle, self.drawing.height - 6, self.x.title, 10, SOFT, "middle"))
+        upright = Text(10, (self.top + self.bottom) / 2, self.y.title, 10, SOFT, "middle",
+                       turned=True)  # fmt: skip
+        self.drawing.add(upright)
+
+
+def _widened(given: Scale, span: float) -> Scale:
+    middle = (given.low + given.high) / 2
+    return Scale(given.title, middle - span / 2, middle + span / 2, given.ticks, given.labels)

@@ -1,0 +1,140 @@
+"""Blocks of a report, told once and written twice: as HTML and as PDF."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from bridge.document.drawing import Drawing
+
+GOOD, DOUBTFUL, BAD, QUIET = "good", "doubtful", "bad", "quiet"
+
+
+@dataclass(frozen=True)
+class Strong:
+    """Text in bold."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Badge:
+    """A short word on a coloured ground; ``kind`` is GOOD, DOUBTFUL, BAD or QUIET."""
+
+    text: str
+    kind: str
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A small bar for a share of 0 to 1, with its figure beside it."""
+
+    share: float
+    text: str
+
+
+Cell = str | Strong | Badge | Bar
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The answer in one word and one sentence."""
+
+    badge: Badge
+    text: str
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One large figure."""
+
+    label: str
+    value: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """Large figures side by side."""
+
+    tiles: tuple[Tile, ...]
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A heading inside a section."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Paragraph:
+    """A paragraph; ``kind`` is empty, "lead" (larger) or "note" (smaller)."""
+
+    text: str
+    kind: str = ""
+
+
+@dataclass(frozen=True)
+class Bullets:
+    """A list."""
+
+    items: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Names and what belongs to them, as on the front of a certificate."""
+
+    pairs: tuple[tuple[str, str], ...]
+    title: str = ""
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Pairs side by side where there is room."""
+
+    columns: tuple[Pairs, ...]
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table; ``widths`` are relative, ``numbers`` are the columns that stand to the right."""
+
+    heads: tuple[str, ...]
+    rows: Sequence[Sequence[Cell]]
+    widths: tuple[float, ...] = ()
+    numbers: tuple[int, ...] = ()
+    sums: int = 0  # rows at the end that are set off from the others
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Drawings side by side where there is room, with one caption."""
+
+    drawings: tuple[Drawing, ...]
+    caption: str = ""
+
+
+Block = Verdict | Tiles | Heading | Paragraph | Bullets | Columns | Table | Pictures
+
+
+@dataclass(frozen=True)
+class Part:
+    """One section of a document."""
+
+    key: str
+    title: str
+    about: str
+    blocks: tuple[Block, ...]
+    folded: bool = False  # True: the page shows it only when asked to
+
+
+@dataclass(frozen=True)
+class Document:
+    """A whole report."""
+
+    title: str
+    subtitle: str
+    parts: tuple[Part, ...]
+    footer: str = field(default="")  # stands on every page of the PDF

@@ -1,0 +1,108 @@
+"""Output files: written beside their place, then renamed, so that none is ever half-written.
+
+A new one is the owner's to write and the group's to read (0640), whatever the umask; one that takes
+the place of another keeps that one's permissions.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import stat
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import InputError, RunError
+
+PARQUET = (".parquet", ".pq")
+MODE = 0o640  # of a new file
+FOLDER_MODE = 0o750  # of a new folder of recordings, sessions and the like
+
+
+def require_writable(path: Path, *inputs: Path) -> Path:
+    """Return the path if a file can be written there; asked before the work is done.
+
+    Raises InputError where its folder is missing, it is a folder itself, or it is one of the
+    inputs.
+    """
+    if path.is_dir():
+        raise InputError(f"{path}: found a folder, expected a file to write")
+    folder = path.parent
+    if not folder.is_dir():
+        raise InputError(f"{path}: found no folder {folder}, expected an existing one")
+    for given in inputs:
+        if path.exists() and given.exists() and path.samefile(given):
+            raise InputError(f"{path}: found the output to be the input {given}, expected another")
+    if not os.access(folder, os.W_OK):
+        raise InputError(f"{path}: found a folder {folder} that cannot be written to")
+    return path
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[IO[str]]:
+    """Give a text file that takes the place of ``path`` when the block ends without an error."""
+    with replacing_bytes(path) as raw:
+        file = io.TextIOWrapper(raw, "utf-8", newline="\n")
+        try:
+            yield file
+        finally:
+            file.detach()  # flushes; the file below is closed by who has opened it
+
+
+@contextlib.contextmanager
+def replacing_bytes(path: Path) -> Iterator[IO[bytes]]:
+    """Give a binary file that takes the place of ``path`` when the block ends without an error."""
+    place = Path(os.path.realpath(path))
+    part = place.with_name(f".{place.name}.{os.getpid()}.part")
+    try:
+        with open(part, "wb", opener=private) as file:
+            _keep_mode(place, file.fileno())
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, place)
+    except OSError as error:
+        raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink()
+
+
+def private(path: str | Path, flags: int) -> int:
+    """Open a file for ``open``: a new one is nobody else's (0640)."""
+    return os.open(path, flags | os.O_CLOEXEC, MODE)
+
+
+def _keep_mode(place: Path, fd: int) -> None:
+    """Give a file the permissions of the one whose place it takes."""
+    with contextlib.suppress(OSError):
+        os.fchmod(fd, stat.S_IMODE(place.stat().st_mode))
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file in one step."""
+    with replacing(path) as file:
+        file.write(text)
+
+
+def write_table(path: Path, columns: Sequence[str], table: NDArray[np.float64]) -> None:
+    """Write rows (N, k) under k column names, as Parquet where the path's suffix says so, or CSV.
+
+    Every number reads back exactly.
+    """
+    if path.suffix.lower() in PARQUET:
+        import pyarrow
+        from pyarrow import parquet
+
+        frame = pyarrow.table({name: table[:, k] for k, name in enumerate(columns)})
+        with replacing_bytes(path) as raw:
+            parquet.write_table(frame, raw)
+        return
+    with replacing(path) as file:
+        file.write(",".join(columns) + "\n")
+        np.savetxt(file, table, fmt="%.17g", delimiter=",")

@@ -1,0 +1,133 @@
+"""A document as a PDF: A4, its own font, numbered pages."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+
+from reportlab.lib.colors import HexColor
+from reportlab.lib.pagesizes import A4
+from reportlab.lib.units import mm
+from reportlab.pdfgen.canvas import Canvas
+from reportlab.platypus import (
+    BaseDocTemplate,
+    CondPageBreak,
+    Flowable,
+    Frame,
+    KeepTogether,
+    PageTemplate,
+    Spacer,
+)
+from reportlab.platypus import Paragraph as Text
+
+from bridge.document.blocks import (
+    Block,
+    Bullets,
+    Columns,
+    Document,
+    Heading,
+    Paragraph,
+    Part,
+    Pictures,
+    Table,
+    Tiles,
+    Verdict,
+)
+from bridge.document.pdf_drawing import DrawnRow
+from bridge.document.pdf_style import STYLES, badge_markup
+from bridge.document.pdf_table import columns_table, table, tiles_table
+from bridge.document.pdf_text import PLAIN, load_fonts, markup
+
+SIDE, TOP, BOTTOM = 18 * mm, 16 * mm, 18 * mm
+WIDTH = A4[0] - 2 * SIDE
+ROOM = 120  # pt, for a heading and the first rows of a long table
+WHOLE = 14  # rows of a table up to which it is not divided between pages
+
+
+def pdf(document: Document) -> bytes:
+    """Return the whole file."""
+    load_fonts()
+    file = io.BytesIO()
+    template = BaseDocTemplate(
+        file, pagesize=A4, title=document.title, author="Gapbridge", subject=document.subtitle,
+        leftMargin=SIDE, rightMargin=SIDE, topMargin=TOP, bottomMargin=BOTTOM,
+    )  # fmt: skip
+    frame = Frame(SIDE, BOTTOM, WIDTH, A4[1] - TOP - BOTTOM, 0, 0, 0, 0)
+    template.addPageTemplates([PageTemplate("page", [frame], onPage=_footer(document.footer))])
+    story: list[Flowable] = [
+        Text(markup(document.title), STYLES["title"]),
+        Text(markup(document.subtitle), STYLES["subtitle"]),
+    ]
+    for part in document.parts:
+        story += _part(part)
+    template.build(story)
+    return file.getvalue()
+
+
+def _footer(text: str) -> Callable[[Canvas, BaseDocTemplate], None]:
+    def draw(canvas: Canvas, template: BaseDocTemplate) -> None:
+        canvas.saveState()
+        line = Text(markup(text), STYLES["tile_label"])
+        line.wrap(WIDTH - 60, 20)
+        line.drawOn(canvas, SIDE, 9.3 * mm)
+        canvas.setFont(PLAIN, 7.5)
+        canvas.setFillColor(HexColor("#5b6770"))
+        canvas.drawRightString(A4[0] - SIDE, 10 * mm, f"page {canvas.getPageNumber()}")
+        canvas.restoreState()
+
+    return draw
+
+
+def _part(part: Part) -> list[Flowable]:
+    """Return a section; its heading never stands alone at the foot of a page."""
+    head: list[Flowable] = [Text(markup(part.title), STYLES["h2"])]
+    if part.about:
+        head.append(Text(markup(part.about), STYLES["note"]))
+    kept: list[list[Flowable]] = [head]
+    for block in part.blocks:
+        groups = _block(block)
+        if isinstance(block, Table) and len(block.rows) > WHOLE:
+            # its head begins where some of its rows have room, and the rest goes on
+            loose = kept.pop() if kept[-1] is head or _is_heading(kept[-1][-1]) else []
+            kept += [[CondPageBreak(ROOM)], *[[f] for f in loose], *groups]
+            continue
+        if kept[-1] is head or (_is_heading(kept[-1][-1])):
+            kept[-1] = [*kept[-1], *groups.pop(0)]
+        kept += groups
+    return [KeepTogether(group) if len(group) > 1 else group[0] for group in kept]
+
+
+def _is_heading(flowable: Flowable) -> bool:
+    return isinstance(flowable, Text) and flowable.style is STYLES["h3"]
+
+
+def _block(block: Block) -> list[list[Flowable]]:
+    """Return what a block is made of, in groups that no page's end divides."""
+    if isinstance(block, Paragraph):
+        return [[Text(markup(block.text), STYLES[block.kind or "text"])]]
+    if isinstance(block, Heading):
+        return [[Text(markup(block.text), STYLES["h3"])]]
+    if isinstance(block, Bullets):
+        return [[Text(markup(i), STYLES["bullet"], bulletText="•")] for i in block.items]
+    if isinstance(block, Verdict):
+        word = Text(badge_markup(block.badge), STYLES["verdict"])
+        return [[word, Text(markup(block.text), STYLES["lead"])]]
+    if isinstance(block, Tiles):
+        return [[tiles_table(block, WIDTH), Spacer(1, 8)]]
+    if isinstance(block, Columns):
+        return [[columns_table(block, WIDTH), Spacer(1, 6)]]
+    if isinstance(block, Table):
+        long = len(block.rows) > WHOLE
+        grid, space = table(block, WIDTH), Spacer(1, 8)
+        return [[grid], [space]] if long else [[grid, space]]
+    return _pictures(block)
+
+
+def _pictures(block: Pictures) -> list[list[Flowable]]:
+    """Return the drawings, two in a row; the caption stays with the last row."""
+    rows: list[list[Flowable]] = [
+        [DrawnRow(block.drawings[i : i + 2])] for i in range(0, len(block.drawings), 2)
+    ]
+    if block.caption:
+        rows[-1].append(Text(markup(block.caption), STYLES["note"]))
+    return rows

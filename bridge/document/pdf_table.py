@@ -1,0 +1,129 @@
+"""Tables of the PDF: rows and columns, large figures, pairs."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from reportlab.lib.colors import HexColor
+from reportlab.platypus import Flowable, Paragraph, TableStyle
+from reportlab.platypus import Table as Grid
+
+from bridge.document.blocks import Badge, Bar, Cell, Columns, Pairs, Strong, Table, Tiles
+from bridge.document.pdf_style import STYLES, badge_markup
+from bridge.document.pdf_text import markup
+
+LINE, RULE = HexColor("#e3e8ec"), HexColor("#9aa5b1")
+Command = tuple[str, tuple[int, int], tuple[int, int], *tuple[Any, ...]]
+BAR = 38.0  # pt, a full bar
+
+
+def table(block: Table, width: float) -> Flowable:
+    """Return a table whose head is repeated on every page that it reaches."""
+    shares = block.widths or (1.0,) * len(block.heads)
+    widths = [width * share / sum(shares) for share in shares]
+    heads = [
+        Paragraph(markup(h), STYLES["head_number" if i in block.numbers else "head"])
+        for i, h in enumerate(block.heads)
+    ]
+    first_sum = len(block.rows) - block.sums
+    rows = [
+        [_cell(c, i in block.numbers, number >= first_sum) for i, c in enumerate(cells)]
+        for number, cells in enumerate(block.rows)
+    ]
+    style: list[Command] = [
+        ("VALIGN", (0, 0), (-1, -1), "TOP"), ("VALIGN", (0, 0), (-1, 0), "BOTTOM"),
+        ("LINEBELOW", (0, 0), (-1, 0), 0.8, RULE),
+        ("LINEBELOW", (0, 1), (-1, -1), 0.4, LINE),
+        ("LEFTPADDING", (0, 0), (-1, -1), 0), ("RIGHTPADDING", (0, 0), (-1, -1), 6),
+        ("TOPPADDING", (0, 0), (-1, -1), 2.5), ("BOTTOMPADDING", (0, 0), (-1, -1), 2.5),
+    ]  # fmt: skip
+    if block.sums:
+        style.append(("LINEABOVE", (0, first_sum + 1), (-1, first_sum + 1), 0.8, RULE))
+    return Grid([heads, *rows], widths, repeatRows=1, style=TableStyle(style))
+
+
+def tiles_table(block: Tiles, width: float) -> Flowable:
+    """Return large figures in boxes, four in a row."""
+    rows = [block.tiles[i : i + 4] for i in range(0, len(block.tiles), 4)]
+    cells = [
+        [
+            [
+                Paragraph(markup(t.label), STYLES["tile_label"]),
+                Paragraph(markup(t.value), STYLES["tile_value"]),
+                Paragraph(markup(t.note), STYLES["tile_label"]),
+            ]
+            for t in row
+        ]
+        + [""] * (min(4, len(block.tiles)) - len(row))
+        for row in rows
+    ]
+    columns = len(cells[0])
+    style: list[Command] = [
+        ("VALIGN", (0, 0), (-1, -1), "TOP"), ("LEFTPADDING", (0, 0), (-1, -1), 7),
+        ("TOPPADDING", (0, 0), (-1, -1), 5), ("BOTTOMPADDING", (0, 0), (-1, -1), 5),
+    ]  # fmt: skip
+    for number, row in enumerate(rows):
+        style.append(("GRID", (0, number), (len(row) - 1, number), 0.6, LINE))
+    return Grid(cells, [width / columns] * columns, style=TableStyle(style))
+
+
+def columns_table(block: Columns, width: float) -> Flowable:
+    """Return pairs side by side."""
+    each = width / len(block.columns)
+    cells = [
+        [Paragraph(markup(p.title), STYLES["h3"]), _pairs(p, each - 14)] if p.title else
+        [_pairs(p, each - 14)]
+        for p in block.columns
+    ]  # fmt: skip
+    style: list[Command] = [
+        ("VALIGN", (0, 0), (-1, -1), "TOP"), ("LEFTPADDING", (0, 0), (-1, -1), 0),
+        ("TOPPADDING", (0, 0), (-1, -1), 0), ("BOTTOMPADDING", (0, 0), (-1, -1), 2),
+    ]  # fmt: skip
+    return Grid([cells], [each] * len(cells), style=TableStyle(style))
+
+
+def _pairs(block: Pairs, width: float) -> Flowable:
+    rows = [
+        [Paragraph(markup(k), STYLES["name"]), Paragraph(markup(v), STYLES["cell"])]
+        for k, v in block.pairs
+    ]
+    style = [
+        ("VALIGN", (0, 0), (-1, -1), "TOP"), ("LEFTPADDING", (0, 0), (-1, -1), 0),
+        ("TOPPADDING", (0, 0), (-1, -1), 1.5), ("BOTTOMPADDING", (0, 0), (-1, -1), 1.5),
+    ]  # fmt: skip
+    return Grid(rows, [width * 0.34, width * 0.66], style=TableStyle(style))
+
+
+def _cell(cell: Cell, number: bool, strong: bool) -> Flowable:
+    if isinstance(cell, Bar):
+        return _Bar(cell)
+    if isinstance(cell, Badge):
+        return Paragraph(badge_markup(cell), STYLES["cell"])
+    text = markup(cell.text if isinstance(cell, Strong) else cell)
+    if strong or isinstance(cell, Strong):
+        text = f"<b>{text}</b>"
+    return Paragraph(text, STYLES["number" if number else "cell"])
+
+
+class _Bar(Flowable):
+    """A share as a bar with its figure beside it."""
+
+    def __init__(self, bar: Bar) -> None:
+        super().__init__()
+        self.share = min(max(bar.share, 0.0), 1.0) if math.isfinite(bar.share) else 0.0
+        self.text = Paragraph(markup(bar.text), STYLES["cell"])
+
+    def wrap(self, available_width: float, available_height: float) -> tuple[float, float]:
+        """Return the size that the bar takes, pt."""
+        self.text.wrap(max(available_width - BAR - 5, 20), available_height)
+        return available_width, float(self.text.height)
+
+    def draw(self) -> None:
+        """Draw the bar on the canvas that the page gives."""
+        middle = self.text.height - 7.5
+        self.canv.setFillColor(HexColor("#eef1f4"))
+        self.canv.rect(0, middle, BAR, 5, 0, 1)
+        self.canv.setFillColor(HexColor("#1f77b4"))
+        self.canv.rect(0, middle, BAR * self.share, 5, 0, 1)
+        self.text.drawOn(self.canv, BAR + 5, 0)

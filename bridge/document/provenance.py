@@ -1,0 +1,83 @@
+"""Where a result comes from: version, time, the command's arguments, and the files it read."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import click
+
+from core.log.log import Log
+from core.ranges import range_of
+
+BLOCK = 1 << 20  # bytes read at a time
+
+
+def provenance(files: Mapping[str, Sequence[Path]]) -> dict[str, Any]:
+    """Return the provenance of the running command's result, as JSON and cells hold it.
+
+    ``files`` are what it read, by their role (``log``, ``cell``); a folder counts as all of its
+    files. Arguments are those of the command that differ from their defaults.
+    """
+    context = click.get_current_context(silent=True)
+    return {
+        "version": installed_version(),
+        "time": datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
+        "command": "" if context is None else str(context.info_name),
+        "arguments": {} if context is None else _arguments(context),
+        "files": [
+            {"role": role, "name": path.name, "sha256": digest(path)}
+            for role, paths in files.items()
+            for path in paths
+        ],
+    }
+
+
+def fitted(origin: dict[str, Any], log: Log) -> dict[str, Any]:
+    """Return the provenance of a cell: with the ranges that its model was fitted on."""
+    ranges = {name: [low, high] for name, (low, high) in range_of(log).items()}
+    return {**origin, "fitted": ranges}
+
+
+def installed_version() -> str:
+    """Return the version of the package, or "unknown" where it is not installed."""
+    try:
+        return version("gapbridge")
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def digest(path: Path) -> str | None:
+    """Return the SHA-256 of a file, or of all files of a folder by name; None: unreadable."""
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    found = hashlib.sha256()
+    try:
+        for file in files:
+            with file.open("rb") as stream:
+                while block := stream.read(BLOCK):
+                    found.update(block)
+    except OSError:
+        return None
+    return found.hexdigest()
+
+
+def _arguments(context: click.Context) -> dict[str, Any]:
+    given = {}
+    for parameter in context.command.params:
+        value = context.params.get(parameter.name or "")
+        if value is None or value is False or value == ():
+            continue
+        option = isinstance(parameter, click.Option)
+        name = max(parameter.opts, key=len).lstrip("-") if option else parameter.name or ""
+        given[name] = _plain(value)
+    return given
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return value if isinstance(value, (bool, int, float)) else str(value)

@@ -1,0 +1,65 @@
+"""A drawing as SVG that stands inside a page."""
+
+from __future__ import annotations
+
+from html import escape
+
+from bridge.document.drawing import Circle, Drawing, Line, Rectangle, Shape, Stroke, Text
+
+
+def svg(drawing: Drawing) -> str:
+    """Return the drawing as one SVG element, as wide as its place but not wider than drawn."""
+    width, height = _number(drawing.width), _number(drawing.height)
+    # as wide as its place allows, up to half as wide again as it was drawn
+    most = _number(1.45 * drawing.width)
+    shapes = "".join(_shape(shape) for shape in drawing.shapes)
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
+        f'width="{width}" height="{height}" style="max-width:min(100%,{most}px)" role="img" '
+        f'aria-label="{escape(drawing.title)}">{shapes}</svg>'
+    )
+
+
+def _shape(shape: Shape) -> str:
+    if isinstance(shape, Line):
+        points = " ".join(f"{_number(x)},{_number(y)}" for x, y in shape.points)
+        return f'<polyline points="{points}" fill="none" {_stroke(shape.stroke)}/>'
+    if isinstance(shape, Rectangle):
+        return (
+            f'<rect x="{_number(shape.x)}" y="{_number(shape.y)}" width="{_number(shape.width)}" '
+            f'height="{_number(shape.height)}" fill="{shape.fill}">{_hint(shape.hint)}</rect>'
+        )
+    if isinstance(shape, Circle):
+        stroke = _stroke(shape.stroke) if shape.stroke else ""
+        solid = "" if shape.opacity == 1.0 else f' fill-opacity="{_number(shape.opacity)}"'
+        return (
+            f'<circle cx="{_number(shape.x)}" cy="{_number(shape.y)}" r="{_number(shape.radius)}" '
+            f'fill="{shape.fill or "none"}"{solid} {stroke}>{_hint(shape.hint)}</circle>'
+        )
+    return _text(shape)
+
+
+def _text(shape: Text) -> str:
+    x, y = _number(shape.x), _number(shape.y)
+    turned = f' transform="rotate(-90 {x} {y})"' if shape.turned else ""
+    bold = ' font-weight="600"' if shape.bold else ""
+    return (
+        f'<text x="{x}" y="{y}" font-size="{_number(shape.size)}" fill="{shape.colour}" '
+        f'text-anchor="{shape.anchor}"{bold}{turned}>{escape(shape.text)}</text>'
+    )
+
+
+def _stroke(stroke: Stroke) -> str:
+    dashes = ' stroke-dasharray="4 3"' if stroke.dashed else ""
+    return (
+        f'stroke="{stroke.colour}" stroke-width="{_number(stroke.width)}" '
+        f'stroke-linejoin="round"{dashes}'
+    )
+
+
+def _hint(text: str) -> str:
+    return f"<title>{escape(text)}</title>" if text else ""
+
+
+def _number(value: float) -> str:
+    return f"{value:.2f}".rstrip("0").rstrip(".")

@@ -1,0 +1,200 @@
+"""What a fleet's sessions say together of compliance: the hierarchical fit of each type."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from bridge.fleet.arms import by_arm
+from bridge.fleet.drift import Drift, believed
+from bridge.fleet.outlying import Outlier
+from bridge.fleet.task import Outcome
+from core.estimation.hierarchical import ArmFit, Scatter, SessionFit, TypeFit, fit_type
+from core.estimation.hierarchical_evidence import Evidence
+
+Array = NDArray[np.float64]
+UNIT = "rad/Nm"
+UNLIKE = 3.5  # deviations of what arms of a type scatter, from which on an arm is told
+SURPRISING = 3.0  # times the usual noise, in variance
+
+
+@dataclass(frozen=True)
+class FittedSession:
+    """One session in the fit."""
+
+    outcome: Outcome
+    fit: SessionFit
+    gap_before: float  # m, rms of one coordinate, with the cell's flexibilities
+    gap_after: float  # m, with the arm's
+    gap_held_out: float  # m, with the arm's as all other sessions tell it
+
+
+@dataclass(frozen=True)
+class FittedArm:
+    """One arm in the fit; its sessions in their order."""
+
+    name: str
+    fit: ArmFit
+    sessions: tuple[FittedSession, ...]
+
+    @property
+    def poses(self) -> int:
+        """Return how many poses of it were used."""
+        return sum(int(s.outcome.result["evidence"]["poses"]) for s in self.sessions)
+
+
+@dataclass(frozen=True)
+class FittedType:
+    """All arms of a type."""
+
+    name: str
+    parameters: tuple[str, ...]  # (2n,)
+    scatter: Scatter
+    arms: tuple[FittedArm, ...]
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """The fleet."""
+
+    types: tuple[FittedType, ...]
+    drifts: tuple[Drift, ...]
+    outliers: tuple[Outlier, ...]
+
+
+def fitted(outcomes: Sequence[Outcome]) -> Fitted:
+    """Return the hierarchical fit of every type that has a usable session."""
+    kinds: dict[tuple[str, int], dict[str, list[Outcome]]] = {}
+    for arm, sessions in by_arm(outcomes).items():
+        for outcome in sessions:
+            kind = (outcome.result["type"], outcome.result["joints"])
+            kinds.setdefault(kind, {}).setdefault(arm, []).append(outcome)
+    types = tuple(_type(kind[0], kinds[kind]) for kind in sorted(kinds))
+    drifts = tuple(believed([d for t in types for d in _drifts(t)]))
+    outliers = sorted((o for t in types for o in _outliers(t)), key=lambda o: -abs(o.deviations))
+    return Fitted(types, drifts, tuple(outliers))
+
+
+def _type(name: str, arms: dict[str, list[Outcome]]) -> FittedType:
+    given = [o for sessions in arms.values() for o in sessions]
+    number = [i for i, sessions in enumerate(arms.values()) for _ in sessions]
+    evidence = [_evidence(o) for o in given]
+    nominal = np.median([o.result["nominal"] for o in given], axis=0)
+    fit = fit_type(evidence, number, nominal, float(given[0].result["usual"]))
+    sessions = [
+        _session(o, e, fit, s, i)
+        for s, (o, e, i) in enumerate(zip(given, evidence, number, strict=True))
+    ]
+    found, begin = [], 0
+    for i, (arm, own) in enumerate(arms.items()):
+        found.append(FittedArm(arm, fit.arms[i], tuple(sessions[begin : begin + len(own)])))
+        begin += len(own)
+    n = len(nominal) // 2
+    names = [f"{kind}_compliance_{j + 1}" for kind in ("axial", "radial") for j in range(n)]
+    return FittedType(name, tuple(names), fit.scatter, tuple(found))
+
+
+def _evidence(outcome: Outcome) -> Evidence:
+    given = dict(outcome.result["evidence"])
+    return Evidence(**(given | {k: np.array(given[k]) for k in ("matrix", "right")}))
+
+
+def _session(
+    outcome: Outcome, evidence: Evidence, fit: TypeFit, session: int, arm: int
+) -> FittedSession:
+    def rms(flexibility: Array) -> float:
+        left = evidence.matrix @ flexibility - evidence.right
+        rows = evidence.freedom + np.linalg.matrix_rank(evidence.matrix)
+        return math.sqrt((float(left @ left) + evidence.squares) / max(rows, 1))
+
+    one = fit.sessions[session]
+    return FittedSession(
+        outcome, one, rms(np.array(outcome.result["nominal"])), rms(fit.arms[arm].flexibility),
+        rms(one.without),
+    )  # fmt: skip
+
+
+def _drifts(kind: FittedType) -> Iterator[Drift]:
+    for arm in kind.arms:
+        names = tuple(s.outcome.session for s in arm.sessions)
+        for j, parameter in enumerate(kind.parameters):
+            slope, std = float(arm.fit.drift[j]), float(arm.fit.drift_std[j])
+            if math.isfinite(slope) and kind.scatter.shown[j]:
+                yield Drift(
+                    arm.name, parameter, UNIT, "session", slope, std,
+                    float(2 * norm.sf(abs(slope) / std)),
+                    tuple(float(i) for i in range(len(names))),
+                    tuple(float(s.fit.flexibility[j]) for s in arm.sessions),
+                    tuple(float(s.fit.std[j]) for s in arm.sessions), names,
+                )  # fmt: skip
+
+
+def _outliers(kind: FittedType) -> Iterator[Outlier]:
+    for arm in kind.arms:
+        for j in np.flatnonzero((np.abs(arm.fit.beside_type) > UNLIKE) & kind.scatter.shown):
+            yield Outlier(
+                arm.name, "", kind.parameters[j], float(arm.fit.flexibility[j]),
+                float(kind.scatter.mean[j]), UNIT, float(arm.fit.beside_type[j]),
+            )  # fmt: skip
+        for session in arm.sessions:
+            if session.fit.surprise > SURPRISING:
+                yield Outlier(
+                    arm.name, session.outcome.session, "misfit of the session", session.gap_after,
+                    kind.scatter.noise, "m", math.sqrt(session.fit.surprise),
+                )  # fmt: skip
+
+
+def rows(found: Fitted) -> Iterator[dict[str, Any]]:
+    """Give a row per flexibility of each type, arm and session."""
+    for kind in found.types:
+        type_std = np.sqrt(np.diag(kind.scatter.covariance))
+        for j, parameter in enumerate(kind.parameters):
+            shared = {
+                "type": kind.name, "parameter": parameter, "unit": UNIT,
+                "joint": j % (len(kind.parameters) // 2) + 1, "shown": bool(kind.scatter.shown[j]),
+            }  # fmt: skip
+            yield (
+                shared
+                | {"level": "type", "scatter": float(kind.scatter.between_arms[j])}
+                | (_interval(kind.scatter.mean[j], type_std[j]))
+            )
+            for arm in kind.arms:
+                yield shared | {
+                    "level": "arm", "arm": arm.name, "own_share": float(arm.fit.own[j]),
+                    "scatter": float(kind.scatter.between_sessions[j]),
+                    "drift": _known(arm.fit.drift[j]), "drift_std": _known(arm.fit.drift_std[j]),
+                    "drift_per": "session",
+                } | _interval(arm.fit.flexibility[j], arm.fit.std[j])  # fmt: skip
+                for session in arm.sessions:
+                    yield shared | {
+                        "level": "session", "arm": arm.name, "session": session.outcome.session,
+                    } | _interval(session.fit.flexibility[j], session.fit.std[j])  # fmt: skip
+
+
+def session_figures(found: Fitted) -> dict[str, dict[str, Any]]:
+    """Return the figures of each session by its name."""
+    return {
+        s.outcome.session: {
+            "wild": s.outcome.result["evidence"]["wild"], "noise": s.fit.noise,
+            "gap_before": s.gap_before, "gap_after": s.gap_after, "gap_held_out": s.gap_held_out,
+            "surprise": s.fit.surprise,
+        }
+        for kind in found.types for arm in kind.arms for s in arm.sessions
+    }  # fmt: skip
+
+
+def _interval(value: float, std: float) -> dict[str, float]:
+    """Return a value with its 95 % interval; a flexibility is not below zero."""
+    return {"value": float(value), "std": float(std),
+            "low": max(float(value - 1.96 * std), 0.0),
+            "high": float(value + 1.96 * std)}  # fmt: skip
+
+
+def _known(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

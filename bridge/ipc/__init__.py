@@ -1,0 +1,1 @@
+"""Between the processes of a cell: shared memory, sockets, events and side processes."""

@@ -1,0 +1,96 @@
+"""What the daemon asks of its loop, through memory that only the daemon can write to.
+
+One word for each command, holding the number of its last request; numbers only grow, over all
+processes of the loop. So no command overwrites another one and none has to be taken back: the loop
+compares a word with what it has taken, and says in a word of its own (Page.tell_taken) up to which
+number it has. A STOP stays what it is until the process that it was meant for has ended.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from enum import IntEnum
+
+import numpy as np
+
+from bridge.ipc.sealed_memory import make_memory, map_as_reader, map_as_writer
+
+_SIZE, _WORD = 4096, 8  # bytes
+
+
+class Command(IntEnum):
+    """What the daemon asks for."""
+
+    ARM = 1  # a person's, or the cell file's at the start
+    DISARM = 2  # a person's: ramp out and observe; in a fault, acknowledge it
+    RAMP_OUT = 3  # ramp out and observe; acknowledges nothing
+    STOP = 4  # ramp out and end
+
+
+class CommandPage:
+    """The daemon's side: numbers requests and writes them. From any of its threads."""
+
+    def __init__(self) -> None:
+        self.fd = make_memory("gapbridge-commands", _SIZE)
+        self._map = map_as_writer(self.fd, _SIZE)
+        self._words = np.frombuffer(self._map, np.int64)
+        self._lock = threading.Lock()
+        self.last = 0  # number of the last request, written or about to be
+
+    def number(self) -> int:
+        """Return the number of a request that is about to be written."""
+        with self._lock:
+            self.last += 1
+            return self.last
+
+    def ask(self, command: Command, number: int = 0) -> int:
+        """Write a request, by its number where it has one already; returns the number."""
+        number = number or self.number()
+        with self._lock:
+            self._words[command] = max(number, int(self._words[command]))
+        return number
+
+    def last_of(self, command: Command) -> int:
+        """Return the number of the last request of a kind that was written; 0: none."""
+        return int(self._words[command])
+
+    def close(self) -> None:
+        """Let go of the memory."""
+        self._words = np.zeros(1 + max(Command), np.int64)
+        self._map.close()
+        os.close(self.fd)
+
+
+class Commands:
+    """The loop's side: takes what is new. ``after`` is the last request that is not for it."""
+
+    def __init__(self, fd: int, after: int = 0) -> None:
+        self._map = map_as_reader(fd, _SIZE)
+        self._seen = b""
+        self._taken = dict.fromkeys(Command, after)
+        self.taken = after  # number of the newest request that was taken
+        self.stop = False  # has been asked for, and stays
+
+    def take(self) -> list[Command]:
+        """Return what was asked for since the last call, in the order of asking.
+
+        An ARM that is older than something taken already is void: what came after it stands.
+        """
+        words = self._map[: _WORD * (1 + max(Command))]
+        if words == self._seen:
+            return []
+        self._seen = words
+        numbers = [int.from_bytes(words[_WORD * c :][:_WORD], sys.byteorder) for c in Command]
+        found = []
+        for number, command in sorted(zip(numbers, Command, strict=True)):
+            if number <= self._taken[command]:
+                continue
+            self._taken[command] = number
+            if command == Command.ARM and number < self.taken:
+                continue
+            self.taken = max(self.taken, number)
+            self.stop |= command == Command.STOP
+            found.append(command)
+        return found

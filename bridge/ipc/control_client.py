@@ -1,0 +1,61 @@
+"""Talking to running daemons over their local sockets."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+from pathlib import Path
+from typing import Any
+
+from bridge.cell.runtime_folder import candidates, cell_key
+from core.errors import InputError, RunError
+
+PATIENCE = 60.0  # s: a loop may have to start anew, arming uploads a program to the robot
+
+
+def ask(cell: Path, command: str) -> Any:
+    """Return a daemon's answer to a command.
+
+    Raises InputError where no daemon runs for the cell, RunError where it refuses.
+    """
+    if not cell.exists():
+        raise InputError(f"{cell}: file not found, expected a cell file (YAML)")
+    name = f"{cell_key(cell)}.sock"
+    refused = ""
+    for folder in candidates():
+        try:
+            return ask_socket(folder / name, command)
+        except PermissionError:
+            refused = f"{folder / name}: found a daemon of another user, expected your own"
+        except OSError:
+            continue
+    raise InputError(refused or f"{cell}: found no running daemon, expected one: gapbridge run")
+
+
+def ask_socket(path: Path, command: str) -> Any:
+    """Return the answer from a daemon's socket. Raises OSError, RunError."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as link:
+        link.settimeout(PATIENCE)
+        link.connect(str(path))
+        link.sendall(json.dumps({"command": command}).encode() + b"\n")
+        with link.makefile("rb") as file:
+            line = file.readline()
+    try:
+        reply = json.loads(line)
+    except ValueError:
+        raise RunError(f"{path}: the daemon ended without an answer") from None
+    if not reply.get("ok"):
+        raise RunError(str(reply.get("error", "refused")))
+    return reply.get("answer")
+
+
+def running() -> list[Any]:
+    """Return the status of every daemon that can be asked."""
+    found = []
+    for folder in dict.fromkeys(candidates()):
+        with contextlib.suppress(OSError):
+            for path in sorted(folder.glob("*.sock")):
+                with contextlib.suppress(OSError, RunError):
+                    found.append(ask_socket(path, "status"))
+    return found

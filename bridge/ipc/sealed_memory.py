@@ -1,0 +1,77 @@
+"""Memory that one process writes to and nobody else ever can: not by a descriptor, nor by /proc.
+
+A descriptor opened for reading protects nothing by itself: whoever has it opens the same memory for
+writing through ``/proc/self/fd``. So the writer maps its memory first and then seals it
+(``F_SEAL_FUTURE_WRITE``, memfd_create(2)): its own mapping stays, and every later one, by whatever
+process and descriptor, is for reading only. Where the system has no seals (not Linux) modes stand
+alone.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import mmap
+import os
+import tempfile
+
+_FUTURE_WRITE = getattr(fcntl, "F_SEAL_FUTURE_WRITE", 0x0010)  # linux/fcntl.h
+HAS_SEALS = hasattr(os, "memfd_create") and hasattr(fcntl, "F_ADD_SEALS")
+
+
+def make_memory(name: str, size: int) -> int:
+    """Return the descriptor of ``size`` zeroed bytes that no path leads to, not sealed yet."""
+    if HAS_SEALS:
+        fd = os.memfd_create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    else:
+        with tempfile.TemporaryFile() as file:
+            fd = os.dup(file.fileno())
+    os.ftruncate(fd, size)
+    return fd
+
+
+def map_as_writer(fd: int, size: int) -> mmap.mmap:
+    """Return the memory mapped for writing, the last mapping of that kind that there can be.
+
+    Raises OSError where somebody else has sealed it before.
+    """
+    found = mmap.mmap(fd, size, access=mmap.ACCESS_WRITE)
+    seal(fd)
+    return found
+
+
+def map_as_reader(fd: int, size: int) -> mmap.mmap:
+    """Return the memory mapped for reading."""
+    return mmap.mmap(fd, size, access=mmap.ACCESS_READ)
+
+
+def seal(fd: int) -> None:
+    """Refuse all further writing, growing and shrinking, and that this be taken back."""
+    if HAS_SEALS:
+        every = fcntl.F_SEAL_GROW | fcntl.F_SEAL_SHRINK | _FUTURE_WRITE | fcntl.F_SEAL_SEAL
+        fcntl.fcntl(fd, fcntl.F_ADD_SEALS, every)
+
+
+def sealed_bytes(name: str, data: bytes) -> int:
+    """Return the descriptor of memory that holds ``data`` and that nobody can change."""
+    fd = make_memory(name, len(data))
+    rest, at = memoryview(data), 0
+    while rest:
+        done = os.pwrite(fd, rest, at)
+        rest, at = rest[done:], at + done
+    seal(fd)
+    return fd
+
+
+def all_bytes(fd: int) -> bytes:
+    """Return what ``sealed_bytes`` was given, and close the descriptor."""
+    with os.fdopen(fd, "rb") as file:
+        file.seek(0)
+        return file.read()
+
+
+def is_sealed(fd: int) -> bool:
+    """Return whether nobody can begin to write any more."""
+    if not HAS_SEALS:
+        return True
+    seals = fcntl.fcntl(fd, fcntl.F_GET_SEALS)
+    return bool(seals & _FUTURE_WRITE) and bool(seals & fcntl.F_SEAL_SEAL)

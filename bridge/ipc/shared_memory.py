@@ -1,0 +1,292 @@
+"""Memory that the loop's process writes and all others read: heartbeat, state, counts, cycles.
+
+One writer, words of 8 bytes each, and no locks: whichever side dies, stands still or is killed, the
+others go on. Cycles go through a ring; each row begins with its own number, so that a reader knows
+a row that is not whole, or was overwritten.
+
+A process of the loop maps its page and seals it (sealed_memory.py): nobody else can write to it.
+The next process gets a page of its own that begins as a copy, so cycles and counts go on over all
+processes of a run; the daemon and who reads along change over to it (RunPage, FollowedPage).
+Nothing is asked for through this memory: commands have their own (command_page.py).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import time
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.ipc.counts import Count
+from bridge.ipc.sealed_memory import is_sealed, make_memory, map_as_reader, map_as_writer, seal
+
+Array = NDArray[np.float64]
+WORDS = 128
+ROWS = 8192  # cycles kept: 16 s at 500 Hz
+NAME = "gapbridge-cycles"  # of the memory, as /proc shows it
+# words; the heartbeat's time is a float in a word of its own
+_BEATS, _PHASE, _STATE, _TAKEN, _WRITTEN, _ENDED, _SEEN = range(7)
+_BEAT_TIME = 32
+_COUNTS = 64  # from here on one word for each Count, over all processes of the loop
+
+
+class Phase(IntEnum):
+    """What the loop's process is at; each may take a different time without a heartbeat."""
+
+    STARTING = 0  # imports, compilation
+    CONNECTING = 1  # constructors of the robot's library, which can hang for ever
+    RUNNING = 2
+    ARMING = 3
+    ENDING = 4
+
+
+def slices_of(n: int) -> dict[str, slice]:
+    """Return where each field of a cycle stands in its row: 1, n, 3 or 6 numbers, n joints."""
+    found, at = {}, 0
+    for name, size in (
+        ("number", 1), ("timestamp", 1), ("state", 1), ("written", 1), ("missed", 1),
+        ("age", 1), ("duration", 1), ("clamped", 1), ("residual", 1),
+        ("target_q", n), ("actual_q", n), ("actual_qd", n), ("actual_current_as_torque", n),
+        ("joint_temperatures", n), ("payload", 1), ("payload_cog", 3),
+        ("actual_TCP_force", 6), ("ft_raw_wrench", 6),
+        ("nominal_q", n), ("corrected_q", n), ("offset", 6),
+        ("received", 1), ("flags", 1), ("robot_mode", 1), ("safety_mode", 1),
+        ("runtime_state", 1), ("safety_status_bits", 1), ("speed_scaling", 1), ("own_q", n),
+        ("attempted", 1), ("ramp_time", 1), ("rate", 1), ("loop", 1),
+    ):  # fmt: skip
+        found[name] = slice(at, at + size)
+        at += size
+    return found
+
+
+class Page:
+    """The shared memory, seen from any side.
+
+    Without ``fd`` it is made; with one it is joined, for reading only unless ``writable``. Who
+    joins it for writing is the last who can.
+    """
+
+    def __init__(self, n: int, fd: int | None = None, writable: bool = True) -> None:
+        self.n = n
+        self.slices = slices_of(n)
+        self.width = max(part.stop for part in self.slices.values())
+        self._size = 8 * (WORDS + ROWS * self.width)
+        self._attach(make_memory(NAME, self._size) if fd is None else fd, writable)
+
+    def _attach(self, fd: int, writable: bool) -> None:
+        """Look at this memory from now on; what was looked at before stays for who still does."""
+        self.fd = fd
+        self._map = (map_as_writer if writable else map_as_reader)(fd, self._size)
+        self._words = np.frombuffer(self._map, np.int64, WORDS)
+        self._times = np.frombuffer(self._map, np.float64, WORDS)
+        rows = np.frombuffer(self._map, np.float64, ROWS * self.width, 8 * WORDS)
+        self._rows = rows.reshape(ROWS, self.width)
+
+    # -- the loop's side --------------------------------------------------------------------------
+
+    def beat(self) -> None:
+        """Tell that the loop is alive."""
+        self._times[_BEAT_TIME] = time.monotonic()
+        self._words[_BEATS] += 1
+
+    def enter(self, phase: Phase) -> None:
+        """Tell what comes next."""
+        self.beat()
+        self._words[_PHASE] = phase
+
+    def tell_state(self, state: int) -> None:
+        """Tell the supervisor's state."""
+        self._words[_STATE] = state
+
+    def tell_ended(self) -> None:
+        """Tell that the source has come to its end."""
+        self._words[_ENDED] = 1
+
+    def tell_seen(self) -> None:
+        """Tell that a state has been read: the link works."""
+        self._words[_SEEN] = 1
+
+    def count(self, what: Count, times: int = 1) -> None:
+        """Count an event."""
+        self._words[_COUNTS + what] += times
+
+    def next_row(self) -> Array:
+        """Return the row of the next cycle, to be filled from column 1 on."""
+        row: Array = self._rows[self._words[_WRITTEN] % ROWS]
+        row[0] = -1.0
+        return row
+
+    def publish(self) -> None:
+        """Hand the filled row over."""
+        written = int(self._words[_WRITTEN])
+        self._rows[written % ROWS, 0] = written
+        self._words[_WRITTEN] = written + 1
+
+    def tell_taken(self, number: int) -> None:
+        """Tell up to which number requests have been taken; see command_page.py."""
+        self._words[_TAKEN] = number
+
+    # -- who reads --------------------------------------------------------------------------------
+
+    def follow(self) -> None:
+        """Change over to the page of the newest process of the loop, where there is another."""
+
+    def open_for_reading(self) -> int:
+        """Return a further descriptor of the page, to be closed by the caller; read-only."""
+        return _read_only(self.fd)
+
+    @property
+    def taken(self) -> int:
+        """Return the number of the newest request that the loop has taken."""
+        return int(self._words[_TAKEN])
+
+    @property
+    def phase(self) -> Phase:
+        """Return what the loop's process is at."""
+        return Phase(int(self._words[_PHASE]))
+
+    @property
+    def state(self) -> int:
+        """Return the supervisor's state."""
+        return int(self._words[_STATE])
+
+    @property
+    def ended(self) -> bool:
+        """Return whether the source has come to its end."""
+        return bool(self._words[_ENDED])
+
+    @property
+    def seen(self) -> bool:
+        """Return whether a state has been read."""
+        return bool(self._words[_SEEN])
+
+    @property
+    def silence(self) -> float:
+        """Return s since the last heartbeat; 0 before the first."""
+        beat = float(self._times[_BEAT_TIME])
+        return time.monotonic() - beat if beat else 0.0
+
+    @property
+    def written(self) -> int:
+        """Return how many cycles have been handed over since the daemon's start."""
+        return int(self._words[_WRITTEN])
+
+    def counts(self) -> dict[str, int]:
+        """Return how often each Count has happened since the daemon's start."""
+        return {what.words: int(self._words[_COUNTS + what]) for what in Count}
+
+    def reader(self, first: int = 0) -> PageReader:
+        """Return a reader of its own cursor that begins at row number ``first``."""
+        return PageReader(self, first)
+
+    def rows(self, first: int, last: int) -> tuple[Array, int]:
+        """Return copies of the rows (k, width) of numbers first..last-1, and how many are gone."""
+        oldest = max(first, last - ROWS + ROWS // 8)  # what is older may be under the pen
+        index = np.arange(oldest, last)
+        places = index % ROWS
+        rows = self._rows[places]
+        whole = (rows[:, 0] == index) & (self._rows[places, 0] == index)
+        return rows[whole], oldest - first + int((~whole).sum())
+
+    def close(self) -> None:
+        """Let go of the memory."""
+        self._words = self._times = np.empty(0)  # type: ignore[assignment]
+        self._rows = np.empty((0, 0))
+        self._map.close()
+        os.close(self.fd)
+
+
+class RunPage(Page):
+    """The daemon's view, for reading only: one page after the other, cycles and counts going on."""
+
+    def __init__(self, n: int) -> None:
+        super().__init__(n, writable=False)
+        seal(self.fd)  # of no loop: it only says that nothing has happened yet
+        self._shown = os.dup(self.fd)  # the newest one that nobody but its loop can write to
+
+    def renew(self) -> None:
+        """Make a page for a new process of the loop, the former being dead; cycles go on."""
+        fd = make_memory(NAME, self._size)
+        head = self._words.copy()
+        head[[_BEATS, _PHASE, _STATE, _ENDED, _SEEN]] = 0
+        head[_BEAT_TIME] = 0
+        os.pwrite(fd, head.tobytes(), 0)
+        if self.written:
+            _write_whole(fd, self._rows, head.nbytes)
+        before = self.fd
+        self._attach(fd, writable=False)  # first: other threads read along
+        os.close(before)
+
+    def promote(self) -> bool:
+        """Show the page to who reads along once its loop has sealed it; returns whether it has."""
+        if os.path.sameopenfile(self.fd, self._shown) or not is_sealed(self.fd):
+            return False
+        os.close(self._shown)
+        self._shown = os.dup(self.fd)
+        return True
+
+    def open_for_reading(self) -> int:
+        """Return a descriptor of the page that is shown, to be closed by the caller."""
+        return _read_only(self._shown)
+
+    def close(self) -> None:
+        """Let go of the memory."""
+        super().close()
+        os.close(self._shown)
+
+
+class FollowedPage(Page):
+    """A side process's view: it changes over to each page that the daemon sends it."""
+
+    def __init__(self, n: int, fd: int, successors: socket.socket) -> None:
+        super().__init__(n, fd, writable=False)
+        self._successors = successors
+        successors.setblocking(False)
+
+    def follow(self) -> None:
+        """Change over to the newest page that has come."""
+        with contextlib.suppress(OSError):
+            while True:
+                data, found, _, _ = socket.recv_fds(self._successors, 1, 4)
+                if not data:  # the daemon is gone
+                    return
+                for fd in found:
+                    before = self.fd
+                    self._attach(fd, writable=False)
+                    os.close(before)
+
+
+class PageReader:
+    """One reader of a page's cycles; any number of them read side by side."""
+
+    def __init__(self, page: Page, first: int) -> None:
+        self._page = page
+        self.next = first  # number of the first row that it has not read
+        self.lost = 0  # rows overwritten before they were read
+
+    def drain(self) -> Array:
+        """Return a copy of the rows (k, width) that came since the last call."""
+        self._page.follow()
+        last = self._page.written
+        if last < self.next:
+            return np.empty((0, self._page.width))
+        rows, gone = self._page.rows(self.next, last)
+        self.lost += gone
+        self.next = last
+        return rows
+
+
+def _read_only(fd: int) -> int:
+    path = f"/proc/self/fd/{fd}"
+    return os.open(path, os.O_RDONLY) if os.path.exists(path) else os.dup(fd)
+
+
+def _write_whole(fd: int, rows: Array, at: int) -> None:
+    data = memoryview(rows.tobytes())
+    while data:
+        done = os.pwrite(fd, data, at)
+        data, at = data[done:], at + done

@@ -1,0 +1,139 @@
+"""A side process's own half: its order, the shared page, the daemon's events.
+
+Recorder, status page and metrics are such processes. They read along and never hold up the loop;
+the daemon starts them (side_process.py). A module for one of them begins with ``take_order()`` and
+ends when ``order.events.closed`` says that the daemon is gone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import socket
+import sys
+import threading
+import time
+from dataclasses import dataclass
+from typing import Any
+
+from bridge.cell.daemon_settings import DaemonSettings
+from bridge.ipc.shared_memory import FollowedPage, Page
+
+FAREWELL = 5.0  # s that a side process may take to end after the daemon
+NICENESS = 5  # the loop comes first
+_PIECE = 1 << 16
+
+
+class EventLines:
+    """The daemon's events as they come in through a pipe, one JSON object a line."""
+
+    def __init__(self, fd: int) -> None:
+        self.fd = fd  # for select and event loops
+        os.set_blocking(fd, False)
+        self._rest = b""
+        self.closed = False  # the daemon is gone: finish and end
+
+    def poll(self) -> list[dict[str, Any]]:
+        """Return the events that have arrived; never blocks."""
+        while not self.closed:
+            try:
+                data = os.read(self.fd, _PIECE)
+            except BlockingIOError:
+                break
+            self.closed = not data
+            self._rest += data
+        *lines, self._rest = self._rest.split(b"\n")
+        return [event for event in map(read_event, lines) if event is not None]
+
+    def wait(self, timeout: float) -> None:
+        """Sleep until something arrives, the daemon is gone, or ``timeout`` s are over."""
+        if not self.closed:
+            select.select([self.fd], [], [], timeout)
+
+
+class EventWriter:
+    """Writes events into a pipe, one JSON object a line; never blocks and never tears a line."""
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        os.set_blocking(fd, False)
+        self._rest = b""
+        self.sent = 0
+        self.dropped = 0  # events that found the pipe full
+
+    def tell(self, event: dict[str, Any]) -> bool:
+        """Write an event; returns False where the pipe is full or nobody reads it."""
+        self._flush()
+        if self._rest:
+            self.dropped += 1
+            return False
+        self._rest = (json.dumps(event, default=str) + "\n").encode()
+        whole = len(self._rest)
+        self._flush()
+        if len(self._rest) == whole:  # nothing of it has left: as if it had never been
+            self._rest = b""
+            self.dropped += 1
+            return False
+        self.sent += 1
+        return True
+
+    def _flush(self) -> None:
+        """Write what is left of an event that has left in part."""
+        with contextlib.suppress(OSError):
+            while self._rest:
+                self._rest = self._rest[os.write(self._fd, self._rest) :]
+
+
+@dataclass(frozen=True)
+class Order:
+    """What the daemon tells a side process at its start."""
+
+    settings: DaemonSettings
+    n: int  # joints
+    session: str  # name of the daemon's run, run-YYYYmmdd-HHMMSS
+    page: Page  # for reading only
+    events: EventLines
+    up: EventWriter
+    extra: dict[str, Any]
+
+    def tell(self, event: dict[str, Any]) -> None:
+        """Tell the daemon of an event (a dict with "kind"), who hands it to all; never blocks."""
+        self.up.tell({"time": time.time(), "monotonic": time.monotonic(), **event})
+
+
+def take_order() -> Order:
+    """Return the order that the daemon has written on stdin."""
+    given = json.loads(sys.stdin.readline())
+    with contextlib.suppress(OSError):
+        os.nice(NICENESS)
+    events = EventLines(given["events"])
+    threading.Thread(target=_end_after_daemon, args=(events.fd,), daemon=True).start()
+    return Order(
+        settings=DaemonSettings.model_validate(given["settings"]),
+        n=given["n"],
+        session=given["session"],
+        page=FollowedPage(given["n"], given["page"], socket.socket(fileno=given["pages"])),
+        events=events,
+        up=EventWriter(given["up"]),
+        extra=given.get("extra", {}),
+    )
+
+
+def read_event(line: bytes) -> dict[str, Any] | None:
+    """Return the event of a line; None where it is none."""
+    try:
+        found = json.loads(line)
+    except ValueError:
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def _end_after_daemon(fd: int) -> None:
+    """End the process, hanging or not, some time after the daemon's end of the pipe closed."""
+    watch = select.poll()
+    watch.register(fd, 0)  # hang-ups only, which are always told
+    watch.poll()
+    time.sleep(FAREWELL)
+    os._exit(1)

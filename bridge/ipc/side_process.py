@@ -1,0 +1,186 @@
+"""The daemon's half of a side process: start it, tell it of events, start it anew.
+
+Whatever a side process does - hang, die, stop reading - the daemon never waits for it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import socket
+import subprocess
+import sys
+import termios
+import time
+from typing import IO, Any
+
+from bridge.ipc.shared_memory import Page
+from bridge.ipc.side_main import EventLines, EventWriter
+
+BACKOFF = (0.2, 10.0)  # s before a restart: first, most
+HEALTHY = 10.0  # s after which a restart counts as the first again
+STALLED = 10.0  # s in which a process that lives has read its events at least once
+STARTING = 60.0  # s that its imports may take on a busy machine
+PIPE_SIZE = 1 << 18  # bytes
+
+
+class SideProcess:
+    """``python -m module``, reading along, restarted with backoff when it died or stands still.
+
+    ``order`` holds ``settings`` (a DaemonSettings as JSON), ``n``, ``session`` and ``extra``; see
+    side_main.Order.
+    """
+
+    def __init__(
+        self, module: str, order: dict[str, Any], page: Page, log: IO[Any] | int = -3
+    ) -> None:
+        self.module, self.order = module, order
+        self.restarts = 0
+        self.stalls = 0
+        self._dropped = 0
+        self._page, self._log = page, log
+        self._process: subprocess.Popen[bytes] | None = None
+        self._wait = BACKOFF[0]
+        self._retry_at = 0.0  # s, monotonic
+        self._start()
+
+    @property
+    def pid(self) -> int | None:
+        """Return its process id; None between two of them."""
+        return None if self._process is None else self._process.pid
+
+    @property
+    def dropped(self) -> int:
+        """Return how many events it did not get because it did not read."""
+        return self._dropped + self._down.dropped
+
+    def tell(self, event: dict[str, Any]) -> None:
+        """Pass an event on; where its pipe is full the event is dropped and counted."""
+        if self._down_fd is None:
+            self._dropped += 1
+        else:
+            self._down.tell(event)
+
+    def show(self, page: Page) -> None:
+        """Have it change over to another page; one that does not look gets it when it is anew."""
+        if self._process is None:
+            return
+        fd = page.open_for_reading()
+        with contextlib.suppress(OSError):
+            socket.send_fds(self._pages, [b"p"], [fd])
+        os.close(fd)
+
+    def events(self) -> list[dict[str, Any]]:
+        """Return the events that it has told."""
+        return self._up.poll()
+
+    def check(self) -> str | None:
+        """Look after it; returns in words what went wrong, None where nothing did."""
+        now = time.monotonic()
+        if self._process is None:
+            if now >= self._retry_at:
+                self.restarts += 1
+                self._start()
+            return None
+        code = self._process.poll()
+        if code is None:
+            return self._check_reading(now)
+        self._let_go()
+        if now - self._started > HEALTHY:
+            self._wait = BACKOFF[0]
+        self._retry_at = now + self._wait
+        self._wait = min(2.0 * self._wait, BACKOFF[1])
+        return f"{self.module} ended with {code}"
+
+    def close(self, patience: float = 3.0) -> None:
+        """Tell it that the daemon ends, give it ``patience`` s to finish, then end it."""
+        self.begin_close()
+        if self._process is not None:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(patience)
+            self._process.kill()
+            self._process.wait()
+            self._let_go()
+
+    def begin_close(self) -> None:
+        """Tell it that the daemon ends, without waiting."""
+        if self._process is not None:
+            self._close_down()
+
+    # -- inside -----------------------------------------------------------------------------------
+
+    def _start(self) -> None:
+        theirs, ours = os.pipe()
+        up_ours, up_theirs = os.pipe()
+        with contextlib.suppress(OSError):
+            fcntl.fcntl(ours, fcntl.F_SETPIPE_SZ, PIPE_SIZE)
+        page = self._page.open_for_reading()
+        self._pages, pages = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._pages.setblocking(False)
+        passed = (theirs, up_theirs, page, pages.detach())
+        try:
+            # spawned, never forked; in a session of its own, so that a Ctrl-C reaches the daemon
+            # only, which then ends it in order
+            self._process = subprocess.Popen(
+                [sys.executable, "-X", "faulthandler", "-m", self.module],
+                stdin=subprocess.PIPE, stdout=self._log, stderr=self._log, env=environment(),
+                pass_fds=passed, start_new_session=True,
+            )  # fmt: skip
+        finally:
+            for fd in passed:
+                os.close(fd)
+        self._down_fd: int | None = ours
+        self._down, self._up = EventWriter(ours), EventLines(up_ours)
+        self._started = self._read_at = time.monotonic()
+        self._has_read = False
+        order = {
+            **self.order, "page": page, "events": theirs, "up": up_theirs, "pages": passed[3],
+        }  # fmt: skip
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # gone already, which check() sees
+            self._process.stdin.write((json.dumps(order) + "\n").encode())
+            self._process.stdin.close()
+
+    def _check_reading(self, now: float) -> str | None:
+        """End it where it lives but has not emptied its pipe for too long."""
+        assert self._process is not None
+        if self._down_fd is None:
+            return None
+        unread = int.from_bytes(
+            fcntl.ioctl(self._down_fd, termios.FIONREAD, b"\0" * 4), sys.byteorder
+        )
+        if unread == 0:
+            self._read_at = now
+            self._has_read = self._has_read or self._down.sent > 0
+        patience = STALLED if self._has_read else STARTING
+        if now - self._read_at < patience:
+            return None
+        self.stalls += 1
+        self._process.kill()
+        return f"{self.module} stood still for {now - self._read_at:.0f} s and was ended"
+
+    def _close_down(self) -> None:
+        if self._down_fd is not None:
+            self._dropped += self._down.dropped
+            self._down.dropped = 0
+            os.close(self._down_fd)
+            self._down_fd = None
+
+    def _let_go(self) -> None:
+        self._process = None
+        self._close_down()
+        os.close(self._up.fd)
+        self._up.closed = True
+        self._pages.close()
+
+
+def environment() -> dict[str, str]:
+    """Return the environment with this interpreter's import path, and one thread for algebra."""
+    found = dict(os.environ)
+    found["PYTHONPATH"] = os.pathsep.join(p for p in sys.path if p)
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        found[name] = "1"
+    found.pop("NOTIFY_SOCKET", None)  # only the daemon itself speaks to the service manager
+    return found

@@ -1,0 +1,108 @@
+"""What acts on the arm now, for the model: from one state after the other."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.load_bounds import LoadBounds
+from core.loads import Loads
+from core.state import RobotState
+
+Vector = NDArray[np.float64]
+MOVED = 1e-5  # rad: a joint that has come this far has moved, in that direction
+
+
+class LiveLoads:
+    """Keeps one row of loads up to date: filtered force, payload, temperature, last motion.
+
+    The controller's declared payload stands instead of the model's own, because its TCP force has
+    that payload taken off. Where a load is beyond ``bounds``, none of the state's is taken: the
+    last ones stay, and ``doubt`` says why.
+    """
+
+    def __init__(
+        self, n: int, use_force: bool, time_constant: float, bounds: LoadBounds | None = None
+    ) -> None:
+        self._bounds = bounds or LoadBounds(math.inf)
+        self._has_payload = False  # a payload has been taken
+        self.doubt: str | None = None  # why a load of the last state cannot be
+        self._use_force = use_force
+        self._constant = time_constant
+        self._wrench = np.zeros((1, 6))
+        self._mass = np.zeros(1)
+        self._cog = np.zeros((1, 3))
+        self._temperature = np.zeros((1, n))
+        self._approach = np.zeros((1, n))
+        self._turned_at: Vector | None = None
+        self._last = -math.inf  # s, controller clock
+
+    def update(self, state: RobotState) -> Loads:
+        """Return the loads (one row) of this state; the arrays are this object's own."""
+        self.doubt = self._doubt(state)
+        if self.doubt is None:
+            self._filter_force(state)
+            self._take_payload(state)
+        self._follow_motion(state.actual_q)
+        has_payload = self._has_payload
+        if state.joint_temperatures is not None:
+            self._temperature[0] = state.joint_temperatures
+        return Loads(
+            payload_mass=self._mass if has_payload else None,
+            payload_cog=self._cog if has_payload else None,
+            wrench=self._wrench if self._use_force else None,
+            temperature=None if state.joint_temperatures is None else self._temperature,
+            approach=self._approach,
+        )
+
+    def _doubt(self, state: RobotState) -> str | None:
+        """Return in words which load of a state cannot be; None: all can.
+
+        Together: the controller takes the declared payload off its force.
+        """
+        found = None
+        if state.payload is not None and state.payload_cog is not None:
+            found = self._bounds.doubt_payload(state.payload, state.payload_cog)
+        if found is None and self._use_force and not state.sensor_lost:
+            found = self._bounds.doubt_wrench(state.actual_TCP_force)
+        return found
+
+    def _take_payload(self, state: RobotState) -> None:
+        """Take the declared payload over, where there is one."""
+        self._has_payload = state.payload is not None and state.payload_cog is not None
+        if self._has_payload:
+            self._mass[0] = state.payload
+            self._cog[0] = state.payload_cog
+
+    def forget(self) -> None:
+        """Begin anew after a gap: an old force means nothing."""
+        self._last = -math.inf
+
+    def _filter_force(self, state: RobotState) -> None:
+        """Low-pass the force: its noise must not shake the arm. A long gap begins anew.
+
+        A sensor that was lost counts as no force; the limiter leads over.
+        """
+        if state.sensor_lost and not np.isfinite(state.actual_TCP_force).all():
+            self._wrench[0], self._last = 0.0, -math.inf
+            return
+        gap = state.timestamp - self._last
+        self._last = state.timestamp
+        if self._constant <= 0.0 or not 0.0 < gap < 10.0 * self._constant:
+            self._wrench[0] = state.actual_TCP_force
+            return
+        share = 1.0 - math.exp(-gap / self._constant)
+        self._wrench[0] += share * (state.actual_TCP_force - self._wrench[0])
+
+    def _follow_motion(self, q: Vector) -> None:
+        before = self._turned_at
+        if before is None:
+            self._turned_at = q.copy()
+            return
+        way = q - before
+        moved = np.abs(way) > MOVED
+        if moved.any():
+            self._approach[0, moved] = np.sign(way[moved])
+            before[moved] = q[moved]

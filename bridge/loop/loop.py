@@ -1,0 +1,314 @@
+"""The loop: read a state, check it, compensate, limit, write. One owner of the link.
+
+No setpoint leaves without a fresh, valid state behind it; starting never moves the arm; silence is
+a fault. What the loop is doing is one of the states in supervisor.py.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.cell.daemon_settings import DaemonSettings
+from bridge.ipc.command_page import Command, Commands
+from bridge.ipc.counts import Count
+from bridge.ipc.cycle_row import fill_row
+from bridge.ipc.shared_memory import Page, Phase
+from bridge.loop.checks import NOTHING, RAMPING_OUT, UNSOLVED, LoopChecks
+from bridge.loop.controller_clock import ControllerClock
+from bridge.loop.link_monitor import StateWatch, hold_time
+from bridge.loop.live_loads import LiveLoads
+from bridge.loop.offset_in_force import OffsetInForce
+from bridge.loop.readiness import ModelCheck
+from bridge.loop.setpoint_stream import SetpointStream, longest_withdrawal
+from bridge.loop.supervisor import Cause, State, Supervisor
+from bridge.loop.writing import Writing
+from bridge.setpoint_source.source import Source, Told
+from core.errors import InvalidStateError, LinkError
+from core.load_bounds import LoadBounds
+from core.loads import Loads
+from core.model import Model
+from core.setpoint import Setpoint
+from core.state import RobotState
+from drivers.driver import Driver
+
+Vector = NDArray[np.float64]
+
+LONGEST_STOP = 1.0  # s from a request to stop to letting go, beside what the cell's rates take
+HASTY_RAMP = 0.5  # s: what a stop takes for the ramp at most
+
+UNSENT = 2  # "attempted" of a cycle whose setpoint was computed and did not (wholly) leave
+
+Tell = Callable[[dict[str, Any]], None]
+
+
+class Exit(IntEnum):
+    """Exit codes of the loop's process."""
+
+    DONE = 0
+    INPUT = 2
+    LINK = 3
+    CRASH = 4
+
+
+class Loop:
+    """One run of the loop in its process; ``run`` returns when it is over."""
+
+    def __init__(
+        self,
+        settings: DaemonSettings,
+        model: Model,
+        driver: Driver,
+        source: Source,
+        page: Page,
+        tell: Tell,
+        number: int = 0,
+    ) -> None:
+        self._number = number  # which process of the loop this is, from 0
+        self._settings, self._driver, self._source = settings, driver, source
+        self._page, self._tell = page, tell
+        self._stream = SetpointStream(model, settings.limits, driver.rate)
+        self._loads = LiveLoads(
+            model.arm.n, settings.setpoints.use_force, settings.setpoints.force_filter,
+            LoadBounds.of(model),
+        )  # fmt: skip
+        self._acting = Loads()  # of the last cycle
+        self._model_check = ModelCheck(model, settings.setpoints.use_force)
+        self._clock = ControllerClock(driver.rate, hold_time(driver.rate))
+        self._supervisor = Supervisor(self._changed)
+        patience = settings.link.state_timeout
+        self._watch = StateWatch(
+            driver, model.arm, self._supervisor, page, tell, self._lose, patience
+        )
+        self._checks = LoopChecks(
+            driver.rate, self._supervisor, page, tell, patience, driver.moves_arm
+        )
+        self._in_force = self._kept_offset()
+        self._writing = Writing(
+            settings.setpoints, driver, source, self._stream, self._supervisor, page, tell,
+            self._skip, self._lose, self._in_force,
+        )  # fmt: skip
+        self._acknowledged = False  # a person has seen the fault; it ends when the robot is fine
+        self._stop_by: float | None = None  # s, monotonic
+        self._exit: Exit | None = None
+        self.stop_requested = False  # set by signal handlers
+
+    def _kept_offset(self) -> OffsetInForce:
+        """Return where the offset that an arm is left with is kept."""
+        if not self._driver.moves_arm:  # the robot's own program takes it out
+            return OffsetInForce(self._driver.n, None)
+        return OffsetInForce.of_link(self._driver.n, self._settings.link)
+
+    # -- the frame --------------------------------------------------------------------------------
+
+    def run(self, commands: Commands, may_write: bool, latched: str = "") -> Exit:
+        """Connect and loop until told to stop, or until the link is lost.
+
+        ``commands``: the daemon's, and the only way to arm. ``may_write`` False: nothing can arm.
+        ``latched``: the fault of a loop before this one that nobody has acknowledged.
+        """
+        self._page.enter(Phase.CONNECTING)
+        try:
+            self._driver.connect()
+        except LinkError as error:
+            self._tell({"kind": "failure", "detail": str(error)})
+            return Exit.LINK
+        self._watch.forget()
+        self._supervisor.take(Cause.CONNECTED)
+        if latched:
+            self._supervisor.take(Cause.LATCHED, latched)
+        self._page.enter(Phase.RUNNING)
+        wanted = False
+        while self._exit is None:
+            self._page.beat()
+            asked = commands.take()
+            for command in asked:
+                wanted = command == Command.ARM
+                if command in (Command.DISARM, Command.RAMP_OUT):
+                    self._disarm(command == Command.DISARM)
+            if asked:
+                self._page.tell_taken(commands.taken)
+            if self.stop_requested or commands.stop:
+                self._stop()
+            seen = self._page.seen and self._checks.rate.known
+            if wanted and may_write and seen and self._stop_by is None:
+                wanted = False
+                self._arm()
+            if self._exit is None:
+                self._cycle()
+        self._page.enter(Phase.ENDING)
+        self._source.close()
+        return self._exit
+
+    def _arm(self) -> None:
+        """Arm where a robot is that can move, and nothing that waits for a person."""
+        if self._supervisor.state == State.FAULT:
+            words = "a fault is latched: acknowledge it first (gapbridge disarm)"
+        elif not self._checks.fine:
+            words = f"the robot is not ready: {self._checks.robot}"
+        elif not_ready := self._not_ready():
+            words = not_ready
+        else:
+            self._supervisor.take(Cause.ARM)
+            return
+        self._tell({"kind": "refused", "what": "arm", "detail": words})
+
+    def _not_ready(self) -> str:
+        """Return in words why writing could come to nothing here; empty: it can."""
+        stream = self._stream
+        self._model_check.forget()
+        if self._checks.rate.doubt:
+            return self._checks.rate.doubt
+        if self._loads.doubt is not None:
+            return f"the load is implausible: {self._loads.doubt}"
+        if not stream.finite:
+            return "the model's correction is no number at the present pose"
+        if stream.unsolved:
+            return f"the correction cannot be solved at the present pose: {stream.unsolved}"
+        if not self._model_check.corrects(self._acting):
+            return (
+                "the model corrects nothing at any pose: found neither compliance nor an effect in "
+                "the cell that moves the TCP under what acts now"
+            )
+        return ""
+
+    def _disarm(self, by_a_person: bool) -> None:
+        if self._supervisor.state == State.FAULT:
+            self._acknowledged |= by_a_person
+        else:
+            self._supervisor.take(Cause.DISARM)
+
+    def _changed(self, before: State, after: State, cause: Cause, detail: str) -> None:
+        self._page.tell_state(after)
+        self._tell(
+            {"kind": "transition", "from": before.name, "to": after.name, "cause": cause.value,
+             "detail": detail, "cycle": self._page.written}
+        )  # fmt: skip
+        if after == State.FAULT:
+            self._acknowledged = False
+        if after == State.ARMED:
+            self._skip()
+
+    def _skip(self) -> None:
+        """Do not count what the loop does not see now: it does something else."""
+        self._clock.skip()
+        self._checks.forget()
+        self._watch.forget()
+
+    def _stop(self) -> None:
+        """Ramp out, then end; a deadline makes sure of the end."""
+        if self._stop_by is None:
+            needed = LONGEST_STOP + longest_withdrawal(self._settings.limits)
+            self._stop_by = time.monotonic() + needed
+            self._stream.hasten(HASTY_RAMP)
+            self._supervisor.take(Cause.STOP)
+        if not self._supervisor.state.writes or time.monotonic() > self._stop_by:
+            self._writing.release()
+            self._supervisor.take(Cause.RAMPED_OUT, "not at rest in time")
+            self._exit = Exit.DONE
+
+    def _lose(self, detail: str) -> None:
+        """Give the process up: a link that broke is only safe in a new one."""
+        self._page.count(Count.LINK_LOST)
+        self._supervisor.take(Cause.LINK_LOST, detail)
+        self._tell({"kind": "failure", "detail": detail})
+        self._exit = Exit.LINK
+
+    # -- one cycle --------------------------------------------------------------------------------
+
+    def _cycle(self) -> None:
+        self._watch.has_written = self._writing.has_armed
+        state = self._watch.next()
+        if state is None:
+            return
+        try:
+            own = self._driver.nominal_q(state)
+        except InvalidStateError as error:
+            self._watch.doubt(str(error))
+            return
+        missed = self._clock.take(state, self._supervisor.state.writes)
+        expiry = self._clock.expiry(state)
+        is_fresh = self._watch.believe(expiry)
+        self._page.tell_seen()
+        if self._checks.begin(state, missed):
+            self._loads.forget()
+        self._acknowledge()
+        supervisor, writing = self._supervisor, self._writing
+        if supervisor.state == State.FAULT:
+            writing.ready = False  # its own watchdog, or a person, has the robot
+        loads = self._acting = self._loads.update(state)
+        self._checks.judge_loads(self._loads.doubt)
+        self._checks.judge_settings(state, self._driver)
+        seen = time.monotonic()
+        if is_fresh and supervisor.state == State.ARMED and writing.start(state, own):
+            self._record(state, missed, own, loads, None, at=seen)
+            return  # the state is old by now
+        holding = supervisor.state == State.HOLDING
+        writes = supervisor.state.writes
+        written = None
+        if writes:
+            written = writing.write(state, own, loads, expiry if is_fresh else -np.inf)
+        if writes and writing.ramps_out:
+            self._checks.flags |= RAMPING_OUT
+        setpoint = writing.unsent if writes and written is None else written
+        self._record(state, missed, own, loads, setpoint, writes, written is not None)
+        clamped = 0 if written is None else self._stream.clamped
+        commanded = own if written is None else written.q
+        self._checks.end(state, commanded, clamped, time.monotonic() - state.received)
+        if written is not None and holding and writing.at_rest(written, state):
+            writing.release()  # takes a moment: after the cycle has been timed
+            supervisor.take(Cause.RAMPED_OUT)
+
+    def _acknowledge(self) -> None:
+        """Leave a fault that a person has acknowledged, once the robot is fine."""
+        if self._acknowledged and self._supervisor.state == State.FAULT and self._checks.fine:
+            self._acknowledged = False
+            self._supervisor.take(Cause.ACKNOWLEDGED)
+
+    def _record(
+        self,
+        state: RobotState,
+        missed: int,
+        own: Vector,
+        loads: Loads,
+        setpoint: Setpoint | None,
+        attempted: bool = False,
+        left: bool = False,
+        at: float | None = None,
+    ) -> None:
+        """Publish a cycle: ``setpoint`` was computed for writing, and has ``left`` or not."""
+        page, stream = self._page, self._stream
+        if setpoint is None:
+            correction = stream.correct(own, loads)
+            nominal, corrected, offset = own, correction.q, correction.offset_in_base
+            if not stream.finite:
+                self._supervisor.take(Cause.BAD_OUTPUT, "the model's correction is no number")
+            elif not self._model_check.corrects(loads):
+                self._checks.flags |= NOTHING
+        else:
+            nominal, corrected, offset = setpoint.nominal_q, setpoint.q, setpoint.offset_in_base
+        if stream.unsolved:
+            self._checks.flags |= UNSOLVED
+        clamped = stream.clamped if setpoint is not None else 0
+        late = 0.0 if at is None else time.monotonic() - at  # arming: no part of the cycle
+        row, slices = page.next_row(), page.slices
+        fill_row(row, slices, state, nominal, corrected, offset)
+        row[2] = self._supervisor.state
+        row[3] = left
+        row[4] = missed
+        row[5] = self._clock.age(state) - late
+        row[6] = time.monotonic() - state.received - late
+        row[7] = clamped
+        row[8] = stream.residual
+        row[slices["own_q"]] = own
+        row[slices["flags"].start] = self._checks.flags
+        last = slices["attempted"].start
+        kind = UNSENT if setpoint is not None and not left else int(attempted)
+        row[last : last + 4] = (kind, stream.ramp_time, self._driver.rate, self._number)
+        page.publish()
+        self._source.tell(Told(self._supervisor.state, nominal, corrected, offset, left, clamped))

@@ -1,0 +1,158 @@
+"""The loop's process: ``python -m bridge.loop.main``, started by the daemon and by nobody else.
+
+It holds the loop and one driver, and is expendable: the robot's library can abort it, crash it or
+hang it. Settings come as one line of JSON on stdin, requests through memory that only the daemon
+writes to; cycles go out through shared memory, events as JSON through a socket. It always ends by
+``os._exit``, because destroying the library's objects is not safe.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import gc
+import importlib
+import json
+import os
+import pickle
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from bridge.cell.daemon_settings import DaemonSettings
+from bridge.cell.sections import SetpointSettings
+from bridge.ipc.command_page import Commands
+from bridge.ipc.sealed_memory import all_bytes
+from bridge.ipc.shared_memory import Page, Phase
+from bridge.loop.loop import Exit, Loop
+from bridge.loop.realtime import become_realtime
+from bridge.loop.replay import ReplayedLoop
+from bridge.loop.setpoint_stream import SetpointStream, gate_bounds
+from bridge.setpoint_source import make_source
+from bridge.setpoint_source.source import Source
+from core.errors import GapbridgeError, InputError
+from core.files import read_only_from
+from core.loads import Loads
+from core.model import Model
+from drivers import make_driver
+from drivers.driver import Driver
+from drivers.ft_sensor.joined import DriverWithSensor
+from drivers.replay import ReplayDriver
+
+_PR_SET_PDEATHSIG = 1
+LONGEST_WORDS = 1000  # of an event
+
+
+def main() -> None:
+    """Run the loop; never returns."""
+    order = json.loads(sys.stdin.readline())
+    os.set_blocking(order["events"], False)
+    tell = _teller(order["events"])
+    code: int = Exit.CRASH
+    try:
+        code = _run(order, tell)
+    except InputError as error:
+        tell({"kind": "failure", "detail": str(error), "input": True})
+        code = Exit.INPUT
+    except GapbridgeError as error:
+        tell({"kind": "failure", "detail": str(error)})
+        code = Exit.LINK
+    except BaseException as error:
+        traceback.print_exc()
+        tell({"kind": "failure", "detail": f"the loop failed: {type(error).__name__}: {error}"})
+    sys.stderr.flush()
+    os._exit(code)
+
+
+def _run(order: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Exit:
+    page = Page(order["n"], order["page"])
+    page.enter(Phase.STARTING)
+    files = pickle.loads(all_bytes(order["files"]))  # by the daemon, which started this process
+    read_only_from(files)  # the disk is the daemon's to read, at start and reload
+    settings = DaemonSettings.model_validate(order["settings"])
+    model = _read_model(settings)
+    driver = make_driver(settings.link, model, gate_bounds(settings.limits))
+    source = _make_source(settings, model, driver)
+    loop = _make_loop(settings, model, driver, source, page, tell, order["number"])
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: setattr(loop, "stop_requested", True))
+    _end_with_parent(order["parent"])
+    _compile(settings, model)
+    if order["may_write"]:
+        source.open()
+    granted = ", ".join(become_realtime(1.0 / driver.rate))
+    tell({"kind": "granted", "hash": order["hash"], "detail": granted})
+    commands = Commands(order["commands"], order["after"])
+    return loop.run(commands, order["may_write"], order["latched"])
+
+
+def _make_source(settings: DaemonSettings, model: Model, driver: Driver) -> Source:
+    """Return where setpoints come from; on a recording they are in the recording."""
+    is_replay = isinstance(driver, ReplayDriver)
+    setpoints = SetpointSettings() if is_replay else settings.setpoints
+    return make_source(setpoints, model.arm.n, driver.moves_arm, settings.cell.parent, driver.rate)
+
+
+def _make_loop(
+    settings: DaemonSettings, model: Model, driver: Driver, source: Source, *more: Any
+) -> Loop:
+    """Return the loop of a link; a recording has the sensor's readings in it."""
+    if isinstance(driver, ReplayDriver):
+        return ReplayedLoop(settings, model, driver, source, *more)
+    if settings.ft_sensor is not None:
+        driver = DriverWithSensor(driver, settings.ft_sensor, model)
+    return Loop(settings, model, driver, source, *more)
+
+
+def _teller(events: int) -> Callable[[dict[str, Any]], None]:
+    """Return a function that tells the daemon of an event and never blocks."""
+
+    def tell(event: dict[str, Any]) -> None:
+        if len(event.get("detail", "")) > LONGEST_WORDS:
+            event = {**event, "detail": event["detail"][:LONGEST_WORDS]}
+        now = {"time": time.time(), "monotonic": time.monotonic()}
+        with contextlib.suppress(OSError):  # a message each: taken whole, or not at all
+            os.write(events, json.dumps({**now, **event}).encode())
+
+    return tell
+
+
+def _read_model(settings: DaemonSettings) -> Model:
+    module, function = settings.model_source.split(":")
+    found = getattr(importlib.import_module(module), function)(settings.cell).model
+    if not isinstance(found, Model):
+        raise InputError(f"{settings.model_source}: found {type(found).__name__}, expected a Model")
+    return found
+
+
+def _compile(settings: DaemonSettings, model: Model) -> None:
+    """Have everything compiled, or loaded, before the first cycle: it may take seconds."""
+    arm = model.arm
+    stream = SetpointStream(model, settings.limits, settings.link.rate)
+    q = np.clip(np.zeros(arm.n), arm.limits.lower, arm.limits.upper)
+    loads = Loads(
+        np.zeros(1), np.zeros((1, 3)), np.zeros((1, 6)), np.full((1, arm.n), 25.0),
+        np.zeros((1, arm.n)),
+    )  # fmt: skip
+    correction = stream.correct(q, loads)
+    with contextlib.suppress(GapbridgeError):
+        stream.limiter.start(q)
+        stream.limiter.limit(q, correction.q, correction.offset_in_base, 0.0, q, 0.002)
+    gc.collect()
+
+
+def _end_with_parent(parent: int) -> None:
+    """Have the kernel send SIGTERM when the daemon dies, so that the arm is not left to itself."""
+    if sys.platform.startswith("linux"):
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+    if os.getppid() != parent:
+        os._exit(Exit.DONE)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,80 @@
+"""The offset that an arm was left with, known to whoever begins writing next.
+
+Where setpoints are the arm's only motion, a fault leaves it at its last setpoint: where it was
+wanted, and the offset. The next beginning counts on from there; else each arming would add one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import mmap
+import os
+from pathlib import Path
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.cell.runtime_folder import runtime_folder
+from drivers.controller_address import address_of
+from drivers.driver import DriverSettings
+
+Vector = NDArray[np.float64]
+STAYED = 0.02  # rad: an arm that is farther from its last setpoint has been moved by somebody
+
+
+class InForce(NamedTuple):
+    """A joint offset (n,) rad and the TCP offset (6,) in base that it makes, m and rad."""
+
+    delta: Vector
+    offset_in_base: Vector
+
+
+class OffsetInForce:
+    """What was sent last, kept in a file of the runtime folder that outlives any kill.
+
+    Two places are written in turn, and then which of them is whole: a process that ends in between
+    leaves the one before. ``path`` None: kept in memory alone.
+    """
+
+    def __init__(self, n: int, path: Path | None) -> None:
+        self._n, size = n, 2 * n + 6
+        count = 1 + 2 * size
+        self._memory: mmap.mmap | bytearray
+        if path is None:
+            self._memory = bytearray(8 * count)
+        else:
+            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+            try:
+                if os.fstat(fd).st_size != 8 * count:  # new, or of another arm
+                    os.ftruncate(fd, 0)
+                    os.ftruncate(fd, 8 * count)
+                self._memory = mmap.mmap(fd, 8 * count)
+            finally:
+                os.close(fd)
+        kept = np.frombuffer(self._memory, np.float64)
+        self._which = kept[:1]  # 0: nothing; 1, 2: the place that is whole
+        self._places = kept[1:].reshape(2, size)
+
+    @classmethod
+    def of_link(cls, n: int, link: DriverSettings) -> Self:
+        """Return what is kept for one controller. Raises InputError where no folder can be had."""
+        key = hashlib.sha256(address_of(link).encode()).hexdigest()[:16]
+        return cls(n, runtime_folder() / f"{key}.offset")
+
+    def note(self, q: Vector, delta: Vector, offset_in_base: Vector) -> None:
+        """Keep what has been sent: joints (n,) rad, the offset in them, and its TCP offset (6,)."""
+        place = 0 if self._which[0] == 2.0 else 1
+        row, n = self._places[place], self._n
+        row[:n], row[n : 2 * n], row[2 * n :] = q, delta, offset_in_base
+        self._which[0] = place + 1.0
+
+    def at(self, q: Vector) -> InForce | None:
+        """Return the offset that an arm at q (n,) still has; None: it has none, or was moved."""
+        if self._which[0] not in (1.0, 2.0):
+            return None
+        row, n = self._places[int(self._which[0]) - 1], self._n
+        stayed = bool((np.abs(row[:n] - q) <= STAYED).all()) and bool(np.isfinite(row).all())
+        if not stayed or not row[n : 2 * n].any():
+            return None
+        return InForce(row[n : 2 * n].copy(), row[2 * n :].copy())

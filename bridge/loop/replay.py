@@ -1,0 +1,127 @@
+"""The loop on a recording: it computes anew, and is in the states that it was in then.
+
+Who armed, what ran dry and when, is the recording's; the correction, the ramp and the limiter are
+computed. With the same cell every offset comes out bit for bit as it was.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Any, cast
+
+import numpy as np
+
+from bridge.loop.checks import RAMPING_OUT, RESYNC
+from bridge.loop.live_loads import LiveLoads
+from bridge.loop.loop import UNSENT, Exit, Loop
+from bridge.loop.offset_in_force import InForce, OffsetInForce
+from bridge.loop.setpoint_stream import SetpointStream
+from bridge.loop.supervisor import Cause, State
+from core.errors import GateError, LimitError
+from core.load_bounds import LoadBounds
+from core.loads import Loads
+from core.model import Model
+from core.setpoint import Setpoint
+from core.state import RobotState
+from drivers.replay import Cycle, EndOfRecordingError, ReplayDriver
+
+
+class _Followed(StrEnum):
+    """Why a replayed loop changes its state."""
+
+    RECORDED = "as recorded"
+
+
+class ReplayedLoop(Loop):
+    """A loop whose driver is a recording."""
+
+    def __init__(self, settings: Any, model: Model, driver: ReplayDriver, *more: Any) -> None:
+        super().__init__(settings, model, driver, *more)
+        self._model, self._recording = model, driver
+        self._process: int | None = None  # of the loop then
+        self._streaming = False  # between the first setpoint of a stream and its last
+
+    def _kept_offset(self) -> OffsetInForce:
+        """Keep it in memory: a recording leaves no arm anywhere."""
+        return OffsetInForce(self._driver.n, None)
+
+    def _cycle(self) -> None:
+        try:
+            state = self._recording.read_state()
+        except EndOfRecordingError as error:
+            self._page.tell_ended()
+            self._tell({"kind": "note", "detail": str(error)})
+            self._exit = Exit.DONE
+            return
+        cycle = self._recording.cycle
+        assert cycle is not None
+        if cycle.loop != self._process:
+            self._renew(cycle.loop)
+        missed = self._clock.take(state)
+        self._page.tell_seen()
+        if cycle.flags & RESYNC:
+            self._loads.forget()
+        loads = self._loads.update(state)
+        self._checks.flags = cycle.flags
+        self._follow(State(cycle.state))
+        setpoint = self._write_again(cycle, state, loads)
+        left = cycle.written and setpoint is not None
+        self._record(state, missed, cycle.own_q, loads, setpoint, cycle.attempted > 0, left)
+
+    def _renew(self, process: int) -> None:
+        """Begin as a new process of the loop begins, knowing nothing of the former."""
+        first, self._process = self._process is None, process
+        if first:
+            return
+        settings = self._settings
+        self._stream = SetpointStream(self._model, settings.limits, self._recording.rate)
+        self._loads = LiveLoads(
+            self._model.arm.n, settings.setpoints.use_force, settings.setpoints.force_filter,
+            LoadBounds.of(self._model),
+        )  # fmt: skip
+        self._clock.skip()
+        self._streaming = False
+
+    def _follow(self, state: State) -> None:
+        before = self._supervisor.state
+        if state != before:
+            self._supervisor.state = state
+            self._changed(before, state, cast("Cause", _Followed.RECORDED), "")
+
+    def _began_with(self, cycle: Cycle) -> InForce | None:
+        """Return the offset in force that a stream began with: nominal joints are without it."""
+        found = self._in_force.at(cycle.own_q)
+        if found is None:
+            return None
+        before = cycle.nominal_q - cycle.own_q
+        return found if np.linalg.norm(before + found.delta) < np.linalg.norm(before) else None
+
+    def _write_again(self, cycle: Cycle, state: RobotState, loads: Loads) -> Setpoint | None:
+        """Compute the setpoint of a cycle that had one; None where none left."""
+        stream = self._stream
+        if not cycle.attempted:
+            if self._streaming:
+                stream.end()
+                self._recording.release()
+            self._streaming = False
+            return None
+        try:
+            if not self._streaming:
+                in_force = self._began_with(cycle)
+                stream.start(cycle.own_q, state.timestamp, led=True, in_force=in_force)
+                self._recording.arm(state)
+                self._streaming = True
+            if not cycle.written and cycle.attempted != UNSENT:
+                stream.forget()  # it was refused, and left no trace
+                return None
+            stream.hasten(cycle.ramp_time)
+            goal = 0.0 if cycle.flags & RAMPING_OUT else 1.0
+            setpoint = stream.advance(state, cycle.nominal_q, loads, goal)
+            if cycle.written:
+                self._recording.write_setpoint(setpoint)
+                self._in_force.note(setpoint.q, stream.joint_offset, setpoint.offset_in_base)
+        except (LimitError, GateError) as error:  # of another cell than it was then
+            stream.forget()
+            self._tell({"kind": "refused", "detail": str(error)})
+            return None
+        return setpoint

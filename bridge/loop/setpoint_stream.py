@@ -1,0 +1,227 @@
+"""From a nominal setpoint to what may be written: correct, ramp, limit."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.cell.sections import LimitSettings
+from bridge.loop.nominal_stream import NominalStream
+from bridge.loop.offset_in_force import InForce
+from core.arm import Arm
+from core.compensation import Compensator, Correction
+from core.errors import StaleStateError
+from core.limits import LONGEST_GAP, Limiter, Limits
+from core.loads import Loads
+from core.model import Model
+from core.setpoint import Setpoint
+from core.state import RobotState
+from drivers.gate import GateBounds
+
+Vector = NDArray[np.float64]
+SOLVED = 1e-5  # m: corrections that miss the wanted pose by more are not used
+USUAL_VELOCITY = np.pi  # rad/s: of joints whose limit is not known
+
+
+def limits_of(settings: LimitSettings, arm: Arm, rate: float) -> Limits:
+    """Return the limits of a cell for its arm."""
+    own = np.where(np.isfinite(arm.limits.velocity), arm.limits.velocity, USUAL_VELOCITY)
+    velocity = settings.velocity_share * own
+    if settings.joint_velocity is not None:
+        velocity = np.minimum(velocity, settings.joint_velocity)
+    return Limits(
+        lower=arm.limits.lower + settings.joint_margin,
+        upper=arm.limits.upper - settings.joint_margin,
+        velocity=velocity,
+        offset=settings.offset,
+        offset_rotation=settings.offset_rotation,
+        offset_rate=settings.offset_rate,
+        offset_rotation_rate=settings.offset_rotation_rate,
+        joint_offset=settings.joint_offset,
+        following=settings.following,
+        cycle=1.0 / rate,
+    )
+
+
+def gate_bounds(settings: LimitSettings) -> GateBounds:
+    """Return the limits of a cell for the gate before the wire."""
+    return GateBounds(
+        settings.offset, settings.offset_rotation, settings.offset_rate,
+        settings.offset_rotation_rate, settings.joint_offset, settings.joint_velocity,
+        settings.velocity_share,
+    )  # fmt: skip
+
+
+def longest_withdrawal(settings: LimitSettings) -> float:
+    """Return how long an offset of the whole envelope takes to go at the cell's rates, s."""
+    return max(
+        settings.offset / settings.offset_rate,
+        settings.offset_rotation / settings.offset_rotation_rate,
+    )
+
+
+class SetpointStream:
+    """One stream of setpoints between ``start`` and coming to rest."""
+
+    def __init__(self, model: Model, settings: LimitSettings, rate: float) -> None:
+        limits = limits_of(settings, model.arm, rate)
+        self.limiter = Limiter(limits, model.arm.n)
+        self._compensator = Compensator(model)
+        self._nominal = NominalStream(limits.velocity)
+        self._ramp_time = settings.ramp_time
+        self._longest_gap = LONGEST_GAP / rate
+        self._ramp = 0.0
+        self._resumes = False  # begun with an offset in force, which the ramp goes on from
+        self._last = 0.0  # s, controller time of the last setpoint
+        self._start_gap: Vector | None = None  # rad: where the arm stood minus the first setpoint
+        self._since_start = 0.0  # s
+        self.residual = 0.0  # m, of the last correction
+        self.finite = True  # the last correction is numbers
+        self._loads = Loads()  # of the last correction
+        self._solved = np.zeros(model.arm.n + 6)  # joint and TCP offset of the last one solved
+        self.clamped = 0  # bits of the last setpoint
+
+    def correct(self, nominal_q: Vector, loads: Loads) -> Correction:
+        """Return the correction alone, neither ramped nor limited."""
+        correction = self._compensator.correct(nominal_q, loads)
+        self.residual = float(correction.residual)
+        # plain numbers: twelve of them cost four calls on arrays more
+        numbers = correction.q.tolist() + correction.offset_in_base.tolist()
+        self.finite = math.isfinite(sum(numbers))
+        self._loads = loads
+        return correction
+
+    @property
+    def unsolved(self) -> str:
+        """Return in words why the last correction does not meet the wanted pose; empty: it does."""
+        if self.residual < SOLVED:
+            return ""
+        loads = self._loads
+        mass = self._compensator.model.payload_mass
+        if loads.payload_mass is not None:
+            mass = float(loads.payload_mass[0])
+        force = 0.0 if loads.wrench is None else float(np.linalg.norm(loads.wrench[0, :3]))
+        under = f"under a payload of {mass:.3g} kg and a force of {force:.3g} N"
+        if not math.isfinite(self.residual):
+            return f"the model finds no equilibrium {under}: are compliance and effects right?"
+        return (
+            f"the corrected setpoint stays {1e3 * self.residual:.3g} mm from the wanted pose "
+            f"{under}, expected at most {1e3 * SOLVED:g} mm: a singular pose, or a model that "
+            "bends too far"
+        )
+
+    def start(
+        self, own_q: Vector, timestamp: float, led: bool = False, in_force: InForce | None = None
+    ) -> Vector:
+        """Begin at rest at ``own_q`` (n,); returns the nominal joints there. Raises LimitError.
+
+        ``led``: the setpoints that follow are led over from where the arm stands already.
+        ``in_force``: an offset that the arm stands at; left out: there is none.
+        """
+        nominal = own_q
+        if in_force is None:
+            self.limiter.start(own_q)
+        else:
+            nominal = own_q - in_force.delta
+            self.limiter.start(own_q, in_force.delta, in_force.offset_in_base)
+        self._nominal.start(nominal)
+        self._ramp, self._resumes = 0.0, in_force is not None
+        self._solved[:] = 0.0
+        self._start_gap, self._since_start = None, np.inf if led else 0.0
+        # as if a setpoint had been there one cycle ago
+        self._last = timestamp - self.limiter.limits.cycle
+        return nominal
+
+    def advance(
+        self, state: RobotState, source_q: Vector | None, loads: Loads, goal: float,
+        expiry: float = np.inf,
+    ) -> Setpoint:  # fmt: skip
+        """Return the next setpoint; ``source_q`` None: the motion brakes.
+
+        ``goal`` is where the ramp goes: 1 in, 0 out. The setpoint's arrays hold until the next
+        call. Raises LimitError, and StaleStateError where it is later than ``expiry`` (s,
+        monotonic) by now: then nothing has changed and nothing may leave.
+        """
+        gap = state.timestamp - self._last
+        if gap < 0.0 and goal == 0.0:
+            # the clock went back, which has ended the motion: what is left goes out step by step
+            gap = self.limiter.limits.cycle
+        usable = min(max(gap, 0.0), self._longest_gap)
+        stream = self._nominal
+        if source_q is not None:
+            source_q = self._without_start_gap(source_q, usable)
+        nominal = stream.brake(usable) if source_q is None else source_q
+        correction = self.correct(nominal, loads)
+        corrected, offset, n = correction.q, correction.offset_in_base, len(nominal)
+        if self.residual < SOLVED:
+            self._solved[:n], self._solved[n:] = corrected - nominal, offset
+        else:  # the last one that was solved is ramped out: the loop ends the motion
+            corrected, offset = nominal + self._solved[:n], self._solved[n:]
+        step, before = usable / self._ramp_time, self._share(offset)
+        ramp = min(max(goal, before - step), before + step)
+        if time.monotonic() > expiry:
+            raise StaleStateError("the state was too old before its setpoint could leave")
+        limited = self.limiter.limit(nominal, corrected, offset, ramp, state.actual_q, gap)
+        if source_q is not None:
+            stream.follow(source_q, gap)
+            self._since_start += usable
+        self._ramp, self._resumes = ramp, False
+        self._last, self.clamped = state.timestamp, limited.clamped
+        return Setpoint(limited.q, nominal, limited.offset_in_base, state.timestamp, state.received)
+
+    def _share(self, offset_in_base: Vector) -> float:
+        """Return where the ramp is; at a beginning with an offset in force, its share of this one.
+
+        0..1, by the length of the TCP's shift.
+        """
+        if not self._resumes:
+            return self._ramp
+        wanted = float(np.linalg.norm(offset_in_base[:3]))
+        held = float(np.linalg.norm(self.limiter.offset_in_base[:3]))
+        return min(held / wanted, 1.0) if wanted > 0.0 else 0.0
+
+    @property
+    def joint_offset(self) -> Vector:
+        """Return the joint offset (n,) in the last setpoint, rad: read-only, of this moment."""
+        return self.limiter.joint_offset
+
+    def forget(self) -> None:
+        """Solve the next correction from nothing: a refused setpoint leaves no trace in it."""
+        self._compensator.forget()
+
+    @property
+    def ramp_time(self) -> float:
+        """Return the time that ramps take now at least, s."""
+        return self._ramp_time
+
+    @property
+    def is_bare(self) -> bool:
+        """Return whether no offset is left."""
+        bare = self._ramp == 0.0 and not self._resumes
+        return bare and not self.limiter.offset_in_base.any()
+
+    def _without_start_gap(self, source_q: Vector, gap: float) -> Vector:
+        """Return the source's setpoint, led over to from where the arm stood: no first jump."""
+        if self._start_gap is None:
+            self._start_gap = self._nominal.q - source_q
+        share = (self._since_start + gap) / self._ramp_time
+        if share >= 1.0:
+            return source_q
+        left = 1.0 - share * share * (3.0 - 2.0 * share)
+        return source_q + left * self._start_gap
+
+    @property
+    def rests(self) -> bool:
+        """Return whether no offset is left and the motion has come to rest."""
+        return self.is_bare and self._nominal.rests
+
+    def hasten(self, ramp_time: float) -> None:
+        """Ramp within ``ramp_time`` s from now on, where it was to take longer."""
+        self._ramp_time = min(self._ramp_time, ramp_time)
+
+    def end(self) -> None:
+        """End the stream; nothing leaves until the next ``start``."""
+        self.limiter.reset()

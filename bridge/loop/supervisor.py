@@ -1,0 +1,118 @@
+"""The states of a run and what leads from one to the other: one explicit table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import IntEnum, StrEnum
+
+
+class State(IntEnum):
+    """What the loop is doing."""
+
+    DISCONNECTED = 0
+    OBSERVING = 1  # reads, computes, records; writes nothing
+    ARMED = 2  # told to write; waits for the source's first setpoint
+    COMPENSATING = 3  # writes; the offset ramps in and stays
+    HOLDING = 4  # writes; the offset ramps out, the arm comes to rest
+    FAULT = 5  # writes nothing until a person has acknowledged it
+
+    @property
+    def writes(self) -> bool:
+        """Return whether setpoints leave in this state."""
+        return self in (State.COMPENSATING, State.HOLDING)
+
+
+class Cause(StrEnum):
+    """Why a state was left."""
+
+    CONNECTED = "connected"
+    LATCHED = "fault latched"  # one that a process of the loop before this one has found
+    ARM = "arm"
+    DISARM = "disarm"
+    STOP = "stop"
+    START_REFUSED = "start refused"
+    WRITING = "writing"
+    SOURCE_DRY = "source dry"
+    SETPOINT_REFUSED = "setpoint refused"
+    STALE = "state stale"
+    IMPLAUSIBLE = "state implausible"
+    FROZEN = "values frozen"
+    RESYNC = "gap in time"
+    OVERRUN = "deadlines missed"
+    SATURATED = "offset saturated"
+    BAD_OUTPUT = "correction no number"
+    UNSOLVED = "correction unsolved"
+    LOAD = "load implausible"
+    NOT_FOLLOWING = "robot not following"
+    MISMATCH = "robot set otherwise"
+    FOREIGN = "another commander"
+    INEFFECTIVE = "write without effect"
+    SILENCE = "silence"
+    UNSAFE = "robot not ready"
+    WRITE_FAILED = "write failed"
+    RAMPED_OUT = "ramped out"
+    ACKNOWLEDGED = "acknowledged"
+    LINK_LOST = "link lost"
+
+
+_S, _C = State, Cause
+
+STOPS_AT_ONCE = (_C.SILENCE, _C.UNSAFE, _C.WRITE_FAILED, _C.BAD_OUTPUT)
+"""Faults after which nothing more is written, whatever was going on."""
+
+RAMPS_OUT = (
+    _C.DISARM, _C.STOP, _C.SOURCE_DRY, _C.SETPOINT_REFUSED, _C.STALE, _C.IMPLAUSIBLE, _C.FROZEN,
+    _C.RESYNC, _C.OVERRUN, _C.SATURATED, _C.UNSOLVED, _C.LOAD, _C.NOT_FOLLOWING, _C.MISMATCH,
+    _C.FOREIGN, _C.INEFFECTIVE,
+)  # fmt: skip
+"""Causes that end compensating by way of a ramp."""
+
+TRANSITIONS: dict[tuple[State, Cause], State] = {
+    (_S.DISCONNECTED, _C.CONNECTED): _S.OBSERVING,
+    (_S.OBSERVING, _C.ARM): _S.ARMED,
+    (_S.OBSERVING, _C.LATCHED): _S.FAULT,
+    (_S.ARMED, _C.WRITING): _S.COMPENSATING,
+    (_S.ARMED, _C.START_REFUSED): _S.OBSERVING,
+    **{(_S.ARMED, cause): _S.OBSERVING for cause in RAMPS_OUT},
+    **{(_S.ARMED, cause): _S.FAULT for cause in STOPS_AT_ONCE},
+    **{(_S.COMPENSATING, cause): _S.HOLDING for cause in RAMPS_OUT},
+    **{(_S.COMPENSATING, cause): _S.FAULT for cause in STOPS_AT_ONCE},
+    (_S.HOLDING, _C.RAMPED_OUT): _S.OBSERVING,
+    # what cannot be ramped out must not be written either
+    (_S.HOLDING, _C.SETPOINT_REFUSED): _S.FAULT,
+    (_S.HOLDING, _C.FOREIGN): _S.FAULT,
+    (_S.HOLDING, _C.INEFFECTIVE): _S.FAULT,
+    **{(_S.HOLDING, cause): _S.FAULT for cause in STOPS_AT_ONCE},
+    (_S.FAULT, _C.ACKNOWLEDGED): _S.OBSERVING,
+    **{(s, _C.LINK_LOST): _S.DISCONNECTED for s in State if s},
+}
+"""(state, cause) -> next state. What is not in the table changes nothing.
+
+Only a person's ARM leads to writing; no fault leads back to it. While observing nothing is written,
+so that nothing found then latches: what still lasts when somebody arms is refused there. FAULT is
+left by a person's ACKNOWLEDGED, or with the link.
+"""
+
+HEALED_BY_RECONNECTING = (_C.SILENCE, _C.WRITE_FAILED, _C.INEFFECTIVE)
+"""Faults of a link. They end with it: its successor begins by observing. All others stay latched
+over a new link and a new process, until a person acknowledges them."""
+
+Listener = Callable[[State, State, Cause, str], None]
+
+
+class Supervisor:
+    """Holds the state; every change goes through the table and is told to one listener."""
+
+    def __init__(self, listener: Listener) -> None:
+        self.state = State.DISCONNECTED
+        self._listener = listener
+
+    def take(self, cause: Cause, detail: str = "") -> bool:
+        """Change state as the table says; returns whether it did."""
+        before = self.state
+        after = TRANSITIONS.get((before, cause))
+        if after is None:
+            return False
+        self.state = after
+        self._listener(before, after, cause, detail)
+        return True

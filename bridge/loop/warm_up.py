@@ -1,0 +1,44 @@
+"""Compile the inner loops: ``python -m bridge.loop.warm_up``, once per installation.
+
+Numba keeps what it has compiled beside the sources. Without this, the first command of a new
+installation spends half a minute on it, in the middle of its work.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bridge.loop.nominal_stream import NominalStream
+from core.arm import builtin_arm
+from core.compensation import correct
+from core.estimation.pose_jacobian import pose_columns
+from core.kernels.factor import factor_blocks
+from core.limits import Limiter, Limits
+from core.model import Model
+from drivers.offset_inverse import Nominal
+from drivers.ur_rtde.state import plausible
+
+
+def warm_up() -> None:
+    """Call each compiled function once; CAN and Modbus drivers compile theirs when made."""
+    n = 6
+    model = Model(builtin_arm("ur10e")).with_compliance([1e-6] * n, [1e-6] * n)
+    q = np.array([[0.0, -1.5, 1.8, -1.87, -1.57, 0.0]])
+    for rows in (q, np.repeat(q, 4, axis=0)):  # one by one, and in blocks
+        model.predict(rows)
+        model.linear_form(rows)
+    pose_columns(model, q, None, [(0, 0)], np.array([1e-9]))
+    gap, factor = np.zeros((1, 3)), np.zeros((2 * n + 1, 2 * n + 1))
+    factor_blocks(model.chain(), model.rows(q), gap, gap, 0, 0, 1, factor)
+    corrected = correct(model, q)
+    Nominal(model)
+    plausible(q[0], q[0], q[0], 0.0)
+    NominalStream(np.ones(n))
+    limits = Limits(np.full(n, -7.0), np.full(n, 7.0), np.full(n, 3.0))
+    limiter = Limiter(limits, n)
+    limiter.start(q[0])
+    limiter.limit(q[0], corrected.q[0], corrected.offset_in_base[0], 1.0, q[0], 0.002)
+
+
+if __name__ == "__main__":
+    warm_up()

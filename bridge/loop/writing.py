@@ -1,0 +1,275 @@
+"""The writing half of the loop: begin, send, bring to rest, let go."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.cell.sections import SetpointSettings
+from bridge.ipc.counts import Count
+from bridge.ipc.shared_memory import Page, Phase
+from bridge.loop.link_monitor import hold_time
+from bridge.loop.offset_in_force import OffsetInForce
+from bridge.loop.setpoint_stream import SetpointStream
+from bridge.loop.supervisor import Cause, State, Supervisor
+from bridge.setpoint_source.source import Source, SourceDryError
+from core.errors import (
+    ForeignCommandError,
+    GateError,
+    IneffectiveWriteError,
+    LimitError,
+    PartialWriteError,
+    StaleStateError,
+    WriteError,
+)
+from core.loads import Loads
+from core.setpoint import Setpoint
+from core.state import RobotState
+from drivers.driver import Driver
+
+Vector = NDArray[np.float64]
+SETTLED, LONGEST_SETTLING = 2e-6, 0.3  # rad, s
+PARTS_IN_A_ROW = 3  # setpoints that left in part only, after which the motion is ended
+
+
+class Writing:
+    """Sends what the states of the supervisor allow, and nothing else."""
+
+    def __init__(
+        self,
+        settings: SetpointSettings,
+        driver: Driver,
+        source: Source,
+        stream: SetpointStream,
+        supervisor: Supervisor,
+        page: Page,
+        tell: Callable[[dict[str, Any]], None],
+        skip: Callable[[], None],
+        lose: Callable[[str], None],
+        in_force: OffsetInForce | None = None,
+    ) -> None:
+        self._settings, self._driver, self._source = settings, driver, source
+        self._stream, self._supervisor, self._page = stream, supervisor, page
+        self._tell, self._skip, self._lose = tell, skip, lose
+        self._in_force = in_force or OffsetInForce(driver.n, None)
+        self.ready = False  # the driver is armed
+        self.has_armed = False  # it was, at some time in this process
+        self.unsent: Setpoint | None = None  # computed in the last cycle, and not (wholly) sent
+        self.ramps_out = False  # the last one's offset was to go
+        self._failed = 0  # setpoints in a row that left in part only
+        self._settling = 0.0  # s, monotonic: since when the last setpoint stands
+
+    def start(self, state: RobotState, own: Vector) -> bool:
+        """Begin writing once the source has a first setpoint and the driver is ready.
+
+        Returns whether it took so long that a fresh state is needed.
+        """
+        first = self._source.first(own)
+        if first is None:
+            if self.ready:
+                self._refuse_start("the source fell silent before the first setpoint")
+            return False
+        away = np.abs(first - own)
+        tolerance = self._settings.start_tolerance
+        if not (away <= tolerance).all():
+            joint = int(np.argmax(away))
+            self._refuse_start(
+                f"joint {joint + 1}: found the first setpoint {away[joint]:.4f} rad from the arm, "
+                f"expected at most {tolerance:g} (setpoints.start_tolerance)"
+            )
+            return False
+        try:
+            if not self.ready:
+                self._arm_driver(state)
+                return True
+            in_force = self._in_force.at(own) if self._driver.moves_arm else None
+            nominal = self._stream.start(own, state.timestamp, in_force=in_force)
+        except (WriteError, LimitError) as error:
+            if isinstance(error, ForeignCommandError):
+                self._page.count(Count.FOREIGN)
+            self._refuse_start(str(error))
+            return True
+        self._source.begin(state.timestamp, nominal)
+        self._failed = 0
+        self._supervisor.take(Cause.WRITING)
+        return False
+
+    def _arm_driver(self, state: RobotState) -> None:
+        """Make the driver ready, which takes a moment: a fresh state is needed after it."""
+        self._page.enter(Phase.ARMING)
+        self.has_armed = True
+        try:
+            self._check_way()
+            self._driver.arm(state)
+            self.ready = True
+        finally:
+            self._page.enter(Phase.RUNNING)
+            self._skip()
+
+    def _check_way(self) -> None:
+        """Refuse a link on which no state can be fresh. Raises WriteError."""
+        taken, most = self._driver.round_trip(), hold_time(self._driver.rate)
+        if taken is not None and taken > most:
+            raise WriteError(
+                f"link: a question and its answer take {1e3 * taken:.0f} ms, expected at most "
+                f"{1e3 * most:.0f} ms: no state behind a setpoint may be older"
+            )
+
+    def _refuse_start(self, detail: str) -> None:
+        self.release()
+        self._supervisor.take(Cause.START_REFUSED, detail)
+
+    def write(
+        self, state: RobotState, own: Vector, loads: Loads, expiry: float = np.inf
+    ) -> Setpoint | None:
+        """Send one setpoint; returns it, or None where none has left.
+
+        ``expiry`` (s, monotonic): later than that nothing may leave that is made of this state.
+        """
+        stream, self.unsent = self._stream, None
+        self.ramps_out = self._supervisor.state == State.HOLDING
+        if time.monotonic() > expiry:
+            stream.forget()
+            return None
+        source_q = self._next(state, own)
+        self.ramps_out = self._supervisor.state == State.HOLDING
+        goal = 0.0 if self.ramps_out else 1.0
+        try:
+            self._driver.keep_alive()  # may wait for the robot: before the state's age is judged
+            setpoint = stream.advance(state, source_q, loads, goal, expiry)
+        except StaleStateError:
+            stream.forget()
+            self._page.count(Count.LATE)
+            return None
+        except WriteError as error:
+            stream.forget()
+            self._fail(error)
+            return None
+        except LimitError as error:
+            stream.forget()
+            self._end(Count.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))
+            return None
+        try:
+            if not stream.finite:
+                self.unsent = _copied(setpoint)
+                words = "the model's correction is no number"
+                self._end(Count.BAD_OUTPUT, Cause.BAD_OUTPUT, words)
+            elif time.monotonic() > expiry:  # the system stopped this process since it was judged
+                self.unsent = _copied(setpoint)
+                self._page.count(Count.LATE)
+            else:
+                self._driver.write_setpoint(setpoint)
+                self._in_force.note(setpoint.q, stream.joint_offset, setpoint.offset_in_base)
+                self._failed = 0
+                self._judge_correction()
+                self._judge_sending(expiry)
+                return setpoint
+        except WriteError as error:
+            self.unsent = _copied(setpoint)
+            self._fail(error)
+        return None
+
+    def _judge_correction(self) -> None:
+        """End the motion where the model has no correction; the offset is on its way out."""
+        words = self._stream.unsolved
+        if words and self._supervisor.take(Cause.UNSOLVED, words):
+            self._page.count(Count.UNSOLVED)
+
+    def _judge_sending(self, expiry: float) -> None:
+        """End the motion where the system stopped this process between judging and sending."""
+        late = time.monotonic() - expiry
+        if late > 0.0:
+            words = f"a setpoint left {1e3 * late:.0f} ms after its state was too old"
+            self._page.count(Count.OVERRUN)
+            self._supervisor.take(Cause.OVERRUN, words)
+
+    def _fail(self, error: WriteError) -> None:
+        """Act on a setpoint that could not be delivered."""
+        if isinstance(error, GateError):
+            self._end(Count.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))
+        elif isinstance(error, PartialWriteError):
+            self._repeat(str(error))
+        elif isinstance(error, IneffectiveWriteError):
+            self._end(Count.WRITE_INEFFECTIVE, Cause.INEFFECTIVE, str(error))
+        elif isinstance(error, ForeignCommandError):
+            self._end(Count.FOREIGN, Cause.FOREIGN, str(error))
+        else:
+            self._page.count(Count.WRITE_FAILED)
+            self._supervisor.take(Cause.WRITE_FAILED, str(error))
+            self.ready = False
+            self._lose(str(error))
+
+    def _repeat(self, detail: str) -> None:
+        """Leave it to the next cycle, whose setpoint goes out whole; after some, end the motion."""
+        self._page.count(Count.WRITE_PARTIAL)
+        self._failed += 1
+        if self._failed >= PARTS_IN_A_ROW:
+            self._failed = 0
+            self._end(Count.WRITE_INEFFECTIVE, Cause.INEFFECTIVE, detail)
+
+    def _end(self, what: Count, cause: Cause, detail: str) -> None:
+        """End the motion as the table says; let go where it says that nothing more is written."""
+        self._page.count(what)
+        self._supervisor.take(cause, detail)
+        if not self._supervisor.state.writes:
+            self.release()
+
+    def at_rest(self, setpoint: Setpoint, state: RobotState) -> bool:
+        """Return whether the offset is out, and the arm, where it is ours, stands.
+
+        The controller's target follows late: who lets go at once leaves the arm short of it.
+        """
+        if not self._driver.moves_arm:
+            return self._stream.is_bare
+        if not self._stream.rests:
+            return False
+        now = time.monotonic()
+        self._settling = self._settling or now
+        near = bool((np.abs(state.target_q - setpoint.q) < SETTLED).all())
+        if near or now - self._settling > LONGEST_SETTLING:
+            self._settling = 0.0
+            return True
+        return False
+
+    def _next(self, state: RobotState, own: Vector) -> Vector | None:
+        """Return the source's setpoint; None: the motion must brake."""
+        if self._supervisor.state == State.HOLDING:
+            return None if self._driver.moves_arm else own
+        try:
+            found = self._source.sample(state.timestamp, own)
+        except SourceDryError as error:
+            self._page.count(Count.SOURCE_DRY)
+            self._supervisor.take(Cause.SOURCE_DRY, str(error))
+            return None if self._driver.moves_arm else own
+        if self._source.ended and not self._page.ended:
+            self._page.tell_ended()
+            words = "the source has come to its end; the arm stays there"
+            self._tell({"kind": "source", "what": "ended", "detail": words})
+        return found
+
+    def release(self) -> None:
+        """Leave the robot to itself; the arm has come to rest, or its watchdog stops it."""
+        self._stream.end()
+        if not self.ready:
+            return
+        self.ready = False
+        self._page.enter(Phase.ARMING)
+        try:
+            self._driver.release()
+        except WriteError as error:
+            self._tell({"kind": "link", "what": "release", "detail": str(error)})
+        self._page.enter(Phase.RUNNING)
+        self._skip()
+
+
+def _copied(setpoint: Setpoint) -> Setpoint:
+    """Return a setpoint whose arrays stay, whatever the limiter does next."""
+    return setpoint._replace(
+        q=setpoint.q.copy(),
+        nominal_q=setpoint.nominal_q.copy(),
+        offset_in_base=setpoint.offset_in_base.copy(),
+    )

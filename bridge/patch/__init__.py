@@ -1,0 +1,25 @@
+"""Writing a cell's effects into the models of simulators, each format in a file of its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bridge.patch.changes import ModelChanges, changes_of
+from bridge.patch.mjcf import Mjcf
+from bridge.patch.model_format import ModelFormat, Patched, PatchOptions
+from bridge.patch.urdf import Urdf
+from core.errors import InputError
+
+FORMATS: tuple[ModelFormat, ...] = (Mjcf(), Urdf())
+
+
+def format_of(path: Path) -> ModelFormat:
+    """Return the format of a model by its suffix. Raises InputError naming those known."""
+    for one in FORMATS:
+        if path.suffix.lower() in one.suffixes:
+            return one
+    known = ", ".join(suffix for one in FORMATS for suffix in one.suffixes)
+    raise InputError(f"{path}: found {path.suffix or 'no suffix'}, expected one of {known}")
+
+
+__all__ = ["ModelChanges", "ModelFormat", "PatchOptions", "Patched", "changes_of", "format_of"]

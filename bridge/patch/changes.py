@@ -1,0 +1,142 @@
+"""What has to change in a model of the nominal arm so that it behaves as the cell's model.
+
+Geometry, tool, gravity and springs are the difference of two chains, with the cell's effects and
+without; the rest is what each effect says in a simulator's terms. No effect is named here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.effects import CATALOGUE
+from core.effects.effect import Effect
+from core.effects.simulator import Kind, SimulatorChange
+from core.errors import InputError
+from core.model import Model
+from core.rotation import rotation_matrix, transform
+
+Array = NDArray[np.float64]
+ANGLE, DISTANCE = 1e-3, 1e-3  # rad, m: by which an axis may be off and still be the same arm's
+TINY = 1e-12
+
+
+@dataclass(frozen=True)
+class Springs:
+    """Flexibilities that the cell adds; n joints."""
+
+    joint: Array  # (n, 3) rad/Nm about x, y, z (the axis) of each joint's frame
+    softening: Array  # (n,) 1/(Nm)2 of the axial spring: theta = c M / sqrt(1 + softening M^2)
+    link: Array  # (n,) 1/(N m2): 1/EI of the link after each joint
+    base: Array  # (3,) rad/Nm about the base axes
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Lines of the joints' axes at zero angles, in one frame."""
+
+    point: Array  # (n, 3) m
+    direction: Array  # (n, 3) unit vectors
+
+
+@dataclass(frozen=True)
+class ModelChanges:
+    """What the cell's effects do to its arm."""
+
+    model: Model  # of the cell, effects included
+    joint_in_base: Array  # (n+1, 4, 4) nominal frames at zero angles: joints, then the flange
+    shift: Array  # (n+1, 4, 4) what follows each nominal frame: joint_in_base @ shift
+    tcp_in_base: Array  # (4, 4) nominal
+    tcp_shift: Array  # (4, 4) tool_in_flange's change, flange's included
+    gravity: Array | None  # (3,) m/s2 in base, None where the cell does not turn it
+    springs: Springs
+    settings: tuple[SimulatorChange, ...]
+    not_held: tuple[tuple[str, str], ...]  # effect, what people do instead: no format holds it
+
+    @property
+    def n(self) -> int:
+        """Return the number of joints."""
+        return len(self.shift) - 1
+
+    def axes(self) -> Axes:
+        """Return the nominal axes in base."""
+        frames = self.joint_in_base[: self.n]
+        return Axes(frames[:, :3, 3], frames[:, :3, 2])
+
+    def of_joint(self, kind: Kind, joint: int) -> float:
+        """Return the sum of the settings of a kind at a joint (from 1)."""
+        return sum(s.value for s in self.settings if (s.kind, s.joint) == (kind, joint))
+
+    def moved(self, joint: int, base_in_world: Array) -> Array:
+        """Return the motion (4, 4) in world of everything from joint (from 0; n: flange) on."""
+        frame = base_in_world @ self.joint_in_base[joint]
+        return np.asarray(frame @ self.shift[joint] @ np.linalg.inv(frame))
+
+
+def changes_of(model: Model) -> ModelChanges:
+    """Return what the terms of a model change of its nominal arm."""
+    nominal, real, arm = model.without_terms().chain(), model.chain(), model.arm
+    n = arm.n
+    steps = [transform(nominal.rotation[i], nominal.position[i]) for i in range(n + 1)]
+    shift = np.array([
+        np.linalg.inv(steps[i]) @ transform(real.rotation[i], real.position[i])
+        for i in range(n + 1)
+    ])  # fmt: skip
+    settings = tuple(
+        setting for term in model.terms
+        for setting in CATALOGUE[term.effect].simulator(term, arm)
+    )  # fmt: skip
+    for setting in settings:
+        if setting.kind is Kind.JOINT_ZERO and setting.joint is not None:
+            turn = rotation_matrix(np.array([0.0, 0.0, setting.value]))
+            shift[setting.joint - 1] = shift[setting.joint - 1] @ transform(turn, np.zeros(3))
+    frames = [steps[0]]
+    for step in steps[1:]:
+        frames.append(frames[-1] @ step)
+    tool = transform(nominal.tool_rotation, nominal.tool_position)
+    real_tool = transform(real.tool_rotation, real.tool_position)
+    turned = not np.allclose(real.gravity, nominal.gravity, rtol=0, atol=1e-12)
+    springs = Springs(real.compliance, real.softening, real.flexibility, real.base_compliance)
+    return ModelChanges(
+        model, np.array(frames), shift, frames[-1] @ tool,
+        np.linalg.inv(tool) @ shift[n] @ real_tool, real.gravity if turned else None, springs,
+        settings, _not_held(model),
+    )  # fmt: skip
+
+
+def _not_held(model: Model) -> tuple[tuple[str, str], ...]:
+    """Return the effects that are neither in the chain nor anything a simulator knows."""
+    found: dict[str, str] = {}
+    for term in model.terms:
+        effect = CATALOGUE[term.effect]
+        in_chain = type(effect).shape is not Effect.shape
+        if not in_chain and not effect.simulator(term, model.arm):
+            found[effect.identifier] = effect.instead
+    return tuple(found.items())
+
+
+def base_in_world(ours: Axes, theirs: Axes, source: str, names: tuple[str, ...]) -> Array:
+    """Return where the cell's base stands (4, 4) in the world of a user's model.
+
+    The rotation that brings our axes' directions onto theirs (Kabsch), then the shift that brings
+    the lines together (least squares). Raises InputError, naming the first joint whose axis does
+    not agree: the model is of another arm, or has its zero elsewhere.
+    """
+    U, _, Vt = np.linalg.svd(theirs.direction.T @ ours.direction)
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    across = np.array([np.eye(3) - np.outer(d, d) for d in theirs.direction])
+    away = theirs.point - ours.point @ R.T
+    t = np.linalg.lstsq(across.reshape(-1, 3), np.einsum("nij,nj->ni", across, away).ravel(),
+                        rcond=1e-9)[0]  # fmt: skip
+    turned, distance = ours.direction @ R.T, np.einsum("nij,nj->ni", across, away - t)
+    for name, a, b, d in zip(names, turned, theirs.direction, distance, strict=True):
+        angle = float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
+        if angle > ANGLE or np.linalg.norm(d) > DISTANCE:
+            raise InputError(
+                f"{source}: joint {name}: found its axis {np.degrees(angle):.3g} deg and "
+                f"{1e3 * np.linalg.norm(d):.3g} mm off the cell's nominal arm at zero angles, "
+                "expected the same arm with the same zero"
+            )
+    return transform(R, t)

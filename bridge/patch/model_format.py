@@ -1,0 +1,70 @@
+"""The base of the formats that a cell's effects can be written into."""
+
+from __future__ import annotations
+
+import difflib
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from bridge.patch.changes import ModelChanges
+from core.errors import InputError
+from core.log.sources.joint_order import order_joints
+
+
+@dataclass(frozen=True)
+class PatchOptions:
+    """What the user says of the model."""
+
+    joints: tuple[str, ...] = ()  # its joints, in the order of the arm's
+    tcp: str = ""  # its TCP: a site, link or prim
+
+
+@dataclass(frozen=True)
+class Patched:
+    """A patched model and what was done to it."""
+
+    text: str
+    changed: tuple[str, ...]  # one line a change
+    not_held: tuple[str, ...]  # one line a thing that the format cannot hold, and what to do
+
+
+class ModelFormat(ABC):
+    """One format of models."""
+
+    suffixes: ClassVar[tuple[str, ...]]
+
+    @abstractmethod
+    def patch(self, path: Path, changes: ModelChanges, options: PatchOptions,
+              notes: Sequence[str]) -> Patched:  # fmt: skip
+        """Return the model at ``path`` with the changes in it; ``notes`` go in as comments.
+
+        Raises InputError where the model cannot be read, is of another arm, or does not say which
+        joint is which.
+        """
+
+
+def pick_joints(
+    path: Path, found: Sequence[str], changes: ModelChanges, options: PatchOptions
+) -> tuple[str, ...]:
+    """Return the model's joint names in the order of the arm's. Raises InputError."""
+    n = changes.n
+    arm = changes.model.arm.joint_names or tuple(f"joint_{i + 1}" for i in range(n))
+    names = order_joints(path, found, arm, options.joints)
+    if len(names) != n:
+        raise InputError(
+            f"{path}: joints: found {len(names)} ({', '.join(names)}), expected {n} as the "
+            "cell's arm has"
+        )
+    return names
+
+
+def named_one(path: Path, option: str, name: str, found: Sequence[str]) -> str:
+    """Return a name that the model has; raises InputError with the nearest one."""
+    if name in found:
+        return name
+    near = difflib.get_close_matches(name, found, n=1)
+    hint = f"; did you mean {near[0]}?" if near else f": {', '.join(found) or 'none'}"
+    raise InputError(f"{path}: {option}: found {name}, expected one that the model has{hint}")

@@ -1,0 +1,244 @@
+"""URDF: origins, inertials, friction and damping; only attributes that change are rewritten."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.patch.changes import TINY, Axes, ModelChanges, base_in_world
+from bridge.patch.model_format import (
+    ModelFormat,
+    Patched,
+    PatchOptions,
+    named_one,
+    pick_joints,
+)
+from core.effects.simulator import Kind
+from core.errors import InputError
+from core.rotation import rpy_matrix, transform
+
+Array = NDArray[np.float64]
+TURNING = ("revolute", "continuous")
+INSTEAD = {
+    Kind.ARMATURE: "rotor inertia: set the armature where the simulator has it",
+    Kind.DELAY: "delay: in the controller, or the simulator's actuator",
+    Kind.LAG: "lag of the servo: in the controller, or the simulator's actuator",
+    Kind.SERVO_COMPLIANCE: "gain of the servo: in the controller's settings",
+    Kind.PLAY: "play: SDF or MJCF with a second, limited joint",
+    Kind.PAYLOAD: "load: change the inertial of the link that carries it",
+}
+
+
+class Urdf(ModelFormat):
+    """The Unified Robot Description Format."""
+
+    suffixes = (".urdf",)
+
+    def patch(self, path: Path, changes: ModelChanges, options: PatchOptions,
+              notes: Sequence[str]) -> Patched:  # fmt: skip
+        """Return the URDF with changed attributes; order and comments stay."""
+        document = _Document(path)
+        names = pick_joints(path, document.turning(), changes, options)
+        frames = document.child_frames()
+        world = base_in_world(changes.axes(), document.axes(names, frames), str(path), names)
+        changed = []
+        for i, name in enumerate(names):
+            if not np.allclose(changes.shift[i], np.eye(4), rtol=0, atol=TINY):
+                document.move(name, changes.moved(i, world), frames)
+                changed.append(f"joint {name}: origin")
+            changed += _dynamics(document, name, i + 1, changes)
+        changed += _inertials(document, names, changes)
+        missing = [*_tool(document, path, changes, options, world, frames, changed),
+                   *_springs(changes), *_settings(changes)]  # fmt: skip
+        document.comment(["Patched by gapbridge.", *changed, *notes,
+                          *(f"not in this file: {line}" for line in missing)])  # fmt: skip
+        return Patched(document.text, tuple(changed), tuple(missing))
+
+
+class _Document:
+    """A URDF as text, of which single attributes are rewritten where they stand."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            self.text = path.read_text(encoding="utf-8")
+            self.root = ElementTree.fromstring(self.text)
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"{path}: cannot be read ({error})") from None
+        except ElementTree.ParseError as error:
+            raise InputError(f"{path}: found broken XML ({error}), expected a URDF") from None
+        if self.root.tag != "robot":
+            raise InputError(f"{path}: found <{self.root.tag}>, expected a URDF's <robot>")
+        self.joints = {str(j.get("name")): j for j in self.root.findall("joint")}
+        self.links = {str(link.get("name")): link for link in self.root.findall("link")}
+
+    def turning(self) -> list[str]:
+        return [name for name, joint in self.joints.items() if joint.get("type") in TURNING]
+
+    def end(self, joint: str, tag: str) -> str:
+        found = self.joints[joint].find(tag)
+        return "" if found is None else str(found.get("link"))
+
+    def origin(self, joint: str) -> Array:
+        found = self.joints[joint].find("origin")
+        given = {} if found is None else found.attrib
+        xyz, rpy = (np.array(given.get(k, "0 0 0").split(), dtype=float) for k in ("xyz", "rpy"))
+        return transform(rpy_matrix(rpy), xyz)
+
+    def child_frames(self) -> dict[str, Array]:
+        """Return the frames (4, 4) of all links in the root's, joints at zero."""
+        parent_of = {self.end(name, "child"): name for name in self.joints}
+        frames: dict[str, Array] = {}
+
+        def frame(link: str) -> Array:
+            if link not in frames:
+                joint = parent_of.get(link)
+                frames[link] = np.eye(4) if joint is None else (
+                    frame(self.end(joint, "parent")) @ self.origin(joint)
+                )  # fmt: skip
+            return frames[link]
+
+        for link in self.links:
+            frame(link)
+        return frames
+
+    def axes(self, names: Sequence[str], frames: dict[str, Array]) -> Axes:
+        point, direction = [], []
+        for name in names:
+            frame, found = frames[self.end(name, "child")], self.joints[name].find("axis")
+            axis = np.array(("1 0 0" if found is None else found.get("xyz", "1 0 0")).split(),
+                            dtype=float)  # fmt: skip
+            point.append(frame[:3, 3])
+            direction.append(frame[:3, :3] @ axis / np.linalg.norm(axis))
+        return Axes(np.array(point), np.array(direction))
+
+    def move(self, joint: str, motion: Array, frames: dict[str, Array]) -> None:
+        """Move a joint's child (and all beyond) by a motion (4, 4) in the root's frame."""
+        parent = frames[self.end(joint, "parent")]
+        origin = np.linalg.inv(parent) @ motion @ parent @ self.origin(joint)
+        self.write("joint", joint, "origin",
+                   {"xyz": origin[:3, 3], "rpy": _roll_pitch_yaw(origin[:3, :3])})  # fmt: skip
+
+    def write(self, kind: str, name: str, tag: str, values: dict[str, Array | float]) -> None:
+        """Rewrite attributes of <tag> in <kind name=...>; the element is made where missing."""
+        with_type = r"(?=[^>]*\btype\s*=)" if kind == "joint" else ""  # no transmission's joint
+        block = re.search(
+            rf"<{kind}\b{with_type}[^>]*\bname\s*=\s*([\"']){re.escape(name)}\1[^>]*>.*?</{kind}>",
+            self.text, re.DOTALL,
+        )  # fmt: skip
+        assert block is not None, f"{kind} {name}"
+        inside = block[0]
+        numbers = {key: " ".join(f"{v:.17g}" for v in np.atleast_1d(value))
+                   for key, value in values.items()}  # fmt: skip
+        element = re.search(rf"<{tag}\b[^>]*?/?>", _without_comments(inside))
+        if element is None:
+            attributes = " ".join(f'{key}="{value}"' for key, value in numbers.items())
+            new = inside.replace(f"</{kind}>", f"  <{tag} {attributes}/>\n  </{kind}>")
+        else:
+            old = written = element[0]
+            for key, value in numbers.items():
+                pattern = rf"(\b{key}\s*=\s*)([\"']).*?\2"
+                if re.search(pattern, written):
+                    written = re.sub(pattern, rf"\g<1>\g<2>{value}\g<2>", written, count=1)
+                else:
+                    written = re.sub(r"\s*(/?>)$", rf' {key}="{value}"\1', written)
+            place = element.start()
+            new = inside[:place] + written + inside[place + len(old) :]
+        self.text = self.text[: block.start()] + new + self.text[block.end() :]
+
+    def comment(self, lines: Sequence[str]) -> None:
+        """Put lines into a comment right inside of <robot>."""
+        text = "\n       ".join(line.replace("--", "- -") for line in lines)
+        self.text = re.sub(
+            r"(<robot\b[^>]*>)", lambda found: f"{found[1]}\n  <!-- {text} -->", self.text, count=1
+        )
+
+
+def _without_comments(text: str) -> str:
+    """Return the text with comments blanked out, so that places stay."""
+    return re.sub(r"<!--.*?-->", lambda found: " " * len(found[0]), text, flags=re.DOTALL)
+
+
+def _roll_pitch_yaw(R: Array) -> Array:
+    """Return roll, pitch, yaw (3,) of a rotation: fixed axes x, y, z, as URDF has them."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(R).as_euler("xyz"))
+
+
+def _dynamics(document: _Document, name: str, joint: int, changes: ModelChanges) -> list[str]:
+    found = document.joints[name].find("dynamics")
+    given = {} if found is None else found.attrib
+    values: dict[str, Array | float] = {}
+    for kind, key in ((Kind.FRICTION, "friction"), (Kind.DAMPING, "damping")):
+        added = changes.of_joint(kind, joint)
+        if added:
+            values[key] = float(given.get(key, 0)) + added
+    if values:
+        document.write("joint", name, "dynamics", values)
+    return [f"joint {name}: {key} {value:.6g}" for key, value in values.items()]
+
+
+def _inertials(document: _Document, names: Sequence[str], changes: ModelChanges) -> list[str]:
+    lines = []
+    for i, name in enumerate(names):
+        factor = 1 + changes.of_joint(Kind.LINK_SCALE, i + 1)
+        link = document.end(name, "child")
+        inertial = document.links[link].find("inertial")
+        if factor == 1 or inertial is None:
+            continue
+        for tag, keys in (("mass", ("value",)), ("inertia", ("ixx", "ixy", "ixz", "iyy", "iyz",
+                                                             "izz"))):  # fmt: skip
+            element = inertial.find(tag)
+            given = {} if element is None else element.attrib
+            values: dict[str, Array | float] = {
+                key: float(given[key]) * factor for key in keys if key in given
+            }
+            if values:
+                document.write("link", link, tag, values)
+        lines.append(f"link {link}: mass and inertia times {factor:.6g}")
+    return lines
+
+
+def _tool(
+    document: _Document, path: Path, changes: ModelChanges, options: PatchOptions, world: Array,
+    frames: dict[str, Array], changed: list[str],
+) -> list[str]:  # fmt: skip
+    """Move the TCP's link; returns what cannot be held."""
+    if np.allclose(changes.tcp_shift, np.eye(4), rtol=0, atol=TINY):
+        return []
+    if not options.tcp:
+        return ["tool: name the fixed link of the TCP with --tcp"]
+    link = named_one(path, "--tcp", options.tcp, list(document.links))
+    joint = next((j for j in document.joints if document.end(j, "child") == link), None)
+    if joint is None or document.joints[joint].get("type") != "fixed":
+        raise InputError(f"{path}: --tcp: found {link}, expected a link behind a fixed joint")
+    frame = world @ changes.tcp_in_base
+    motion = frame @ changes.tcp_shift @ np.linalg.inv(frame)
+    document.move(joint, motion, frames)
+    changed.append(f"link {link}: TCP")
+    return []
+
+
+def _springs(changes: ModelChanges) -> list[str]:
+    springs = changes.springs
+    lines = []
+    if springs.joint.any():
+        lines.append("flexible joints: SDF or MJCF with springs on further joints")
+    if springs.link.any():
+        lines.append("flexible links: MJCF or SDF with springs across the links")
+    if springs.base.any():
+        lines.append("flexible base: MJCF or SDF with springs below the base")
+    if changes.gravity is not None:
+        lines.append("direction of gravity: in the simulator's world")
+    return lines
+
+
+def _settings(changes: ModelChanges) -> list[str]:
+    kinds = {setting.kind for setting in changes.settings}
+    own = [text for kind, text in INSTEAD.items() if kind in kinds]
+    return own + [f"{name}: {instead}" for name, instead in changes.not_held]

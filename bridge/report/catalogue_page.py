@@ -1,0 +1,72 @@
+"""The catalogue as a page of the documentation, generated from the effects' own docstrings.
+
+Example: python -m bridge.report.catalogue_page docs/catalogue.md
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from pathlib import Path
+
+from bridge.report.words import CHANNELS as CHANNEL_WORDS
+from bridge.report.words import effect_words
+from core.arm import builtin_arm
+from core.effects import CATALOGUE, CHANNELS, Effect
+
+PAGE = Path(__file__).parents[2] / "docs" / "catalogue.md"
+HEAD = """\
+# The catalogue of effects
+
+Generated from the effects' docstrings by `python -m bridge.report.catalogue_page`; do not edit.
+`gapbridge explain EFFECT` prints the same text. Parameters are what the real arm has more than the
+model, in SI units.
+"""
+
+
+def catalogue_page() -> str:
+    """Return the page as Markdown: a table of all effects by channel, then one part each."""
+    parts = [HEAD]
+    for channel, unit in CHANNELS.items():
+        parts += [f"## {CHANNEL_WORDS[channel]} (`{channel}`, {unit})", "", _table(channel), ""]
+    parts += ["## Effect by effect", ""]
+    parts += [_effect(effect) for effect in CATALOGUE.values()]
+    return "\n".join(parts).rstrip() + "\n"
+
+
+def _table(channel: str) -> str:
+    rows = ["| effect | in plain words | where |", "| --- | --- | --- |"]
+    for name, effect in CATALOGUE.items():
+        if channel in effect.channels:
+            rows.append(f"| [`{name}`](#{name}) | {effect_words(name)} | {_place(effect)} |")
+    return "\n".join(rows)
+
+
+def _place(effect: Effect) -> str:
+    return "one joint each" if effect.sites(builtin_arm("ur10e"))[0].joint else "the whole arm"
+
+
+def _effect(effect: Effect) -> str:
+    arm = builtin_arm("ur10e")
+    lines = [f"### {effect.identifier}", "", inspect.getdoc(effect) or "", ""]
+    lines.append(f"- shows in: {', '.join(effect.channels)}; sits at: {_place(effect)}")
+    if effect.motion:
+        lines.append(f"- the log must hold: {effect.motion}")
+    if effect.needs:
+        lines.append(f"- columns beyond the channel's own: {', '.join(effect.needs)}")
+    told = [
+        f"`{parameter.name or 'value'}` ({parameter.unit or 'no unit'})"
+        for parameter in effect.parameters(arm, effect.sites(arm)[0])
+    ]
+    return "\n".join([*lines, f"- parameters: {', '.join(told)}", ""])
+
+
+def main(arguments: list[str]) -> int:
+    """Write the page to the file that is named, or to its place in the checkout."""
+    path = Path(arguments[0]) if arguments else PAGE
+    path.write_text(catalogue_page(), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

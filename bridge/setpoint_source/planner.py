@@ -1,0 +1,264 @@
+"""Setpoints from a planner on this machine over a Unix socket: one line per setpoint.
+
+A line is JSON, ``{"q": [..n..]}``, or n numbers with commas between, rad. The newest line counts.
+Where a planner is slower than the loop, joints glide from setpoint to setpoint over the time that
+two lines are apart.
+
+Whoever writes here moves the arm, so nobody gets a second guess: the first line that is no
+setpoint, or more lines than the robot has cycles, is answered with ``error: ...`` and ends the
+connection. A connection holds the feed from its first good line on, until it closes, or until it
+has been silent for the timeout and another planner sends a good line.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import socket
+import stat
+import time
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.cell.sections import SetpointSettings
+from bridge.ipc.control_socket import peer_of
+from bridge.setpoint_source.glide import Glide
+from bridge.setpoint_source.source import Source
+from core.errors import RunError
+
+Vector = NDArray[np.float64]
+LONGEST_LINE = 4096  # bytes
+MOST_BYTES = 16384  # read in one cycle
+MOST_LINES = 8  # taken in one cycle; what is left is taken in the next ones
+MOST_WAITING = 4  # connections without a good line yet
+SPAN = 2.0  # s over which lines are counted against the robot's cycles
+
+
+class Connection:
+    """One planner's connection: its unread bytes and how many lines it may still send."""
+
+    def __init__(self, link: socket.socket, rate: float) -> None:
+        link.setblocking(False)
+        self._link, self._rate = link, rate
+        self._buffer = b""
+        self._credit = SPAN * rate
+        self._at = self.opened = time.monotonic()
+        self.heard = 0.0  # s, monotonic: of the last good line
+        self.admitted = False  # a token has been given, or none is asked for
+        self.closed = False
+
+    def lines(self) -> list[bytes]:
+        """Return the lines that have arrived, some of them; closes where there is no end."""
+        if b"\n" not in self._buffer:
+            self._read()
+        *lines, rest = self._buffer.split(b"\n", MOST_LINES)
+        self._buffer = rest
+        if len(rest.split(b"\n", 1)[0]) > LONGEST_LINE:
+            self.refuse("a line without end")
+            return []
+        now = time.monotonic()
+        self._credit = min(self._credit + (now - self._at) * self._rate, SPAN * self._rate)
+        self._credit -= len(lines)
+        self._at = now
+        if self._credit < 0.0:
+            self.refuse(f"found more than {self._rate:g} lines per second, the robot's rate")
+            return []
+        return lines
+
+    def _read(self) -> None:
+        try:
+            data = self._link.recv(MOST_BYTES)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self.close()
+        self._buffer += data
+
+    def refuse(self, words: str) -> None:
+        """Say why, and close."""
+        with contextlib.suppress(OSError):
+            self._link.send(f"error: {words}\n".encode())
+        self.close()
+
+    def close(self) -> None:
+        """Close; may be repeated."""
+        self.closed = True
+        self._buffer = b""
+        self._link.close()
+
+
+class PlannerSource(Source):
+    """Listens for one planner at a time on a Unix socket of mode 0600. Never blocks.
+
+    A second planner is refused with a line as long as the first one sends.
+    """
+
+    def __init__(
+        self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
+    ) -> None:
+        super().__init__(settings, n, moves_arm, folder, rate)
+        self._listener: socket.socket | None = None
+        self._planner: Connection | None = None
+        self._waiting: list[Connection] = []
+        self._glide = Glide(settings.timeout, "line")
+        self.refused = 0  # connections that were ended for what they sent
+
+    def open(self) -> None:
+        """Listen. Raises RunError where that is not possible."""
+        try:
+            listener = self._listen()
+        except OSError as error:
+            raise RunError(
+                f"setpoints: cannot listen on {self.where}: {error.strerror or error}"
+            ) from None
+        listener.listen(MOST_WAITING)
+        listener.setblocking(False)
+        self._listener = listener
+
+    @property
+    def where(self) -> str:
+        """Return where it listens."""
+        return str(self.settings.socket)
+
+    def _listen(self) -> socket.socket:
+        """Return a bound socket. Raises OSError."""
+        path = self.settings.socket
+        if path is None:
+            raise OSError("no path, expected setpoints.socket")
+        with contextlib.suppress(FileNotFoundError):  # left behind by a loop that was killed
+            if stat.S_ISSOCK(path.lstat().st_mode):
+                path.unlink()
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        mask = os.umask(0o177)  # nobody comes in between bind and chmod
+        try:
+            listener.bind(str(path))
+        except OSError:
+            listener.close()
+            raise
+        finally:
+            os.umask(mask)
+        return listener
+
+    def _may_connect(self, link: socket.socket) -> bool:
+        """Return whether the kernel says that it is the daemon's own user, or root."""
+        return peer_of(link).uid in (0, os.geteuid())
+
+    def _admit(self, connection: Connection, line: bytes) -> bool:
+        """Return whether a first line admits a connection and is used up by that."""
+        connection.admitted = True
+        return False
+
+    def close(self) -> None:
+        """Close planner and listener, and take the socket away."""
+        for connection in (self._planner, *self._waiting):
+            if connection is not None:
+                connection.close()
+        self._planner, self._waiting = None, []
+        listener, self._listener = self._listener, None
+        if listener is not None:
+            listener.close()
+            self._tidy()
+
+    def _tidy(self) -> None:
+        if self.settings.socket is not None:
+            with contextlib.suppress(OSError):
+                self.settings.socket.unlink()
+
+    def first(self, own_q: Vector) -> Vector | None:
+        """Return the newest setpoint where one has come lately."""
+        self._receive()
+        return self._glide.first()
+
+    def begin(self, timestamp: float, own_q: Vector) -> None:
+        """Start from where the arm stands."""
+        self._glide.begin(own_q)
+
+    def sample(self, timestamp: float, own_q: Vector) -> Vector:
+        """Return the setpoint of this moment. Raises SourceDryError where no line came in time."""
+        if self._receive():
+            self._glide.turn()
+        return self._glide.sample()
+
+    def _receive(self) -> bool:
+        """Take what has arrived; returns whether there is a new setpoint."""
+        self._accept()
+        new = self._planner is not None and self._read(self._planner)
+        for connection in tuple(self._waiting):
+            new |= self._read(connection)
+        if self._planner is not None and self._planner.closed:
+            self._planner = None
+        self._waiting = [c for c in self._waiting if not c.closed and c is not self._planner]
+        return new
+
+    @property
+    def _is_held(self) -> bool:
+        """Return whether a planner is at work, which no other one may push aside."""
+        planner = self._planner
+        if planner is None or planner.closed:
+            return False
+        return time.monotonic() - planner.heard <= self.settings.timeout
+
+    def _accept(self) -> None:
+        if self._listener is None:
+            return
+        try:
+            link, _ = self._listener.accept()
+        except OSError:
+            return
+        connection = Connection(link, self.rate)
+        if not self._may_connect(link):
+            self._end(connection, "another user's process, expected one of the daemon's own user")
+        elif self._is_held:
+            connection.refuse("another planner is connected")
+        else:
+            self._waiting.append(connection)
+            if len(self._waiting) > MOST_WAITING:
+                self._waiting.pop(0).refuse("too many connections without a setpoint")
+
+    def _read(self, connection: Connection) -> bool:
+        """Take the lines of a connection; returns whether one of them is a new setpoint."""
+        new = False
+        for line in connection.lines():
+            text = line.strip()
+            if not text:
+                continue
+            if not connection.admitted and self._admit(connection, text):
+                continue
+            if not connection.closed:
+                new |= self._take(connection, text)
+            if connection.closed:
+                break
+        return new
+
+    def _take(self, connection: Connection, text: bytes) -> bool:
+        try:
+            found = json.loads(text)["q"] if text.startswith(b"{") else text.split(b",")
+            values = [float(v) for v in found]
+        except (ValueError, KeyError, TypeError, RecursionError):
+            shown = text[:60].decode("utf-8", "replace")
+            self._end(connection, f'found {shown!r}, expected {{"q": [...]}}')
+            return False
+        if len(values) != self.n or not all(map(math.isfinite, values)):
+            words = f"found {len(values)} numbers, expected {self.n} finite ones, rad"
+            self._end(connection, words)
+            return False
+        if connection is not self._planner:
+            if self._is_held:
+                connection.refuse("another planner is connected")
+                return False
+            if self._planner is not None:
+                self._planner.refuse("silent, and another planner has taken the feed")
+            self._planner = connection
+        connection.heard = time.monotonic()
+        self._glide.take(np.array(values))
+        return True
+
+    def _end(self, connection: Connection, words: str) -> None:
+        self.refused += 1
+        connection.refuse(words)

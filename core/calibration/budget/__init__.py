@@ -1,0 +1,1 @@
+"""The uncertainty of the calibrated arm, input by input."""

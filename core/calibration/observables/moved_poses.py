@@ -1,0 +1,31 @@
+"""How the poses of a calibration's readings change with its parameters."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.calibration.readings import Readings
+from core.estimation.pose_jacobian import PoseColumns, pose_columns
+
+if TYPE_CHECKING:
+    from core.calibration.parameters import Parameters
+
+Array = NDArray[np.float64]
+SHARE = 0.01  # of a parameter's usual size, as the step of a difference
+
+
+def moved_poses(parameters: Parameters, values: Array, readings: Readings) -> PoseColumns:
+    """Return the TCP poses of the readings at ``values`` (p,), and their slopes (6, p, N)."""
+    model = parameters.model(values)
+    present = {(term.effect, term.site) for term in model.terms}
+    # a model leaves out terms of zeros, which have slopes nevertheless
+    model = model.with_terms([t for t in parameters.terms if (t.effect, t.site) not in present])
+    numbers = {(term.effect, term.site): i for i, term in enumerate(model.terms)}
+    chosen = []
+    for t, k in parameters.place:
+        term = parameters.terms[t]
+        chosen.append((numbers[term.effect, term.site], k))
+    return pose_columns(model, readings.q, readings.loads, chosen, SHARE * parameters.scales)

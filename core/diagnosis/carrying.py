@@ -1,0 +1,118 @@
+"""What carries from session to session: each cause's value, session by session.
+
+A cause is fitted with a value of its own in each session, all other causes shared. It carries where
+the values agree; where they differ by more than chance and by more than a model cares for, it has
+changed, and is named as changed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arm import Arm
+from core.diagnosis.selection.candidate import Candidate
+from core.diagnosis.selection.selection import Selection
+from core.effects import CATALOGUE, Reported
+
+Array = NDArray[np.float64]
+CHANCE = 0.001  # probability below which the values differ by more than chance
+MATTERS = 0.2  # share of a cause's size: sessions that differ by less are alike for a model
+SHOWN = 3.0  # whitened length of an effect of usual size from which a session shows it
+
+
+@dataclass(frozen=True)
+class Carried:
+    """One effect's values in the sessions that show it."""
+
+    effect: str
+    carries: bool
+    p_value: float  # that sessions with one value differ as much
+    values: tuple[tuple[int, tuple[Reported, ...]], ...]  # session, its parameters
+
+
+def carried(selection: Selection, chosen: Sequence[int], arm: Arm) -> tuple[Carried, ...]:
+    """Return how the effects of the ``chosen`` candidates carry; () where there is one session."""
+    session = selection.observation.session
+    if session is None:
+        return ()
+    of_row = np.repeat(session[selection.kept], selection.observation.measured.shape[1])
+    space = selection.space
+    effects = dict.fromkeys(space.candidates[c].family for c in chosen)
+    found = []
+    for effect in effects:
+        own = [c for c in chosen if space.candidates[c].family == effect]
+        rest = [c for c in chosen if c not in own]
+        one = _compared(selection, own, rest, of_row, arm)
+        if one is not None:
+            found.append(one)
+    return tuple(found)
+
+
+def _compared(
+    selection: Selection, own: list[int], rest: list[int], of_row: NDArray[np.int64], arm: Arm
+) -> Carried | None:
+    space, raw = selection.space, selection.raw
+    columns = raw.columns(space, own)
+    usual = np.concatenate([[p.scale for p in space.candidates[c].parameters] for c in own])
+    shown = [
+        int(s) for s in np.unique(of_row)
+        if np.sqrt(np.sum((columns[of_row == s] * usual) ** 2, axis=0)).max() > SHOWN
+    ]  # fmt: skip
+    if len(shown) < 2:
+        return None
+    width = columns.shape[1]
+    split = np.hstack([columns * (of_row == s)[:, None] for s in shown])
+    beside = np.hstack([raw.columns(space, rest), raw.nuisance])
+    A = np.hstack([split, beside])
+    size = np.sqrt(np.einsum("ij,ij->j", A, A)) + 1e-300
+    solution, *_ = np.linalg.lstsq(A / size, raw.target, rcond=1e-9)
+    left = raw.target - (A / size) @ solution
+    variance = max(float(left @ left) / max(len(left) - A.shape[1], 1), space.floor)
+    inverse = np.linalg.pinv((A / size).T @ (A / size), rcond=1e-10, hermitian=True)
+    covariance = (inverse * variance / np.outer(size, size))[: split.shape[1], : split.shape[1]]
+    values = (solution / size)[: split.shape[1]].reshape(len(shown), width)
+    p_value, matters = _differing(values, covariance, columns, of_row, shown)
+    told = []
+    for i, s in enumerate(shown):
+        block = slice(i * width, (i + 1) * width)
+        told.append((s, _reported(space.candidates, own, values[i], covariance[block, block], arm)))
+    effect = space.candidates[own[0]].family
+    return Carried(effect, not (p_value < CHANCE and matters), p_value, tuple(told))
+
+
+def _differing(
+    values: Array, covariance: Array, columns: Array, of_row: NDArray[np.int64], shown: list[int]
+) -> tuple[float, bool]:
+    """Return the probability of such differences (S, d) by chance, and whether they matter."""
+    from scipy.special import gammaincc
+
+    count, width = values.shape
+    C = np.kron(np.eye(count)[1:] - np.eye(count)[0], np.eye(width))  # each against the first
+    apart = C @ values.ravel()
+    spread = C @ covariance @ C.T
+    square = float(apart @ np.linalg.pinv(spread, rcond=1e-10, hermitian=True) @ apart)
+    p_value = float(gammaincc(len(apart) / 2, square / 2))
+    mean = values.mean(axis=0)
+    change = np.concatenate(
+        [columns[of_row == s] @ (values[i] - mean) for i, s in enumerate(shown)]
+    )
+    whole = np.concatenate([columns[of_row == s] @ mean for s in shown])
+    return p_value, bool(change @ change > MATTERS**2 * (whole @ whole))
+
+
+def _reported(
+    candidates: Sequence[Candidate], own: list[int], x: Array, covariance: Array, arm: Arm
+) -> tuple[Reported, ...]:
+    told: list[Reported] = []
+    at = 0
+    for c in own:
+        candidate = candidates[c]
+        d = len(candidate.parameters)
+        part = covariance[at : at + d, at : at + d]
+        told += CATALOGUE[candidate.family].reported(arm, candidate.term(x[at : at + d]), part)
+        at += d
+    return tuple(told)

@@ -1,0 +1,242 @@
+"""The position channel: measured TCP poses against predicted ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.observation import NotObservable, Observation, Predict, stacked
+from core.diagnosis.selection.unnamed import unnamed_rivals
+from core.effects import Term
+from core.errors import LogError
+from core.estimation.compliance_fit import Data, fit_nuisances
+from core.estimation.identification import pose_groups
+from core.estimation.registration import IDENTITY, Registration, frame_columns, register_robustly
+from core.loads import Loads
+from core.log.log import Log
+from core.metrology import Metrology
+from core.model import Model, Poses
+from core.rotation import rotation_matrix, rotation_vector
+from core.sessions import session_of, sessions_in
+
+Array = NDArray[np.float64]
+LEVER = 0.2  # m/rad: first weight of a rotation against a position
+VARIES = 1e-9  # spread below which a quantity counts as constant
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where the instrument stands, and where the target sits on the flange, in one session."""
+
+    frame: Registration
+    tool_in_flange: Array  # (4, 4)
+
+    def moved(self, step: Array) -> Placement:
+        """Return the placement after a small step: frame (6,), then tool (0, 3 or 6,), flange."""
+        tool = self.tool_in_flange.copy()
+        if len(step) > 6:
+            tool[:3, 3] += step[6:9]
+        if len(step) > 9:
+            tool[:3, :3] = rotation_matrix(step[9:12]) @ tool[:3, :3]
+        return Placement(self.frame.moved(step[:6]), tool)
+
+
+def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotObservable:
+    """Return the position channel of a log, or what it lacks.
+
+    Rows whose measured position is not finite are left out. Without a registered instrument the
+    frame of each session is estimated (robustly) and six nuisance columns keep it free; where the
+    target was remounted, three more (six with rotations) keep each session's tool point free.
+    Raises LogError where joints, loads or temperatures hold something unusable, or a session has
+    too few poses for a frame of its own.
+    """
+    if log.get("measured_position") is None:
+        return NotObservable("position", ("measured_position",))
+    if not (log.has("actual_q") or log.has("target_q")):
+        return NotObservable("position", ("actual_q",))
+    index, parts = session_of(log), []
+    for s, part in enumerate(sessions_in(log)):
+        seen = _observe_session(model, part, metrology)
+        if seen is None:
+            continue
+        _check_enough(seen, part, log.session_names[s] if log.session_names else "")
+        own_rows = np.flatnonzero(index == s)[seen.rows]
+        parts.append(_numbered(seen, s, own_rows))
+    if not parts:
+        return NotObservable("position", ("measured_position",))
+    if len(log.session_names) < 2:
+        return replace(parts[0], session=None)
+    rows = np.concatenate([part.rows for part in parts])
+    found = quantities(log, rows) | approaches(log.loads().approach, rows)
+    for k in range(3):  # the sessions' frames differ: positions compare in base only
+        found[f"measured_position_{k}"] = np.concatenate([p.measured[:, k] for p in parts])
+    return stacked(parts, found)
+
+
+def _numbered(seen: Observation, session: int, rows: NDArray[np.int64]) -> Observation:
+    """Return a session's observation with its number and its rows in the joined log."""
+    rebase = seen.rebase
+
+    def moved(step: Array) -> Observation:
+        assert rebase is not None
+        return _numbered(rebase(step), session, rows)
+
+    return replace(
+        seen, rows=rows, session=np.full(len(rows), session),
+        rebase=None if rebase is None else moved,
+    )  # fmt: skip
+
+
+def _check_enough(seen: Observation, log: Log, name: str) -> None:
+    """Raise LogError where a session of several has too few poses for its nuisances."""
+    N, k, p = seen.nuisance.shape
+    if name and N * k < p + 3:
+        raise LogError(
+            f"{log.path}: session {name}: found {N} measured pose(s), expected at least "
+            f"{-(-(p + 3) // k)}: its frame{' and tool point' if p > 6 else ''} are fitted on them"
+        )
+
+
+def _observe_session(
+    model: Model, log: Log, metrology: Metrology, placement: Placement | None = None
+) -> Observation | None:
+    """Return the position channel of one session, or None where nothing was measured."""
+    q = log.require("actual_q", "target_q")
+    measured, turned = log.columns["measured_position"], log.get("measured_rotation")
+    whole_pose = measured if turned is None else np.hstack([measured, turned])
+    rows = np.flatnonzero(np.isfinite(whole_pose).all(axis=1))
+    if not len(rows):
+        return None
+    q, measured, loads = q[rows], measured[rows], log.loads()[rows]
+    rotation = None if turned is None else rotation_matrix(turned[rows])
+    if placement is None:
+        placement = _placed(model, Data(q, loads, measured, rotation, metrology.registered),
+                            metrology)  # fmt: skip
+    frame = placement.frame
+    model = replace(model, tool_in_flange=placement.tool_in_flange)
+    poses = model.predict(q, loads)
+    in_base = frame.in_base(measured)
+    reference = None if rotation is None else frame.rotation_in_base(rotation)
+
+    k = 3 if reference is None else 6
+    value = in_base if reference is None else np.hstack([in_base, np.zeros((len(rows), 3))])
+    nuisance = np.zeros((len(rows), k, 0))
+    if not metrology.registered:
+        nuisance = -frame_columns(in_base)[:, :k]
+    if metrology.remounted:
+        nuisance = np.concatenate([nuisance, _tool_columns(model, poses, k)], axis=2)
+    form = model.linear_form(q, loads)
+    placed = placement
+
+    def rebase(step: Array) -> Observation:
+        whole = np.concatenate([np.zeros(6), step]) if metrology.registered else step
+        moved = _observe_session(model, log, metrology, placed.moved(whole))
+        assert moved is not None
+        return moved
+
+    return Observation(
+        channel="position",
+        unit="m",
+        measured=value,
+        predict=_prediction(model, q, loads, reference),
+        nuisance=nuisance,
+        weight=np.repeat([1.0, LEVER], 3)[:k],
+        sigma=float(np.hypot(metrology.sigma, metrology.repeatability or 0.0)),
+        sigma_is_whole=metrology.repeatability is not None,
+        quantities=quantities(log, rows) | approaches(loads.approach),
+        groups=pose_groups(q) if len(q) <= 3000 else rounded_groups(q),
+        rows=rows,
+        axes=("x", "y", "z", "rx", "ry", "rz")[:k],
+        joint_columns=form.jacobian[:, :k],
+        axial_moment=np.einsum("nij,nji->ni", form.moment, form.jacobian[:, 3:]),
+        unnamed=lambda: unnamed_rivals(model, q, loads, k),
+        tool_axes=poses.rotation,
+        times=loads.time,
+        rebase=rebase if nuisance.shape[2] else None,
+    )
+
+
+def rounded_groups(q: Array, tolerance: float = 1e-3) -> NDArray[np.int64]:
+    """Return a number per row (N,): rows alike when rounded to ``tolerance`` (rad) share one.
+
+    Of many rows; a pair on either side of a rounding border counts as two poses.
+    """
+    rounded = np.round(q / tolerance)
+    return np.asarray(np.unique(rounded, axis=0, return_inverse=True)[1].reshape(-1))
+
+
+def session_model(model: Model, log: Log, metrology: Metrology) -> Model:
+    """Return the model with the tool point of one session, where it was remounted."""
+    if not metrology.remounted or metrology.registered or not log.has("measured_position"):
+        return model
+    q = log.require("actual_q", "target_q")
+    measured = log.columns["measured_position"]
+    rows = np.flatnonzero(np.isfinite(measured).all(axis=1))
+    if 3 * len(rows) < 12:
+        return model
+    data = Data(q[rows], log.loads()[rows], measured[rows], None, registered=False)
+    tool = _placed(model, data, metrology).tool_in_flange
+    return replace(model, tool_in_flange=tool)
+
+
+def _placed(model: Model, data: Data, metrology: Metrology) -> Placement:
+    """Return a first estimate of what is free in a session, outliers down-weighted."""
+    frame, tool = IDENTITY, model.tool_in_flange
+    if not metrology.registered:
+        frame = register_robustly(data.position, model.predict(data.q, data.loads).position)
+    if metrology.remounted and not metrology.registered:
+        fit = fit_nuisances(model, data)
+        frame, tool = fit.frame, fit.model.tool_in_flange
+    return Placement(frame, tool)
+
+
+def _tool_columns(model: Model, poses: Poses, k: int) -> Array:
+    """Return d prediction / d tool point (N, k, 3), with rotations (N, 6, 6), flange axes."""
+    flange = poses.rotation @ model.tool_in_flange[:3, :3].T
+    columns = np.zeros((len(flange), k, k))
+    columns[:, :3, :3] = flange
+    if k == 6:
+        columns[:, 3:, 3:] = flange
+    return columns
+
+
+def _prediction(model: Model, q: Array, loads: Loads, reference: Array | None) -> Predict:
+    """Return terms -> positions (N, 3), with rotations as vectors off ``reference`` (N, 6)."""
+
+    def predict(terms: Sequence[Term]) -> Array:
+        real = model.with_terms(terms).predict(q, loads)
+        if reference is None:
+            return real.position
+        # rotations as small vectors against the measured ones, so that gaps simply subtract
+        off = rotation_vector(real.rotation @ np.swapaxes(reference, 1, 2))
+        return np.hstack([real.position, off])
+
+    return predict
+
+
+def quantities(log: Log, rows: NDArray[np.int64]) -> dict[str, Array]:
+    """Return every scalar column of the log that varies over ``rows``, by its name in the log."""
+    found: dict[str, Array] = {}
+    q = "actual_q" if log.has("actual_q") else "target_q"
+    for name in ("timestamp", "session", q, "payload", "payload_cog", "joint_temperatures",
+                 "actual_TCP_force", "measured_position"):  # fmt: skip
+        column = log.get(name)
+        if column is None:
+            continue
+        values = column[rows].reshape(len(rows), -1)
+        for i in range(values.shape[1]):
+            if np.isfinite(values[:, i]).all() and np.ptp(values[:, i]) > VARIES:
+                found[name if column.ndim == 1 else f"{name}_{i}"] = values[:, i]
+    return found
+
+
+def approaches(approach: Array | None, rows: NDArray[np.int64] | None = None) -> dict[str, Array]:
+    """Return the joints' last motions as quantities, where both directions occur often enough."""
+    if approach is None:
+        return {}
+    approach = approach if rows is None else approach[rows]
+    both = (np.sum(approach > 0, axis=0) >= 4) & (np.sum(approach < 0, axis=0) >= 4)
+    return {f"approach_{i}": approach[:, i] for i in np.flatnonzero(both)}

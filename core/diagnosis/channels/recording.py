@@ -1,0 +1,118 @@
+"""What the channels of recordings share: which rows are samples, conditions, quantities."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.derivatives import signal_noise
+from core.diagnosis.observation import HELD
+from core.estimation.identification import pose_groups
+from core.log.log import Log
+from core.motion import Motion
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+MOST_SAMPLES = 30_000  # rows judged of a long log, evenly picked: what memory holds
+STRETCHES = 24  # conditions of a recording: even stretches of time
+FEWEST_CONDITIONS = 5
+SMALLEST_TORQUE = 1e-3  # Nm
+HARDLY = 1e-3  # share of the largest held torque by which one has to change to count
+REPEATED = 0.5  # distinct values over samples below which a signal comes in steps
+VARIES = 1e-9  # spread below which a quantity counts as constant
+
+
+def picked(usable: NDArray[np.bool_], most: int = MOST_SAMPLES) -> Index:
+    """Return at most ``most`` of the usable rows, evenly spread."""
+    rows = np.flatnonzero(usable)
+    if len(rows) <= most:
+        return rows
+    return rows[np.round(np.linspace(0, len(rows) - 1, most)).astype(np.int64)]
+
+
+def conditions(motion: Motion) -> Index:
+    """Return the condition of each row: its stretch of time if moving, else its pose.
+
+    Where the log holds fewer than five poses, another load counts as another condition.
+    """
+    if motion.moving:
+        t = motion.recorded_time
+        number = t / max(float(t[-1]), 1e-9) * STRETCHES
+        return np.asarray(np.minimum(number.astype(np.int64), STRETCHES - 1))
+    loads = motion.loads
+    groups = pose_groups(motion.q)
+    if groups.max() + 1 >= FEWEST_CONDITIONS:
+        return groups
+    given = [loads.payload_mass, loads.payload_cog, loads.wrench]
+    columns = [np.asarray(c).reshape(len(motion), -1) for c in given if c is not None]
+    table = np.column_stack([groups, *columns])
+    found = np.unique(np.round(table, 6), axis=0, return_inverse=True)[1].reshape(-1)
+    if found.max() + 1 >= FEWEST_CONDITIONS:
+        return np.asarray(found)
+    return np.arange(len(motion))
+
+
+def quantities(log: Log, motion: Motion) -> dict[str, Array]:
+    """Return what a leftover may depend on: columns of the log, and speeds, where they vary."""
+    found: dict[str, Array] = {}
+    columns: dict[str, Array | None] = {
+        "timestamp": motion.t,
+        "actual_q" if log.has("actual_q") else "target_q": motion.q,
+        "actual_qd": motion.qd,
+    }
+    for name in ("session", "payload", "payload_cog", "joint_temperatures", "actual_TCP_force"):
+        column = log.get(name)
+        columns[name] = None if column is None else column[motion.rows]
+    for name, values in columns.items():
+        if values is None:
+            continue
+        table = values.reshape(len(motion), -1)
+        for i in range(table.shape[1]):
+            if np.isfinite(table[:, i]).all() and np.ptp(table[:, i]) > VARIES:
+                found[name if values.ndim == 1 else f"{name}_{i}"] = table[:, i]
+    return found
+
+
+def held_torques(motion: Motion) -> dict[str, Array]:
+    """Return the torques that the joints hold, where they vary, as quantities."""
+    if motion.held is None:
+        return {}
+    largest = max(float(np.abs(motion.held).max(initial=0.0)), SMALLEST_TORQUE)
+    return {
+        f"{HELD}_{i}": motion.held[:, i]
+        for i in np.flatnonzero(np.ptp(motion.held, axis=0) > HARDLY * largest)
+    }
+
+
+def instrument_noise(signal: Array, motion: Motion) -> Array | None:
+    """Return 1 sigma (k,) of a recorded signal (N, k) by differences of neighbouring samples.
+
+    Not less than its resolution makes (a step over the root of 12). None for poses at rest, whose
+    neighbours in the log have nothing in common.
+    """
+    if not motion.moving:
+        return None
+    whole = np.isfinite(signal).all(axis=1)
+    step = signal_step(signal[whole])
+    return np.maximum(signal_noise(signal[whole]), step / np.sqrt(12))
+
+
+def signal_step(signal: Array) -> Array:
+    """Return the step (k,) in which each signal (N, k) is reported; 0 where it has none."""
+    steps = np.zeros(signal.shape[1])
+    for j, values in enumerate(signal.T):
+        distinct = np.unique(values)
+        # a continuous signal repeats no value; a stepped one has far fewer values than samples
+        if 2 < len(distinct) < REPEATED * len(values):
+            steps[j] = float(np.diff(distinct).min())
+    return steps
+
+
+def joint_axes(n: int) -> tuple[str, ...]:
+    """Return the names of coordinates that are joints."""
+    return tuple(f"joint {i + 1}" for i in range(n))
+
+
+def own_joints(count: int, n: int) -> Array:
+    """Return the joint columns (N, n, n) of channels whose coordinates are the joints."""
+    return np.broadcast_to(np.eye(n), (count, n, n))

@@ -1,0 +1,79 @@
+"""Another simulator's prediction, row by row, in place of the model's own.
+
+The user's simulator says where the arm should be; the model only says how an effect changes that.
+Its values travel with the log under names of their own, so that rows stay together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.observation import NotObservable, Observation
+from core.effects import Term
+from core.errors import LogError
+from core.log.log import Log
+from core.metrology import Metrology
+from core.model import Model
+
+Array = NDArray[np.float64]
+Observe = Callable[[Model, Log, Metrology], Observation | NotObservable]
+SHOWN_BY = {
+    "position": "measured_position",
+    "wrench": "ft_raw_wrench",
+    "tracking": "actual_q",
+    "torque": "actual_current_as_torque",
+}
+PREFIX = "simulated "
+
+
+def joined(log: Log, simulated: Log) -> Log:
+    """Return the log with the simulator's values beside its own.
+
+    Raises LogError where the two have not the same rows, or the simulator's has nothing to compare.
+    """
+    if len(simulated) != len(log):
+        raise LogError(
+            f"{simulated.path}: found {len(simulated)} rows, expected {len(log)} as in {log.path}"
+        )
+    found = {
+        PREFIX + name: simulated.require(name) for name in SHOWN_BY.values() if simulated.has(name)
+    }
+    if not found:
+        wanted = ", ".join(f"{name}_0.." for name in SHOWN_BY.values())
+        raise LogError(f"{simulated.path}: columns: found no prediction, expected one of {wanted}")
+    return replace(log, columns={**log.columns, **found})
+
+
+def predicted_by(channel: str, observe: Observe) -> Observe:
+    """Return an observer whose prediction is the simulator's; a channel it lacks is not seen."""
+
+    def seen_by_simulator(
+        model: Model, log: Log, metrology: Metrology
+    ) -> Observation | NotObservable:
+        values = log.get(PREFIX + SHOWN_BY[channel])
+        seen = observe(model, log, metrology)
+        if isinstance(seen, NotObservable):
+            return seen
+        if values is None:
+            return NotObservable(channel, (f"{SHOWN_BY[channel]} (in the simulator's log)",))
+        return _with_prediction(seen, values)
+
+    return seen_by_simulator
+
+
+def _with_prediction(seen: Observation, values: Array) -> Observation:
+    own, rebase = seen.predict, seen.rebase
+    nominal = own(())
+    base = nominal.copy()
+    part = values[seen.rows]
+    base[:, : part.shape[1]] = part  # rotations, where measured, stay the model's
+
+    def predict(terms: Sequence[Term]) -> Array:
+        return np.asarray(base + (own(terms) - nominal)) if terms else base
+
+    moved = None if rebase is None else lambda step: _with_prediction(rebase(step), values)
+    return replace(seen, predict=predict, rebase=moved)

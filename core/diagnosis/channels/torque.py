@@ -1,0 +1,118 @@
+"""The torque channel: measured joint torques against the rigid arm's inverse dynamics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.channels.recording import (
+    conditions,
+    instrument_noise,
+    joint_axes,
+    own_joints,
+    picked,
+    quantities,
+)
+from core.diagnosis.observation import NotObservable, Observation
+from core.diagnosis.selection.unnamed import unnamed_pulls
+from core.dynamics import predict_torque, with_pieces
+from core.effects import Term
+from core.log.log import Log
+from core.metrology import Metrology
+from core.model import Model
+from core.motion import Motion, motion_of
+from core.sessions import session_of
+
+Array = NDArray[np.float64]
+ENOUGH = 0.4  # share of rows that must remain for rests to be left out too
+BRIEF = 0.15  # s: a joint that is slow for no longer is turning round, not resting
+
+
+def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotObservable:
+    """Return the torque channel of a log (Nm, one coordinate a joint), or what it lacks.
+
+    Rows without derivatives (edges, gaps), with a torque that is not finite, or in which a joint
+    turns round, so that nobody knows the sign of its friction, are left out; of long logs at most
+    30,000 rows are taken, evenly, after the derivatives. An arm whose links have no mass has no
+    torques to compare with. Raises LogError where the log holds something unusable.
+    """
+    measured = log.get("actual_current_as_torque")
+    lacking = _lacking(model, log)
+    if measured is None or lacking:
+        return NotObservable("torque", lacking)
+    whole = motion_of(log)
+    finite = np.isfinite(measured[whole.rows]).all(axis=1)
+    rows = picked(whole.valid & finite & _steady(whole))
+    if not len(rows):
+        return NotObservable("torque", ("actual_current_as_torque",))
+    return _observed(model, log, measured, whole, rows)
+
+
+def _observed(
+    model: Model, log: Log, measured: Array, whole: Motion, rows: NDArray[np.int64]
+) -> Observation:
+    """Return the channel at some rows of the motion."""
+    motion = with_pieces(model, whole.pick(rows))
+
+    def predict(terms: Sequence[Term]) -> Array:
+        return predict_torque(model, motion, terms)
+
+    n = model.arm.n
+    return Observation(
+        channel="torque",
+        unit="Nm",
+        measured=measured[motion.rows],
+        predict=predict,
+        nuisance=np.zeros((len(motion), n, 0)),
+        weight=np.ones(n),
+        sigma=0.0,
+        sigma_is_whole=False,
+        quantities=quantities(log, motion),
+        groups=conditions(motion),
+        rows=motion.rows,
+        axes=joint_axes(n),
+        joint_columns=own_joints(len(motion), n),
+        order_in_time=motion.moving,
+        friction=motion.direction if motion.moving else None,
+        unnamed=lambda: unnamed_pulls(model, motion, "torque"),
+        instrument=instrument_noise(measured[whole.rows], whole),
+        fewer=lambda take: _observed(model, log, measured, whole, rows[take]),
+        session=session_of(log)[motion.rows] if log.session_names else None,
+    )
+
+
+def _lacking(model: Model, log: Log) -> tuple[str, ...]:
+    needs = [] if log.has("actual_current_as_torque") else ["actual_current_as_torque"]
+    if not (log.has("actual_q") or log.has("target_q")):
+        needs.append("actual_q")
+    if not model.arm.mass.any():
+        needs.append("masses of the links (in the cell's robot)")
+    return tuple(needs)
+
+
+def _steady(motion: Motion) -> NDArray[np.bool_]:
+    """Return the rows (N,) in which every joint's friction has a known sign, as far as can be.
+
+    Joints that never move count as known (no friction). Where joints move one at a time, so that
+    some joint rests in most rows, only the turning round is left out.
+    """
+    keep = np.ones(len(motion), dtype=bool)
+    if not motion.moving:
+        return keep
+    slow = motion.turning
+    if np.mean(~slow.any(axis=1)) >= ENOUGH:
+        return np.asarray(~slow.any(axis=1))
+    for j in range(slow.shape[1]):
+        for first, last in _runs(slow[:, j]):
+            if motion.t[last] - motion.t[first] < BRIEF:
+                keep[first : last + 1] = False
+    return keep
+
+
+def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return first and last index of each run of True."""
+    edges = np.diff(np.concatenate([[0], flags.astype(int), [0]]))
+    first, last = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
+    return [(int(a), int(b)) for a, b in zip(first, last, strict=True)]

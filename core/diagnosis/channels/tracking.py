@@ -1,0 +1,130 @@
+"""The tracking channel: where the encoders stand against where they were told to be."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.channels.recording import (
+    Index,
+    conditions,
+    held_torques,
+    instrument_noise,
+    joint_axes,
+    own_joints,
+    picked,
+    quantities,
+)
+from core.diagnosis.observation import NotObservable, Observation, Predict
+from core.dynamics import predict_tracking, with_held
+from core.effects import Term
+from core.log.log import Log
+from core.metrology import Metrology
+from core.model import Model
+from core.motion import Motion, motion_of
+from core.sessions import session_of
+
+Array = NDArray[np.float64]
+SHORTEST_LEAD = 0.1  # s left out at the start of each stretch, whose past is unknown
+TEXT = 2e-7  # rad: smaller differences come from how the log was written
+REMEMBERED = 64  # predictions of one joint
+LEADS = 4.0  # times the delay: what is left out where it is longer
+
+
+def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotObservable:
+    """Return the tracking channel of a log (rad, one coordinate a joint), or what it lacks.
+
+    Delays are predicted on every row; of long logs at most 30,000 rows are compared, evenly. The
+    start of each stretch is left out, because the commands before it are unknown. ``sigma`` is the
+    encoder's step over the root of 12. Raises LogError where the log holds something unusable.
+    """
+    needs = tuple(name for name in ("target_q", "actual_q") if not log.has(name))
+    if needs:
+        return NotObservable("tracking", needs)
+    motion = with_held(model, motion_of(log))
+    return _observed(model, log, motion, picked(_known_past(motion)))
+
+
+def _observed(model: Model, log: Log, motion: Motion, rows: Index) -> Observation:
+    """Return the channel at some rows of the motion."""
+    part = motion.pick(rows)
+    n, target = model.arm.n, motion.target_q
+    assert target is not None
+    return Observation(
+        channel="tracking",
+        unit="rad",
+        measured=part.q,
+        predict=_following(model, motion, rows),
+        nuisance=np.zeros((len(part), n, 0)),
+        weight=np.ones(n),
+        sigma=encoder_step(log.require("actual_q")) / np.sqrt(12),
+        sigma_is_whole=False,
+        quantities=held_torques(part) | quantities(log, part),
+        groups=conditions(part),
+        rows=part.rows,
+        axes=joint_axes(n),
+        joint_columns=own_joints(len(part), n),
+        order_in_time=motion.moving,
+        instrument=instrument_noise(motion.q - target, motion),
+        fewer=lambda take: _observed(model, log, motion, rows[take]),
+        session=session_of(log)[part.rows] if log.session_names else None,
+    )
+
+
+def _following(model: Model, motion: Motion, rows: Index) -> Predict:
+    """Return where the encoders of some rows stand under further terms.
+
+    A fit asks again and again with one joint changed: the others are remembered.
+    """
+    plain: Array = predict_tracking(model, motion)[rows]
+
+    @lru_cache(maxsize=REMEMBERED)
+    def joint_under(joint: int, own: tuple[Term, ...]) -> Array:
+        return np.asarray(predict_tracking(model, motion, own)[rows, joint - 1])
+
+    def predict(terms: Sequence[Term]) -> Array:
+        if any(term.site.joint is None for term in terms):
+            return np.asarray(predict_tracking(model, motion, terms)[rows])
+        told = plain.copy()
+        for joint in {term.site.joint for term in terms if term.site.joint is not None}:
+            own = tuple(term for term in terms if term.site.joint == joint)
+            told[:, joint - 1] = joint_under(joint, own)
+        return told
+
+    return predict
+
+
+def encoder_step(q: Array) -> float:
+    """Return the step (rad) in which encoder angles (N, n) are told; 0 where they have none."""
+    steps = []
+    for angles in q.T:
+        gaps = np.diff(np.unique(angles))
+        gaps = gaps[gaps > TEXT]
+        if len(gaps) < 20:
+            continue
+        step = float(np.quantile(gaps, 0.05))
+        few = gaps[gaps < 20.5 * step] / step
+        whole = np.abs(few - np.round(few)) < 0.1
+        if len(few) >= 10 and whole.mean() > 0.9:
+            steps.append(step)
+    return float(np.median(steps)) if steps else 0.0
+
+
+def _known_past(motion: Motion) -> NDArray[np.bool_]:
+    """Return the rows (N,) whose commands before them are in the log."""
+    keep = np.ones(len(motion), dtype=bool)
+    if not motion.moving:
+        return keep
+    assert motion.target_q is not None
+    # the slope of the gap over the speed is the whole delay, joint by joint
+    behind = ((motion.target_q - motion.q) * motion.qd).sum(axis=0)
+    speed = (motion.qd**2).sum(axis=0)
+    delay = np.where(speed > 1e-6 * len(motion), behind / np.maximum(speed, 1e-12), 0.0)
+    lead = max(SHORTEST_LEAD, LEADS * float(np.abs(delay).max()))
+    begins = np.concatenate([[True], np.diff(motion.stretch) > 0])
+    since = motion.t - np.maximum.accumulate(np.where(begins, motion.t, -np.inf))
+    late = since >= min(lead, 0.25 * float(motion.t[-1] - motion.t[0]))
+    return np.asarray(late) if late.any() else keep

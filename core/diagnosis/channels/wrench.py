@@ -1,0 +1,119 @@
+"""The wrench channel: the flange sensor against what payload and pull do to it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.derivatives import signal_noise
+from core.diagnosis.channels.recording import (
+    VARIES,
+    conditions,
+    instrument_noise,
+    picked,
+    quantities,
+)
+from core.diagnosis.observation import NotObservable, Observation
+from core.diagnosis.selection.unnamed import unnamed_pulls
+from core.dynamics import predict_wrench, with_pieces
+from core.effects import Term
+from core.log.log import Log
+from core.metrology import Metrology
+from core.model import Model
+from core.motion import Motion, motion_of
+from core.sessions import session_of
+
+Array = NDArray[np.float64]
+AXES = ("fx", "fy", "fz", "mx", "my", "mz")
+USUAL_WEIGHT = 10.0  # N/Nm between force and torque where the log does not tell
+WEIGHTS = (1.0, 1000.0)  # N/Nm, the range that a sensor can have
+
+
+def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotObservable:
+    """Return the wrench channel of a log (N), or what it lacks.
+
+    Torques are weighed by the ratio of the noise of forces to that of torques. Rows without
+    derivatives and rows whose wrench is not finite are left out; of long logs at most 30,000 rows
+    are taken, evenly, after the derivatives. Raises LogError where the log holds something
+    unusable.
+    """
+    measured = log.get("ft_raw_wrench")
+    needs = [] if measured is not None else ["ft_raw_wrench"]
+    if not (log.has("actual_q") or log.has("target_q")):
+        needs.append("actual_q")
+    if measured is None or needs:
+        return NotObservable("wrench", tuple(needs))
+    whole = motion_of(log)
+    rows = picked(whole.valid & np.isfinite(measured[whole.rows]).all(axis=1))
+    if not len(rows):
+        return NotObservable("wrench", ("ft_raw_wrench",))
+    return _observed(model, log, measured, whole, rows)
+
+
+def _observed(
+    model: Model, log: Log, measured: Array, whole: Motion, rows: NDArray[np.int64]
+) -> Observation:
+    """Return the channel at some rows of the motion."""
+    motion = with_pieces(model, whole.pick(rows))
+    value = measured[motion.rows]
+
+    def predict(terms: Sequence[Term]) -> Array:
+        return predict_wrench(model, motion, terms)
+
+    expected = predict(())
+    noise = _noise(measured[whole.rows], whole, value, expected, motion)
+    return Observation(
+        channel="wrench",
+        unit="N",
+        measured=value,
+        predict=predict,
+        nuisance=np.zeros((len(motion), 6, 0)),
+        weight=np.repeat([1.0, torque_weight(noise, value)], 3),
+        sigma=0.0,
+        sigma_is_whole=False,
+        quantities=quantities(log, motion) | _readings(expected),
+        groups=conditions(motion),
+        rows=motion.rows,
+        axes=AXES,
+        order_in_time=motion.moving,
+        unnamed=lambda: unnamed_pulls(model, motion, "wrench"),
+        instrument=instrument_noise(measured[whole.rows], whole),
+        fewer=lambda take: _observed(model, log, measured, whole, rows[take]),
+        session=session_of(log)[motion.rows] if log.session_names else None,
+    )
+
+
+def _readings(wrench: Array) -> dict[str, Array]:
+    """Return the expected readings (N, 6) as quantities: a bad sensor errs by what it carries."""
+    spread = np.ptp(wrench, axis=0)
+    return {f"ft_raw_wrench_{i}": wrench[:, i] for i in np.flatnonzero(spread > VARIES)}
+
+
+def torque_weight(noise: Array, wrench: Array) -> float:
+    """Return N/Nm that makes torques comparable with forces: the ratio of their noise (6,)."""
+    force, torque = (float(np.sqrt(np.mean(noise[k] ** 2))) for k in (slice(3), slice(3, 6)))
+    tiny = 1e-7 * max(float(np.abs(wrench).max()), 1e-3)
+    if not (force > tiny and torque > 1e-2 * tiny):
+        return USUAL_WEIGHT  # no noise to speak of
+    return float(np.clip(force / torque, *WEIGHTS))
+
+
+def _noise(sensor: Array, whole: Motion, value: Array, predicted: Array, motion: Motion) -> Array:
+    """Return the noise of each axis (6,): white noise if moving, else what a loose fit leaves."""
+    if whole.moving:
+        kept = sensor[np.isfinite(sensor).all(axis=1)]
+        return signal_noise(kept)
+    assert motion.pieces is not None
+    time = (motion.t - motion.t[0]) / max(float(np.ptp(motion.t)), 1.0)
+    design = [np.ones((len(motion), 1)), time[:, None], predicted, motion.pieces.payload_wrench]
+    while design:
+        loose = np.column_stack(design)
+        spare = len(motion) - np.linalg.matrix_rank(loose)
+        if spare >= max(5, len(motion) // 4):
+            left = value - loose @ np.linalg.lstsq(loose, value, rcond=None)[0]
+            typical = 1.4826 * np.median(np.abs(left), axis=0)
+            return np.asarray(typical * np.sqrt(len(motion) / spare))
+        design.pop()
+    return np.zeros(6)

@@ -1,0 +1,134 @@
+"""Every row judges: what a search on some rows found is fitted anew, and judged, on all of them.
+
+A search needs thousands of columns and looks at a part of a long log; the few candidates that it
+found, and their rivals, fit into memory for every row. There values, ties and gains are decided.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.criteria import TIE
+from core.diagnosis.held_out import HeldOut
+from core.diagnosis.judgement import Judgement
+from core.diagnosis.observation import Observation
+from core.diagnosis.selection.candidate import Candidate
+from core.diagnosis.selection.following import exact_columns
+from core.diagnosis.selection.geometry import links_of
+from core.diagnosis.selection.local_search import rivals
+from core.diagnosis.selection.noise import carried_to
+from core.diagnosis.selection.outliers import inliers
+from core.diagnosis.selection.problem import fit
+from core.diagnosis.selection.refit import refit
+from core.diagnosis.selection.selection import Selection, standing
+from core.diagnosis.selection.state import Work, sample_space
+from core.effects import Term
+from core.model import Model
+
+Array = NDArray[np.float64]
+MOST_RIVALS = 12  # of all causes together
+
+
+def on_every_row(
+    selection: Selection, accused: Sequence[int], whole: Observation, model: Model
+) -> Selection:
+    """Return the selection with its ``accused`` terms (positions) refitted on ``whole``.
+
+    Its space holds the named terms found, at their positions, and the accused ones' rivals.
+    """
+    candidates = [selection.space.candidates[c] for c in selection.term_index]
+    candidates += _rivals(selection, accused)
+    terms = tuple(selection.terms[p] for p in accused)
+    placed = _placed(whole, terms)
+    noise = carried_to(placed, selection.noise)
+    work = Work(placed, model.arm, candidates, noise, np.ones(len(placed.rows), dtype=bool))
+    work.kept = inliers(work, placed.measured - placed.predict(terms))
+    base = terms if placed.channel != "tracking" else ()
+    columns = [exact_columns(placed, c, base) for c in candidates]
+    space, raw = sample_space(work, columns, base, [])
+    links = {p: selection.prior[c] for p, c in enumerate(selection.term_index)
+             if c in selection.prior and p in accused}  # fmt: skip
+    near = links_of(space, links).beside(space, links) if links else space
+    found = fit(near, tuple(p for p in accused if p not in links))
+    fitted, index, spread, residual = refit(work, space, found, links)
+    values, covariance = list(selection.terms), list(selection.covariance)
+    for c, term, own in zip(index, fitted, spread, strict=True):
+        values[c], covariance[c] = term, own
+    return Selection(
+        work.observation, space, found, tuple(values), tuple(range(len(values))),
+        tuple(covariance), work.kept, noise, residual, base, raw, links,
+    )  # fmt: skip
+
+
+def still_accused(
+    selection: Selection, judgement: Judgement, held: HeldOut, model: Model
+) -> tuple[Selection, Judgement]:
+    """Return what all rows leave accused: effects that shrink the gap where nothing was fitted.
+
+    The weakest goes first. Ties that all rows decide are none any more.
+    """
+    accused, withdrawn = list(judgement.accused), list(judgement.withdrawn)
+    while accused and held.possible:
+        effects = dict.fromkeys(selection.terms[p].effect for p in accused)
+        gain = {
+            effect: held.shrink(
+                accused, [p for p in accused if selection.terms[p].effect != effect]
+            ).interval[0]
+            for effect in effects
+        }
+        weakest = min(gain, key=lambda effect: gain[effect])
+        if gain[weakest] > 0:
+            break
+        gone = [p for p in accused if selection.terms[p].effect == weakest]
+        accused = [p for p in accused if p not in gone]
+        withdrawn += [(p, "over all rows the gap does not shrink by it") for p in gone]
+    if tuple(accused) != judgement.accused:
+        whole = standing(selection, model.arm, accused)
+        links = {p: own for p, own in selection.prior.items() if p in accused}
+        whole = replace(whole, prior=links)
+        single = tuple(p for p in accused if p not in links)
+        selection = replace(whole, found=fit(whole.working, single))
+    ties = {p: _ties(selection, p) for p in accused if p not in selection.prior}
+    return selection, replace(
+        judgement, accused=tuple(accused), withdrawn=tuple(withdrawn), ties=ties
+    )
+
+
+def _ties(selection: Selection, position: int) -> tuple[str, ...]:
+    own = selection.terms[position].effect
+    names = (
+        selection.space.candidates[other].family
+        for _, other in rivals(selection.working, selection.found, position, TIE)
+    )
+    return tuple(dict.fromkeys(name for name in names if name != own))
+
+
+def _rivals(selection: Selection, accused: Sequence[int]) -> list[Candidate]:
+    """Return the named candidates that explain as well, on the searched rows, as an accused one."""
+    space = selection.working
+    near: dict[int, float] = {}
+    for p in accused:
+        if selection.term_index[p] in selection.prior:
+            continue
+        for score, other in rivals(space, selection.found, selection.term_index[p], TIE):
+            if space.candidates[other].named and other not in selection.term_index:
+                near[other] = min(score, near.get(other, np.inf))
+    best = sorted(near, key=lambda c: near[c])[:MOST_RIVALS]
+    return [space.candidates[c] for c in best]
+
+
+def _placed(whole: Observation, terms: Sequence[Term]) -> Observation:
+    """Return the observation with its frames fitted to the terms found."""
+    if whole.rebase is None:
+        return whole
+    gap = whole.measured - whole.predict(terms)
+    weight = whole.weight[: gap.shape[1], None]
+    A = (whole.nuisance * weight).reshape(gap.size, -1)
+    distance = np.linalg.norm(gap, axis=1)
+    row = np.repeat(1 / (1 + (distance / (3 * np.median(distance) + 1e-300)) ** 2), gap.shape[1])
+    b = (gap[..., None] * weight).ravel()
+    return whole.rebase(np.linalg.lstsq(A * row[:, None], b * row, rcond=1e-12)[0])

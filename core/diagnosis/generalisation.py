@@ -1,0 +1,167 @@
+"""What to expect where nothing was fitted: in another region of joint space, in another session.
+
+Poses that stand among the fitted ones flatter a model. For a *new region* the folds are regions of
+joint space (of a recording: stretches of time, with a gap to what is fitted); the frame comes from
+the fit's poses. For a *new session* the folds are sessions: the judged session gets a frame (and a
+tool point, if remounted) fitted on itself, and nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.observation import Observation
+from core.diagnosis.selection.selection import Selection
+from core.estimation.regions import joint_regions
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+REGIONS = 5  # of joint space, or stretches of time: each is left out whole
+MANY_ROWS = 6000  # of the sample space: from there sums instead of a decomposition of all rows
+TINY = 1e-12  # share of the largest eigenvalue
+FEWEST = 3  # samples of a region that the figure needs
+GAP = 0.02  # share of a recording on either side of a judged stretch that is not fitted either
+RANK = 1e-9
+
+
+@dataclass(frozen=True)
+class Generalisation:
+    """Figures of one coordinate, rms, in the channel's unit; None: cannot be had."""
+
+    new_region: float | None
+    new_session: float | None
+    by_session: tuple[tuple[int, float], ...] = ()  # session, its remainder when left out
+
+
+NOWHERE = Generalisation(None, None)
+
+
+def generalisation(selection: Selection, chosen: Sequence[int]) -> Generalisation:
+    """Return what ``chosen`` candidates leave where their fit saw nothing."""
+    problem = _Problem(selection, tuple(chosen))
+    new_region = problem.new_region()
+    each = problem.by_session()
+    left = np.concatenate([r for _, r in each]) if each else None
+    return Generalisation(
+        new_region, None if left is None else _rms(left), tuple((s, _rms(r)) for s, r in each)
+    )
+
+
+class _Problem:
+    """The whitened rows of a selection's kept samples: columns of the causes, nuisances, gap."""
+
+    def __init__(self, selection: Selection, chosen: tuple[int, ...]) -> None:
+        observation, kept = selection.observation, selection.kept
+        self._k = observation.measured.shape[1]
+        self._own = min(self._k, 3) if observation.channel in ("position", "wrench") else self._k
+        self._unwhiten = np.linalg.inv(selection.noise.whitener[kept])
+        raw = selection.raw
+        self._causes = raw.columns(selection.space, chosen)
+        self._pull = selection.pull(chosen)
+        self._nuisance, self._gap = raw.nuisance, raw.target
+        self._owner = np.array(observation.nuisance_session or (0,) * raw.nuisance.shape[1])
+        whole = observation.session
+        self._session = np.zeros(int(kept.sum()), dtype=np.int64) if whole is None else whole[kept]
+        self._fold, self._near = regions(observation, kept)
+
+    def new_region(self) -> float | None:
+        """Return the rms over regions left out in turn, frames from the fitted poses."""
+        left = []
+        for fold in range(int(self._fold.max()) + 1):
+            out = self._fold == fold
+            fitted = ~out & ~self._near[fold]
+            # a session without fitted poses has no frame there
+            framed = [s for s in np.unique(self._session) if self._enough(s, fitted)]
+            judged = out & np.isin(self._session, framed)
+            columns = np.isin(self._owner, framed)
+            A = np.hstack([self._causes, self._nuisance[:, columns]])
+            fitted &= np.isin(self._session, framed)
+            if judged.sum() < FEWEST or self._k * fitted.sum() <= A.shape[1]:
+                continue
+            x = _solved(A[self._rows(fitted)], self._gap[self._rows(fitted)], self._pull)
+            rows = self._rows(judged)
+            left.append(self._in_unit(self._gap[rows] - A[rows] @ x, judged))
+        if len(left) < 2:
+            return None
+        return _rms(np.concatenate(left))
+
+    def by_session(self) -> list[tuple[int, Array]]:
+        """Return each session's remainder (n, own) under a fit of the others, itself placed."""
+        sessions = np.unique(self._session)
+        found = []
+        for s in sessions if len(sessions) > 1 else ():
+            out = self._session == s
+            rest, own = self._owner != s, self._owner == s
+            A = np.hstack([self._causes, self._nuisance[:, rest]])
+            rows = self._rows(~out)
+            if len(self._gap[rows]) <= A.shape[1]:
+                continue
+            x = _solved(A[rows], self._gap[rows], self._pull)[: self._causes.shape[1]]
+            rows = self._rows(out)
+            left, N = self._gap[rows] - self._causes[rows] @ x, self._nuisance[rows][:, own]
+            left = left - N @ _solved(N, left)
+            found.append((int(s), self._in_unit(left, out)))
+        return found
+
+    def _enough(self, session: int, fitted: NDArray[np.bool_]) -> bool:
+        own = int((self._owner == session).sum())
+        return self._k * int((fitted & (self._session == session)).sum()) >= own + 3
+
+    def _rows(self, samples: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        return np.repeat(samples, self._k)
+
+    def _in_unit(self, left: Array, samples: NDArray[np.bool_]) -> Array:
+        """Return whitened residuals as the channel's own coordinates (n, own)."""
+        return np.asarray(
+            (self._unwhiten[samples] @ left.reshape(-1, self._k, 1))[:, : self._own, 0]
+        )
+
+
+def regions(
+    observation: Observation, kept: NDArray[np.bool_], seed: int = 0
+) -> tuple[Index, NDArray[np.bool_]]:
+    """Return the region (n,) of each kept sample, and what else lies too near each (folds, n)."""
+    n = int(kept.sum())
+    if observation.order_in_time:
+        place = np.arange(n) / n
+        fold = np.minimum((place * REGIONS).astype(np.int64), REGIONS - 1)
+        near = np.array([
+            (fold != f)
+            & (place > f / REGIONS - GAP)
+            & (place < (f + 1) / REGIONS + GAP)
+            for f in range(REGIONS)
+        ])  # fmt: skip
+        return fold, near
+    names = [q for q in observation.quantities if q.startswith(("actual_q_", "target_q_"))]
+    if not names or n < REGIONS:
+        return np.zeros(n, dtype=np.int64), np.zeros((1, n), dtype=bool)
+    poses = np.stack([observation.quantities[name][kept] for name in names], axis=1)
+    fold = joint_regions(poses, REGIONS, seed)
+    return fold, np.zeros((int(fold.max()) + 1, n), dtype=bool)
+
+
+def _solved(A: Array, b: Array, pull: Array | None = None) -> Array:
+    """Return the least squares solution (p,), columns scaled to one length.
+
+    ``pull`` is one over the prior sigma of each of the first columns (0: none).
+    """
+    if not A.shape[1]:
+        return np.zeros(0)
+    if pull is not None and pull.any():
+        rows = np.zeros((len(pull), A.shape[1]))
+        rows[:, : len(pull)] = np.diag(pull)
+        A, b = np.vstack([A, rows]), np.concatenate([b, np.zeros(len(pull))])
+    unit = 1 / np.sqrt(np.einsum("ij,ij->j", A, A) + 1e-300)
+    if len(A) > MANY_ROWS:
+        size, V = np.linalg.eigh((A.T @ A) * np.outer(unit, unit))
+        inverse = np.where(size > TINY * size[-1], 1 / np.maximum(size, 1e-300), 0.0)
+        return np.asarray(unit * (V @ (inverse * (V.T @ (unit * (A.T @ b))))))
+    return np.asarray(np.linalg.lstsq(A * unit, b, rcond=RANK)[0] * unit)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))

@@ -1,0 +1,143 @@
+"""Mistakes of frames, axes and rows, suspected by name where the measured poses are far off.
+
+An arm errs by millimetres. Where poses are centimetres off, a frame, an axis, a sign or a row is
+taken wrongly; the one change that brings measured and predicted poses together names the mistake.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import InputError
+from core.estimation.registration import register_robustly
+from core.log.log import Log
+from core.metrology import Metrology
+from core.model import Model
+from core.rotation import rotation_matrix, rotation_vector
+
+Array = NDArray[np.float64]
+MOST = 200  # rows looked at
+FEWEST = 6
+FAR = 0.02  # m and rad: more than any arm errs
+BETTER = 0.1  # share of the distance that may be left for a mistake to be named
+
+
+def frame_findings(model: Model, log: Log, metrology: Metrology) -> list[str]:
+    """Return what is suspicious about where the measured poses are, or []."""
+    measured = log.get("measured_position")
+    q = log.get("actual_q") if log.has("actual_q") else log.get("target_q")
+    if measured is None or q is None:
+        return []
+    good = np.flatnonzero(np.isfinite(measured).all(axis=1) & np.isfinite(q).all(axis=1))
+    if len(good) < FEWEST:
+        return []
+    rows = good[np.unique(np.linspace(0, len(good) - 1, MOST).astype(int))]
+    try:
+        predicted = model.rigid_pose(q[rows]).position
+    except InputError:
+        return []
+    seen = measured[rows]
+    distance = _off(seen, predicted)
+    told = []
+    if distance > FAR:
+        told.append(_why(model, q, measured, rows, distance))
+    elif metrology.registered:
+        here = float(np.median(np.linalg.norm(seen - predicted, axis=1)))
+        if here > FAR and distance < BETTER * here:
+            told.append(
+                f"the measured positions lie {1e3 * here:.0f} mm from where the arm is, and fit it "
+                "in a frame of their own: they are not in base; set metrology.registered to false"
+            )
+    turned = log.get("measured_rotation")
+    if turned is not None and not told:
+        told += _rotations(model, q[rows], seen, turned[rows], metrology)
+    return told
+
+
+def _off(measured: Array, predicted: Array) -> float:
+    """Return the median distance (m) in the frame that fits best."""
+    frame = register_robustly(measured, predicted)
+    return float(np.median(np.linalg.norm(frame.in_base(measured) - predicted, axis=1)))
+
+
+def _why(model: Model, q: Array, measured: Array, rows: Array, distance: float) -> str:
+    """Return the finding on positions that do not follow the arm."""
+    best, name = distance, ""
+    for what, trial_q, trial in _mistakes(model, q, measured, rows):
+        if len(trial) < FEWEST:
+            continue
+        left = _off(trial, model.rigid_pose(trial_q).position)
+        if left < best:
+            best, name = left, what
+    told = f"the measured positions do not follow the arm: {1e3 * distance:.0f} mm off in any frame"
+    if name and best < BETTER * distance:
+        return f"{told}; {name}: then {1e3 * best:.1f} mm"
+    return f"{told}; is it the right arm, tool and order of joints and rows?"
+
+
+def _mistakes(
+    model: Model, q: Array, measured: Array, rows: Array
+) -> Iterator[tuple[str, Array, Array]]:
+    """Yield each mistake with joint angles and positions that would put it right."""
+    seen = measured[rows]
+    mirrored = seen * [1.0, 1.0, -1.0]
+    yield "they look mirrored (axes of a left-handed frame)", q[rows], mirrored
+    for joint in range(q.shape[1]):
+        turned = q[rows].copy()
+        turned[:, joint] *= -1
+        yield f"joint {joint + 1} looks turned round in sign", turned, seen
+    yield "the joints look turned round in order", q[rows][:, ::-1], seen
+    for step, word in ((1, "late"), (-1, "early")):
+        inside = rows[(rows + step >= 0) & (rows + step < len(q))]
+        inside = inside[np.isfinite(measured[inside + step]).all(axis=1)]
+        yield f"they look one row too {word}", q[inside], measured[inside + step]
+    predicted = model.rigid_pose(q[rows]).position
+    size = _size(seen) / max(_size(predicted), 1e-9)
+    for unit, factor in (("centimetres", 100.0), ("inches", 1 / 0.0254), ("feet", 1 / 0.3048)):
+        if abs(np.log(size / factor)) < 0.2:
+            yield f"they look like {unit}, expected m", q[rows], seen / factor
+
+
+def _size(position: Array) -> float:
+    return float(np.median(np.linalg.norm(position - np.median(position, axis=0), axis=1)))
+
+
+def _rotations(
+    model: Model, q: Array, seen: Array, turned: Array, metrology: Metrology
+) -> list[str]:
+    good = np.isfinite(turned).all(axis=1)
+    if good.sum() < FEWEST:
+        return []
+    q, seen, turned = q[good], seen[good], turned[good]
+    poses = model.rigid_pose(q)
+    frame = register_robustly(seen, poses.position)
+    base = np.eye(3) if metrology.registered else frame.rotation
+    left, constant = _turned_off(poses.rotation, base, rotation_matrix(turned))
+    if left > 10 * FAR:
+        told = "the measured rotations do not follow the arm"
+        if _turned_off(poses.rotation, base, _roll_pitch_yaw(turned))[0] < FAR:
+            return [f"{told}: they look like roll, pitch and yaw, expected rotation vectors"]
+        return [f"{told}: {left:.1f} rad off; expected rotation vectors of the TCP"]
+    if constant > 10 * FAR:
+        return [
+            f"the measured rotations are turned by {constant:.2f} rad against the cell's tool, the "
+            "same in every pose: the target's axes are not those of tool.tcp"
+        ]
+    return []
+
+
+def _turned_off(predicted: Array, base: Array, measured: Array) -> tuple[float, float]:
+    """Return how far (rad, median) rotations differ beside a constant turn, and that turn."""
+    off = np.swapaxes(predicted, 1, 2) @ base.T @ measured
+    U, _, Vt = np.linalg.svd(off.sum(axis=0))
+    mean = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    left = np.linalg.norm(rotation_vector(mean.T @ off), axis=1)
+    return float(np.median(left)), float(np.linalg.norm(rotation_vector(mean)))
+
+
+def _roll_pitch_yaw(angles: Array) -> Array:
+    x, y, z = (rotation_matrix(angles[:, k, None] * np.eye(3)[k]) for k in range(3))
+    return np.asarray(z @ y @ x)

@@ -1,0 +1,188 @@
+"""Forces of the wrong sign or in the wrong axes, suspected by name.
+
+An arm gives way in the direction of a pull, and a sensor reads it: where the data agree much better
+with the pull turned round, or taken in tool axes, the column does not mean what a log's does
+(docs/conventions.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.dynamics import predict_torque, predict_wrench
+from core.errors import InputError
+from core.estimation.registration import frame_columns, register_robustly
+from core.loads import Loads
+from core.log.log import Log
+from core.model import Model
+from core.motion import Motion
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+MOST = 200  # rows looked at
+FEWEST = 6  # pulled rows from which a sign can be told
+LEAST = 1.0  # N, Nm: less is no pull
+HALF = 0.5  # what must be left, at most, of what the column as it stands leaves
+ROUNDS = 4
+SHOWN_BY = ("ft_raw_wrench", "actual_current_as_torque")
+
+
+def sign_findings(model: Model, log: Log) -> list[str]:
+    """Return which forces look turned round or in other axes, or []."""
+    q = log.get("actual_q") if log.has("actual_q") else log.get("target_q")
+    if q is None:
+        return []
+    told = []
+    for name in SHOWN_BY:
+        if name == "ft_raw_wrench" or model.arm.mass.any():
+            told += _readings(model, log, q, name)
+    pull = log.get("actual_TCP_force")
+    if pull is None or told:
+        return told
+    for judge in (_bending, *(_sensed(name) for name in SHOWN_BY)):
+        word = judge(model, log, q, pull)
+        if word:
+            return [f"actual_TCP_force {word}; expected what the surroundings do to the tool, "
+                    "in base axes"]  # fmt: skip
+    return []
+
+
+def _rows(q: Array, *columns: Array | None) -> Index:
+    good = np.isfinite(q).all(axis=1)
+    for column in columns:
+        if column is not None:
+            good &= np.isfinite(column.reshape(len(q), -1)).all(axis=1)
+    rows = np.flatnonzero(good)
+    return rows[np.unique(np.linspace(0, len(rows) - 1, MOST).astype(int))] if len(rows) else rows
+
+
+def _loads(log: Log, rows: Index, pull: Array | None) -> Loads:
+    def some(name: str) -> Array | None:
+        column = log.get(name)
+        return None if column is None or not np.isfinite(column).all() else column[rows]
+
+    return Loads(payload_mass=some("payload"), payload_cog=some("payload_cog"), wrench=pull)
+
+
+def _variants(model: Model, q: Array, pull: Array) -> dict[str, Array]:
+    """Return what the pull may mean: a name for each, '' for what the column says."""
+    hand = model.rigid_pose(q).rotation
+    turned = np.hstack([(hand @ part[..., None])[..., 0] for part in (pull[:, :3], pull[:, 3:])])
+    return {
+        "": pull,
+        "looks turned round in sign": -pull,
+        "looks given in tool axes": turned,
+        "looks turned round in sign and given in tool axes": -turned,
+    }
+
+
+def _best(left: dict[str, float]) -> str:
+    """Return the variant that leaves far less than the column as it stands, or ''."""
+    name = min(left, key=lambda key: left[key])
+    return name if left[name] < HALF * left[""] else ""
+
+
+def _bending(model: Model, log: Log, q: Array, pull: Array) -> str:
+    """Return what the pull looks like by how the measured positions give way to it."""
+    measured = log.get("measured_position")
+    if measured is None:
+        return ""
+    rows = _rows(q, measured, pull)
+    pulled = np.abs(pull[rows]).max(axis=1, initial=0.0) > LEAST
+    if pulled.sum() < FEWEST or 3 * len(rows) < 2 * (3 * model.arm.n + 6):
+        return ""
+    left = {}
+    try:
+        for name, variant in _variants(model, q[rows], pull[rows]).items():
+            off = _unbent(model, q[rows], measured[rows], _loads(log, rows, variant))
+            left[name] = float(np.median(np.linalg.norm(off[pulled], axis=1)))
+    except InputError:
+        return ""
+    return _best(left)
+
+
+def _unbent(model: Model, q: Array, measured: Array, loads: Loads) -> Array:
+    """Return what joints that give way, never less than nothing, leave of the positions (N, 3)."""
+    from scipy.optimize import lsq_linear  # a quarter of a second, only where pulls are judged
+
+    predicted = model.predict(q, loads).position
+    seen = register_robustly(measured, predicted).in_base(measured)
+    form, n = model.linear_form(q, loads), model.arm.n
+    free = np.concatenate([form.jacobian[:, :3], frame_columns(seen)[:, :3]], axis=2)
+    A = np.concatenate([form.regressor[:, :3], free], axis=2).reshape(3 * len(q), -1)
+    b = (seen - predicted).ravel()
+    lower = np.concatenate([-np.concatenate(model.compliance()), np.full(n + 6, -np.inf)])
+    lower[: 2 * n] -= 1e-12
+    unit = 1 / np.sqrt(np.einsum("ij,ij->j", A, A) + 1e-300)
+    weight, off = np.ones(len(b)), seen - predicted
+    for _ in range(ROUNDS):
+        root = np.sqrt(weight)
+        x = lsq_linear((A * unit) * root[:, None], b * root, (lower / unit, np.inf)).x
+        off = (b - (A * unit) @ x).reshape(-1, 3)
+        distance = np.linalg.norm(off, axis=1)
+        weight = np.repeat(1 / (1 + (distance / max(3 * np.median(distance), 1e-9)) ** 2), 3)
+    return off
+
+
+def _predicted(
+    model: Model, log: Log, q: Array, name: str, pull: Array | None, rows: Index
+) -> Array:
+    """Return what a channel would read at rest: accelerations matter little to a sign."""
+    count, n = len(rows), model.arm.n
+    nothing = np.zeros((count, n))
+    motion = Motion(
+        t=np.zeros(count), q=q[rows], qd=nothing, qdd=nothing, target_q=None,
+        loads=_loads(log, rows, pull), rows=rows, valid=np.ones(count, dtype=bool),
+        stretch=np.zeros(count, dtype=np.int64), start=0.0, moving=False, still=np.ones(n),
+    )  # fmt: skip
+    how = predict_wrench if name == "ft_raw_wrench" else predict_torque
+    return how(replace(model, terms=()), motion)
+
+
+def _spread(values: Array) -> float:
+    """Return how far values (N, k) scatter about a constant."""
+    return float(np.median(np.linalg.norm(values - np.median(values, axis=0), axis=1)))
+
+
+def _sensed(name: str) -> Callable[[Model, Log, Array, Array], str]:
+    """Return the judge of a pull by what a sensor reads of it."""
+
+    def judge(model: Model, log: Log, q: Array, pull: Array) -> str:
+        column = log.get(name)
+        if column is None or (name != "ft_raw_wrench" and not model.arm.mass.any()):
+            return ""
+        rows = _rows(q, column, pull)
+        pulled = rows[np.abs(pull[rows]).max(axis=1, initial=0.0) > LEAST]
+        if len(pulled) < FEWEST:
+            return ""
+        left = {}
+        for word, variant in _variants(model, q[pulled], pull[pulled]).items():
+            left[word] = _spread(column[pulled] - _predicted(model, log, q, name, variant, pulled))
+        return _best(left)
+
+    return judge
+
+
+def _readings(model: Model, log: Log, q: Array, name: str) -> list[str]:
+    """Return whether a sensor itself looks turned round in sign."""
+    column = log.get(name)
+    pull = log.get("actual_TCP_force")
+    if column is None:
+        return []
+    rows = _rows(q, column, pull)
+    if len(rows) < FEWEST:
+        return []
+    expected = _predicted(model, log, q, name, None if pull is None else pull[rows], rows)
+    asked, other = (_spread(sign * column[rows] - expected) for sign in (1.0, -1.0))
+    if _spread(expected) < LEAST or other > HALF * asked:
+        return []
+    what = {
+        "ft_raw_wrench": "what the load does to the sensor (a mass at rest reads its weight, "
+        "pointing down)",
+        "actual_current_as_torque": "what the motors deliver",
+    }[name]
+    return [f"{name} looks turned round in sign; expected {what}"]

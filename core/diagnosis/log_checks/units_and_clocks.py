@@ -1,0 +1,212 @@
+"""Suspicions: mistakes of units, names and clocks, told by name before anything is fitted.
+
+Frames and signs need the model's prediction: ``frame_suspicion``, ``sign_suspicion``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.log_checks.frames import frame_findings
+from core.diagnosis.log_checks.signs import sign_findings
+from core.errors import LogError
+from core.log.columns import COLUMNS, misspelt
+from core.log.log import Log
+from core.metrology import Metrology
+from core.model import Model
+from core.motion import time_finding
+
+Array = NDArray[np.float64]
+TURNS = 25.0  # rad: joints do not turn further; degrees do
+LEAST_TURN = 7.0  # rad: a little more than one turn, which any encoder may say
+BEYOND = 1.5  # times a joint's limit: no joint stands there
+REACHES = 50.0  # times the arm's reach from the middle: no arm gets there; millimetres do
+HANDS = 3.0  # times the arm's reach: no payload's centre is that far from the flange
+OVERLOAD = 10.0  # times the rated payload (or the arm's own weight): grams
+HOT = 200.0  # °C: no joint gets there; kelvin do
+WARM = 95.0  # °C: arms stop before; Fahrenheit do not
+FULL_TURN = 2 * np.pi + 0.3  # rad: rotation vectors end there
+FEW_POSES = 15
+
+
+def check_units(model: Model, log: Log) -> None:
+    """Raise LogError where a column's values can only be of another unit than a log's.
+
+    Joints or rotations in degrees, positions or centres of gravity in millimetres, payloads in
+    grams, temperatures in kelvin. An endless angle is no degrees: it is told as such, with its row.
+    """
+    for name in ("actual_q", "target_q"):
+        _check_angles(model, log, name)
+    _check_positions(model, log)
+    reach = _reach(model)
+    heaviest = OVERLOAD * _usual_load(model)
+    for name, most, what in (
+        ("measured_rotation", FULL_TURN, "the rotation vectors look like degrees, expected rad"),
+        ("payload", heaviest, "the payload looks like grams, expected kg"),
+        ("payload_cog", HANDS * reach + 1, "the centre of gravity looks like mm, expected m"),
+        ("joint_temperatures", HOT, "the temperatures look like kelvin, expected °C"),
+    ):
+        column = log.get(name)
+        if column is None or not np.isfinite(column).any():
+            continue
+        rows = column.reshape(len(column), -1)
+        size = (
+            np.linalg.norm(rows, axis=1)
+            if name == "measured_rotation"
+            else np.abs(rows).max(axis=1)
+        )
+        # one slip of a digit is no unit: three quarters of what is not zero have to be too large
+        high = size[np.isfinite(size) & (size != 0)]
+        worst = float(np.quantile(high, 0.25)) if len(high) else 0.0
+        if worst > most or (name == "measured_rotation" and _share(high > most) > 0.1):
+            label = name if column.ndim == 1 else f"{name}_*"
+            raise LogError(f"{log.path}: column {label}: found about {worst:.4g}; {what}")
+
+
+def _check_angles(model: Model, log: Log, name: str) -> None:
+    q = log.get(name)
+    if q is None or not np.isfinite(q).any():
+        return
+    if np.isinf(q).any():
+        log.require(name)
+    limits = model.arm.limits
+    widest = BEYOND * np.maximum(np.abs(limits.lower), np.abs(limits.upper))
+    most = np.clip(widest, LEAST_TURN, TURNS)
+    worst = np.nanmax(np.abs(q), axis=0)
+    if (worst > most).any():
+        raise LogError(
+            f"{log.path}: columns {name}_*: found values up to {worst.max():g}; the joint angles "
+            "look like degrees, expected rad"
+        )
+
+
+def _check_positions(model: Model, log: Log) -> None:
+    measured = log.get("measured_position")
+    if measured is None or not np.isfinite(measured).any():
+        return
+    spread = measured - np.nanmedian(measured, axis=0)
+    size = float(np.nanmedian(np.linalg.norm(spread, axis=1)))
+    reach = _reach(model)
+    if size > REACHES * reach:
+        raise LogError(
+            f"{log.path}: columns measured_position_*: found positions {size:g} apart for an arm "
+            f"of {reach:.2f} m reach; the positions look like millimetres, expected m"
+        )
+
+
+def _reach(model: Model) -> float:
+    reach = float(np.linalg.norm(model.arm.link_in_link[:, :3, 3], axis=1).sum())
+    return max(reach + float(np.linalg.norm(model.tool_in_flange[:3, 3])), 0.05)
+
+
+def _usual_load(model: Model) -> float:
+    """Return the rated payload (kg), or the arm's own weight; infinite where neither is known."""
+    own = float(model.arm.mass.sum())
+    rated = model.arm.payload if np.isfinite(model.arm.payload) else (own or np.inf)
+    return max(rated, model.payload_mass)
+
+
+def _share(flags: NDArray[np.bool_]) -> float:
+    return float(np.mean(flags)) if len(flags) else 0.0
+
+
+def findings(log: Log, model: Model | None = None, metrology: Metrology | None = None) -> list[str]:
+    """Return what is odd about a log but does not forbid work.
+
+    With ``model`` also mistakes of frames and signs, by what the arm can do at all.
+    """
+    told = [*_names(log), *_times(log), *_gaps(log)]
+    measured = log.get("measured_position")
+    still = False
+    if measured is not None and len(measured) > 3 and np.isfinite(measured).any():
+        still = float(np.nanmax(np.nanmax(measured, axis=0) - np.nanmin(measured, axis=0))) < 1e-3
+        if still:
+            told.append("the measured positions hardly move: is it the right column?")
+    warm = log.get("joint_temperatures")
+    if warm is not None and np.isfinite(warm).any() and float(np.nanmedian(warm)) > WARM:
+        told.append("the joint temperatures look like Fahrenheit, expected °C")
+    if model is None:
+        return told
+    told += [*_limits(model, log), *_poses(log)]
+    if not still:
+        told += frame_findings(model, log, metrology or Metrology())
+    return told + sign_findings(model, log)
+
+
+def _names(log: Log) -> list[str]:
+    """Return columns that nobody reads but whose name nearly is one of a log's."""
+    told = []
+    lacking = [name for name in COLUMNS if not log.has(name)]
+    for unknown in log.unknown:
+        hint = misspelt([unknown], lacking, log.n)
+        if hint:
+            told.append(f"a column was left out{hint}")
+    return told[:3]
+
+
+def _times(log: Log) -> list[str]:
+    t = log.get("timestamp")
+    if t is None or len(t) < 2:
+        return []
+    try:
+        moving = time_finding(log)
+    except LogError as error:
+        moving = str(error).removeprefix(f"{log.path}: ")
+    if moving is not None:
+        return [moving]
+    told = []
+    repeated, back = int(np.sum(np.diff(t) == 0)), int(np.sum(np.diff(t) < 0))
+    if repeated:
+        told.append(f"{repeated} timestamp(s) are repeated")
+    if back:
+        told.append(f"{back} timestamp(s) run backwards: rows should be in time order")
+    return told
+
+
+def _gaps(log: Log) -> list[str]:
+    told = []
+    for name, what in (
+        ("measured_position", "measured position"),
+        ("measured_rotation", "measured rotation"),
+        ("ft_raw_wrench", "wrench"),
+        ("actual_current_as_torque", "joint torques"),
+    ):
+        column = log.get(name)
+        gone = 0 if column is None else int(np.sum(~np.isfinite(column).all(axis=1)))
+        if gone:
+            told.append(f"{gone} row(s) have no {what} and were left out")
+    return told
+
+
+def _limits(model: Model, log: Log) -> list[str]:
+    q = (
+        log.get(
+            "actual_q",
+        )
+        if log.has("actual_q")
+        else log.get("target_q")
+    )
+    if q is None or not np.isfinite(q).any():
+        return []
+    limits = model.arm.limits
+    out = (np.nanmin(q, axis=0) < limits.lower - 0.05) | (
+        np.nanmax(q, axis=0) > limits.upper + 0.05
+    )
+    if not out.any():
+        return []
+    joints = ", ".join(str(j + 1) for j in np.flatnonzero(out))
+    return [f"joint(s) {joints} stand beyond the limits of the cell's arm: is it the right arm?"]
+
+
+def _poses(log: Log) -> list[str]:
+    q = log.get("actual_q") if log.has("actual_q") else log.get("target_q")
+    if q is None or not np.isfinite(q).all():
+        return []
+    count = len(np.unique(np.round(q, 4), axis=0))
+    if count >= FEW_POSES:
+        return []
+    return [
+        f"{count} different pose(s) are few: what is found may be one of several explanations; "
+        "30 or more that use the joints' whole range tell causes apart"
+    ]

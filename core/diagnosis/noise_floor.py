@@ -1,0 +1,137 @@
+"""The noise floor: measured, never what happens to be left.
+
+In order of trust: a stated sigma that is the whole; repeats of a pose under the same load; the
+differences of neighbouring samples of a recording, and its resolution. Only where none of them can
+be had, and nothing structured is left, does the scatter of the residual stand for the noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.observation import Observation
+from core.diagnosis.selection.selection import Selection
+
+Array = NDArray[np.float64]
+ENOUGH_REPEATS = 10  # degrees of freedom from which repeats measure the noise
+MANY = 400  # samples from which the residual's own rms is the better estimate
+BLOCK = 0.1  # s: what is correlated for less is the sensor's filter, not the arm
+LAGS = 5  # of block means
+FEWEST_BLOCKS = 40
+NOT_WHITE = 0.001  # probability below which a residual is not white
+EXCESS = 0.5  # times the floor: a correlated part smaller than that changes no answer
+
+
+@dataclass(frozen=True)
+class Floor:
+    """1 sigma of one coordinate, and what measured it."""
+
+    rms: float | None
+    source: str  # stated, repeats, neighbouring samples, residual, unknown
+
+
+@dataclass(frozen=True)
+class Whiteness:
+    """Whether a residual is correlated in time."""
+
+    p_value: float  # that white noise (or noise filtered for less than BLOCK) is as correlated
+    excess: float  # rms of the correlated part, in the channel's unit
+    white: bool
+
+
+def noise_floor(selection: Selection, structured: bool) -> Floor:
+    """Return the noise floor of a selection's channel."""
+    observation = selection.observation
+    if observation.sigma_is_whole:
+        return Floor(observation.sigma, "stated")
+    own = own_coordinates(observation)
+    variance, freedom = repeat_variance(observation, selection.residual, selection.kept)
+    if freedom >= ENOUGH_REPEATS:
+        return Floor(float(np.sqrt(max(variance, observation.sigma**2))), "repeats")
+    if observation.instrument is not None:
+        measured = float(np.sqrt(np.mean(observation.instrument[:own] ** 2)))
+        floor = max(measured, observation.sigma)
+        return Floor(floor or None, "neighbouring samples" if floor else "unknown")
+    if not structured:
+        covariance = np.linalg.inv(selection.noise.whitener)
+        each = np.einsum("nij,nij->ni", covariance, covariance)[:, :own]
+        estimated = float(np.mean(each))
+        left = selection.residual[selection.kept][:, :own]
+        if len(left) >= MANY:  # the estimate rests on fewer rows
+            estimated = max(
+                float(np.sum(left**2)) / max(left.size - selection.used, 1), observation.sigma**2
+            )
+        return Floor(float(np.sqrt(estimated)), "residual")
+    if observation.sigma > 0:
+        return Floor(observation.sigma, "stated")
+    return Floor(None, "unknown")
+
+
+def own_coordinates(observation: Observation) -> int:
+    """Return how many coordinates have the channel's own unit."""
+    k = int(observation.measured.shape[1])
+    return min(k, 3) if observation.channel in ("position", "wrench") else k
+
+
+def repeat_variance(
+    observation: Observation, residual: Array, kept: NDArray[np.bool_]
+) -> tuple[float, int]:
+    """Return the variance of one coordinate among repeats, and its degrees of freedom.
+
+    Repeats are the same pose in the same session under the same load, come to by the same motions.
+    """
+    if observation.order_in_time:
+        return 0.0, 0
+    own = own_coordinates(observation)
+    alike = [
+        z for name, z in observation.quantities.items()
+        if name.startswith(("payload", "actual_TCP_force", "approach_", "session"))
+    ]  # fmt: skip
+    table = np.column_stack([observation.groups, *(np.round(z, 3) for z in alike)])[kept]
+    condition = np.unique(table, axis=0, return_inverse=True)[1].reshape(-1)
+    count = np.bincount(condition)
+    left = residual[kept][:, :own]
+    mean = np.stack([np.bincount(condition, left[:, j]) / count for j in range(own)], axis=1)
+    away = left - mean[condition]
+    freedom = int((count - 1).sum()) * own
+    return float(np.sum(away**2)) / max(freedom, 1), freedom
+
+
+def whiteness(selection: Selection, floor: float | None) -> Whiteness | None:
+    """Return whether the residual of a recording is white; None for poses, and short recordings.
+
+    A portmanteau test (Ljung and Box 1978) on means over BLOCK seconds, so that noise which a
+    sensor filters passes; the correlated part has to matter beside the floor, too.
+    """
+    observation = selection.observation
+    t = observation.quantities.get("timestamp")
+    if not observation.order_in_time or t is None or not floor:
+        return None
+    kept, own = selection.kept, own_coordinates(observation)
+    block = np.floor((t[kept] - t[kept][0]) / BLOCK).astype(np.int64)
+    number = np.unique(block, return_inverse=True)[1].reshape(-1)
+    count = np.bincount(number)
+    if len(count) < FEWEST_BLOCKS:
+        return None
+    left = selection.residual[kept][:, :own]
+    mean = np.stack([np.bincount(number, left[:, j]) / count for j in range(own)], axis=1)
+    mean = mean - mean.mean(axis=0)
+    return _portmanteau(mean, floor)
+
+
+def _portmanteau(mean: Array, floor: float) -> Whiteness:
+    from scipy.special import gammaincc
+
+    B, own = mean.shape
+    variance = np.maximum(np.mean(mean**2, axis=0), 1e-300)
+    lagged = np.array([np.mean(mean[lag:] * mean[:-lag], axis=0) for lag in range(1, LAGS + 1)])
+    r = lagged / variance
+    weight = 1 / (B - np.arange(1, LAGS + 1))
+    statistic = B * (B + 2) * np.sum(r**2 * weight[:, None], axis=0)
+    p_value = min(float(gammaincc(LAGS / 2, statistic.max() / 2)) * own, 1.0)
+    # the covariance at the first lag is what white noise has not
+    excess = float(np.sqrt(np.mean(np.maximum(lagged[0], 0.0))))
+    return Whiteness(p_value, excess, not (p_value < NOT_WHITE and excess > EXCESS * floor))

@@ -1,0 +1,169 @@
+"""The leftover: whether it has structure that no accepted term accounts for, and what it follows.
+
+The test is a variance-component score test (Goeman's global test): the leftover against the sum of
+all columns that anything in the catalogue or any smooth function could make. Many small traces add
+up in it where each alone would drown in the number of hypotheses tried.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.observation import HELD
+from core.diagnosis.selection.problem import Space
+
+Array = NDArray[np.float64]
+DRAWS = 1500
+AT_ONCE = 200  # directions: with all draws 2.4 MB
+FOLDS = 7
+ABOUT = 0.05  # held-out share within which two quantities say the same
+MOST = 3000  # samples beyond which the test takes every so many
+
+
+def basis_of(columns: Array) -> Array:
+    """Return an orthonormal basis of columns (m, r), nearly dependent ones left out."""
+    if not columns.shape[1]:
+        return columns
+    unit = columns / (np.sqrt(np.einsum("ij,ij->j", columns, columns)) + 1e-300)
+    U, s, _ = np.linalg.svd(unit, full_matrices=False)
+    return np.asarray(U[:, s > 1e-6 * max(s[0], 1e-300)])
+
+
+def structure_p_value(
+    space: Space,
+    nuisance: Array,
+    chosen: Sequence[int],
+    seed: int = 0,
+    rows: NDArray[np.bool_] | None = None,
+) -> float:
+    """Return the probability that noise alone leaves as much structure as is left.
+
+    ``rows`` (m,) looks at some rows of the sample space only.
+    """
+    if rows is not None:
+        space = replace(space, y=space.y[rows], X=space.X[rows])
+        nuisance = nuisance[rows]
+    fitted = basis_of(np.hstack([nuisance, space.columns(chosen)]))
+    left = np.empty((1 + DRAWS, len(space.y)))
+    left[0] = space.y
+    np.random.default_rng(seed).standard_normal(out=left[1:])
+    left -= (left @ fitted) @ fitted.T
+    whole = np.einsum("ij,ij->i", left, left)
+    worst = []
+    for columns, sizes in _families(space, fitted):
+        # sums of squares along the family's directions, as a share of everything left
+        share = _squares_along(space.X, columns, sizes, left) / whole
+        mean, deviation = float(share[1:].mean()), float(share[1:].std()) + 1e-300
+        worst.append((share - mean) / deviation)
+    top = np.max(np.array(worst), axis=0)  # the most striking family, of data and of each draw
+    return float((1 + np.sum(top[1:] >= top[0])) / (1 + DRAWS))
+
+
+def _squares_along(X: Array, columns: NDArray[np.int64], sizes: Array, left: Array) -> Array:
+    """Return the sum of squares of every leftover (D, m) along the columns, a few at once."""
+    total = np.zeros(len(left))
+    for few in np.array_split(np.arange(len(columns)), 1 + len(columns) // AT_ONCE):
+        along = left @ (X[:, columns[few]] / sizes[few])
+        total += np.einsum("ij,ij->i", along, along)
+    return total
+
+
+def _families(space: Space, fitted: Array) -> Iterator[tuple[NDArray[np.int64], Array]]:
+    """Yield for every family its columns' places (K,) and their sizes without what is fitted (K,).
+
+    What is left has nothing of ``fitted`` in it, so that along the columns it is what it is along
+    the columns without it.
+    """
+    groups: dict[str, list[int]] = {}
+    for c, candidate in enumerate(space.candidates):
+        key = candidate.family if candidate.named else f"{candidate.family} {candidate.target}"
+        groups.setdefault(key, []).append(c)
+    within = fitted.T @ space.X
+    whole = np.einsum("ij,ij->j", space.X, space.X)
+    square = whole - np.einsum("ij,ij->j", within, within)
+    for members in groups.values():
+        columns = space.column_indices(members)
+        columns = columns[square[columns] > 1e-8 * whole[columns]]
+        if len(columns):
+            yield columns, np.sqrt(square[columns])
+
+
+def dependence(
+    space: Space,
+    nuisance: Array,
+    chosen: Sequence[int],
+    groups: NDArray[np.int64],
+    seed: int = 0,
+) -> list[tuple[str, float]]:
+    """Return quantities and the share of the leftover that each predicts held out, best first.
+
+    ``groups`` (m,) says which rows of the sample space are held out together.
+    """
+    fitted = basis_of(np.hstack([nuisance, space.columns(chosen)]))
+    r = space.y - fitted @ (fitted.T @ space.y)
+    names = np.unique(groups)
+    fold_of = np.random.default_rng(seed).permutation(len(names)) % FOLDS
+    fold = fold_of[np.searchsorted(names, groups)]
+    by_size: dict[int, list[int]] = {}
+    for c, candidate in enumerate(space.candidates):
+        if not candidate.named and candidate.quantity:
+            by_size.setdefault(int(space.start[c + 1] - space.start[c]), []).append(c)
+    best: dict[str, float] = {}
+    for size, members in by_size.items():
+        for few in np.array_split(members, 1 + len(members) * size // AT_ONCE):
+            columns = space.X[:, space.column_indices(few.tolist())]
+            clean = columns - fitted @ (fitted.T @ columns)
+            blocks = clean.reshape(len(r), len(few), size).transpose(1, 0, 2)
+            for c, share in zip(few, _held_out_shares(blocks, r, fold), strict=True):
+                quantity = space.candidates[c].quantity
+                best[quantity] = max(best.get(quantity, -np.inf), float(share))
+    return _one_of_a_kind(_loads_before_time(sorted(best.items(), key=lambda item: -item[1])))
+
+
+def _loads_before_time(ranked: list[tuple[str, float]]) -> list[tuple[str, float]]:
+    """Return the ranking with time behind what joints hold where both say about the same.
+
+    Whatever happens once in a log follows its clock.
+    """
+    at = next((i for i, (name, _) in enumerate(ranked) if name == "timestamp"), None)
+    if at is None:
+        return ranked
+    time = ranked[at]
+    as_good = [i for i, (name, share) in enumerate(ranked)
+               if name.startswith(HELD) and at < i and share > time[1] - ABOUT]  # fmt: skip
+    if as_good:
+        ranked.insert(as_good[-1] + 1, time)
+        del ranked[at]
+    return ranked
+
+
+def _one_of_a_kind(ranked: list[tuple[str, float]]) -> list[tuple[str, float]]:
+    """Keep only the best joint temperature: they all rise together and crowd out the rest."""
+    told: list[tuple[str, float]] = []
+    for name, share in ranked:
+        warm = name.startswith("joint_temperatures_")
+        if warm and any(n.startswith("joint_temperatures_") for n, _ in told):
+            continue
+        told.append((name, share))
+    return told
+
+
+def _held_out_shares(columns: Array, r: Array, fold: NDArray[np.int64]) -> Array:
+    """Return the share of r (m,) that each block of columns (B, m, d) predicts held out (B,)."""
+    by_fold = np.argsort(fold, kind="stable")
+    ends = np.searchsorted(fold[by_fold], np.arange(FOLDS + 1))
+    unit, r = columns[:, by_fold], r[by_fold]
+    unit = unit / (np.sqrt(np.einsum("bij,bij->bj", unit, unit))[:, None] + 1e-300)
+    flipped = unit.transpose(0, 2, 1)
+    G, g = flipped @ unit + 1e-6 * np.eye(columns.shape[2]), flipped @ r
+    left = np.zeros(len(columns))
+    for begin, end in pairwise(ends):
+        U, V, u = unit[:, begin:end], flipped[:, :, begin:end], r[begin:end]
+        x = np.linalg.solve(G - V @ U, (g - V @ u)[..., None])
+        left += np.sum((u - (U @ x)[..., 0]) ** 2, axis=1)
+    return np.asarray(1 - left / float(r @ r))

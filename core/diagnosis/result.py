@@ -1,0 +1,190 @@
+"""Causes: what is accused, how surely, and what was considered beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arm import Arm
+from core.diagnosis.held_out import HeldOut, Shrink
+from core.diagnosis.judgement import Judgement
+from core.diagnosis.selection.forward import children
+from core.diagnosis.selection.problem import Found, fit
+from core.diagnosis.selection.selection import Selection
+from core.effects import CATALOGUE, Reported, Term
+
+Array = NDArray[np.float64]
+SHOWN = 3.0  # whitened length of an effect of usual size from which it counts as excited
+OPEN = 30.0  # usual sizes of a parameter: with a wider spread nothing is known of it
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One accused effect, at all of its joints."""
+
+    effect: str
+    joints: tuple[int, ...]
+    parameters: tuple[Reported, ...]
+    shrink: Shrink | None
+    shrink_alone: float | None
+    probability: float
+    indistinguishable_from: tuple[str, ...]
+    terms: tuple[Term, ...]
+    relative_deviation: tuple[float, ...]  # per term: least sigma over value
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Considered:
+    """One effect of the catalogue that is not accused."""
+
+    effect: str
+    shrink_alone: float | None
+    probability: float
+    excited: bool
+    reason: str
+
+
+def causes_of(
+    selection: Selection, judgement: Judgement, held: HeldOut, arm: Arm,
+    shown: Sequence[int] | None = None,
+) -> tuple[Cause, ...]:  # fmt: skip
+    """Return the accused effects, the one with the largest share of the gap first.
+
+    ``shown`` are positions: of all accused only these are returned, the others kept in.
+    """
+    members: dict[str, list[int]] = {}
+    for position in judgement.accused if shown is None else shown:
+        members.setdefault(selection.terms[position].effect, []).append(position)
+    everything = [selection.term_index[p] for p in judgement.accused]
+    causes = [
+        _cause(effect, sorted(positions, key=lambda p: selection.terms[p].site.joint or 0),
+               everything, selection, judgement, held, arm)
+        for effect, positions in members.items()
+    ]  # fmt: skip
+    return tuple(sorted(causes, key=lambda c: -(c.shrink.gap_without if c.shrink else 0.0)))
+
+
+def _cause(
+    effect: str, positions: list[int], everything: list[int], selection: Selection,
+    judgement: Judgement, held: HeldOut, arm: Arm,
+) -> Cause:  # fmt: skip
+    own = {selection.term_index[p] for p in positions}
+    rest = [c for c in everything if c not in own]
+    shrink = held.shrink(everything, rest) if held.possible else None
+    alone = held.shrink(sorted(own), ()).shrink if held.possible else None
+    told: list[Reported] = []
+    notes: list[str] = []
+    relative = []
+    for p in positions:
+        term, covariance = selection.terms[p], selection.covariance[p]
+        told += CATALOGUE[effect].reported(arm, term, covariance)
+        value, deviation = np.array(term.values), np.sqrt(np.maximum(np.diag(covariance), 0))
+        size = np.abs(value[: len(deviation)])
+        relative.append(float(np.min(deviation / np.maximum(size, 1e-300))))
+        notes += _at_bounds(effect, term, arm) + _not_shown(effect, term, deviation, arm)
+    joints = sorted({t.site.joint for t in (selection.terms[p] for p in positions)
+                     if t.site.joint is not None})  # fmt: skip
+    ties = tuple(dict.fromkeys(n for p in positions for n in judgement.ties.get(p, ())))
+    return Cause(
+        effect, tuple(joints), tuple(told), shrink, alone,
+        probability(selection, own), ties,
+        tuple(selection.terms[p] for p in positions), tuple(relative), tuple(notes),
+    )  # fmt: skip
+
+
+def _at_bounds(effect: str, term: Term, arm: Arm) -> list[str]:
+    notes = []
+    for parameter, value in zip(
+        CATALOGUE[effect].parameters(arm, term.site), term.values, strict=True
+    ):
+        if value in (parameter.lower, parameter.upper):
+            name = CATALOGUE[effect].label(term.site, parameter)
+            notes.append(f"{name} stands on its bound ({value:g} {parameter.unit})")
+    return notes
+
+
+def _not_shown(effect: str, term: Term, deviation: Array, arm: Arm) -> list[str]:
+    """Return a note on each parameter that these data leave open ; nothing is hidden."""
+    notes = []
+    for parameter, spread in zip(
+        CATALOGUE[effect].parameters(arm, term.site), deviation, strict=False
+    ):
+        if spread == 0 or spread > OPEN * parameter.scale:
+            name = CATALOGUE[effect].label(term.site, parameter)
+            notes.append(f"{name} is not shown by these data: others can stand in for it")
+    return notes
+
+
+def probability(selection: Selection, own: set[int]) -> float:
+    """Return the probability that the effect is needed: against the best set without it."""
+    found, space = selection.found, selection.working
+    if own & set(selection.block):  # they won over the best set without them by more than chance
+        return 1.0
+    rest = fit(space, tuple(c for c in found.chosen if c not in own))
+    best = rest.score
+    families = {space.candidates[c].family for c in own}
+    for score, c in children(space, rest.chosen, 12):
+        if space.candidates[c].family not in families:
+            best = min(best, score)
+    odds = np.exp(-0.5 * min(max(best - found.score, 0.0), 700.0))
+    return float(1 / (1 + odds))
+
+
+def considered_of(
+    selection: Selection, judgement: Judgement, held: HeldOut, arm: Arm,
+    withhold: Iterable[str] = (),
+) -> tuple[Considered, ...]:  # fmt: skip
+    """Return every other effect of the channel's catalogue, and why it is not accused."""
+    space, channel = selection.working, selection.observation.channel
+    accused = {selection.terms[p].effect for p in judgement.accused}
+    kept = tuple(
+        c for c in (selection.term_index[p] for p in judgement.accused) if c not in selection.block
+    )
+    base = fit(space, kept)
+    reasons = {selection.terms[p].effect: why for p, why in judgement.withdrawn}
+    told = []
+    for identifier, effect in CATALOGUE.items():
+        if channel not in effect.channels or identifier in accused or identifier in withhold:
+            continue
+        own = [c for c, k in enumerate(space.candidates) if k.family == identifier]
+        own = _first_variants(selection, own)
+        excited = any(_shown(selection, c) for c in own)
+        if not own or not excited:
+            needs = effect.motion or ", ".join(effect.needs)
+            told.append(Considered(identifier, None, 0.0, False, f"not excited; needs {needs}"))
+            continue
+        alone = held.shrink(own, ()).shrink if held.possible and len(own) < 40 else None
+        better = min(_score_with(selection, base, c) for c in own)
+        odds = float(np.exp(-0.5 * min(max(better - base.score, -700.0), 700.0)))
+        reason = reasons.get(identifier, "does not pay for its parameters beside what is found")
+        told.append(Considered(identifier, alone, odds / (1 + odds), True, reason))
+    return tuple(told)
+
+
+def _first_variants(selection: Selection, own: list[int]) -> list[int]:
+    """Return one candidate per site: periods and curves come in many variants."""
+    seen: set[int | None] = set()
+    first = []
+    for c in own:
+        joint = selection.space.candidates[c].site.joint
+        if joint not in seen:
+            seen.add(joint)
+            first.append(c)
+    return first
+
+
+def _shown(selection: Selection, c: int) -> bool:
+    space = selection.space
+    usual = np.array([p.scale for p in space.candidates[c].parameters])
+    columns = space.X[:, space.start[c] : space.start[c + 1]] * usual
+    return bool(np.sqrt(np.sum(columns**2, axis=0)).max() > SHOWN)
+
+
+def _score_with(selection: Selection, base: Found, c: int) -> float:
+    if c in base.chosen:
+        return base.score
+    return fit(selection.working, (*base.chosen, c)).score

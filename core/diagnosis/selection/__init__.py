@@ -1,0 +1,1 @@
+"""Which effects explain a log: candidates, search, outliers and noise."""

@@ -1,0 +1,47 @@
+"""Stiffness curves: whether they are bent at all, and the straight ones told as what they are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.selection.problem import Space
+from core.effects import CATALOGUE, Term
+
+Array = NDArray[np.float64]
+BENT = 10.8  # gain of a bent stiffness curve over a straight one that makes it one
+
+
+def not_bent(terms: Sequence[Term], covariance: Sequence[Array]) -> list[int]:
+    """Return positions of stiffness curves that a straight line would fit as well."""
+    straight = []
+    for position, (term, spread) in enumerate(zip(terms, covariance, strict=True)):
+        if not CATALOGUE[term.effect].curved:
+            continue
+        softening, deviation = term.values[1], float(np.sqrt(max(spread[1, 1], 0)))
+        if softening <= 0 or softening < np.sqrt(BENT) * deviation:
+            straight.append(position)
+    return straight
+
+
+def straightened(
+    space: Space,
+    chosen: Sequence[int],
+    index: Sequence[int],
+    terms: Sequence[Term],
+    covariance: Sequence[Array],
+) -> tuple[int, ...] | None:
+    """Return the set with straight curves told as axial compliance, or None if there is none.
+
+    ``index`` gives the candidate of each term. Where axial compliance is no candidate, the curve
+    stays.
+    """
+    instead: dict[int, int] = {}
+    for position in not_bent(terms, covariance):
+        joint, straight = terms[position].site.joint, CATALOGUE[terms[position].effect].contains
+        for c, candidate in enumerate(space.candidates):
+            if candidate.family == straight and candidate.site.joint == joint:
+                instead[index[position]] = c
+    return tuple(instead.get(c, c) for c in chosen) if instead else None

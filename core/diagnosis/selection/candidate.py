@@ -1,0 +1,222 @@
+"""Candidates: everything that may stand behind a gap, each with its columns.
+
+A *named* candidate is an effect of the catalogue at one site; a *smooth* one is an unnamed function
+of one quantity (what wins there is ``unexplained``). Columns are derivatives of the
+channel's whole prediction, by central differences, at the model found so far.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arm import Arm
+from core.diagnosis.observation import HELD, Observation
+from core.effects import CATALOGUE, Effect, Parameter, Site, Term
+from core.errors import InputError
+
+Array = NDArray[np.float64]
+STEP = 1e-2  # of a parameter's usual scale, for central differences
+WHOLE_ORDERS = 128  # cycles a turn that are looked through one by one
+CYCLES = 1.5  # of a periodic line over the joint's range, at least
+HALF_ORDERS = 40  # up to here also the halves
+# (typical moment / M0)^2 that a bent stiffness curve starts from
+SOFTENING = tuple(float(v) for v in np.geomspace(0.1, 3000, 13))
+
+UNNAMED = Effect()
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One hypothesis: columns (m, d) in the flattened, whitened sample space."""
+
+    family: str  # the effect's identifier, or 'smooth'
+    site: Site
+    parameters: tuple[Parameter, ...]
+    fixed: tuple[float | None, ...]  # per parameter of the effect: None = fitted
+    curve: float | None = None  # softening of a bent stiffness curve: columns straight, and bent
+    tried: int = 1  # hypotheses that this one was picked from
+    quantity: str = ""  # what a smooth candidate depends on
+    target: str = ""  # and what it moves
+
+    @property
+    def named(self) -> bool:
+        """Return whether this is a member of the catalogue."""
+        return self.family != "smooth"
+
+    @property
+    def effect(self) -> Effect:
+        """Return the member of the catalogue; of what is in none, an effect without attributes."""
+        return CATALOGUE.get(self.family, UNNAMED)
+
+    @property
+    def gives_way(self) -> bool:
+        """Return whether more of this may take the arm to where it finds no equilibrium."""
+        return self.effect.softens or self.effect.adds_mass
+
+    @property
+    def turns_its_joint(self) -> bool:
+        """Return whether this turns a joint by the joint's own angle alone."""
+        own = Effect.angle_columns
+        return type(self.effect).angle_columns is not own
+
+    @property
+    def periodic(self) -> bool:
+        """Return whether this is one line of a periodic effect."""
+        return self.effect.periodic
+
+    @property
+    def of_no_quantity(self) -> bool:
+        """Return whether this is an unnamed cause that goes by no column of the log."""
+        return not self.named and not self.quantity
+
+    @property
+    def by_own_angle(self) -> bool:
+        """Return whether this is a smooth function of the very joint that it moves."""
+        return bool(self.target) and self.target == own_target(self.quantity)
+
+    def term(self, x: Array) -> Term:
+        """Return the term with fitted values ``x`` (d,)."""
+        if self.curve is not None:
+            return Term(self.family, self.site, (float(np.sum(x)), self.curve))
+        free = iter(float(v) for v in x)
+        values = tuple(next(free) if f is None else f for f in self.fixed)
+        return Term(self.family, self.site, values)
+
+
+def own_target(quantity: str) -> str:
+    """Return the joint whose angle the quantity is, as smooth targets are named ('' if none)."""
+    stem, _, index = quantity.rpartition("_")
+    return f"joint_{int(index) + 1}" if stem in ("actual_q", "target_q") else ""
+
+
+def carrying(quantity: str) -> str:
+    """Return the joint that holds the torque of a quantity, as own_target ('' if none)."""
+    stem, _, index = quantity.rpartition("_")
+    return f"joint_{int(index) + 1}" if stem == HELD else ""
+
+
+def named_candidates(
+    arm: Arm,
+    channel: str,
+    withheld: Iterable[str] = (),
+    with_rotation: bool = False,
+    base: Sequence[Term] = (),
+    turns: Sequence[float] = (),
+) -> list[Candidate]:
+    """Return the catalogue's members for a channel, at every site of the arm.
+
+    What ``base`` holds already comes with its own period or curve. ``turns`` (n,) says how many
+    turns each joint's poses span.
+    """
+    found = []
+    for identifier, effect in CATALOGUE.items():
+        if channel not in effect.channels or identifier in set(withheld) or effect.at_moment:
+            continue
+        for site in effect.sites(arm):
+            inside = [t for t in base if t.effect == identifier and t.site.joint == site.joint]
+            found += _at(arm, effect, site, with_rotation, inside, turns)
+    return found
+
+
+def _at(
+    arm: Arm,
+    effect: Effect,
+    site: Site,
+    with_rotation: bool,
+    inside: Sequence[Term],
+    turns: Sequence[float],
+) -> list[Candidate]:
+    parameters = effect.parameters(arm, site)
+    free: tuple[float | None, ...] = (None,) * len(parameters)
+    if effect.periodic:
+        orders = sorted(
+            set(np.arange(1, WHOLE_ORDERS + 1).astype(float))
+            | set(np.arange(2, 2 * HALF_ORDERS + 1) / 2)
+            | {t.site.order for t in inside if t.site.order is not None}
+        )
+        # one cycle a turn is a usual period; of others, more than one has to be seen
+        seen = turns[site.joint - 1] if site.joint and turns else 1.0
+        least = CYCLES / max(seen, 1e-6)
+        return [
+            Candidate(effect.identifier, Site(site.joint, float(o)), parameters, free)
+            for o in orders
+            if o >= min(least, 3.0) or o in (1.0, 2.0)
+        ]
+    if effect.curved and not inside:
+        return [
+            Candidate(
+                effect.identifier,
+                site,
+                (replace(parameters[0], lower=-np.inf),) * 2,
+                free,
+                curve=s * parameters[1].scale,
+            )
+            for s in SOFTENING
+        ]
+    if effect.shapes:
+        had = {t.values[-1] for t in inside}
+        held = (None,) * (len(parameters) - 1)
+        return [
+            Candidate(effect.identifier, site, parameters[:-1], (*held, shape))
+            for shape in (*effect.shapes, *(had - {*effect.shapes}))
+        ]
+    if any(p.of_rotation for p in parameters) and not with_rotation:
+        shown = tuple(p for p in parameters if not p.of_rotation)
+        held = tuple(0.0 if p.of_rotation else None for p in parameters)
+        return [Candidate(effect.identifier, site, shown, held)]
+    return [Candidate(effect.identifier, site, parameters, free)]
+
+
+def named_columns(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> Array:
+    """Return d prediction / d parameter (N, k, d), ``base`` terms already in the model."""
+    if candidate.effect.periodic:
+        by_angle = angle_columns(observation, candidate)
+        if by_angle is not None:
+            return by_angle
+    if candidate.curve is not None:
+        return _bent_columns(observation, candidate)
+    columns = []
+    for k, parameter in enumerate(candidate.parameters):
+        h = STEP * parameter.scale
+        step = np.zeros(len(candidate.parameters))
+        step[k] = h
+        try:
+            ahead = observation.predict([*base, candidate.term(step)])
+            behind = observation.predict([*base, candidate.term(-step)])
+        except InputError:  # the arm would buckle: no candidate beside this base
+            ahead = behind = observation.measured
+        columns.append((ahead - behind) / (2 * h))
+    return np.stack(columns, axis=-1)
+
+
+def angle_columns(observation: Observation, candidate: Candidate) -> Array | None:
+    """Return exact columns (N, k, d) of what turns a joint by its own angle; None for the rest."""
+    J, joint = observation.joint_columns, candidate.site.joint
+    if J is None or joint is None:
+        return None
+    angle = observation.quantities.get(joint_quantity(observation, joint - 1))
+    still = np.zeros(len(J))  # a joint that never moves has one angle
+    shape = candidate.effect.angle_columns(candidate.site, still if angle is None else angle)
+    return None if shape is None else J[:, :, joint - 1, None] * shape[:, None, :]
+
+
+def _bent_columns(observation: Observation, candidate: Candidate) -> Array:
+    """Return the straight and the bent part of a stiffness curve (N, k, 2).
+
+    Both: a joint that the model holds as compliant already only bends its own line.
+    """
+    i, moment = (candidate.site.joint or 1) - 1, observation.axial_moment
+    assert moment is not None and candidate.curve is not None
+    straight = observation.axial_columns()[:, :, i]
+    bent = 1 / np.sqrt(1 + candidate.curve * moment[:, i] ** 2)
+    return np.stack([straight, straight * bent[:, None]], axis=-1)
+
+
+def joint_quantity(observation: Observation, i: int) -> str:
+    """Return the name of the column with joint i's angle."""
+    name = f"actual_q_{i}"
+    return name if name in observation.quantities else f"target_q_{i}"

@@ -1,0 +1,138 @@
+"""Sets of candidates that grow term by term, several side by side (a beam)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.selection.problem import Found, Space, fit, gains
+
+Array = NDArray[np.float64]
+BEAM = 6
+DEPTH = 9
+PATIENCE = 2  # depths without a better set before the beam stops
+SMOOTH_TERMS = 2  # more unnamed functions than that tell nothing more
+LINES = 4  # periodic lines a joint may have: more are the Fourier series of something else
+DEPENDENT = 1e-5  # share of a block below which a direction counts as given by its others
+
+
+@dataclass
+class State:
+    """A set that grows: what its terms leave of the columns and of the gap."""
+
+    chosen: tuple[int, ...]
+    basis: Array  # (m, r) orthonormal, of the chosen columns
+    r: Array
+    rss: float
+    score: float
+
+
+def clash(space: Space, chosen: Sequence[int], new: int) -> bool:
+    """Return whether a candidate stands instead of, not beside, one that is chosen."""
+    b = space.candidates[new]
+    lines = 0
+    if not b.named and sum(not space.candidates[c].named for c in chosen) >= SMOOTH_TERMS:
+        return True
+    for c in chosen:
+        a = space.candidates[c]
+        if not (a.named and b.named) or a.site.joint != b.site.joint:
+            continue
+        if a.family == b.family and a.periodic:
+            lines += 1
+            if abs((a.site.order or 0) - (b.site.order or 0)) < 0.75 or lines >= LINES:
+                return True
+        elif a.family in (b.family, b.effect.contains) or b.family == a.effect.contains:
+            return True
+    return False
+
+
+def grow(space: Space, state: State, new: int, score: float) -> State:
+    """Return the state with one more term."""
+    block = _without(state.basis, space.X[:, space.start[new] : space.start[new + 1]])
+    U = _directions(block)
+    r = _without(U, state.r)
+    return State((*state.chosen, new), np.hstack([state.basis, U]), r, float(r @ r), score)
+
+
+def _without(basis: Array, columns: Array) -> Array:
+    return np.asarray(columns - basis @ (basis.T @ columns))
+
+
+def _directions(block: Array) -> Array:
+    """Return an orthonormal basis of columns (m, r), nearly dependent ones left out."""
+    unit = np.sqrt(np.einsum("ij,ij->j", block, block)) + 1e-300
+    U, s, _ = np.linalg.svd(block / unit, full_matrices=False)
+    return np.asarray(U[:, s > DEPENDENT])
+
+
+def projected(space: Space, chosen: Sequence[int]) -> State:
+    """Return the state of a whole set."""
+    if not chosen:
+        return State((), np.zeros((len(space.y), 0)), space.y, float(space.y @ space.y), 0.0)
+    U = _directions(space.columns(chosen))
+    r = _without(U, space.y)
+    return State(tuple(chosen), U, r, float(r @ r), 0.0)
+
+
+def offspring(
+    space: Space, state: State, width: int, named_only: bool = False
+) -> list[tuple[float, int]]:
+    """Return the best terms to join a state: (score of the joint set, index), best first."""
+    gain, sign = gains(space, state.r, state.basis)
+    score = space.misfit(np.maximum(state.rss - gain, 1e-300)) + space.price
+    score += space.price[list(state.chosen)].sum()
+    found: list[tuple[float, int]] = []
+    for c in np.argsort(score):
+        candidate = space.candidates[c]
+        if c in state.chosen or (named_only and not candidate.named):
+            continue
+        if clash(space, state.chosen, int(c)):
+            continue
+        single = candidate.named and len(candidate.parameters) == 1
+        if single and candidate.parameters[0].lower == 0 and sign[c] < 0:
+            continue
+        found.append((float(score[c]), int(c)))
+        if len(found) >= width:
+            break
+    return found
+
+
+def children(space: Space, chosen: Sequence[int], width: int) -> list[tuple[float, int]]:
+    """Return the best candidates to join a set: (score of the joint set, index), best first."""
+    return offspring(space, projected(space, chosen), width)
+
+
+def beam_search(
+    space: Space, allowed_depth: int = DEPTH, beam: int = BEAM, named_only: bool = False
+) -> list[Found]:
+    """Return the best sets met, best first (the empty one among them)."""
+    rss = float(space.y @ space.y)
+    empty = replace(projected(space, ()), score=float(space.misfit(np.array(rss))))
+    states, best, waited = [empty], empty.score, 0
+    met: dict[frozenset[int], Found] = {frozenset(): Found((), empty.score, rss)}
+    for _ in range(allowed_depth):
+        born: dict[frozenset[int], tuple[float, int, int]] = {}
+        for s, state in enumerate(states):
+            for score, c in offspring(space, state, max(2 * beam, 12), named_only):
+                key = frozenset((*state.chosen, c))
+                if key not in born or score < born[key][0]:
+                    born[key] = (score, s, c)
+        ranked = sorted(born.values())[: max(2 * beam, 12)]
+        checked = []
+        for _, s, c in ranked:
+            found = fit(space, (*states[s].chosen, c))
+            met[frozenset(found.chosen)] = found
+            if np.isfinite(found.score):
+                checked.append((found.score, s, c))
+        checked.sort()
+        states = [grow(space, states[s], c, score) for score, s, c in checked[:beam]]
+        if not states:
+            break
+        waited = 0 if states[0].score < best - 1e-9 else waited + 1
+        best = min(best, states[0].score)
+        if waited >= PATIENCE:
+            break
+    return sorted(met.values(), key=lambda f: f.score)

@@ -1,0 +1,200 @@
+"""Sets near a set: terms dropped, swapped, merged, or told as one unknown."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.selection.forward import children, clash, grow, offspring, projected
+from core.diagnosis.selection.problem import Found, Space, fit, gains
+
+Array = NDArray[np.float64]
+MERGED = 9  # terms up to which every pair is tried against one
+GROWTH = 30  # terms added to a set at most
+GATHERED = 4.0  # score that one kind of effect at two places may cost beyond two kinds
+
+
+def improve(space: Space, found: Found, named_only: bool = False) -> Found:
+    """Return the set after dropping and swapping terms as long as that pays."""
+    for _ in range(4):
+        better = found
+        for c in found.chosen:
+            rest = tuple(o for o in found.chosen if o != c)
+            trial = fit(space, rest)
+            if trial.score < better.score:
+                better = trial
+            for _, other in offspring(space, projected(space, rest), 3, named_only):
+                if other != c:
+                    trial = fit(space, (*rest, other))
+                    if trial.score < better.score - 1e-6:
+                        better = trial
+        if better is found and 2 < len(found.chosen) <= MERGED:
+            better = _merged(space, found, named_only)
+        if better is found:
+            return found
+        found = better
+    return found
+
+
+def _merged(space: Space, found: Found, named_only: bool) -> Found:
+    """Return the set with two terms replaced by one, where that pays: two that imitate a third."""
+    better = found
+    for i, one in enumerate(found.chosen):
+        for other in found.chosen[i + 1 :]:
+            rest = tuple(c for c in found.chosen if c not in (one, other))
+            for _, new in offspring(space, projected(space, rest), 2, named_only):
+                trial = fit(space, (*rest, new))
+                if trial.score < better.score - 1e-6:
+                    better = trial
+    return better
+
+
+def pruned(space: Space, found: Found) -> Found:
+    """Return the set without the terms that it is better off without, dropped one by one."""
+    while found.chosen:
+        better = None
+        for score, c in _drops(space, found):
+            if score >= found.score:
+                break
+            better = fit(space, tuple(o for o in found.chosen if o != c))
+            if np.isfinite(better.score):
+                break
+        if better is None or better.score >= found.score:
+            break
+        found = better
+    return found
+
+
+def _drops(space: Space, found: Found) -> list[tuple[float, int]]:
+    """Return the score of the set less each of its terms, best first, out of one inverse."""
+    X = space.columns(found.chosen)
+    unit = 1 / np.sqrt(np.einsum("ij,ij->j", X, X) + 1e-300)
+    A = X * unit
+    inverse = np.linalg.pinv(A.T @ A, rcond=1e-12, hermitian=True)
+    x = inverse @ (A.T @ space.y)
+    rss = float(np.sum((space.y - A @ x) ** 2))
+    paid = float(space.price[list(found.chosen)].sum())
+    begin, scores = 0, []
+    for c in found.chosen:
+        own = slice(begin, begin + len(space.candidates[c].parameters))
+        begin = own.stop
+        more = float(x[own] @ np.linalg.pinv(inverse[own, own], hermitian=True) @ x[own])
+        scores.append((float(space.misfit(np.array(rss + more))) + paid - space.price[c], c))
+    return sorted(scores)
+
+
+def joined_sets(space: Space, found: Found) -> list[Found]:
+    """Return the set with one more term, less what that makes needless: unnamed rivals above all.
+
+    Named causes that together imitate something unknown fall away where it is given its own term;
+    where they stand in each other's way, the set grows from that term anew.
+    """
+    unnamed = {c for c, k in enumerate(space.candidates) if k.of_no_quantity}
+    joiners = unnamed | {c for _, c in children(space, found.chosen, 4)}
+    new = sorted(joiners - set(found.chosen))
+    sets = [pruned(space, fit(space, (*found.chosen, c))) for c in new]
+    if found.chosen:
+        sets += [grown(space, fit(space, (c,))) for c in sorted(unnamed)]
+    return sets
+
+
+def grown(space: Space, found: Found, named_only: bool = False) -> Found:
+    """Return the set with the best terms added one by one as long as that pays."""
+    state = projected(space, found.chosen)
+    for _ in range(GROWTH):
+        nearest = offspring(space, state, 1, named_only)
+        if not nearest or nearest[0][0] >= found.score:
+            break
+        better = fit(space, (*found.chosen, nearest[0][1]))
+        if better.score >= found.score:
+            break
+        state, found = grow(space, state, nearest[0][1], better.score), better
+    return found
+
+
+def rivals(space: Space, found: Found, c: int, within: float) -> list[tuple[float, int]]:
+    """Return the candidates that could stand for ``c`` in a set: (score above the best, index)."""
+    rest = tuple(o for o in found.chosen if o != c)
+    told = []
+    for score, other in offspring(space, projected(space, rest), 40):
+        if score > found.score + within:
+            break
+        if other == c:
+            continue
+        trial = fit(space, (*rest, other))
+        if trial.score <= found.score + within:
+            told.append((trial.score - found.score, other))
+    return sorted(told)
+
+
+def gathered(space: Space, found: Found) -> Found:
+    """Return the set with as few kinds of effects as fit the data about as well.
+
+    Which kinds are at work is one guess, at which places another: a kind that is there anyway is
+    the simpler guess for a term that could as well be of it.
+    """
+    for c in found.chosen:
+        family = space.candidates[c].family
+        kinds = {space.candidates[o].family for o in found.chosen if o != c}
+        if not space.candidates[c].named or family in kinds:
+            continue
+        for _, other in rivals(space, found, c, GATHERED):
+            if space.candidates[other].named and space.candidates[other].family in kinds:
+                rest = tuple(o for o in found.chosen if o != c)
+                return gathered(space, fit(space, (*rest, other)))
+    return found
+
+
+def unpack(space: Space, found: Found) -> Found:
+    """Return the set with smooth functions of a joint's own angle told as periodic lines.
+
+    A few lines together look smooth, and each alone is dearer than one smooth function.
+    """
+    for c in found.chosen:
+        candidate = space.candidates[c]
+        if not candidate.by_own_angle:
+            continue
+        joint = candidate.target.removeprefix("joint_")
+        rest = tuple(o for o in found.chosen if o != c)
+        found = min([found, *_lines(space, rest, int(joint))], key=lambda f: f.score)
+    return found
+
+
+def packed(space: Space, found: Found) -> list[Found]:
+    """Return sets with all that a joint does by its own angle told as one smooth function."""
+    sets = []
+    joints = {space.candidates[c].site.joint for c in found.chosen}
+    for joint in joints - {None}:
+        own = {
+            c for c in found.chosen
+            if space.candidates[c].site.joint == joint and space.candidates[c].turns_its_joint
+        }  # fmt: skip
+        if len(own) < 2:
+            continue
+        rest = tuple(c for c in found.chosen if c not in own)
+        for c, candidate in enumerate(space.candidates):
+            if candidate.by_own_angle and candidate.target == f"joint_{joint}":
+                sets.append(fit(space, (*rest, c)))
+    return sorted(sets, key=lambda f: f.score)[:4]
+
+
+def _lines(space: Space, rest: tuple[int, ...], joint: int) -> list[Found]:
+    """Return the best sets of up to three lines of a joint beside ``rest``."""
+    own = [
+        k
+        for k, candidate in enumerate(space.candidates)
+        if candidate.periodic and candidate.site.joint == joint
+    ]
+    grown: list[Found] = []
+    sets = [rest]
+    for _ in range(3):
+        step: list[Found] = []
+        for chosen in sets:
+            state = projected(space, chosen)
+            gain, _ = gains(space, state.r, state.basis)
+            ranked = sorted(own, key=lambda k: -gain[k])[:6]
+            step += [fit(space, (*chosen, k)) for k in ranked if not clash(space, chosen, k)]
+        step.sort(key=lambda f: f.score)
+        grown += step
+        sets = [f.chosen for f in step[:5]]
+    return grown

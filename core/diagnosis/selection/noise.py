@@ -1,0 +1,109 @@
+"""Noise: how the leftovers of a fit scatter, and the whitening that makes them alike.
+
+The instrument's own noise is the same in every coordinate; the arm's repeatability comes through
+its joints, so it grows with the lever and is shared between coordinates. Both sizes are estimated
+by maximum likelihood; the instrument's stated sigma is a lower bound.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.observation import Observation
+
+Array = NDArray[np.float64]
+LARGE = 150  # samples from which every coordinate is taken to scatter alike
+ENOUGH = 400  # samples from which the sizes are estimated
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Sizes of the noise and what whitens it."""
+
+    whitener: Array  # (N, k, k): whitener @ gap has unit variance in every coordinate
+    block_sigma: Array  # (blocks,) 1 sigma of one coordinate, in its own unit
+    joint_sigma: float  # rad, 1 sigma of one joint's repeatability; 0 where there is no lever
+    floor_share: float  # known variance over whole variance: the whitened variance's lower bound
+
+
+def blocks(observation: Observation) -> NDArray[np.int64]:
+    """Return which coordinates share one noise size (k,)."""
+    k = observation.measured.shape[1]
+    if observation.channel in ("position", "wrench"):
+        return np.minimum(np.arange(k) // 3, 1)
+    return np.arange(k)
+
+
+def estimate_noise(
+    observation: Observation, residual: Array, kept: NDArray[np.bool_], shrink: float = 1.0
+) -> Noise:
+    """Return the noise under which ``residual`` (N, k) of the kept samples is most likely.
+
+    ``shrink`` is the share of the degrees of freedom that the fit left over.
+    """
+    block = blocks(observation)
+    count = int(block.max()) + 1
+    # a large log is asked for many causes: joint noise would swallow those not yet found
+    J = observation.joint_columns if len(kept) < LARGE else None
+    use = np.flatnonzero(kept)
+    if len(use) > ENOUGH:
+        use = use[:: len(use) // ENOUGH + 1]
+    r = residual[use] / np.sqrt(max(shrink, 0.05))
+    known = observation.sigma**2
+    spread = np.array([max(np.median(np.abs(r[:, block == b])) * 1.4826, 1e-15)
+                       for b in range(count)])  # fmt: skip
+    if J is None:
+        scale = np.array([max(float(np.mean(r[:, block == b] ** 2)), 1e-30) for b in range(count)])
+        scale[0] = max(scale[0], known)
+        return _noise(observation, block, scale, 0.0)
+    from scipy.optimize import minimize  # a quarter of a second, only where it is looked for
+
+    lever = J[use] @ np.swapaxes(J[use], 1, 2)
+    size = np.sqrt(np.mean(np.einsum("nii->ni", lever)[:, block == 0]))
+    identity = np.stack([np.diag((block == b).astype(float)) for b in range(count)])
+
+    def surprise(x: Array) -> float:
+        variance = np.exp(2 * np.clip(x, -60, 20))
+        V = np.tensordot(_floored(variance[:count], known), identity, 1) + variance[-1] * lever
+        _, log_size = np.linalg.slogdet(V)
+        inner = np.einsum("ni,ni->n", r, np.linalg.solve(V, r[..., None])[..., 0])
+        return float(np.sum(log_size + inner))
+
+    start = np.log(np.concatenate([spread * 0.7, [0.7 * spread[0] / max(size, 1e-12)]]))
+    best = minimize(surprise, start, method="Nelder-Mead",
+                    options={"maxiter": 80 * len(start), "xatol": 0.02, "fatol": 0.05})  # fmt: skip
+    variance = np.exp(2 * np.clip(best.x, -60, 20))
+    return _noise(observation, block, _floored(variance[:count], known), float(variance[-1]))
+
+
+def carried_to(observation: Observation, noise: Noise) -> Noise:
+    """Return the same noise, as estimated on other samples, for the samples of an observation."""
+    return _noise(observation, blocks(observation), noise.block_sigma**2, noise.joint_sigma**2)
+
+
+def _floored(variance: Array, known: float) -> Array:
+    floored = variance.copy()
+    floored[0] = variance[0] + known
+    return floored
+
+
+def _noise(
+    observation: Observation, block: NDArray[np.int64], variance: Array, joint: float
+) -> Noise:
+    N, _k = observation.measured.shape
+    V = np.tile(np.diag(variance[block]), (N, 1, 1))
+    J = observation.joint_columns
+    if J is not None and joint > 0:
+        V = V + joint * (J @ np.swapaxes(J, 1, 2))
+    first = block == 0
+    whole = float(np.mean(np.einsum("nii->ni", V)[:, first]))
+    known = observation.sigma**2
+    if observation.sigma_is_whole and known > 0:
+        factor = known / whole
+        V, variance, joint, whole = V * factor, variance * factor, joint * factor, known
+    whitener = np.linalg.inv(np.linalg.cholesky(V))
+    share = min(known / whole, 1.0) if known > 0 else 1e-6
+    return Noise(whitener, np.sqrt(variance), float(np.sqrt(joint)), share)

@@ -1,0 +1,183 @@
+"""The sample space in which candidates compete: whitened, without nuisance, every try priced."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.selection.candidate import Candidate
+
+Array = NDArray[np.float64]
+RANK = 1e-10  # share of a column's square below which it counts as already explained
+DEPENDENT = 1e-8  # the same of a direction among several columns
+AT_ONCE = 250_000  # numbers of a temporary: 2 MB
+SMOOTH_PRICE = 18.0  # what an unnamed function pays beyond a named cause
+MARGIN = 6.0  # what every accusation pays: keeps clean logs clean
+ABSURD = 200.0  # times a parameter's usual size: beyond, a fit is no explanation
+SENSED = ("N", "Nm", "N/s", "Nm/s")  # units of sensor biases, which may have any size
+SHARP = 6000.0  # times the usual softening of a stiffness curve
+USUAL_ORDERS = (1.0, 2.0, 3.0, 4.0)  # eccentricity and its kin
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Candidates with equally many columns, these at unit size."""
+
+    index: NDArray[np.int64]  # (n,) candidates
+    columns: NDArray[np.int64]  # (n, d)
+    unit: Array  # (n, d) one over each column's size
+    gram: Array  # (n, d, d) of the unit columns
+
+
+def _blocks(X: Array, index: NDArray[np.int64], columns: NDArray[np.int64]) -> Blocks:
+    n, d = columns.shape
+    gram = np.empty((n, d, d))
+    for few in np.array_split(np.arange(n), 1 + n * d * len(X) // AT_ONCE):
+        block = X[:, columns[few].ravel()].T.reshape(len(few), d, len(X))
+        gram[few] = block @ block.transpose(0, 2, 1)
+    unit = 1 / np.sqrt(np.einsum("cii->ci", gram) + 1e-300)
+    return Blocks(index, columns, unit, gram * unit[:, :, None] * unit[:, None, :])
+
+
+@dataclass(frozen=True)
+class Space:
+    """The whitened sample space: y and the blocks of columns, nuisance projected out."""
+
+    y: Array  # (m,)
+    X: Array  # (m, K)
+    start: NDArray[np.int64]  # (C+1,) first column of each candidate
+    candidates: tuple[Candidate, ...]
+    price: Array  # (C,)
+    freedom: float  # m minus nuisance
+    floor: float  # variance of one coordinate that is known to be there
+
+    @cached_property
+    def blocks(self) -> tuple[Blocks, ...]:
+        """Return the candidates by their number of columns."""
+        size = np.diff(self.start)
+        return tuple(
+            _blocks(self.X, index, self.start[index][:, None] + np.arange(d))
+            for d in np.unique(size)
+            for index in [np.flatnonzero(size == d)]
+        )
+
+    def columns(self, chosen: Sequence[int]) -> Array:
+        """Return the columns of a set of candidates (m, sum d)."""
+        parts = [self.X[:, self.start[c] : self.start[c + 1]] for c in chosen]
+        return np.hstack(parts) if parts else np.zeros((len(self.y), 0))
+
+    def column_indices(self, chosen: Sequence[int]) -> NDArray[np.int64]:
+        """Return where in ``X`` the columns of a set of candidates are (sum d,)."""
+        parts = [np.arange(self.start[c], self.start[c + 1]) for c in chosen]
+        return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
+
+    def misfit(self, rss: Array) -> Array:
+        """Return -2 log likelihood of residual sums of squares, variance profiled out."""
+        variance = np.maximum(rss / self.freedom, self.floor)
+        return np.asarray(self.freedom * np.log(variance) + rss / variance)
+
+
+@dataclass(frozen=True)
+class Found:
+    """One set of candidates with its joint least-squares fit."""
+
+    chosen: tuple[int, ...]
+    score: float
+    rss: float
+    values: tuple[Array, ...] = field(default=())  # per candidate (d,)
+    deviations: tuple[Array, ...] = field(default=())  # per candidate (d,), 1 sigma
+
+
+def prices(candidates: Sequence[Candidate], freedom: float) -> Array:
+    """Return what each candidate pays: d log m + 2 log(number of its like) + a margin."""
+    families = {c.family for c in candidates if c.named} or {""}
+    count: dict[str, int] = {}
+    for c in candidates:
+        count[_kind(c)] = count.get(_kind(c), 0) + c.tried
+    paid = []
+    for c in candidates:
+        tried = count[_kind(c)] * (len(families) if c.named else 1)
+        d = len(c.parameters)
+        extra = MARGIN if c.named else SMOOTH_PRICE
+        paid.append(d * np.log(max(freedom, 2.0)) + 2 * np.log(tried) + extra)
+    return np.array(paid)
+
+
+def _kind(candidate: Candidate) -> str:
+    """Return among how many of its like a candidate was tried: usual lines are few."""
+    if candidate.periodic and (candidate.site.order or 0) in USUAL_ORDERS:
+        return "usual lines"
+    if candidate.of_no_quantity:
+        return "rivals"
+    return candidate.family
+
+
+def gains(space: Space, r: Array, basis: Array | None = None) -> tuple[Array, Array]:
+    """Return how much of |r|^2 each candidate takes (C,), and its first value's sign (C,).
+
+    ``basis`` (m, p), orthonormal, is projected out of the columns; of them all only their parts
+    along it are formed, so that a step of a search costs little beside the columns themselves.
+    """
+    within = np.zeros((0, space.X.shape[1])) if basis is None else basis.T @ space.X
+    g = space.X.T @ r
+    if basis is not None:
+        g -= within.T @ (basis.T @ r)
+    gain, sign = np.zeros(len(space.candidates)), np.ones(len(space.candidates))
+    for blocks in space.blocks:
+        own = g[blocks.columns] * blocks.unit
+        taken = (within[:, blocks.columns] * blocks.unit).transpose(1, 2, 0)
+        if blocks.columns.shape[1] == 1:
+            left = blocks.gram[:, 0, 0] - np.sum(taken[:, 0] ** 2, axis=1)
+            along, alive = own, (left > RANK)[:, None]
+            left = left[:, None]
+            sign[blocks.index] = np.sign(own[:, 0])
+        else:
+            left, vectors = np.linalg.eigh(blocks.gram - taken @ taken.transpose(0, 2, 1))
+            along, alive = np.einsum("cji,cj->ci", vectors, own), left > DEPENDENT
+        share = np.where(alive, along**2 / np.where(alive, left, 1), 0)
+        gain[blocks.index] = share.sum(axis=1)
+    return gain, sign
+
+
+def fit(space: Space, chosen: Sequence[int]) -> Found:
+    """Return the joint fit of a set; its score is infinite where it breaks a bound or is absurd."""
+    if not chosen:
+        rss = float(space.y @ space.y)
+        return Found((), float(space.misfit(np.array(rss))), rss)
+    X = space.columns(chosen)
+    unit = 1 / np.sqrt(np.einsum("ij,ij->j", X, X) + 1e-300)
+    U, s, V = np.linalg.svd(X * unit, full_matrices=False)
+    V = V[s > 1e-6 * s[0]] / s[s > 1e-6 * s[0], None]  # of nearly dependent columns the mean
+    solution = V.T @ (space.y @ U)[: len(V)]
+    rss = float(np.sum((space.y - (X * unit) @ solution) ** 2))
+    variance = max(rss / max(space.freedom - X.shape[1], 1.0), space.floor)
+    values = solution * unit
+    deviation = np.sqrt(np.einsum("ij,ij->j", V, V) * variance) * unit
+    score = float(space.misfit(np.array(rss)) + space.price[list(chosen)].sum())
+    ends = np.cumsum([0, *(len(space.candidates[c].parameters) for c in chosen)]).tolist()
+    own = [slice(begin, end) for begin, end in pairwise(ends)]
+    parts, spread = [values[o] for o in own], [deviation[o] for o in own]
+    for c, x, s in zip(chosen, parts, spread, strict=True):
+        if not _plausible(space.candidates[c], x, s):
+            score = np.inf
+    return Found(tuple(chosen), score, rss, tuple(parts), tuple(spread))
+
+
+def _plausible(candidate: Candidate, x: Array, s: Array) -> bool:
+    if not candidate.named:
+        return True
+    if candidate.curve is not None and x.sum() < candidate.parameters[0].lower - s.max():
+        return False
+    for parameter, value, deviation in zip(candidate.parameters, x, s, strict=True):
+        lower = -np.inf if candidate.curve is not None else parameter.lower
+        if value < lower - 2.5 * deviation or value > parameter.upper:
+            return False
+        most = (SHARP if parameter.name == "softening" else ABSURD) * parameter.scale
+        if parameter.unit not in SENSED and abs(value) - 3 * deviation > most:
+            return False
+    return True

@@ -1,0 +1,189 @@
+"""The exact refit: Gauss-Newton on the whole prediction, frames and all."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arm import Arm
+from core.diagnosis.selection.candidate import Candidate, angle_columns
+from core.diagnosis.selection.problem import Found, Space
+from core.diagnosis.selection.state import Work, flat
+from core.effects import Term
+from core.errors import InputError
+
+Array = NDArray[np.float64]
+REFITS = 8
+NO_PRIOR: Mapping[int, Array] = {}
+WEAK = 100.0  # usual sizes of a parameter: how far the data may take it against nothing
+
+
+def refit(
+    work: Work, space: Space, found: Found, links: Mapping[int, Array] = NO_PRIOR
+) -> tuple[tuple[Term, ...], tuple[int, ...], tuple[Array, ...], Array]:
+    """Refit the named terms exactly, smooth ones kept linear; moves the frame along.
+
+    ``links`` are further candidates, with 1 sigma of each number: these are kept near nominal.
+    """
+    index = (*(c for c in found.chosen if space.candidates[c].named), *links)
+    freed = {c: _freed(work.arm, space.candidates[c]) for c in index}
+    smooth = [c for c in found.chosen if not space.candidates[c].named]
+    x = [
+        np.array(space.candidates[c].term(v).values)[: len(freed[c].parameters)]
+        for c, v in zip(found.chosen, found.values, strict=True)
+        if c in index
+    ] + [np.zeros(len(space.candidates[c].parameters)) for c in links]
+    usual = [links[c] if c in links else _wide(freed[c]) for c in index]
+    extra = space.columns(smooth)
+    covariance: list[Array] = []
+    for _ in range(REFITS):
+        observation = work.observation
+        terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
+        gap = observation.measured - observation.predict(terms)
+        blocks = []
+        for k, c in enumerate(index):
+            others = terms[:k] + terms[k + 1 :]
+            blocks.append(flat(_slope(work, freed[c], x[k], others), work))
+        nuisance = flat(observation.nuisance, work)
+        A = np.hstack([*blocks, extra, nuisance])
+        b = flat(gap[..., None], work)[:, 0]
+        size = np.sqrt(np.einsum("ij,ij->j", A, A))
+        unit = np.where(size > 1e-150, 1 / np.maximum(size, 1e-150), 0.0)  # 0: moves nothing
+        pull, towards = _pull(usual, x, A.shape[1])
+        step = _step(np.vstack([A, pull]), np.concatenate([b, towards]), unit, freed, index, x)
+        sizes = [len(v) for v in x]
+        cuts = np.cumsum([*sizes, extra.shape[1]])
+        parts = np.split(step, cuts)
+        moved, share = 0.0, _share(work, freed, index, x, parts, A, b)
+        for k in range(len(x)):
+            x[k] = _within(freed[index[k]], x[k] + share * parts[k])
+            scale = np.array([p.scale for p in freed[index[k]].parameters])
+            moved = max(moved, float(np.abs(parts[k] / scale).max()))
+        if observation.rebase is not None:
+            moved_terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
+            left = observation.measured - observation.predict(moved_terms)
+            work.observation = observation.rebase(_along(extra, nuisance, left, work))
+        residual_ss = float(np.sum((b - A @ step) ** 2))
+        variance = max(residual_ss / max(len(b) - A.shape[1], 1), space.floor)
+        whole = np.vstack([A, pull]) * unit
+        inverse = np.linalg.pinv(whole.T @ whole, rcond=1e-13, hermitian=True)
+        spread = inverse * np.outer(unit, unit) * variance
+        begin = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
+        covariance = [spread[i:j, i:j] for i, j in itertools.pairwise(begin)]
+        if moved < 1e-6:
+            break
+    terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
+    gap = work.observation.measured - work.observation.predict(terms)
+    nuisance = work.observation.nuisance
+    if nuisance.shape[2]:
+        gap = gap - nuisance @ _along(extra, flat(nuisance, work), gap, work)
+    return terms, index, tuple(covariance), gap
+
+
+def _step(
+    A: Array, b: Array, unit: Array, freed: dict[int, Candidate], index: tuple[int, ...],
+    x: list[Array],
+) -> Array:  # fmt: skip
+    """Return the Gauss-Newton step (k,); what stands on a bound and would pass it stays there.
+
+    Cut off afterwards, such a step would no longer be one downhill, and the fit would stand still.
+    """
+    parameters = [p for c in index for p in freed[c].parameters]
+    now = np.concatenate([*x, np.zeros(0)])
+    lower, upper = (np.array([getattr(p, end) for p in parameters]) for end in ("lower", "upper"))
+    free = np.ones(len(unit), dtype=bool)
+    step = np.zeros(len(unit))
+    for _ in range(1 + len(now)):
+        own = unit * free
+        step = np.linalg.lstsq(A * own, b, rcond=1e-9)[0] * own
+        ahead = step[: len(now)]
+        stuck = ((now <= lower) & (ahead < 0)) | ((now >= upper) & (ahead > 0))
+        if not stuck.any():
+            break
+        free[: len(now)] &= ~stuck
+    return step
+
+
+def _along(extra: Array, nuisance: Array, gap: Array, work: Work) -> Array:
+    """Return what of the nuisance (p,) a gap (N, k) asks for, unnamed functions beside it."""
+    b = flat(gap[..., None], work)[:, 0]
+    solution = np.linalg.lstsq(np.hstack([extra, nuisance]), b, rcond=1e-12)[0]
+    return np.asarray(solution[extra.shape[1] :])
+
+
+def _pull(usual: list[Array], x: list[Array], width: int) -> tuple[Array, Array]:
+    """Return rows (k, width) and targets that pull parameters ``x`` towards nominal.
+
+    ``usual`` is how far each may be from there. Where that is many usual sizes only combinations
+    without any trace in the data feel it: lengths along parallel axes, which run off else.
+    """
+    size = np.concatenate([*usual, np.zeros(0)])
+    rows = np.zeros((len(size), width))
+    rows[np.arange(len(size)), np.arange(len(size))] = 1 / size
+    return rows, -np.concatenate([*x, np.zeros(0)]) / size
+
+
+def _wide(candidate: Candidate) -> Array:
+    """Return how far (d,) the data may take a cause that stands for itself."""
+    return np.array([WEAK * p.scale for p in candidate.parameters])
+
+
+def _share(
+    work: Work, freed: dict[int, Candidate], index: tuple[int, ...], x: list[Array],
+    parts: list[Array], A: Array, b: Array,
+) -> float:  # fmt: skip
+    """Return the share of a Gauss-Newton step to go: less than all where it would overshoot."""
+    if not index:
+        return 1.0
+    linear = A[:, sum(len(v) for v in x) :]  # smooth terms and nuisance, refitted for each trial
+    Q = np.linalg.qr(linear)[0] if linear.shape[1] else linear
+
+    def left(share: float) -> float:
+        terms = [freed[c].term(_within(freed[c], v + share * part))
+                 for c, v, part in zip(index, x, parts, strict=False)]  # fmt: skip
+        try:
+            gap = work.observation.measured - work.observation.predict(terms)
+        except InputError:
+            return float("inf")
+        r = flat(gap[..., None], work)[:, 0]
+        r = r - Q @ (Q.T @ r)
+        return float(r @ r)
+
+    now = left(0.0)
+    for share in (1.0, 0.5, 0.25, 0.1, 0.03):
+        if left(share) <= now:
+            return share
+    return 0.0
+
+
+def _freed(arm: Arm, candidate: Candidate) -> Candidate:
+    """Return the candidate with what its columns held fixed (a softening) fitted too."""
+    if not (candidate.effect.curved or candidate.effect.shapes):
+        return candidate
+    parameters = candidate.effect.parameters(arm, candidate.site)
+    return replace(candidate, parameters=parameters, fixed=(None,) * len(parameters), curve=None)
+
+
+def _slope(work: Work, candidate: Candidate, x: Array, others: tuple[Term, ...]) -> Array:
+    """Return d prediction / d parameter (N, k, d) at the term's present values."""
+    by_angle = angle_columns(work.observation, candidate)
+    if by_angle is not None:
+        return by_angle
+    columns = []
+    for k, parameter in enumerate(candidate.parameters):
+        h = np.zeros(len(x))
+        h[k] = 1e-2 * parameter.scale
+        ahead = work.observation.predict([*others, candidate.term(x + h)])
+        behind = work.observation.predict([*others, candidate.term(x - h)])
+        columns.append((ahead - behind) / (2 * h[k]))
+    return np.stack(columns, axis=-1)
+
+
+def _within(candidate: Candidate, x: Array) -> Array:
+    lower = np.array([p.lower for p in candidate.parameters])
+    upper = np.array([p.upper for p in candidate.parameters])
+    return np.asarray(np.clip(x, lower, upper))

@@ -1,0 +1,317 @@
+"""Selection: from an observation to the terms that explain it.
+
+Rounds of: columns at the model found so far, search, exact refit (Gauss-Newton on the whole
+prediction, frames and all), wild readings looked at again; until the set stays the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arm import Arm
+from core.diagnosis.criteria import HEAVIEST
+from core.diagnosis.observation import Observation
+from core.diagnosis.selection.bent import straightened
+from core.diagnosis.selection.candidate import (
+    Candidate,
+    joint_quantity,
+    named_candidates,
+)
+from core.diagnosis.selection.following import exact_columns, one_delay
+from core.diagnosis.selection.geometry import Links, links_of, with_links
+from core.diagnosis.selection.local_search import pruned
+from core.diagnosis.selection.moments import step_candidates
+from core.diagnosis.selection.noise import Noise, estimate_noise
+from core.diagnosis.selection.outliers import look_again, look_for_wild, with_wild_explained
+from core.diagnosis.selection.problem import Found, Space, fit
+from core.diagnosis.selection.refit import refit
+from core.diagnosis.selection.search import LARGE, screened_search
+from core.diagnosis.selection.smooth import smooth_candidates
+from core.diagnosis.selection.state import Raw, Work, flat, locate, sample_space
+from core.effects import Term
+from core.errors import InputError
+from core.model import Model
+
+Array = NDArray[np.float64]
+ROUNDS = 5
+FORBIDDEN = 1e9  # a price that no fit is worth
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What explains an observation, and the space in which it won."""
+
+    observation: Observation  # frame as finally estimated
+    space: Space  # columns at the final model; kept samples only
+    found: Found  # without the links, where their geometry as a whole is a cause
+    terms: tuple[Term, ...]  # the named part, refitted exactly
+    term_index: tuple[int, ...]  # candidate index of each term
+    covariance: tuple[Array, ...]  # per term (d, d) of its fitted parameters
+    kept: NDArray[np.bool_]  # (N,) samples that are not wild
+    noise: Noise
+    residual: Array  # (N, k) measured - predicted by the named terms, frame estimated along
+    base: tuple[Term, ...]
+    raw: Raw  # the space before the nuisance was projected out
+    prior: dict[int, Array] = field(default_factory=dict)  # 1 sigma (d,) of the numbers of each
+    # link's candidate, where the geometry of all links is a cause
+
+    @property
+    def nuisance_basis(self) -> Array:
+        """Return an orthonormal basis (m, p) of the nuisance in the sample space."""
+        return self.raw.basis
+
+    @property
+    def block(self) -> tuple[int, ...]:
+        """Return the candidates of all links, where their geometry is a cause as a whole."""
+        return tuple(self.prior)
+
+    @cached_property
+    def links(self) -> Links | None:
+        """Return the links' geometry as a whole, where it is a cause."""
+        return links_of(self.space, self.prior) if self.prior else None
+
+    @cached_property
+    def working(self) -> Space:
+        """Return the space in which ``found`` won: beside the links, where they are a cause."""
+        return self.space if self.links is None else self.links.beside(self.space, self.block)
+
+    def rows_of(self, columns: Array) -> Array:
+        """Return columns (N, k, d) as rows (m, d) of the working space."""
+        kept, B = self.kept, self.nuisance_basis
+        rows = (self.noise.whitener[kept] @ columns[kept]).reshape(len(B), -1)
+        rows = rows - B @ (B.T @ rows)
+        return np.asarray(rows if self.links is None else self.links.whitened(rows))
+
+    def pull(self, chosen: Sequence[int]) -> Array:
+        """Return one over the prior sigma of each number of a set of candidates; 0: none."""
+        size = np.diff(self.space.start)
+        each = [1 / self.prior[c] if c in self.prior else np.zeros(int(size[c])) for c in chosen]
+        return np.concatenate([*each, np.zeros(0)])
+
+    def fitted(self, chosen: Sequence[int]) -> dict[int, Array]:
+        """Return the linear values (d,) of a set of candidates; links are kept near nominal."""
+        space, size = self.space, np.diff(self.space.start)
+        X = space.columns(chosen)
+        whole = X.T @ X + np.diag(self.pull(chosen) ** 2)
+        unit = 1 / np.sqrt(np.diag(whole) + 1e-300)
+        inverse = np.linalg.pinv(whole * np.outer(unit, unit), rcond=1e-12, hermitian=True)
+        x = unit * (inverse @ (unit * (X.T @ space.y)))
+        return dict(zip(chosen, np.split(x, np.cumsum(size[list(chosen)])[:-1]), strict=True))
+
+    def without_links(self) -> Selection:
+        """Return the selection with the links' geometry no cause, the rest as it is."""
+        index = [p for p, c in enumerate(self.term_index) if c not in self.block]
+        return replace(
+            self, prior={}, found=fit(self.space, self.found.chosen),
+            terms=tuple(self.terms[p] for p in index),
+            term_index=tuple(self.term_index[p] for p in index),
+            covariance=tuple(self.covariance[p] for p in index),
+        )  # fmt: skip
+
+    @property
+    def used(self) -> float:
+        """Return the number of fitted unknowns, nuisance included; of the links what they use."""
+        links = 0.0 if self.links is None else self.links.used
+        return float(self.raw.nuisance.shape[1] + sum(len(v) for v in self.found.values)) + links
+
+    @property
+    def groups(self) -> NDArray[np.int64]:
+        """Return the condition of every row of the sample space (m,)."""
+        k = self.observation.measured.shape[1]
+        return np.repeat(self.observation.groups[self.kept], k)
+
+
+def select(
+    observation: Observation,
+    model: Model,
+    withheld: Iterable[str] = (),
+    progress: Callable[[str], None] | None = None,
+) -> Selection:
+    """Return the best explanation of an observation by named effects and smooth functions."""
+    arm = model.arm
+    rotation = observation.measured.shape[1] > 3
+    base: tuple[Term, ...] = ()
+    turns = [
+        float(np.ptp(observation.quantities.get(joint_quantity(observation, i), np.zeros(1))))
+        / (2 * np.pi)
+        for i in range(arm.n)
+    ]
+    kept = np.ones(len(observation.rows), dtype=bool)
+    first = estimate_noise(observation, observation.measured - observation.predict(()), kept)
+    work = Work(observation, arm, [], first, kept)
+    found: Found | None = None
+    space: Space | None = None
+    near: Space | None = None  # the same, beside the links where their geometry is a cause
+    columns: list[Array] = []
+    smooth = smooth_candidates(observation)
+    for turn in range(ROUNDS):
+        if progress:
+            progress(f"{observation.channel}: round {turn + 1}")
+        work.candidates = [
+            _bounded(c, model, observation)
+            for c in named_candidates(arm, observation.channel, withheld, rotation, base, turns)
+            if _has_what_it_needs(c, observation)
+        ]
+        space, near, columns = (
+            None,
+            None,
+            [],
+        )  # the last round's, as large as the new ones: not both at a time
+        columns = [exact_columns(work.observation, c, base) for c in work.candidates]
+        if turn == 0:
+            look_for_wild(work, columns)
+        stepping = step_candidates(work, columns, base, withheld)
+        work.candidates += [candidate for candidate, _ in stepping]
+        columns += [own for _, own in stepping]
+        space, raw = sample_space(work, columns, base, smooth)
+        inside = [locate(work.candidates, t)[0] for t in base]
+        best = one_delay(space, screened_search(space, base=inside))
+        if turn > 0 and not work.kept.all():
+            space, raw, best = with_wild_explained(work, columns, base, smooth, (space, raw, best))
+        near, best, links = with_links(space, best, inside)
+        counted, whitened_by = work.kept.copy(), work.noise
+        framed = work.observation
+        try:
+            exact = _exactly(near, best, work)
+            terms, index, covariance, residual = refit(work, space, exact, links)
+        except InputError:  # absurd flexibilities: the arm would buckle
+            work.observation = framed  # not the frame that went astray with them
+            best, near, links = _stiff(space, best, inside), space, {}
+            terms, index, covariance, residual = refit(work, space, best)
+        straight = straightened(space, best.chosen, index, terms, covariance)
+        if straight is not None:
+            best = pruned(near, fit(near, straight))
+            terms, index, covariance, residual = refit(work, space, best, links)
+        same = terms_alike(terms, base) and turn > 0
+        found = best
+        used = sum(len(v) for v in best.values) + (links_of(space, links).used if links else 0)
+        free = 1 - used / space.freedom
+        changed = look_again(work, _less_smooth(work, space, best, smooth, residual), free)
+        if same and not changed:
+            break
+        base = terms
+    assert space is not None and near is not None and found is not None
+    if len(space.y) >= LARGE and any(not space.candidates[c].named for c in found.chosen):
+        work.kept, work.noise = counted.copy(), whitened_by
+        # what goes into a model has to predict without the unnamed function beside it
+        alone = fit(near, [c for c in found.chosen if space.candidates[c].named])
+        terms, index, covariance, residual = refit(work, space, alone, links)
+    return Selection(
+        work.observation, space, found, terms, index, covariance, counted, whitened_by,
+        residual, base, raw, links,
+    )  # fmt: skip
+
+
+def _stiff(space: Space, best: Found, inside: list[int]) -> Found:
+    """Return the best set without anything that gives way: what was found makes no arm."""
+    gives_way = np.array([c.gives_way for c in space.candidates])
+    stiff = replace(space, price=np.where(gives_way, FORBIDDEN, space.price))
+    start = {*inside, *best.chosen} - {int(c) for c in np.flatnonzero(gives_way)}
+    return screened_search(stiff, base=sorted(start))
+
+
+def _exactly(space: Space, best: Found, work: Work) -> Found:
+    """Return what of a set is refitted: of delays and lags the named alone.
+
+    Beside them an unnamed function takes up what their curves lack at a first guess, and they would
+    never come to where it is not needed.
+    """
+    if work.observation.channel != "tracking":
+        return best
+    return fit(space, [c for c in best.chosen if space.candidates[c].named])
+
+
+def _less_smooth(
+    work: Work, space: Space, best: Found, smooth: list[tuple[Candidate, Array]], residual: Array
+) -> Array:
+    """Return the residual (N, k) less what the set's unnamed functions take of it.
+
+    They are part of the explanation: what they account for is no noise. Not so in a large log of
+    poses, where causes and a function of time share out the same: the causes stand alone there.
+    """
+    named = len(work.candidates)
+    columns = [smooth[c - named][1] for c in best.chosen if c >= named]
+    poses = work.observation.channel == "position" and len(space.y) >= LARGE
+    if not columns or poses:
+        return residual
+    both = np.concatenate([*columns, work.observation.nuisance], axis=2)
+    rows, target = flat(both, work), flat(residual[..., None], work)[:, 0]
+    return np.asarray(residual - both @ np.linalg.lstsq(rows, target, rcond=1e-9)[0])
+
+
+def standing(
+    selection: Selection, arm: Arm, accused: Sequence[int], beside: Sequence[int] = ()
+) -> Selection:
+    """Return the selection with some of its terms (positions) refitted as all there is.
+
+    Values that were fitted beside a withdrawn term are not those that stand without it. ``beside``
+    are unnamed functions that account for what is left: in a short log it would bias the values; a
+    long one averages over it, and its model has to predict without them.
+    """
+    short = len(selection.space.y) < LARGE
+    if not accused or (len(accused) == len(selection.terms) and not (short and beside)):
+        return selection
+    work = Work(selection.observation, arm, [], selection.noise, selection.kept)
+    chosen = [selection.term_index[p] for p in accused]
+    links = selection.prior if set(chosen) & set(selection.prior) else {}
+    space = selection.working if links else selection.space
+    if short:
+        chosen += beside
+    alone = fit(space, [c for c in chosen if c not in links])
+    fitted, index, spread, residual = refit(work, selection.space, alone, links)
+    terms, covariance = list(selection.terms), list(selection.covariance)
+    for c, term, own in zip(index, fitted, spread, strict=True):
+        position = selection.term_index.index(c)
+        terms[position], covariance[position] = term, own
+    return replace(
+        selection, observation=work.observation, terms=tuple(terms),
+        covariance=tuple(covariance), residual=residual,
+    )  # fmt: skip
+
+
+def _bounded(candidate: Candidate, model: Model, observation: Observation) -> Candidate:
+    """Return the candidate with bounds that keep the whole model physical (flexibility >= 0).
+
+    Of a curve the bound holds for what its two parts come to together.
+    """
+    if candidate.effect.adds_mass:
+        least, most = _loads_that_can_be(model, observation)
+        mass = replace(candidate.parameters[0], lower=least, upper=most)
+        return replace(candidate, parameters=(mass, *candidate.parameters[1:]))
+    kind, curved = candidate.effect.flexibility, candidate.curve is not None
+    if not (kind or curved):
+        return candidate
+    axial, radial = model.compliance()
+    own = radial if kind == "radial" else axial
+    assert candidate.site.joint is not None
+    lower = -float(own[candidate.site.joint - 1])
+    bounded = replace(candidate.parameters[0], lower=lower)
+    return replace(candidate, parameters=(bounded, *candidate.parameters[1:]))
+
+
+def _loads_that_can_be(model: Model, observation: Observation) -> tuple[float, float]:
+    """Return how far a payload may be off: the true one is no less than nothing, and no giant."""
+    declared = observation.quantities.get("payload", np.array([model.payload_mass]))
+    most = HEAVIEST * max(float(declared.max()), model.arm.payload)
+    return -float(declared.min()), most
+
+
+def _has_what_it_needs(candidate: Candidate, observation: Observation) -> bool:
+    if candidate.periodic:  # of a joint that moves at all
+        assert candidate.site.joint is not None
+        return joint_quantity(observation, candidate.site.joint - 1) in observation.quantities
+    return all(
+        any(q == need or q.startswith(f"{need}_") for q in observation.quantities)
+        for need in candidate.effect.needs
+        if need != "approach"  # without reversals play is an offset: a tie to be told
+    )
+
+
+def terms_alike(a: tuple[Term, ...], b: tuple[Term, ...]) -> bool:
+    """Return whether two sets of terms accuse the same effects at the same sites."""
+    return {(t.effect, t.site) for t in a} == {(t.effect, t.site) for t in b}

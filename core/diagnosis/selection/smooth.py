@@ -1,0 +1,154 @@
+"""Smooth candidates: unnamed functions of one quantity, the rivals of the catalogue.
+
+Where one of them wins, the answer is ``unexplained`` and what it depends on. Each moves one target:
+a joint's angle, the measurement in base axes, the tool in flange axes, or the scale of the arm.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.observation import Observation
+from core.diagnosis.selection.candidate import Candidate, carrying, own_target
+from core.effects import Parameter, Site
+
+Array = NDArray[np.float64]
+Pair = tuple[Candidate, Array]
+KNOTS = 5
+BUMPS = 24  # places along a joint's range where something local may sit
+CHANGES_FRICTION = ("timestamp", "payload")
+SLOW = (0.03, 0.1, 0.3)  # shares of the greatest speed over which friction may fall (Stribeck)
+STEPS = 23  # moments at which something may have jumped
+
+
+def smooth_candidates(observation: Observation) -> list[Pair]:
+    """Return the smooth candidates of an observation with their columns (N, k, d)."""
+    found: list[Pair] = []
+    moved = targets(observation)
+    for name, z in observation.quantities.items():
+        shapes = [linear_basis(z)]
+        if len(np.unique(z)) > 2:
+            shapes.append(spline_basis(z))
+        for target, directions in moved.items():
+            own = target == own_target(name)
+            carries = target == carrying(name)
+            for shape in shapes:
+                full = np.hstack([np.ones((len(z), 1)), shape]) if own or carries else shape
+                found.append(_spread(name, target, directions, full))
+            if own:
+                found += _bumps(name, target, z, directions)
+        if name == "timestamp":
+            found += _steps(name, z, moved)
+        found += _frictions(name, z, observation)
+    found += _springs(observation)
+    for target, columns in observation.unnamed():
+        found.append((_candidate("", target, columns.shape[-1]), columns))
+    return found
+
+
+def _springs(observation: Observation) -> list[Pair]:
+    """Return joints that give way to their own moment by a curve of any shape."""
+    J, moment = observation.joint_columns, observation.axial_moment
+    if J is None or moment is None:
+        return []
+    return [
+        _spread("", f"moment_{j + 1}", J[:, :, j : j + 1], spline_basis(moment[:, j]))
+        for j in range(moment.shape[1])
+        if np.ptp(moment[:, j]) > 1e-9 * max(float(np.abs(moment).max()), 1e-300)
+    ]
+
+
+def _frictions(name: str, z: Array, observation: Observation) -> list[Pair]:
+    """Return friction that changes with time, load, or the joint's own warmth or slowness."""
+    if observation.friction is None:
+        return []
+    found = []
+    stem, _, index = name.rpartition("_")
+    for j in range(observation.friction.shape[1]):
+        shapes = []
+        if name in CHANGES_FRICTION or (stem == "joint_temperatures" and index == str(j)):
+            shapes = [linear_basis(z)]
+        elif stem == "actual_qd" and index == str(j):
+            slow = np.abs(z) / max(float(np.abs(z).max()), 1e-300)
+            shapes = [np.exp(-slow / share)[:, None] for share in SLOW]
+        columns = np.zeros((*observation.friction.shape, 1))
+        columns[:, j, 0] = observation.friction[:, j]
+        found += [_spread(name, f"friction_{j + 1}", columns, shape) for shape in shapes]
+    return found
+
+
+def targets(observation: Observation) -> dict[str, Array]:
+    """Return what may be moved: name -> directions (N, k, directions)."""
+    N, k = observation.measured.shape
+    J = observation.joint_columns
+    if J is None:
+        return {axis: np.tile(np.eye(k)[:, i : i + 1], (N, 1, 1))
+                for i, axis in enumerate(observation.axes)}  # fmt: skip
+    found = {f"joint_{i + 1}": J[:, :, i : i + 1] for i in range(J.shape[2])}
+    if observation.channel != "position":  # each coordinate is a joint
+        return found
+    shift = np.zeros((N, k, 3))
+    shift[:, :3] = np.eye(3)
+    found["position"] = shift
+    scale = np.zeros((N, k, 1))
+    scale[:, :3, 0] = observation.measured[:, :3]
+    found["scale"] = scale
+    if observation.tool_axes is not None:
+        tool = np.zeros((N, k, 3))
+        tool[:, :3] = observation.tool_axes
+        found["tool"] = tool
+    return found
+
+
+def _spread(quantity: str, target: str, directions: Array, shape: Array) -> Pair:
+    columns = directions[:, :, :, None] * shape[:, None, None, :]
+    columns = columns.reshape(*columns.shape[:2], -1)
+    return _candidate(quantity, target, columns.shape[-1]), columns
+
+
+def _candidate(quantity: str, target: str, size: int) -> Candidate:
+    scale = (Parameter("", "", 1e-3),) * size
+    return Candidate("smooth", Site(), scale, (None,) * size, quantity=quantity, target=target)
+
+
+def _bumps(name: str, target: str, z: Array, directions: Array) -> list[Pair]:
+    found = []
+    low, high = float(z.min()), float(z.max())
+    for width in ((high - low) / BUMPS, (high - low) / (2.5 * BUMPS), 2.4 * (high - low) / BUMPS):
+        for centre in np.arange(low, high, width):
+            bump = np.exp(-0.5 * ((z - centre) / width) ** 2)
+            if (bump > 0.3).sum() >= 2:
+                found.append(_spread(name, target, directions, bump[:, None]))
+    return found
+
+
+def _steps(name: str, z: Array, targets: dict[str, Array]) -> list[Pair]:
+    found = []
+    for quantile in np.linspace(0.06, 0.94, STEPS):
+        after = (z > np.quantile(z, quantile)).astype(float)[:, None]
+        if 2 <= after.sum() <= len(z) - 2:
+            found += [_spread(name, target, d, after) for target, d in targets.items()]
+    return found
+
+
+def linear_basis(z: Array) -> Array:
+    """Return the quantity itself, centred and of unit size (N, 1)."""
+    return np.asarray(((z - z.mean()) / max(float(np.std(z)), 1e-300))[:, None])
+
+
+def spline_basis(z: Array) -> Array:
+    """Return a smooth basis (N, <= KNOTS - 1) over the quantity's ranks and range, centred.
+
+    Few distinct values give one indicator each; otherwise natural cubics (truncated powers).
+    """
+    levels = np.unique(np.round(z / max(np.ptp(z), 1e-300), 6))
+    unit = (z - z.min()) / np.ptp(z)
+    if len(levels) <= KNOTS:
+        values = np.round(z / np.ptp(z), 6)
+        basis = np.stack([(values == level).astype(float) for level in levels[1:]], axis=1)
+    else:
+        knots = np.linspace(0, 1, KNOTS)[1:-1]
+        powers = [unit, unit**2, *(np.clip(unit - t, 0, None) ** 3 for t in knots[:2])]
+        basis = np.stack(powers, axis=1)
+    return np.asarray(basis - basis.mean(axis=0))

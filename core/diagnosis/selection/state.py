@@ -1,0 +1,121 @@
+"""The state of a selection: what is observed, by whom it may be explained, and how it scatters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arm import Arm
+from core.diagnosis.observation import Observation
+from core.diagnosis.selection.candidate import Candidate
+from core.diagnosis.selection.noise import Noise
+from core.diagnosis.selection.problem import AT_ONCE, Space, prices
+from core.effects import Term
+
+Array = NDArray[np.float64]
+DEAD = 1e-7  # share of a column that the nuisance leaves: below, nothing is left
+UNSEEN = 3.0
+KNOWN_SHARE = 0.7  # a stated repeatability is an average: less than this share of it is not assumed
+
+
+@dataclass
+class Work:
+    """What a selection works on; candidates, noise and kept samples change from round to round."""
+
+    observation: Observation
+    arm: Arm
+    candidates: list[Candidate]
+    noise: Noise
+    kept: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Raw:
+    """The whitened rows of the kept samples before the nuisance was projected out.
+
+    All columns are as large as the sample space itself, so they are put together when asked for.
+    """
+
+    nuisance: Array  # (m, p)
+    target: Array  # (m,)
+    basis: Array  # (m, p) orthonormal, of the nuisance
+    taken: Array  # (p, K) what the nuisance took of every column
+
+    def columns(self, space: Space, chosen: Sequence[int]) -> Array:
+        """Return the columns (m, sum d) of a set of candidates as they were."""
+        taken = self.taken[:, space.column_indices(chosen)]
+        return np.asarray(space.columns(chosen) + self.basis @ taken)
+
+
+def flat(columns: Array, work: Work) -> Array:
+    """Return (N, k, d) columns as whitened (m, d) rows of the kept samples."""
+    kept = work.noise.whitener[work.kept] @ columns[work.kept]
+    return np.asarray(kept.reshape(kept.shape[0] * kept.shape[1], columns.shape[-1]))
+
+
+def sample_space(
+    work: Work,
+    columns: list[Array],
+    base: tuple[Term, ...],
+    smooth: list[tuple[Candidate, Array]],
+) -> tuple[Space, Raw]:
+    """Return the sample space at the model found so far, and what it was before projection."""
+    observation = work.observation
+    candidates = [*work.candidates, *(c for c, _ in smooth)]
+    size = np.array([len(c.parameters) for c in candidates])
+    start = np.concatenate([[0], np.cumsum(size)])
+    X = np.empty((int(work.kept.sum()) * observation.measured.shape[1], int(start[-1])))
+    for c, block in enumerate([*columns, *(s for _, s in smooth)]):
+        X[:, start[c] : start[c + 1]] = flat(block, work)
+    chords = observation.channel == "tracking"  # from nothing: nothing has to be put back
+    gap = (observation.measured - observation.predict(() if chords else base))[..., None]
+    # what the terms already in the model explain is put back, in the linear form at hand
+    for term in () if chords else base:
+        c, x = locate(work.candidates, term)
+        gap = gap + columns[c] @ x[:, None]
+    target = flat(gap, work)[:, 0]
+    nuisance = flat(observation.nuisance, work)
+    Q = np.linalg.qr(nuisance)[0] if nuisance.shape[1] else nuisance
+    whole = _sizes(X)
+    taken, y = Q.T @ X, target - Q @ (Q.T @ target)
+    for few in np.array_split(np.arange(X.shape[1]), 1 + X.size // AT_ONCE):
+        X[:, few] -= Q @ taken[:, few]
+    X[:, _sizes(X) < DEAD * whole] = 0.0  # the frame takes it up wholly; the rest is rounding
+    freedom = float(len(target) - Q.shape[1])
+    price = prices(candidates, freedom) + np.array([_unseen(c, observation) for c in candidates])
+    space = Space(
+        y, X, start, tuple(candidates), price, freedom,
+        KNOWN_SHARE if observation.sigma_is_whole else work.noise.floor_share,
+    )  # fmt: skip
+    return space, Raw(nuisance, target, Q, taken)
+
+
+def _sizes(X: Array) -> Array:
+    return np.asarray(np.sqrt(np.einsum("ij,ij->j", X, X)))
+
+
+def _unseen(candidate: Candidate, observation: Observation) -> float:
+    """Return what an effect pays more whose motion the log does not show: play without reversals.
+
+    It then stands behind the plain offset that it equals, as a tie.
+    """
+    if not candidate.effect.by_approach or candidate.site.joint is None:
+        return 0.0
+    return 0.0 if f"approach_{candidate.site.joint - 1}" in observation.quantities else UNSEEN
+
+
+def locate(candidates: list[Candidate], term: Term) -> tuple[int, Array]:
+    """Return the candidate of a term, and the term's fitted values."""
+    for c, candidate in enumerate(candidates):
+        if candidate.family == term.effect and candidate.site == term.site:
+            if candidate.fixed != (None,) * len(term.values) and not np.allclose(
+                [f for f in candidate.fixed if f is not None],
+                [v for f, v in zip(candidate.fixed, term.values, strict=True) if f is not None],
+            ):
+                continue
+            free = [v for f, v in zip(candidate.fixed, term.values, strict=True) if f is None]
+            return c, np.array(free)
+    raise KeyError(term)

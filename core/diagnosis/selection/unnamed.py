@@ -1,0 +1,157 @@
+"""Rivals of the catalogue that follow no single quantity: something gives way, something pulls.
+
+They stand for causes that the catalogue does not hold. Where one of them wins over named causes the
+answer is ``unexplained``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.dynamics import frames_of, pieces_of
+from core.effects.effect import typical_moment
+from core.kernels.reference import Chain, Rows, predict_rows
+from core.loads import Loads
+from core.model import Model
+from core.motion import Motion
+from core.rotation import rotation_vector
+
+Array = NDArray[np.float64]
+SHORTEST = 1e-3  # m: shorter links do not bend
+OFF = 0.1  # m, of a load from the TCP
+PULL = 1.0  # N, step of the central differences
+
+
+def unnamed_rivals(model: Model, q: Array, loads: Loads, k: int) -> tuple[tuple[str, Array], ...]:
+    """Return target and columns (N, k, d) of every rival; ``q`` (N, n) rad, k is 3 or 6.
+
+    Each joint bending across its axis as it likes; each link bending across its length, however its
+    stiffness is spread; the base tilting; a pull at the tool that nobody declared: downwards, in
+    any direction of base, in any direction of the tool.
+    """
+    return (
+        *_bending(model, q, loads, k),
+        *_links(model, q, loads, k),
+        *_pulls(model, q, loads, k),
+    )
+
+
+def _bending(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Array]]:
+    chain, rows = model.chain(), model.rows(q, loads)
+    step = 1e-2 * 1e-3 / typical_moment(model.arm)
+    found = []
+    for i in range(model.arm.n + 1):
+        columns = np.zeros((len(q), k, 2))
+        for axis in range(2):  # about z it would only blur the catalogue's own stiffness
+            ends = []
+            for h in (step, -step):
+                bent, tilted = chain.compliance.copy(), chain.base_compliance.copy()
+                if i == 0:
+                    tilted[axis] += h
+                else:
+                    bent[i - 1, axis] += h
+                changed = chain._replace(compliance=bent, base_compliance=tilted)
+                ends.append(_poses(changed, rows))
+            columns[:, :, axis] = _change(ends, 2 * step, k)
+        found.append((f"joint_{i}" if i else "base", columns))
+    return found
+
+
+def _links(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Array]]:
+    """Return three hinges along each link, at its ends and its middle, each with its own give."""
+    still = np.zeros_like(q)
+    frames = frames_of(model.chain(), q, still, still)
+    tip = model.predict(q, loads).position
+    form = model.linear_form(q, loads)
+    found = []
+    for i in range(model.arm.n - 1):
+        near, far = frames.origin[:, i], frames.origin[:, i + 1]
+        along = far - near
+        length = np.linalg.norm(along, axis=1, keepdims=True)
+        if float(length.min()) < SHORTEST:
+            continue
+        along = along / length
+        at = (near, (near + far) / 2, far)
+        moments = [form.moment[:, i], form.moment[:, i + 1]]
+        moments.insert(1, (moments[0] + moments[1]) / 2)
+        columns = np.zeros((len(q), 6, 3))
+        for hinge, (place, moment) in enumerate(zip(at, moments, strict=True)):
+            turn = moment - along * np.sum(along * moment, axis=1, keepdims=True)
+            columns[:, :3, hinge] = np.cross(turn, tip - place)
+            columns[:, 3:, hinge] = turn
+        found.append((f"link_{i + 1}", columns[:, :k]))
+    return found
+
+
+def _pulls(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Array]]:
+    if not model.chain().compliance.any():
+        return []  # a rigid arm does not show what pulls at it
+    chain = model.chain()
+    tool_axes = model.predict(q, loads).rotation
+    declared = np.zeros((len(q), 6)) if loads.wrench is None else loads.wrench
+    in_base = np.zeros((len(q), k, 3))
+    for axis in range(3):
+        ends = []
+        for h in (PULL, -PULL):
+            pulled = np.array(np.broadcast_to(declared, (len(q), 6)))
+            pulled[:, axis] += h
+            ends.append(_poses(chain, model.rows(q, replace(loads, wrench=pulled))))
+        in_base[:, :, axis] = _change(ends, 2 * PULL, k)
+    down = model.gravity / max(float(np.linalg.norm(model.gravity)), 1e-300)
+    return [
+        ("load", in_base @ down[:, None]),
+        ("pull", in_base),
+        ("tool pull", in_base @ tool_axes),
+    ]
+
+
+def unnamed_pulls(model: Model, motion: Motion, channel: str) -> tuple[tuple[str, Array], ...]:
+    """Return what an undeclared pull at the tool does to torques (N, n, d) or wrenches (N, 6, d).
+
+    A mass somewhere at the tool, a pull in any direction of base and, for torques, in any direction
+    of the tool (to a sensor on the flange that is a bias).
+    """
+    count, columns = len(motion), []
+    for axis in range(3):
+        unit = np.zeros((count, 6))
+        unit[:, axis] = 1.0
+        pulled = replace(motion, loads=replace(motion.loads, wrench=unit))
+        pieces = pieces_of(model, pulled)
+        columns.append(pieces.external_torque if channel == "torque" else pieces.external_wrench)
+    in_base = np.stack(columns, axis=2)
+    found = [("load", _loads_anywhere(model, motion, channel)), ("pull", in_base)]
+    if channel == "torque":
+        found.append(("tool pull", in_base @ model.rigid_pose(motion.q).rotation))
+    return tuple(found)
+
+
+def _loads_anywhere(model: Model, motion: Motion, channel: str) -> Array:
+    """Return columns (N, k, 4) of a mass at the TCP and of its being off there along each axis."""
+    at_tool = model.tool_in_flange[:3, 3]
+    columns = []
+    for off in (np.zeros(3), *(OFF * np.eye(3))):
+        place = np.tile(at_tool + off, (len(motion), 1))
+        pieces = pieces_of(model, replace(motion, loads=replace(motion.loads, payload_cog=place)))
+        columns.append(pieces.payload_torque if channel == "torque" else pieces.payload_wrench)
+    columns[1:] = [(c - columns[0]) / OFF for c in columns[1:]]
+    return np.stack(columns, axis=2)
+
+
+def _poses(chain: Chain, rows: Rows) -> tuple[Array, Array]:
+    count = len(rows.q)
+    position, rotation = np.empty((count, 3)), np.empty((count, 3, 3))
+    predict_rows(chain, rows, position, rotation)
+    return position, rotation
+
+
+def _change(ends: list[tuple[Array, Array]], step: float, k: int) -> Array:
+    """Return the change (N, k) of position and rotation vector per unit between two ends."""
+    (position, rotation), (before, turned) = ends
+    columns = np.empty((len(position), k))
+    columns[:, :3] = (position - before) / step
+    if k > 3:
+        columns[:, 3:] = rotation_vector(rotation @ np.swapaxes(turned, 1, 2)) / step
+    return columns

@@ -1,0 +1,70 @@
+"""Servos that stop before they are there."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from core.effects.effect import JointEffect, Parameter, Site, Term
+from core.interpolation import played, stretches
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from core.arm import Arm
+    from core.motion import Motion
+
+
+class DeadBand(JointEffect):
+    """The servo rests within w of its target and moves again only once it is further off.
+
+    Coming from below it rests at target - w, from above at target + w; in motion it is play of half
+    width w between target and actual. Comes from controllers that ignore small errors, and from dry
+    friction that a proportional servo does not overcome. Live, the setpoint goes w further in the
+    direction of the joint's last motion. Needs motion both ways: one way only it looks like a
+    constant error of the servo. A lag goes by speed, a dead band does not.
+    Source: Tao, Kokotovic, "Adaptive Control of Systems with Actuator and Sensor Nonlinearities"
+    (1996), ch. 2, backlash.
+    """
+
+    identifier = "dead_band"
+    title = "servo stops before its target"
+    label_words = "dead band of servo {joint}"
+    order = 70
+    by_approach = True
+    channels = ("tracking",)
+    motion = "the joint moved both ways, or poses reached from both sides"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the half width w."""
+        return (Parameter("", "rad", 1e-3, 0.0, 0.2),)
+
+    def track(
+        self, term: Term, arm: Arm, q: NDArray[np.float64], motion: Motion
+    ) -> NDArray[np.float64]:
+        """Move the joint only where its target has left the band."""
+        if not motion.moving:
+            return super().track(term, arm, q, motion)
+        assert term.site.joint is not None
+        i, width = term.site.joint - 1, term.values[0]
+        result = q.copy()
+        for part in stretches(motion):
+            result[part, i] = played(q[part, i], width, float(motion.q[part.start, i]))
+        return result
+
+    def settle(
+        self,
+        term: Term,
+        arm: Arm,
+        q: NDArray[np.float64],
+        held: NDArray[np.float64],
+        approach: NDArray[np.float64] | None,
+    ) -> NDArray[np.float64]:
+        """Let the joint rest on the side that it came from."""
+        assert term.site.joint is not None
+        if approach is None:
+            return q
+        i = term.site.joint - 1
+        result = q.copy()
+        result[:, i] -= term.values[0] * approach[:, i]
+        return result

@@ -1,0 +1,55 @@
+"""Links whose centre of gravity is elsewhere."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from core.effects.effect import JointEffect, Parameter, Site, Term, typical_moment
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from core.arm import Arm
+    from core.motion import Motion
+
+
+class LinkCog(JointEffect):
+    """A link's centre of gravity is elsewhere: its first moment, mass times the shift.
+
+    Axes of the URDF link (with ``dh`` those of the row's frame). Comes from cables, covers, and
+    drawings without motors. Shows in the weight that the joint and those before it hold; the mass
+    stays, which ``link_inertia`` changes. Part of it is felt by no joint, or cannot be told from
+    the next link's: only some combinations are found, the rest stays open. Under one constant load
+    the last link's is the same as ``payload_cog``.
+    Source: Gautier, Khalil, IEEE Trans. Robotics and Automation 6 (1990) 368, on base parameters.
+    """
+
+    identifier = "link_cog"
+    title = "link's centre of gravity is elsewhere"
+    label_words = "first moment {part} of link {joint}"
+    order = 22
+    carried = True
+    felt_by_all = True
+    channels = ("torque",)
+    motion = "poses that turn the link against gravity, or its accelerations"
+
+    def sites(self, arm: Arm) -> tuple[Site, ...]:
+        """Return the links that have a mass."""
+        return tuple(Site(joint=i + 1) for i in range(arm.n) if arm.mass[i] > 0)
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the first moment in the link's axes."""
+        scale = 1e-3 * typical_moment(arm)  # some centimetres of a link of some kg
+        return tuple(Parameter(k, "kg m", scale, -1e3 * scale, 1e3 * scale) for k in "xyz")
+
+    def drive(
+        self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion
+    ) -> NDArray[np.float64]:
+        """Add what holds and moves the first moment."""
+        assert term.site.joint is not None
+        assert motion.pieces is not None
+        i, moment = term.site.joint - 1, np.array(term.values)
+        in_link = moment if arm.body_axes is None else arm.body_axes[i] @ moment
+        return torque + motion.pieces.link_from(i, in_link)

@@ -1,0 +1,49 @@
+"""Friction that grows with load."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from core.effects.effect import JointEffect, Parameter, Site, Term
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from core.arm import Arm
+    from core.motion import Motion
+
+
+class LoadFriction(JointEffect):
+    """The motor delivers a torque more that grows with the joint's load: + mu |tau_load| sign(qd).
+
+    tau_load is the inverse dynamics of the rigid arm with payload and pull, without friction and
+    rotor. Comes from gears that lose a share of what they transmit. At one load it is the same as
+    Coulomb friction: poses or payloads that change the load, with motion both ways, separate them.
+    Near standstill the direction counts smoothly, as for Coulomb friction.
+    Source: Hamon, Gautier, Garrec, "Dynamic identification of robots with a dry friction model
+    depending on load and velocity", IROS (2010).
+    """
+
+    identifier = "load_friction"
+    title = "friction grows with load"
+    label_words = "load friction of joint {joint}"
+    order = 53
+    channels = ("torque",)
+    motion = "the joint moved both ways under loads that change"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the share of the load."""
+        return (Parameter("", "", 0.05, 0.0, 5.0),)
+
+    def drive(
+        self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion
+    ) -> NDArray[np.float64]:
+        """Add the friction that the motor overcomes."""
+        assert term.site.joint is not None
+        assert motion.load is not None
+        i = term.site.joint - 1
+        result = torque.copy()
+        result[:, i] += term.values[0] * np.abs(motion.load[:, i]) * motion.direction[:, i]
+        return result

@@ -1,0 +1,68 @@
+"""A payload whose centre of gravity is elsewhere."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from core.effects.effect import Effect, Parameter, Site, Term
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from core.arm import Arm
+    from core.kernels.reference import Rows
+    from core.loads import Loads
+    from core.motion import Motion
+
+
+class PayloadCog(Effect):
+    """The load's centre of gravity is elsewhere: true centre = declared + shift, flange axes.
+
+    Comes from a drawing of the gripper without its hoses, or a part that is held off centre. Shows
+    as moment at the flange sensor, as joint torque and as bending; needs a payload, and poses that
+    turn the flange against gravity. Under one constant load the last link's ``link_cog`` is the
+    same; a second payload tells them apart. A shift along gravity alone shows nothing.
+    Source: Hollerbach, Khalil, Gautier, "Model Identification", Springer Handbook of Robotics
+    (2016), ch. 6.
+    """
+
+    identifier = "payload_cog"
+    title = "load's centre of gravity is elsewhere"
+    label_words = "centre of gravity {part}"
+    order = 12
+    needs_softness = True
+    carried = True
+    felt_by_all = True
+    corrects = "payload"
+    channels = ("position", "wrench", "torque")
+    motion = "a payload, and poses that turn the flange against gravity"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the shift in flange axes."""
+        return tuple(Parameter(k, "m", 0.02, -1.0, 1.0) for k in "xyz")
+
+    def condition(
+        self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]
+    ) -> None:
+        """Move the centre of gravity."""
+        rows.payload_cog[:] += term.values
+
+    def sense(
+        self, term: Term, arm: Arm, wrench: NDArray[np.float64], motion: Motion
+    ) -> NDArray[np.float64]:
+        """Add what the load does more to the sensor from there."""
+        assert motion.pieces is not None
+        _, moved = motion.pieces.payload_from(np.array(term.values))
+        there = moved - motion.pieces.payload_wrench
+        return wrench + motion.pieces.carried_mass[:, None] * there
+
+    def drive(
+        self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion
+    ) -> NDArray[np.float64]:
+        """Add what holds and moves the load more from there."""
+        assert motion.pieces is not None
+        moved, _ = motion.pieces.payload_from(np.array(term.values))
+        there = moved - motion.pieces.payload_torque
+        return torque + motion.pieces.carried_mass[:, None] * there

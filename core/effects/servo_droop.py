@@ -1,0 +1,52 @@
+"""Servos that give way under what they hold."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from core.effects.effect import JointEffect, Parameter, Site, Term, typical_moment
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from core.arm import Arm
+
+
+class ServoDroop(JointEffect):
+    """The servo rests short of its target, by the torque it holds: actual_q = target_q - c tau.
+
+    tau is the torque (Nm) that the joint holds about its axis at rest: gravity, payload and pull,
+    positive where the motor pushes towards positive q. Comes from proportional position control
+    without an integral part (hobby servos, CAN joint modules, impedance modes). Live, c tau is
+    added to the setpoint. A constant error of the servo looks the same under one constant torque;
+    a delay differs in that it goes by speed, not by load.
+    Source: Siciliano et al., "Robotics" (2009), ch. 8.3: steady state of PD control without gravity
+    compensation.
+    """
+
+    identifier = "servo_droop"
+    title = "servo gives way under load"
+    label_words = "droop of servo {joint} per torque"
+    order = 60
+    channels = ("tracking",)
+    motion = "poses, payloads or pulls that change the torque that the joint holds"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the droop per torque."""
+        return (Parameter("", "rad/Nm", 5e-3 / typical_moment(arm), 0.0, 1.0),)
+
+    def settle(
+        self,
+        term: Term,
+        arm: Arm,
+        q: NDArray[np.float64],
+        held: NDArray[np.float64],
+        approach: NDArray[np.float64] | None,
+    ) -> NDArray[np.float64]:
+        """Let the joint give way."""
+        assert term.site.joint is not None
+        i = term.site.joint - 1
+        result = q.copy()
+        result[:, i] -= term.values[0] * held[:, i]
+        return result

@@ -1,0 +1,30 @@
+"""What an effect asks of a simulator's model, in the simulator's own terms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, auto
+
+
+class Kind(Enum):
+    """A quantity that simulators know."""
+
+    JOINT_ZERO = auto()  # rad: the joint turns further than its encoder says
+    FRICTION = auto()  # Nm, Coulomb
+    DAMPING = auto()  # Nm s/rad
+    ARMATURE = auto()  # kg m2: inertia of the rotor at the joint's side of the gear
+    DELAY = auto()  # s, of the command
+    LAG = auto()  # s: time constant of the servo
+    SERVO_COMPLIANCE = auto()  # rad/Nm: 1 / proportional gain of a position servo
+    PLAY = auto()  # rad: whole clearance
+    PAYLOAD = auto()  # kg, at the declared centre of gravity
+    LINK_SCALE = auto()  # relative increase of a link's mass and inertia
+
+
+@dataclass(frozen=True)
+class SimulatorChange:
+    """One change: by ``value`` in the kind's unit, at a joint (from 1) or the whole arm."""
+
+    kind: Kind
+    joint: int | None
+    value: float

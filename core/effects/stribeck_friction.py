@@ -1,0 +1,54 @@
+"""Friction that is higher just after the joint breaks away."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from core.effects.coulomb_friction import joint_scale
+from core.effects.effect import JointEffect, Parameter, Site, Term
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from core.arm import Arm
+    from core.motion import Motion
+
+SLOWEST = 1e-4  # rad/s
+
+
+class StribeckFriction(JointEffect):
+    """The motor delivers more at low speed: + (F_s - F_c) exp(-(qd / v_s)^2) sign(qd).
+
+    Above the Coulomb friction, which it comes on top of; v_s is the speed at which a film of grease
+    has built up. Needs slow motion: rows in which the direction is unsure count smoothly, and a log
+    without speeds near v_s shows nothing of it. At one speed it is the same as Coulomb friction.
+    Source: Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30 (1994) 1083.
+    """
+
+    identifier = "stribeck_friction"
+    title = "friction is higher at low speed"
+    label_words = "breakaway friction of joint {joint} {part}"
+    order = 54
+    channels = ("torque",)
+    motion = "the joint moved both ways, slowly and fast"
+    shapes = tuple(float(v) for v in np.geomspace(4e-3, 0.6, 9))
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the torque at standstill above Coulomb's, and the speed at which it is gone."""
+        return (
+            Parameter("", "Nm", 0.03 * joint_scale(arm, site), 0.0, np.inf),
+            Parameter("velocity", "rad/s", 0.05, 0.0, 10.0),
+        )
+
+    def drive(
+        self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion
+    ) -> NDArray[np.float64]:
+        """Add the friction that the motor overcomes."""
+        assert term.site.joint is not None
+        i, speed = term.site.joint - 1, max(abs(term.values[1]), SLOWEST)
+        result = torque.copy()
+        fading = np.exp(-((motion.qd[:, i] / speed) ** 2))
+        result[:, i] += term.values[0] * fading * motion.direction[:, i]
+        return result

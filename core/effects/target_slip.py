@@ -1,0 +1,59 @@
+"""A measuring target that moves on the tool."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from core.effects.effect import Effect, Parameter, Site, Term, rows_after
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from core.arm import Arm
+    from core.kernels.reference import Chain
+    from core.loads import Loads
+
+
+class TargetSlip(Effect):
+    """The target on the tool moves once, at one moment of the log, by a shift in flange axes.
+
+    Comes from a reflector or probe that was knocked, changed or put back. Rows after ``time`` (s of
+    ``timestamp``, or the number of the row where the log has none) have the tool centre point
+    there; live setpoints always do. The moment is found by likelihood over all rows, so it lies
+    between two of them. A joint that slips turns with the joints before it, a target with the
+    flange: poses that differ in the last joints tell them apart. A shift that was there all the
+    time is ``tool_frame``.
+    Source: Page, Biometrika 41 (1954) 100; Hinkley, Biometrika 57 (1970) 1, on change points.
+    """
+
+    identifier = "target_slip"
+    title = "target has slipped on the tool"
+    label_words = "slip of the target {part}"
+    at_moment = True
+    channels = ("position",)
+    motion = "poses before and after the moment, that differ in the orientation of the flange"
+
+    def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
+        """Return the shift in flange axes, and when it happened."""
+        shift = tuple(Parameter(k, "m", 1e-3, -0.5, 0.5) for k in "xyz")
+        return (*shift, Parameter("time", "s", 1.0))
+
+    def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
+        """Move the TCP."""
+        chain.tool_position[:] += term.values[:3]
+
+    def before(
+        self,
+        term: Term,
+        chain: Chain,
+        position: NDArray[np.float64],
+        rotation: NDArray[np.float64],
+        loads: Loads,
+    ) -> None:
+        """Put the TCP back in the rows before the slip."""
+        if loads.time is None:
+            return
+        rows = ~rows_after(term, loads)
+        position[rows] -= rotation[rows] @ (chain.tool_rotation.T @ np.array(term.values[:3]))

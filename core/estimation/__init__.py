@@ -1,0 +1,1 @@
+"""Estimation of compliance and of its siblings: robust, streamed, and over many arms."""

@@ -1,0 +1,153 @@
+"""Which flexibilities the data show, which only together with others, and which not at all.
+
+A flexibility that stays vague against its prior is held at the model's value, one after the other,
+the one first whose absence costs the fit least. What is left carries, for combinations of which
+the data know one number only, the whole of it (base parameters, in the robotics literature's sense:
+Gautier, Khalil, IEEE Trans. Robotics and Automation 6 (1990) 368).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.effects import flexibility_effects
+from core.estimation.compliance_fit import Linear, Mask, solve
+
+Array = NDArray[np.float64]
+VAGUE = 0.3  # of the prior's sigma: what is known no better is not shown
+VISIBLE = float(
+    np.sqrt(VAGUE**-2 - 1)
+)  # length of a column, in units of noise, that is shown alone
+CLOSE = 0.98  # correlation from which two flexibilities count as one combination
+MEMBER = 0.1  # share of a combination from which a flexibility is named in it
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a problem shows."""
+
+    kept: Mask  # (2n,) fitted; the others stay at the model's value
+    covariance: Array  # (2n, 2n): of the kept ones, the others held; prior's square for the others
+    told: tuple[str, ...]  # what is not shown, or only together
+
+
+def choose(linear: Linear, prior: tuple[Array, float], nonnegative: bool) -> Mask:
+    """Return the flexibilities (2n,) that the data show once the others are held."""
+    kept = np.ones(len(prior[0]), dtype=bool)
+    while kept.any():
+        vague = np.flatnonzero(kept)[_spread(linear, kept, prior[1]) > VAGUE]
+        if not len(vague):
+            break
+        costs = np.array([_cost(linear, kept, int(i), prior, nonnegative) for i in vague])
+        cheap = costs <= costs.min() + max(1.0, 1e-9 * costs.min())
+        # of those that are missed alike, the one that the data show least by itself
+        alone = np.linalg.norm(linear.matrix[:, vague], axis=0)
+        kept[vague[np.argmin(np.where(cheap, alone, np.inf))]] = False
+    return kept
+
+
+def _spread(linear: Linear, kept: Mask, sigma: float) -> Array:
+    """Return the standard deviations of the kept flexibilities, in the prior's sigma."""
+    return np.asarray(np.linalg.norm(_root(linear, kept, sigma), axis=1))
+
+
+def _root(linear: Linear, kept: Mask, sigma: float) -> Array:
+    """Return a root (k, k) of the kept ones' covariance in units of the prior's variance."""
+    from scipy.linalg import solve_triangular  # a tenth of a second, only where something is fitted
+
+    size = int(kept.sum())
+    R = np.linalg.qr(np.vstack([linear.matrix[:, kept] * sigma, np.eye(size)]), mode="r")
+    return np.asarray(solve_triangular(R, np.eye(size)))
+
+
+def _cost(
+    linear: Linear, kept: Mask, held: int, prior: tuple[Array, float], nonnegative: bool
+) -> float:
+    """Return the sum of squares of the best fit with one more flexibility held."""
+    mask = kept.copy()
+    mask[held] = False
+    found = solve(linear, mask, prior[0].copy(), prior, nonnegative)
+    left = linear.matrix @ found - linear.right
+    return float(left @ left + np.sum(((found - prior[0]) / prior[1]) ** 2))
+
+
+def what_is_shown(linear: Linear, kept: Mask, sigma: float) -> Shown:
+    """Return covariance and words for the chosen flexibilities; sigma is the prior's (rad/Nm)."""
+    count = len(kept)
+    covariance = np.diag(np.full(count, sigma**2))
+    root = _root(linear, kept, sigma) * sigma
+    covariance[np.ix_(kept, kept)] = root @ root.T
+    columns = linear.matrix * sigma
+    told = [_held(int(i), columns, kept) for i in np.flatnonzero(~kept)]
+    told += _faint(columns, kept) + _alike(covariance, kept)
+    return Shown(kept, covariance, tuple(told))
+
+
+def name(i: int | np.integer[Any], count: int) -> str:
+    """Return the public name of flexibility ``i`` of ``count`` = 2n: axial first, then radial."""
+    n = count // 2
+    named = flexibility_effects()
+    return f"{named['axial']}_{i + 1}" if i < n else f"{named['radial']}_{i - n + 1}"
+
+
+def _held(i: int, columns: Array, kept: Mask) -> str:
+    """Return why flexibility ``i`` is held, and which others stand for it."""
+    count, size = len(kept), float(np.linalg.norm(columns[:, i]))
+    this = name(i, count)
+    if size > VISIBLE and kept.any():
+        share = np.linalg.lstsq(columns[:, kept], columns[:, i], rcond=1e-9)[0]
+        left = np.linalg.norm(columns[:, i] - columns[:, kept] @ share)
+        reach = np.abs(share) * np.linalg.norm(columns[:, kept], axis=0) / size
+        members = [
+            f"{share[k]:+.2f} {name(np.flatnonzero(kept)[k], count)}"
+            for k in np.argsort(-reach)[:3]
+            if reach[k] > MEMBER
+        ]
+        if members and left < VAGUE * size:
+            return (
+                f"{this}: not shown alone by these data, it acts like {' '.join(members)}; what "
+                "they make together is written there, this one stays at the model's value"
+            )
+    return f"{this}: not shown by these data, stays at the model's value"
+
+
+def _faint(columns: Array, kept: Mask) -> list[str]:
+    """Return combinations that show although none of their members does."""
+    held = np.flatnonzero(~kept)
+    if len(held) < 2:
+        return []
+    left = columns[:, held]
+    if kept.any():
+        left = left - columns[:, kept] @ np.linalg.lstsq(columns[:, kept], left, rcond=1e-9)[0]
+    values, vectors = np.linalg.eigh(left.T @ left)
+    told = []
+    for value, vector in zip(values, vectors.T, strict=True):
+        members = np.flatnonzero(np.abs(vector) > 0.3 * np.abs(vector).max())
+        if value > VISIBLE**2 and len(members) > 1:
+            sign = np.sign(vector[members[0]])
+            parts = [f"{sign * vector[k]:+.2f} {name(held[k], len(kept))}" for k in members]
+            told.append(
+                f"{' '.join(parts)}: shown together, none of them alone; they stay at the model's "
+                "values"
+            )
+    return told
+
+
+def _alike(covariance: Array, kept: Mask) -> list[str]:
+    """Return the pairs of kept flexibilities that the data hardly tell apart."""
+    told, std, count = [], np.sqrt(np.diag(covariance)), len(kept)
+    for i in np.flatnonzero(kept):
+        for j in np.flatnonzero(kept):
+            if j > i and std[i] > 0 and std[j] > 0:
+                correlation = covariance[i, j] / (std[i] * std[j])
+                if abs(correlation) > CLOSE:
+                    what = "difference" if correlation > 0 else "sum"
+                    told.append(
+                        f"{name(i, count)} and {name(j, count)}: mostly their {what} is known "
+                        f"(correlation {correlation:+.3f})"
+                    )
+    return told

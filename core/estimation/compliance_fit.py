@@ -1,0 +1,393 @@
+"""The least squares behind the identification: flexibilities, and what is unknown beside them.
+
+Gauss-Newton on the linear form (eq. 4 of docs/conventions.md), taken again at the deflected shape,
+outliers down-weighted. Where the instrument is not registered, its frame and the tool point are
+estimated along: nuisances, projected out before anything is said of a flexibility.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.effects import CATALOGUE
+from core.estimation.registration import IDENTITY, Registration, frame_columns, register_robustly
+from core.loads import Loads
+from core.model import Model, Poses
+from core.rotation import rotation_vector
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+ROUNDS = 12
+NUISANCE_ROUNDS = 20
+SETTLED = 1e-8  # relative step at which a fit has come to rest
+RANK = 1e-10  # singular values of the nuisances below this share are rounding
+WILD = 5.0  # standard deviations beyond which a reading counts as wild
+
+
+@dataclass(frozen=True)
+class Data:
+    """Measured poses of N rows and what acted on the arm."""
+
+    q: Array  # (N, n) rad
+    loads: Loads
+    position: Array  # (N, 3) m, measured, instrument's frame
+    rotation: Array | None  # (N, 3, 3)
+    registered: bool  # the instrument measures the cell's TCP in base: nothing beside is unknown
+    session: NDArray[np.int64] | None = None  # (N,) session of each row; None: there is one
+    sessions: int = 1  # how many there are, in the whole data
+    remounted: bool = False  # each session has a tool point of its own
+
+    def part(self, rows: NDArray[Any]) -> Data:
+        """Return some of the rows."""
+        rotation = None if self.rotation is None else self.rotation[rows]
+        session = None if self.session is None else self.session[rows]
+        return replace(
+            self, q=self.q[rows], loads=self.loads[rows], position=self.position[rows],
+            rotation=rotation, session=session,
+        )  # fmt: skip
+
+    @property
+    def frames(self) -> int:
+        """Return how many frames of the instrument are unknown."""
+        return 0 if self.registered else self.sessions
+
+    @property
+    def tools(self) -> int:
+        """Return how many tool points are unknown."""
+        if self.remounted:
+            return self.sessions
+        return 0 if self.registered else 1
+
+    @property
+    def nuisances(self) -> int:
+        """Return how many numbers are estimated beside the flexibilities: frames, tool points."""
+        return 6 * self.frames + 3 * self.tools
+
+
+@dataclass(frozen=True)
+class Placements:
+    """Where the instrument stood, and where the target sat, in each of several sessions."""
+
+    frames: tuple[Registration, ...]
+    tool_shift: tuple[Array, ...]  # (3,) m, flange axes: against the model's tool point
+
+
+@dataclass(frozen=True)
+class Linear:
+    """The problem at one shape, weighed by the noise, nuisances projected out.
+
+    matrix @ flexibilities = right for the flexibilities (2n,) themselves, not for a step.
+    """
+
+    matrix: Array  # (2n+1, 2n) per rad/Nm
+    right: Array  # (2n+1,)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Where a fit came to rest."""
+
+    model: Model  # with the flexibilities and the tool point found
+    frame: Registration | Placements
+    weights: Array  # (N,)
+    linear: Linear | None = None  # None: only the nuisances were fitted
+
+    @property
+    def flexibility(self) -> Array:
+        """Return the flexibilities (2n,) rad/Nm: axial, then radial."""
+        return flexibilities(self.model)
+
+
+def flexibilities(model: Model) -> Array:
+    """Return the model's linear flexibilities (2n,) rad/Nm: axial, then radial.
+
+    Those that ``with_compliance`` replaces; what a bent stiffness curve holds stays beside.
+    """
+    found = np.zeros(2 * model.arm.n)
+    for term in model.terms:
+        kind = CATALOGUE[term.effect].flexibility
+        if kind and term.site.joint:
+            first = 0 if kind == "axial" else model.arm.n
+            found[first + term.site.joint - 1] += term.values[0]
+    return found
+
+
+def residual(model: Model, data: Data, frame: Registration | Placements) -> tuple[Array, Poses]:
+    """Return measured minus predicted (N, 3 or 6) in base axes, and the predicted poses."""
+    if isinstance(frame, Placements):
+        return _residual_by_session(model, data, frame)
+    poses = model.predict(data.q, data.loads)
+    gap = frame.in_base(data.position) - poses.position
+    if data.rotation is None:
+        return gap, poses
+    turn = frame.rotation_in_base(data.rotation) @ np.swapaxes(poses.rotation, 1, 2)
+    return np.hstack([gap, rotation_vector(turn)]), poses
+
+
+def _residual_by_session(model: Model, data: Data, placements: Placements) -> tuple[Array, Poses]:
+    gap = np.empty((len(data.q), 3 if data.rotation is None else 6))
+    position, rotation = np.empty((len(data.q), 3)), np.empty((len(data.q), 3, 3))
+    assert data.session is not None
+    for s, (frame, shift) in enumerate(zip(placements.frames, placements.tool_shift, strict=True)):
+        rows = np.flatnonzero(data.session == s)
+        if len(rows):
+            own = replace(data.part(rows), session=None, sessions=1)
+            gap[rows], poses = residual(shifted(model, shift), own, frame)
+            position[rows], rotation[rows] = poses.position, poses.rotation
+    return gap, Poses(position, rotation)
+
+
+def shifted(model: Model, tool_shift: Array) -> Model:
+    """Return the model with its tool point moved by ``tool_shift`` (3,), m, flange axes."""
+    tool = model.tool_in_flange.copy()
+    tool[:3, 3] += tool_shift
+    return replace(model, tool_in_flange=tool)
+
+
+def nuisance_columns(model: Model, poses: Poses, width: int, data: Data | None = None) -> Array:
+    """Return d(measured minus predicted) / d(frame step, tool point) as (N, width, 9), negated.
+
+    Of several sessions (``data``): all frames first, then the tool points, (N, width, nuisances).
+    """
+    columns = np.zeros((len(poses.position), width, 9))
+    columns[:, :, :6] = -frame_columns(poses.position)[:, :width]
+    columns[:, :3, 6:] = poses.rotation @ model.tool_in_flange[:3, :3].T  # flange axes in base
+    if data is None or data.session is None:
+        return columns
+    whole = np.zeros((len(columns), width, data.nuisances))
+    for s in range(data.sessions):
+        rows = data.session == s
+        if data.frames:
+            whole[rows, :, 6 * s : 6 * s + 6] = columns[rows, :, :6]
+        at = 6 * data.frames + (3 * s if data.remounted else 0)
+        if data.tools:
+            whole[rows, :, at : at + 3] = columns[rows, :, 6:]
+    return whole
+
+
+def orthonormal(columns: Array) -> Array:
+    """Return an orthonormal base of the columns (M, k); what is only rounding is left out."""
+    U, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(U[:, s > RANK * max(float(s.max(initial=0.0)), 1e-300)])
+
+
+def fit_nuisances(model: Model, data: Data) -> Fit:
+    """Return the frame and tool point that fit best, the model's flexibilities left alone."""
+    if not data.nuisances:
+        gap, _ = residual(model, data, IDENTITY)
+        return Fit(model, IDENTITY, _robust_weights(gap)[0])
+    frame = _first_placements(model, data)
+    for _ in range(NUISANCE_ROUNDS):
+        gap, poses = residual(model, data, frame)
+        weights, scale = _robust_weights(gap)
+        per_cell = per_cell_of(weights, scale, gap.shape[1])
+        columns = nuisance_columns(model, poses, gap.shape[1], data) * per_cell[..., None]
+        flat = columns.reshape(gap.size, -1)
+        step = np.linalg.lstsq(flat, (gap * per_cell).ravel(), rcond=RANK)[0]
+        model, frame = moved(model, frame, step)
+        if np.abs(step).max() < SETTLED:
+            break
+    return Fit(model, frame, weights)
+
+
+def placed_gap(model: Model, data: Data) -> Array:
+    """Return what a model leaves (N, 3 or 6) of one session whose frame is fitted on itself.
+
+    So is its tool point where it was remounted; nothing else of the model moves.
+    """
+    one = replace(data, session=np.zeros(len(data.q), dtype=np.int64), sessions=1)
+    frame = _first_placements(model, one)
+    free = slice(0, one.nuisances if one.remounted else 6 * one.frames)
+    for _ in range(NUISANCE_ROUNDS):
+        gap, poses = residual(model, one, frame)
+        weights, scale = _robust_weights(gap)
+        per_cell = per_cell_of(weights, scale, gap.shape[1])
+        columns = nuisance_columns(model, poses, gap.shape[1], one)[:, :, free]
+        flat = (columns * per_cell[..., None]).reshape(gap.size, -1)
+        if not flat.shape[1]:
+            return gap
+        step = np.zeros(one.nuisances)
+        step[free] = np.linalg.lstsq(flat, (gap * per_cell).ravel(), rcond=RANK)[0]
+        model, frame = moved(model, frame, step)
+        if np.abs(step).max() < SETTLED:
+            break
+    return residual(model, one, frame)[0]
+
+
+def _first_placements(model: Model, data: Data) -> Registration | Placements:
+    """Return the frame of each session as the rigid arm has it, outliers down-weighted."""
+    predicted = model.predict(data.q, data.loads).position
+    if data.session is None:
+        return register_robustly(data.position, predicted)
+    frames = [
+        register_robustly(data.position[rows], predicted[rows])
+        if not data.registered and rows.any() else IDENTITY
+        for rows in (data.session == s for s in range(data.sessions))
+    ]  # fmt: skip
+    return Placements(tuple(frames), (np.zeros(3),) * data.sessions)
+
+
+def fit_flexibilities(
+    begin: Fit,
+    data: Data,
+    kept: Mask,
+    prior: tuple[Array, float],
+    *,
+    nonnegative: bool,
+    rounds: int = ROUNDS,
+) -> Fit:
+    """Return the fit of the ``kept`` flexibilities (2n,), the others as they are in ``begin``.
+
+    ``prior`` is the value (2n,) and the 1 sigma (rad/Nm) that weakly hold every flexibility.
+    """
+    now = begin
+    for _ in range(rounds):
+        before = now.flexibility
+        now = _round(now, data, kept, prior, nonnegative)
+        if np.abs(now.flexibility - before).max() < SETTLED * max(np.abs(before).max(), 1e-12):
+            break
+    return now
+
+
+def _round(now: Fit, data: Data, kept: Mask, prior: tuple[Array, float], nonnegative: bool) -> Fit:
+    """Take one step of Gauss and Newton."""
+    model, n = now.model, now.model.arm.n
+    gap, poses = residual(model, data, now.frame)
+    weights, scale = _robust_weights(gap)
+    width = gap.shape[1]
+    per_cell = per_cell_of(weights, scale, width)
+    form = regressor(model, data, now.frame)[:, :width]
+    A = (form * per_cell[..., None]).reshape(-1, 2 * n)
+    b = (gap * per_cell).ravel()
+    F = np.zeros((len(b), 0))
+    if data.nuisances:
+        F = nuisance_columns(model, poses, width, data) * per_cell[..., None]
+        F = F.reshape(len(b), -1)
+    return stepped(now, (F, A, b), weights, kept, prior, nonnegative=nonnegative)
+
+
+def regressor(model: Model, data: Data, frame: Registration | Placements) -> Array:
+    """Return the linear form's columns (N, 6, 2n), each session with its own tool point."""
+    if not isinstance(frame, Placements):
+        return model.linear_form(data.q, data.loads).regressor
+    assert data.session is not None
+    columns = np.empty((len(data.q), 6, 2 * model.arm.n))
+    for s, shift in enumerate(frame.tool_shift):
+        rows = np.flatnonzero(data.session == s)
+        if len(rows):
+            own = shifted(model, shift)
+            columns[rows] = own.linear_form(data.q[rows], data.loads[rows]).regressor
+    return columns
+
+
+def stepped(
+    now: Fit, problem: tuple[Array, Array, Array], weights: Array, kept: Mask,
+    prior: tuple[Array, float], *, nonnegative: bool,
+) -> Fit:  # fmt: skip
+    """Return the fit after one step of Gauss and Newton.
+
+    ``problem``: columns of the nuisances (M, 0 or 9), of the flexibilities (M, 2n), and the gap
+    (M,), all weighed; or their R factor's, which says the same in fewer rows.
+    """
+    F, A, b = problem
+    model, frame, flexibility = now.model, now.frame, now.flexibility
+    base = orthonormal(F) if F.shape[1] else F
+    linear = _projected(A, b + A @ flexibility, base)
+    found = solve(linear, kept, flexibility, prior, nonnegative)
+    if F.shape[1]:
+        left = b - A @ (found - flexibility)
+        model, frame = moved(model, frame, np.linalg.lstsq(F, left, rcond=RANK)[0])
+    n = model.arm.n
+    return Fit(model.with_compliance(found[:n], found[n:]), frame, weights, linear)
+
+
+def _projected(A: Array, b: Array, Q: Array) -> Linear:
+    """Return the problem off the nuisances ``Q``, brought to as few rows as it has unknowns."""
+    whole = np.column_stack([A, b])
+    R = np.asarray(np.linalg.qr(whole - Q @ (Q.T @ whole), mode="r"))
+    return Linear(R[:, :-1], R[:, -1])
+
+
+def solve(
+    linear: Linear, kept: Mask, now: Array, prior: tuple[Array, float], nonnegative: bool
+) -> Array:
+    """Return the flexibilities (2n,) that solve the problem; those not kept stay as they are.
+
+    One at its bound of zero is exactly zero.
+    """
+    centre, sigma = prior
+    found = now.copy()
+    if not kept.any():
+        return found
+    A = linear.matrix[:, kept]
+    # scaled by what data and prior say together: a column of rounding errors stays harmless
+    norm = np.linalg.norm(A, axis=0)
+    unit = 1 / np.sqrt(norm**2 + sigma**-2 + (1e-9 * norm.max()) ** 2)
+    rows = np.vstack([A * unit, np.diag(unit / sigma)])
+    right = np.concatenate(
+        [linear.right - linear.matrix[:, ~kept] @ now[~kept], centre[kept] / sigma]
+    )
+    if nonnegative:
+        from scipy.optimize import nnls  # a quarter of a second, only where something is fitted
+
+        found[kept] = nnls(rows, right, maxiter=100 * len(unit))[0] * unit
+    else:
+        found[kept] = np.linalg.lstsq(rows, right, rcond=1e-12)[0] * unit
+    return found
+
+
+def moved(
+    model: Model, frame: Registration | Placements, step: NDArray[Any]
+) -> tuple[Model, Registration | Placements]:
+    """Return model and frames after a step of the nuisances: frame (6,), tool point (3,).
+
+    Of several sessions: all frames, then one tool point, or one each where they were remounted.
+    """
+    if not isinstance(frame, Placements):
+        return shifted(model, step[6:]), frame.moved(step[:6])
+    count = len(frame.frames)
+    tools = len(step) - 6 * count if len(step) >= 6 * count else len(step)
+    turns, tool_steps = step[: len(step) - tools], step[len(step) - tools :].reshape(-1, 3)
+    frames = frame.frames
+    if len(turns):
+        pieces = turns.reshape(count, 6)
+        frames = tuple(f.moved(p) for f, p in zip(frames, pieces, strict=True))
+    if len(tool_steps) == 1:
+        return shifted(model, tool_steps[0]), replace(frame, frames=frames)
+    shifts = tuple(a + b for a, b in zip(frame.tool_shift, tool_steps, strict=True))
+    return model, Placements(frames, shifts)
+
+
+def per_cell_of(weights: Array, scale: Array, width: int) -> Array:
+    """Return the factor (N, width) that makes every cell's noise 1 and weighs its row."""
+    return np.asarray(np.sqrt(weights)[:, None] / np.repeat(scale, 3)[:width])
+
+
+def _robust_weights(gap: Array) -> tuple[Array, Array]:
+    """Return weights (N,) (Tukey's biweight on wild rows) and the noise scale of each unit."""
+
+    def middle(part: Array) -> float:
+        return float(np.median(np.abs(part)))
+
+    scale = noise_scale(middle(gap[:, :3]), middle(gap[:, 3:]) if gap.shape[1] > 3 else None)
+    return weights_at(gap, scale), scale
+
+
+def noise_scale(middle: float, turned: float | None) -> Array:
+    """Return the noise (2,), m and rad, from the medians of a gap's absolute values."""
+    spread = [max(1.4826 * value, 1e-12) for value in (middle, turned or 0.0)]
+    return np.array([spread[0], 1.0 if turned is None else spread[1]])
+
+
+def weights_at(gap: Array, scale: Array) -> Array:
+    """Return the weights (N,) of gaps (N, 3 or 6) where the noise is ``scale`` (2,)."""
+    distance = np.linalg.norm(gap / np.repeat(scale, 3)[: gap.shape[1]], axis=1)
+    limit = WILD * np.sqrt(gap.shape[1])
+    weights = np.clip(1 - (distance / limit) ** 2, 0, 1) ** 2
+    # below two deviations nothing is weighed down: clean data keep their full information
+    weights = np.where(distance < 2 * np.sqrt(gap.shape[1]), 1.0, weights)
+    return np.asarray(np.maximum(weights, 1e-12))

@@ -1,0 +1,147 @@
+"""What one session tells of the joint flexibilities, in as few numbers as it takes.
+
+The session's poses, its instrument's frame and its tool point are folded into 2n equations for the
+2n flexibilities, so that a fleet's fit needs neither logs nor models (hierarchical.py).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.effects.effect import typical_moment
+from core.errors import ExcitationError
+from core.estimation.compliance_fit import (
+    WILD,
+    Data,
+    Fit,
+    fit_flexibilities,
+    fit_nuisances,
+    flexibilities,
+    nuisance_columns,
+    orthonormal,
+    residual,
+)
+from core.log.log import Log
+from core.metrology import Metrology
+from core.model import Model
+from core.rotation import rotation_matrix
+
+Array = NDArray[np.float64]
+FEWEST = 4  # poses, where nobody has registered the instrument: three place its frame and tool
+RANK = 1e-9  # singular values below this share of the largest are rounding
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Equations ``matrix @ flexibilities = right``, each with the noise of one coordinate.
+
+    Flexibilities are axial 1..n, then radial 1..n. What the instrument's frame and the tool point
+    can take up is projected out.
+    """
+
+    matrix: Array  # (2n, 2n) m per rad/Nm
+    right: Array  # (2n,) m
+    squares: float  # m2, left over by the best flexibilities
+    freedom: float  # coordinates, less what was fitted
+    least: float  # m, 1 sigma of one coordinate: the instrument alone
+    poses: int
+    wild: int  # poses set aside
+
+
+def evidence(model: Model, log: Log, metrology: Metrology | None = None) -> Evidence:
+    """Return what a log tells of the flexibilities of an arm.
+
+    The equations are taken at the shape that fits the log best, so that their linear form holds.
+    A log that excites little is no error here: it says little, and weighs little. Raises LogError
+    where columns are missing, ExcitationError where there are too few poses to say anything.
+    """
+    metrology = metrology or Metrology()
+    data = _measured(log, metrology)
+    usual = usual_flexibility(model)
+    everything = np.ones(2 * model.arm.n, dtype=bool)
+    before = fit_nuisances(model, data)
+    fit = fit_flexibilities(
+        before, data, everything, (flexibilities(model), 10 * usual), nonnegative=True
+    )
+    return _folded(fit, data, metrology)
+
+
+def _measured(log: Log, metrology: Metrology) -> Data:
+    """Return the rows that have a measured pose."""
+    q = log.require("actual_q", "target_q")
+    position = log.get("measured_position")
+    if position is None:
+        position = log.require("measured_position")
+    turn = log.get("measured_rotation")
+    good = np.isfinite(position).all(axis=1)
+    if turn is not None:
+        good &= np.isfinite(turn).all(axis=1)
+    least = 1 if metrology.registered else FEWEST
+    if good.sum() < least:
+        raise ExcitationError(
+            f"found {int(good.sum())} row(s) with measured poses, expected at least {least}"
+        )
+    rotation = None if turn is None else rotation_matrix(turn[good])
+    return Data(q[good], log.loads()[np.flatnonzero(good)], position[good], rotation,
+                metrology.registered)  # fmt: skip
+
+
+def usual_flexibility(model: Model) -> float:
+    """Return a usual flexibility (rad/Nm) of a joint of an arm of this size."""
+    return 1e-3 / typical_moment(model.arm)
+
+
+def _folded(fit: Fit, data: Data, metrology: Metrology) -> Evidence:
+    gap, poses = residual(fit.model, data, fit.frame)
+    width, count = gap.shape[1], 2 * fit.model.arm.n
+    units = _units(gap)
+    calm = _calm(gap * units, count + data.nuisances, metrology.sigma)
+    if not calm.any():
+        raise ExcitationError("found wild readings alone, expected measured poses")
+    unit = units * np.ones((int(calm.sum()), 1))
+    form = fit.model.linear_form(data.q, data.loads).regressor[calm, :width]
+    A = (form * unit[..., None]).reshape(-1, count)
+    b = (gap[calm] * unit).ravel() + A @ fit.flexibility
+    whole = np.column_stack([A, b])
+    spent = 0
+    if data.nuisances:
+        columns = nuisance_columns(fit.model, poses, width)[calm] * unit[..., None]
+        Q = orthonormal(columns.reshape(len(A), -1))
+        whole, spent = whole - Q @ (Q.T @ whole), Q.shape[1]
+    R = np.zeros((count + 1, count + 1))
+    upper = np.linalg.qr(whole, mode="r")
+    R[: len(upper)] = upper
+    U, size, _ = np.linalg.svd(R[:count, :count])
+    U = U[:, size > RANK * size.max()]
+    # what no flexibility reaches is left over too
+    right = U @ (U.T @ R[:count, count])
+    squares = float(np.sum(R[:, count] ** 2) - right @ right)
+    return Evidence(
+        R[:count, :count], right, max(squares, 0.0),
+        max(float(A.shape[0] - spent - U.shape[1]), 0.0), metrology.sigma,
+        int(calm.sum()), int((~calm).sum()),
+    )  # fmt: skip
+
+
+def _calm(gap: Array, spent: int, least: float) -> NDArray[np.bool_]:
+    """Return the rows (N,) that are no wild readings.
+
+    ``spent`` numbers were fitted to them; ``least`` (m) is the noise that there is in any case.
+    """
+    # of few poses the fit takes up much of the noise: what is left understates it
+    share = max(1 - spent / gap.size, 0.1)
+    scale = max(1.4826 * float(np.median(np.abs(gap))) / np.sqrt(share), least)
+    limit = WILD * scale * np.sqrt(gap.shape[1])
+    return np.asarray(np.linalg.norm(gap, axis=1) < limit)
+
+
+def _units(gap: Array) -> Array:
+    """Return what makes rotations (rad) as noisy as positions (m): (3,) or (6,)."""
+    if gap.shape[1] == 3:
+        return np.ones(3)
+    position, rotation = (float(np.median(np.abs(part))) for part in (gap[:, :3], gap[:, 3:]))
+    ratio = position / rotation if rotation > 0 else 1.0
+    return np.repeat([1.0, ratio], 3)

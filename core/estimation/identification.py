@@ -1,0 +1,313 @@
+"""Identification: the joint flexibilities of an arm, from poses and loads.
+
+Least squares on the paper's linear form (compliance_fit.py), with the instrument's frame and the
+tool point estimated along where nobody registered them. Rank is handled by a choice instead of by
+luck: what the data do not show stays at the model's value and is named (base_parameters.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.effects.effect import typical_moment
+from core.errors import ExcitationError, LogError
+from core.estimation import base_parameters
+from core.estimation.compliance_fit import (
+    Data,
+    Fit,
+    Mask,
+    Placements,
+    fit_flexibilities,
+    fit_nuisances,
+    flexibilities,
+    nuisance_columns,
+    orthonormal,
+    placed_gap,
+    residual,
+)
+from core.estimation.regions import joint_regions
+from core.estimation.registration import Registration
+from core.log.log import Log
+from core.metrology import Metrology
+from core.model import Model
+from core.rotation import rotation_matrix
+from core.sessions import session_of
+
+Array = NDArray[np.float64]
+FOLDS = 5
+LOOK = 3  # rounds of the fit of everything, from which the choice is made
+UNSEEN = float("nan")
+
+
+@dataclass(frozen=True)
+class Identification:
+    """Flexibilities found, what they rest on and how far they carry.
+
+    All four rms are of one coordinate over the same rows, wild readings left out; frame and tool
+    point are fitted before as well as after, and the degrees of freedom spent are counted for both.
+    """
+
+    model: Model  # with the flexibilities, and the tool point that ``tool_offset`` moves
+    axial: Array  # (n,) rad/Nm
+    radial: Array  # (n,) rad/Nm
+    std_axial: Array  # (n,) rad/Nm, 1 sigma; the prior's where not shown
+    std_radial: Array  # (n,) rad/Nm, 1 sigma; the prior's where not shown
+    covariance: Array  # (2n, 2n), axial then radial, of those shown with the others held
+    identifiable: Mask  # (2n,): shown by the data; the others stand at the model's value
+    combinations: tuple[str, ...]  # what the data cannot tell apart or do not show
+    registration: Registration | Placements  # one frame, or one a session
+    tool_offset: Array  # (3,) m, flange axes: found tool point minus the cell's; 0 if registered
+    samples: int
+    gap_rms: float  # m, before
+    remaining_rms: float  # m, after
+    gap_rms_held_out: float  # m, before, on poses that the fit did not see; nan: too few poses
+    remaining_rms_held_out: float  # m, after, on the same poses
+    outliers: NDArray[np.int64]  # rows weighed down as wild
+    notes: tuple[str, ...]
+    remaining_rms_new_region: float = UNSEEN  # m, folds are regions of joint space
+    remaining_rms_new_session: float = UNSEEN  # m, folds are sessions
+
+
+@dataclass(frozen=True)
+class _Task:
+    """How to fit: what the model says of the flexibilities, and how firmly."""
+
+    prior: tuple[Array, float]  # (2n,) rad/Nm, 1 sigma rad/Nm
+    scale: float  # rad/Nm: what is known no better than a share of this is not shown
+    nonnegative: bool
+
+    def run(self, before: Fit, data: Data) -> tuple[Fit, base_parameters.Shown]:
+        """Fit everything, choose what the data show, fit that alone."""
+        centre = self.prior[0]
+        everything = np.ones(len(centre), dtype=bool)
+        look = fit_flexibilities(
+            before, data, everything, self.prior, nonnegative=self.nonnegative, rounds=LOOK
+        )
+        assert look.linear is not None
+        kept = base_parameters.choose(look.linear, (centre, self.scale), self.nonnegative)
+        values, n = np.where(kept, look.flexibility, centre), len(centre) // 2
+        begin = Fit(look.model.with_compliance(values[:n], values[n:]), look.frame, look.weights)
+        fit = fit_flexibilities(begin, data, kept, self.prior, nonnegative=self.nonnegative)
+        assert fit.linear is not None
+        return fit, base_parameters.what_is_shown(fit.linear, kept, self.scale)
+
+
+def identify_compliance(
+    model: Model,
+    log: Log,
+    metrology: Metrology | None = None,
+    *,
+    nonnegative: bool = True,
+    prior_std: float | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Identification:
+    """Return the 2n joint flexibilities that best explain the measured TCP poses of ``log``.
+
+    ``prior_std`` (rad/Nm; default ten times a usual flexibility of an arm of this size; inf: none)
+    weakly holds each flexibility at the model's own value; one that the data do not know better
+    stays there exactly. ``nonnegative`` bounds every flexibility at zero. Where the metrology is
+    not registered, frame and tool point are estimated along. Raises LogError where needed columns
+    are missing, ExcitationError where nothing in the log makes the joints bend.
+    """
+    metrology = metrology or Metrology()
+    data, used = data_of(log, metrology)
+    usual = 1e-2 / typical_moment(model.arm)
+    prior_std = usual if prior_std is None else prior_std
+    require_excitation(model, data, metrology, min(prior_std, usual))
+    centre = flexibilities(model)
+    scale = prior_std if np.isfinite(prior_std) else usual
+    task = _Task((centre, prior_std), scale, nonnegative)
+    tell = progress or (lambda text: None)
+    tell("fitting")
+    before = fit_nuisances(model, data)
+    fit, shown = task.run(before, data)
+    tell("checking on held-out poses")
+    calm = fit.weights > 1e-6
+    held_out = _held_out(model, data, task, calm)
+    found = _result(model, data, used, (before, fit), shown, held_out)
+    return replace(
+        found,
+        remaining_rms_new_region=_in_new_regions(model, data, task, calm),
+        remaining_rms_new_session=_in_new_sessions(model, data, task, calm),
+    )
+
+
+def data_of(log: Log, metrology: Metrology) -> tuple[Data, NDArray[np.int64]]:
+    """Return the rows of a log that have measured poses, and which ones they are."""
+    q = log.require("actual_q", "target_q")
+    measured = log.get("measured_position")
+    if measured is None:
+        log.require("measured_position")
+    assert measured is not None
+    rotation = log.get("measured_rotation")
+    good = np.isfinite(measured).all(axis=1)
+    if rotation is not None:
+        good &= np.isfinite(rotation).all(axis=1)
+    used = np.flatnonzero(good)
+    matrix = None if rotation is None else rotation_matrix(rotation[used])
+    loads = log.loads()[used]
+    data = Data(q[used], loads, measured[used], matrix, metrology.registered)
+    count = max(len(log.session_names), 1)
+    if count > 1 or metrology.remounted:
+        session = session_of(log)[used]
+        _check_sessions(log, session, metrology)
+        data = replace(data, session=session, sessions=count, remounted=metrology.remounted)
+    return data, used
+
+
+def _check_sessions(log: Log, session: NDArray[np.int64], metrology: Metrology) -> None:
+    """Raise LogError where a session has too few poses for what is free in it."""
+    free = (0 if metrology.registered else 6) + (3 if metrology.remounted else 0)
+    for s, name in enumerate(log.session_names):
+        found = int((session == s).sum())
+        if 3 * found < free + 3:
+            raise LogError(
+                f"{log.path}: session {name}: found {found} measured pose(s), expected at least "
+                f"{-(-(free + 3) // 3)}: its frame{' and tool point' if free > 6 else ''} are "
+                "fitted on them"
+            )
+
+
+def require_excitation(model: Model, data: Data, metrology: Metrology, usual: float) -> None:
+    """Raise ExcitationError where nothing in the data makes a joint bend by ``usual`` (rad/Nm)."""
+    n = model.arm.n
+    unknown = 2 + data.nuisances
+    if 3 * len(data.q) < unknown:
+        raise ExcitationError(
+            f"found {len(data.q)} row(s) with measured positions, expected at least "
+            f"{-(-unknown // 3)} to fit the compliance"
+        )
+    form = model.linear_form(data.q, data.loads).regressor[:, :3].reshape(-1, 2 * n)
+    if data.nuisances:
+        poses = model.predict(data.q, data.loads)
+        Q = orthonormal(nuisance_columns(model, poses, 3, data).reshape(len(form), -1))
+        form = form - Q @ (Q.T @ form)
+    shown = np.linalg.norm(form, axis=0) * usual
+    if not (shown > 3 * metrology.sigma).any():
+        weightless = not model.arm.mass.any() and data.loads.wrench is None
+        reason = (
+            "the arm's links have no mass in the cell, and no payload or pull is in the log"
+            if weightless and not _any_payload(model, data)
+            else "no payload, pull or pose in it changes a joint's moment enough to bend it visibly"
+        )
+        raise ExcitationError(
+            f"nothing in the log excites the compliance: {reason}; expected poses under different "
+            "payloads (payload) or pulls (actual_TCP_force)"
+        )
+
+
+def _any_payload(model: Model, data: Data) -> bool:
+    mass = data.loads.payload_mass
+    return bool(model.payload_mass > 0 if mass is None else (mass > 0).any())
+
+
+def pose_groups(q: Array, tolerance: float = 1e-3) -> NDArray[np.int64]:
+    """Return a number per row (N,): rows within ``tolerance`` (rad) of each other share one."""
+    groups = np.full(len(q), -1)
+    count = 0
+    for row in range(len(q)):
+        if groups[row] < 0:
+            close = (np.abs(q[row:] - q[row]).max(axis=1) < tolerance) & (groups[row:] < 0)
+            groups[row:][close] = count
+            count += 1
+    return groups
+
+
+def _held_out(model: Model, data: Data, task: _Task, calm: Mask) -> tuple[float, float]:
+    """Return the rms before and after over calm rows of poses left out; nan: too few poses."""
+    groups = pose_groups(data.q[:2000]) if len(data.q) <= 2000 else np.arange(len(data.q))
+    poses = int(groups.max()) + 1
+    if poses < 2 * FOLDS:
+        return UNSEEN, UNSEEN
+    fold = np.random.default_rng(0).permutation(poses)[groups] % FOLDS
+    left: tuple[list[Array], list[Array]] = ([], [])
+    for k in range(FOLDS):
+        seen, unseen = data.part(fold != k), data.part((fold == k) & calm)
+        if not len(unseen.q):
+            continue
+        before = fit_nuisances(model, seen)
+        for fit, gaps in zip((before, task.run(before, seen)[0]), left, strict=True):
+            gaps.append(residual(fit.model, unseen, fit.frame)[0][:, :3])
+    return _rms(np.vstack(left[0])), _rms(np.vstack(left[1]))
+
+
+def _in_new_regions(model: Model, data: Data, task: _Task, calm: Mask) -> float:
+    """Return the rms over calm rows of regions of joint space left out; nan: too few poses."""
+    if len(np.unique(np.round(data.q, 3), axis=0)) < 2 * FOLDS:
+        return UNSEEN
+    fold, left = joint_regions(data.q, FOLDS), []
+    for k in range(int(fold.max()) + 1):
+        seen, judged = data.part(fold != k), (fold == k) & calm
+        if data.session is not None and seen.session is not None:
+            judged &= np.isin(data.session, _placed_sessions(seen))
+        if not judged.any() or 3 * len(seen.q) <= data.nuisances + 2:
+            continue
+        fit = task.run(fit_nuisances(model, seen), seen)[0]
+        left.append(residual(fit.model, data.part(judged), fit.frame)[0][:, :3])
+    return _rms(np.vstack(left)) if len(left) > 1 else UNSEEN
+
+
+def _placed_sessions(data: Data) -> list[int]:
+    """Return the sessions with enough poses for a frame and a tool point of their own."""
+    assert data.session is not None
+    return [s for s in range(data.sessions) if 3 * int((data.session == s).sum()) >= 12]
+
+
+def _in_new_sessions(model: Model, data: Data, task: _Task, calm: Mask) -> float:
+    """Return the rms over calm rows of sessions left out, each placed on itself; nan: only one."""
+    if data.session is None or data.sessions < 2:
+        return UNSEEN
+    left = []
+    for s in range(data.sessions):
+        rest, own = data.session != s, (data.session == s) & calm
+        if not (rest.any() and own.any()):
+            continue
+        others = data.part(rest)
+        fit = task.run(fit_nuisances(model, others), others)[0]
+        left.append(placed_gap(fit.model, data.part(own))[:, :3])
+    return _rms(np.vstack(left)) if left else UNSEEN
+
+
+def _rms(gap: Array, spent: int = 0) -> float:
+    """Return the rms of one coordinate of (N, 3) for ``spent`` fitted numbers."""
+    return float(np.sqrt(np.sum(gap**2) / max(gap.size - spent, 1)))
+
+
+def _result(
+    model: Model, data: Data, used: NDArray[np.int64], fits: tuple[Fit, Fit],
+    shown: base_parameters.Shown, held_out: tuple[float, float],
+) -> Identification:  # fmt: skip
+    n, kept = model.arm.n, shown.kept
+    after = fits[1]
+    calm = after.weights > 1e-6
+    gaps = [residual(fit.model, data, fit.frame)[0][calm][:, :3] for fit in fits]
+    std, flexibility = np.sqrt(np.diag(shown.covariance)), after.flexibility
+    return Identification(
+        after.model, flexibility[:n], flexibility[n:], std[:n], std[n:], shown.covariance, kept,
+        shown.told, after.frame,
+        after.model.tool_in_flange[:3, 3] - model.tool_in_flange[:3, 3], len(data.q),
+        _rms(gaps[0], data.nuisances), _rms(gaps[1], data.nuisances + int(kept.sum())),
+        *held_out, used[~calm], tuple(notes_of(after, kept, int((~calm).sum()), data.nuisances)),
+    )  # fmt: skip
+
+
+def notes_of(fit: Fit, kept: Mask, wild: int, nuisances: int) -> list[str]:
+    """Return in words what a fit was like: wild readings, bounds reached, what was not shown."""
+    notes = []
+    if wild:
+        notes.append(f"{wild} wild reading(s) weighed down")
+    at_zero = np.flatnonzero((fit.flexibility <= 0) & kept)
+    if len(at_zero):
+        names = ", ".join(base_parameters.name(i, len(kept)) for i in at_zero)
+        notes.append(f"at their bound of zero: {names}")
+    if not kept.any():
+        notes.append("these data show no flexibility at all: the model is left as it was")
+    if isinstance(fit.frame, Placements) and len(fit.frame.frames) > 1:
+        notes.append("each session has a frame of its own, not written to the cell")
+    elif nuisances:
+        notes.append("frame and tool point were estimated along and are not written to the cell")
+    return notes

@@ -1,0 +1,140 @@
+"""How the poses of an arm change with the parameters of its effects: exact, all rows at once.
+
+An effect says how its parameter moves the chain (``Effect.shape_rate``) or the rows (differences of
+``Effect.condition``, which costs no prediction); one compiled sweep then gives every derivative,
+bending under load included. Only what an effect cannot say so is a difference of predictions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import config
+from numpy.typing import NDArray
+
+from core.effects import CATALOGUE
+from core.effects.effect import Effect
+from core.kernels.pose_slopes import slope_blocks
+from core.kernels.rates import chain_rate, of_rows, slots
+from core.kernels.reference import Chain, Rows
+from core.kernels.threads import in_ranges
+from core.loads import Loads
+from core.model import Model, Poses
+from core.rotation import rotation_vector
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Value = tuple[int, int]  # number of the term in the model, number of the value in the term
+Entries = tuple[NDArray[np.int64], NDArray[np.int64], Array]  # starts (p+1), slots, rates
+
+
+@dataclass(frozen=True)
+class PoseColumns:
+    """TCP poses of N rows, and how they change with p parameters, base axes."""
+
+    poses: Poses
+    slopes: Array  # (6, p, N) m and rad per unit: position, then turn
+
+
+def pose_columns(
+    model: Model, q: Array, loads: Loads | None, values: Sequence[Value], steps: Array
+) -> PoseColumns:
+    """Return poses and columns for encoder angles ``q`` (N, n) and some values in the model.
+
+    ``steps`` (p,): what a value is moved by where a difference is taken. Raises InputError where a
+    row has no equilibrium.
+    """
+    loads = loads or Loads()
+    slopes = np.empty((6, len(values), len(q)))
+    chain, rows = model.chain(), model.rows(q, loads)
+    rates, known = _chain_rates(model, chain, values)
+    varying, told = _row_rates(model, q, loads, values, steps)
+    poses = _swept(chain, rows, _entries(rates), varying, slopes)
+    if poses is None:
+        poses, known = model.predict(q, loads), np.zeros(len(values), dtype=bool)
+    for c in np.flatnonzero(~(known & told)).tolist():
+        slopes[:, c] = _difference(model, q, loads, values[c], float(steps[c]))
+    return PoseColumns(poses, slopes)
+
+
+def _chain_rates(model: Model, chain: Chain, values: Sequence[Value]) -> tuple[Array, Mask]:
+    """Return the slots' rates (p, slots), and which parameters' are known (p,)."""
+    n = model.arm.n
+    rates, known = np.zeros((len(values), slots(n))), np.ones(len(values), dtype=bool)
+    for c, (t, k) in enumerate(values):
+        term = model.terms[t]
+        effect = CATALOGUE[term.effect]
+        if type(effect).shape is not Effect.shape:
+            known[c] = effect.shape_rate(term, model.arm, chain, k, chain_rate(n, rates[c]))
+    return rates, known
+
+
+def _entries(rates: Array) -> Entries:
+    """Return what is not zero of rates (p, slots)."""
+    column, slot = np.nonzero(rates)
+    starts = np.searchsorted(column, np.arange(len(rates) + 1))
+    return starts, slot, rates[column, slot]
+
+
+def _row_rates(
+    model: Model, q: Array, loads: Loads, values: Sequence[Value], steps: Array
+) -> tuple[Entries, Mask]:
+    """Return how the rows change, rates (entries, N), and whether slots can say it (p,)."""
+    n, bare = model.arm.n, model.without_terms().rows(q, loads)
+    terms, own = model.conditions(), Effect.condition
+    starts, found_slots, found = [0], [], []
+    told = np.ones(len(values), dtype=bool)
+    for c, (t, k) in enumerate(values):
+        if type(CATALOGUE[model.terms[t].effect]).condition is not own:
+            ends = []
+            for step in (steps[c], -steps[c]):
+                moved = _moved(model, t, k, float(step)).terms[t]
+                ends.append(Rows(*(part.copy() for part in bare)))
+                model.condition(
+                    ends[-1], loads, q, [moved if o is model.terms[t] else o for o in terms]
+                )
+            one, other = ends
+            told[c] = all(np.array_equal(a, b) for a, b in zip(one[3:], other[3:], strict=True))
+            change = np.column_stack([a - b for a, b in zip(one[:3], other[:3], strict=True)])
+            for j in np.flatnonzero(change.any(axis=0)):
+                found_slots.append(of_rows(n) + j)
+                found.append(change[:, j] / (2 * steps[c]))
+        starts.append(len(found))
+    rates = np.array(found) if found else np.zeros((0, len(q)))
+    return (np.array(starts), np.array(found_slots, dtype=np.int64), rates), told
+
+
+def _swept(
+    chain: Chain, rows: Rows, rates: Entries, varying: Entries, slopes: Array
+) -> Poses | None:
+    """Write the slopes (6, p, N) and return the poses; None where the sweep cannot."""
+    if bool(chain.flexibility.any()) or bool(getattr(config, "DISABLE_JIT", 0)):
+        return None
+    count = len(rows.q)
+    position, rotation = np.empty((count, 3)), np.empty((count, 3, 3))
+
+    def work(first: int, last: int) -> int:
+        return int(
+            slope_blocks(chain, rows, rates, varying, first, last, position, rotation, slopes)
+        )
+
+    if any(bad >= 0 for bad in in_ranges(work, count)):
+        return None
+    return Poses(position, rotation)
+
+
+def _moved(model: Model, t: int, k: int, step: float) -> Model:
+    """Return the model with one value of one term changed."""
+    term = model.terms[t]
+    values = [v + step if i == k else v for i, v in enumerate(term.values)]
+    terms = (*model.terms[:t], replace(term, values=tuple(values)), *model.terms[t + 1 :])
+    return replace(model, terms=terms)
+
+
+def _difference(model: Model, q: Array, loads: Loads, value: Value, step: float) -> Array:
+    """Return one column (6, N) by central differences of whole predictions."""
+    one, other = (_moved(model, *value, way).predict(q, loads) for way in (step, -step))
+    turn = rotation_vector(one.rotation @ np.swapaxes(other.rotation, 1, 2))
+    return np.hstack([one.position - other.position, turn]).T / (2 * step)

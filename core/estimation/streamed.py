@@ -1,0 +1,200 @@
+"""Identification from logs of any length: rows pass by in pieces, memory does not grow with them.
+
+The same least squares, weights and choice as identification.py. Held-out figures leave out every
+fifth row by chance, not whole poses: among many thousands of rows, poses are not told apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.effects.effect import typical_moment
+from core.estimation import base_parameters
+from core.estimation.compliance_fit import Data, Fit, Mask, flexibilities, residual, weights_at
+from core.estimation.identification import (
+    FOLDS,
+    LOOK,
+    Identification,
+    data_of,
+    notes_of,
+    require_excitation,
+)
+from core.estimation.streamed_fit import (
+    NONE,
+    Piece,
+    Settled,
+    Stream,
+    fit_flexibilities,
+    fit_nuisances,
+)
+from core.loads import Loads
+from core.log.log import Log
+from core.metrology import Metrology
+from core.model import Model
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
+SAMPLE = 20_000  # rows kept at most, for the first guess and the look whether anything bends
+MANY_OUTLIERS = 100_000  # rows that are named at most
+CALM = 1e-6  # weight below which a row counts as wild
+
+
+@dataclass(frozen=True)
+class _Task:
+    prior: tuple[Array, float]
+    scale: float
+    nonnegative: bool
+
+    def run(self, before: Settled, stream: Stream) -> tuple[Settled, base_parameters.Shown]:
+        """Fit everything, choose what the data show, fit that alone."""
+        centre = self.prior[0]
+        everything = np.ones(len(centre), dtype=bool)
+        look = fit_flexibilities(
+            before, stream, everything, self.prior, nonnegative=self.nonnegative, rounds=LOOK
+        )
+        assert look.fit.linear is not None
+        kept = base_parameters.choose(
+            look.fit.linear, (centre, self.scale), self.nonnegative
+        )  # fmt: skip
+        values, n = np.where(kept, look.fit.flexibility, centre), len(centre) // 2
+        model = look.fit.model.with_compliance(values[:n], values[n:])
+        begin = Settled(Fit(model, look.fit.frame, NONE), look.scale)
+        found = fit_flexibilities(begin, stream, kept, self.prior, nonnegative=self.nonnegative)
+        assert found.fit.linear is not None
+        return found, base_parameters.what_is_shown(found.fit.linear, kept, self.scale)
+
+
+def identify_streamed(
+    model: Model,
+    log: Iterable[Log],
+    metrology: Metrology | None = None,
+    *,
+    nonnegative: bool = True,
+    prior_std: float | None = None,
+    held_out: bool = True,
+    progress: Callable[[str], None] | None = None,
+) -> Identification:
+    """Return what ``identify_compliance`` does, for a log that comes in pieces.
+
+    ``log`` is iterated over again and again (core.log.pieces.LogPieces, or a list of logs).
+    ``held_out`` False spares the five further fits. Raises as ``identify_compliance``.
+    """
+    metrology = metrology or Metrology()
+    tell = progress or (lambda text: None)
+    tell("reading")
+    stream = _stream(log, metrology)
+    usual = 1e-2 / typical_moment(model.arm)
+    prior_std = usual if prior_std is None else prior_std
+    require_excitation(model, stream.sample, metrology, min(prior_std, usual))
+    scale = prior_std if np.isfinite(prior_std) else usual
+    task = _Task((flexibilities(model), prior_std), scale, nonnegative)
+    tell("fitting")
+    before = fit_nuisances(model, stream)
+    after, shown = task.run(before, stream)
+    unseen = (float("nan"), float("nan"))
+    if held_out:
+        tell("checking on held-out rows")
+        unseen = _held_out(model, stream, task, after)
+    return _result(model, stream, (before, after), shown, unseen)
+
+
+def _stream(log: Iterable[Log], metrology: Metrology) -> Stream:
+    """Return the rows with measured poses; passes once over the log."""
+
+    def pieces() -> Iterator[Piece]:
+        first = 0
+        for part in log:
+            data, used = data_of(part, metrology)
+            if len(used):
+                yield Piece(data, used + first)
+            first += len(part)
+
+    counts = [len(piece.rows) for piece in pieces()]
+    every = max(sum(counts) // SAMPLE, 1)
+    kept = [piece.data.part(piece.rows % every == 0) for piece in pieces()]
+    if not kept:  # no row at all: the usual way says so
+        kept = [data_of(next(iter(log)), metrology)[0]]
+    sample = _joined(kept)
+    width = 3 if sample.rotation is None else 6
+    return Stream(pieces, sample, sum(counts), width, sample.nuisances)
+
+
+def _joined(parts: list[Data]) -> Data:
+    def stacked(values: list[Array | None]) -> Array | None:
+        given = [value for value in values if value is not None]
+        return np.concatenate(given) if given else None
+
+    loads = Loads(
+        *(
+            stacked([getattr(part.loads, name) for part in parts])
+            for name in ("payload_mass", "payload_cog", "wrench", "temperature", "approach")
+        )
+    )
+    return Data(
+        np.concatenate([part.q for part in parts]),
+        loads,
+        np.concatenate([part.position for part in parts]),
+        stacked([part.rotation for part in parts]),
+        parts[0].registered,
+    )
+
+
+def fold_of(rows: Rows) -> Rows:
+    """Return the fold (k,) that leaves out each row: by chance, the same at every pass."""
+    x = rows.astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        x = (x ^ (x >> np.uint64(shift))) * np.uint64(factor)  # splitmix64 (Steele et al. 2014)
+    return ((x ^ (x >> np.uint64(31))) % np.uint64(FOLDS)).astype(np.int64)
+
+
+def _held_out(model: Model, stream: Stream, task: _Task, after: Settled) -> tuple[float, float]:
+    """Return the rms before and after over calm rows that each fit did not see."""
+    sums, count = np.zeros(2), 0
+    for k in range(FOLDS):
+        seen = stream.part(lambda rows, k=k: fold_of(rows) != k, 1 - 1 / FOLDS)  # type: ignore[misc]
+        unseen = stream.part(lambda rows, k=k: fold_of(rows) == k, 1 / FOLDS)  # type: ignore[misc]
+        before = fit_nuisances(model, seen)
+        fits = (before.fit, task.run(before, seen)[0].fit)
+        for piece in unseen.pieces():
+            calm = _calm(after, piece.data)
+            gaps = [residual(fit.model, piece.data, fit.frame)[0][calm, :3] for fit in fits]
+            sums += [float(np.sum(gap**2)) for gap in gaps]
+            count += gaps[0].size
+    before_rms, after_rms = np.sqrt(sums / max(count, 1))
+    return float(before_rms), float(after_rms)
+
+
+def _calm(settled: Settled, data: Data) -> Mask:
+    gap = residual(settled.fit.model, data, settled.fit.frame)[0]
+    return np.asarray(weights_at(gap, settled.scale) > CALM)
+
+
+def _result(
+    model: Model, stream: Stream, fits: tuple[Settled, Settled], shown: base_parameters.Shown,
+    held_out: tuple[float, float],
+) -> Identification:  # fmt: skip
+    n, kept, after = model.arm.n, shown.kept, fits[1].fit
+    sums, calm_cells, wild = np.zeros(2), 0, list[Rows]()
+    for piece in stream.pieces():
+        gaps = [residual(one.fit.model, piece.data, one.fit.frame)[0] for one in fits]
+        calm = weights_at(gaps[1], fits[1].scale) > CALM
+        sums += [float(np.sum(gap[calm, :3] ** 2)) for gap in gaps]
+        calm_cells += 3 * int(calm.sum())
+        wild.append(piece.rows[~calm])
+    spent = np.array([stream.nuisances, stream.nuisances + int(kept.sum())])
+    gap_rms, remaining_rms = np.sqrt(sums / np.maximum(calm_cells - spent, 1))
+    std, flexibility = np.sqrt(np.diag(shown.covariance)), after.flexibility
+    count = stream.count - calm_cells // 3
+    named = np.fromiter(islice((row for rows in wild for row in rows), MANY_OUTLIERS), np.int64)
+    return Identification(
+        after.model, flexibility[:n], flexibility[n:], std[:n], std[n:], shown.covariance, kept,
+        shown.told, after.frame,
+        after.model.tool_in_flange[:3, 3] - model.tool_in_flange[:3, 3], stream.count,
+        float(gap_rms), float(remaining_rms), *held_out, named,
+        tuple(notes_of(after, kept, count, stream.nuisances)),
+    )  # fmt: skip

@@ -1,0 +1,170 @@
+"""The least squares of core.estimation.compliance_fit over rows that pass by in pieces.
+
+Each step of Gauss and Newton passes twice over the rows: once for the gap, whose median says what
+is noise and what is wild, once for the R factor of all weighed columns, into which every block of
+rows is folded (core.kernels). What is kept does not grow with the rows; the gaps wait in a file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.estimation.compliance_fit import (
+    NUISANCE_ROUNDS,
+    RANK,
+    ROUNDS,
+    SETTLED,
+    Data,
+    Fit,
+    Mask,
+    moved,
+    noise_scale,
+    nuisance_columns,
+    per_cell_of,
+    residual,
+    stepped,
+    weights_at,
+)
+from core.estimation.registration import IDENTITY, register_robustly
+from core.estimation.spool import Spool
+from core.kernels.factor import factor_blocks
+from core.kernels.threads import in_ranges
+from core.model import Model
+
+Array = NDArray[np.float64]
+NONE = np.zeros(0)  # weights of a fit whose rows nobody keeps
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Some rows with measured poses, and where they stand in the log."""
+
+    data: Data
+    rows: NDArray[np.int64]  # (k,) row in the log, from 0
+
+
+@dataclass(frozen=True)
+class Stream:
+    """All rows, piece by piece, as often as asked for."""
+
+    pieces: Callable[[], Iterator[Piece]]
+    sample: Data  # rows from all over the log, few enough to be kept
+    count: int  # rows with measured poses
+    width: int  # numbers per row: 3, or 6 with rotations
+    nuisances: int
+
+    def part(self, chosen: Callable[[NDArray[np.int64]], Mask], share: float) -> Stream:
+        """Return the rows for which ``chosen(rows)`` holds, about a ``share`` of them."""
+
+        def pieces() -> Iterator[Piece]:
+            for piece in self.pieces():
+                mask = chosen(piece.rows)
+                if mask.any():
+                    yield Piece(piece.data.part(mask), piece.rows[mask])
+
+        return replace(self, pieces=pieces, count=int(self.count * share))
+
+
+@dataclass(frozen=True)
+class Settled:
+    """A fit, and the noise by which its rows were weighed."""
+
+    fit: Fit
+    scale: Array  # (2,) m, rad
+
+
+def fit_nuisances(model: Model, stream: Stream) -> Settled:
+    """Return the frame and tool point that fit best, the model's flexibilities left alone."""
+    if not stream.nuisances:
+        fit = Fit(model, IDENTITY, NONE)
+        with _gaps(fit, stream) as gaps:
+            return Settled(fit, _scale(gaps))
+    sample = stream.sample
+    frame = register_robustly(sample.position, model.predict(sample.q, sample.loads).position)
+    fit = Fit(model, frame, NONE)
+    for _ in range(NUISANCE_ROUNDS):
+        scale, R = weighed(fit, stream)
+        step = np.linalg.lstsq(R[:, :9], R[:, -1], rcond=RANK)[0]
+        fit = Fit(*moved(fit.model, fit.frame, step), NONE)
+        if np.abs(step).max() < SETTLED:
+            break
+    return Settled(fit, scale)
+
+
+def fit_flexibilities(
+    begin: Settled, stream: Stream, kept: Mask, prior: tuple[Array, float], *,
+    nonnegative: bool, rounds: int = ROUNDS,
+) -> Settled:  # fmt: skip
+    """Return the fit of the ``kept`` flexibilities, as ``compliance_fit.fit_flexibilities``."""
+    now = begin
+    for _ in range(rounds):
+        before = now.fit.flexibility
+        scale, R = weighed(now.fit, stream)
+        m = stream.nuisances
+        problem = (R[:, :m], R[:, m:-1], R[:, -1])
+        fit = stepped(now.fit, problem, NONE, kept, prior, nonnegative=nonnegative)
+        now = Settled(fit, scale)
+        if np.abs(fit.flexibility - before).max() < SETTLED * max(np.abs(before).max(), 1e-12):
+            break
+    return now
+
+
+def weighed(fit: Fit, stream: Stream) -> tuple[Array, Array]:
+    """Return the noise (2,) and the R factor (k, k) of [nuisances | flexibilities | gap]."""
+    k = stream.nuisances + 2 * fit.model.arm.n + 1
+    R = np.zeros((k, k))
+    with _gaps(fit, stream) as gaps:
+        scale = _scale(gaps)
+        gaps.rewind()
+        for piece in stream.pieces():
+            gap = gaps.read(len(piece.rows))
+            cells = per_cell_of(weights_at(gap, scale), scale, stream.width)
+            add_rows(fit.model, piece.data, gap, cells, R)
+    return scale, R
+
+
+def add_rows(model: Model, data: Data, gap: Array, cells: Array, R: Array) -> None:
+    """Fold rows into R: columns at the model's shape, ``gap`` and factors ``cells`` (N, width)."""
+    chain, rows = model.chain(), model.rows(data.q, data.loads)
+    nuisances, stopped = data.nuisances, [0]
+    if not chain.flexibility.any():
+        parts: list[Array] = []
+
+        def work(first: int, last: int) -> int:
+            own = np.zeros_like(R)
+            parts.append(own)
+            return int(factor_blocks(chain, rows, gap, cells, nuisances, first, last, own))
+
+        stopped = in_ranges(work, len(gap))
+        if max(stopped) < 0:
+            _fold(R, *parts)
+            return
+    # something bends too far for blocks, or the links themselves do: columns in memory
+    width = gap.shape[1]
+    columns = [model.linear_form(data.q, data.loads).regressor[:, :width], gap[..., None]]
+    if nuisances:
+        columns.insert(0, nuisance_columns(model, model.predict(data.q, data.loads), width))
+    stored = np.concatenate(columns, axis=2) * cells[..., None]
+    _fold(R, stored.reshape(-1, len(R)))
+
+
+def _fold(R: Array, *parts: Array) -> None:
+    folded = np.linalg.qr(np.vstack([R, *parts]), mode="r")
+    R[:] = 0.0
+    R[: len(folded)] = folded
+
+
+def _gaps(fit: Fit, stream: Stream) -> Spool:
+    gaps = Spool(stream.width)
+    for piece in stream.pieces():
+        gaps.append(residual(fit.model, piece.data, fit.frame)[0])
+    return gaps
+
+
+def _scale(gaps: Spool) -> Array:
+    turned = gaps.median_size(3, 6) if gaps.width > 3 else None
+    return noise_scale(gaps.median_size(0, 3), turned)

@@ -1,0 +1,104 @@
+"""The shortest joint offset that moves the tool as wanted, damped where that one would be long."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from core.kernels.reference import JIT
+
+LARGEST_OFFSET = 0.1  # rad: joint offset (norm) beyond which the correction is damped
+REGULAR = 1e-4  # smallest over largest pivot from which elimination is as good as eigenvalues
+
+
+@njit(**JIT)
+def smallest_offset(J, wanted, offset):  # type: ignore[no-untyped-def]
+    """Write the least-squares solution of J offset = wanted, damped to LARGEST_OFFSET.
+
+    Rows of J (6, n) and wanted (6,) are weighted by the lever already. Of many solutions (more than
+    six joints, singular poses) the shortest one. Undamped wherever that is short enough, so that
+    the wanted pose is met exactly right up to a singularity.
+    """
+    n = J.shape[1]
+    size = min(n, 6)
+    # the smaller, regular one of J J^T and J^T J, and what stands right of it
+    G, right = np.empty((size, size)), np.empty(size)
+    for i in range(size):
+        right[i] = wanted[i]
+        if n <= 6:
+            right[i] = 0.0
+            for k in range(6):
+                right[i] += J[k, i] * wanted[k]
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(n if n > 6 else 6):
+                total += J[i, k] * J[j, k] if n > 6 else J[k, i] * J[k, j]
+            G[i, j] = G[j, i] = total
+    y = right.copy()
+    if _eliminated(G.copy(), y):
+        _written(J, y, offset)
+        square = 0.0
+        for i in range(n):
+            square += offset[i] * offset[i]
+        if square <= LARGEST_OFFSET * LARGEST_OFFSET:
+            return
+    _damped(J, G, right, offset)
+
+
+@njit(**JIT)
+def _eliminated(G, y):  # type: ignore[no-untyped-def]
+    """Solve G y = y in place by Cholesky's way; returns False where G is nearly singular."""
+    size = y.shape[0]
+    least, most = np.inf, 0.0
+    for i in range(size):
+        for j in range(i + 1):
+            total = G[i, j]
+            for k in range(j):
+                total -= G[i, k] * G[j, k]
+            if i == j:
+                least, most = min(least, total), max(most, total)
+                if not least > REGULAR * most:
+                    return False
+                G[i, i] = np.sqrt(total)
+            else:
+                G[i, j] = total / G[j, j]
+    for i in range(size):
+        for k in range(i):
+            y[i] -= G[i, k] * y[k]
+        y[i] /= G[i, i]
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
+            y[i] -= G[k, i] * y[k]
+        y[i] /= G[i, i]
+    return True
+
+
+@njit(**JIT)
+def _damped(J, G, right, offset):  # type: ignore[no-untyped-def]
+    """Write the solution by eigenvalues, with as little damping as keeps it short."""
+    wide = J.shape[1] > 6
+    s, V = np.linalg.eigh(G)  # s: the squared singular values
+    y = V.T @ right
+    damping = 1e-14 * max(s[-1], 1e-12)
+    for _ in range(60):
+        square = 0.0
+        for i in range(s.shape[0]):
+            part = y[i] / (max(s[i], 0.0) + damping)
+            square += part * part * (max(s[i], 0.0) if wide else 1.0)
+        if square <= LARGEST_OFFSET * LARGEST_OFFSET:
+            break
+        damping *= 3.0
+    for i in range(s.shape[0]):
+        y[i] /= max(s[i], 0.0) + damping
+    _written(J, V @ y, offset)
+
+
+@njit(**JIT)
+def _written(J, y, offset):  # type: ignore[no-untyped-def]
+    """Write the joint offset (n,) that the solution of the smaller system means."""
+    n = J.shape[1]
+    for i in range(n):
+        offset[i] = 0.0 if n > 6 else y[i]
+        if n > 6:
+            for k in range(6):
+                offset[i] += J[k, i] * y[k]

@@ -1,0 +1,91 @@
+"""Machine code is kept only while every compiled source is as it was.
+
+Numba keeps what it compiled beside the sources. Before it takes that again it looks whether the
+function's own file has changed, not whether another has whose functions were compiled into it
+(numba issue 1833). The correction of a setpoint has the statics in it, and those the placing of
+frames: after an update of the one, the other would go on as before, and say nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from numba import config
+from numba.core import caching
+
+CORE = Path(__file__).resolve().parents[1]
+FOLDERS = (CORE, CORE / "kernels")  # where compiled functions are that others have inside them
+OURS = tuple(CORE.parent / name for name in ("core", "drivers", "bridge"))
+MARK = b"njit"
+USUAL = ("UserProvided", "InTree", "UserWide", "IPython", "Zip")
+
+
+@cache
+def fingerprint() -> bytes:
+    """Return a hash of all sources with compiled functions that others may have inside them."""
+    found = hashlib.sha256()
+    for file, source in _compiled():
+        found.update(b"%s %d " % (file.name.encode(), len(source)) + source)
+    return found.digest()
+
+
+@cache
+def names() -> str:
+    """Return a short hash of the compiled modules' names, for the names of their machine code.
+
+    Numba's index of a function is pickled with the classes of its arguments: an index that was
+    written before a module was renamed cannot even be read.
+    """
+    found = " ".join(file.relative_to(CORE).as_posix() for file, _ in _compiled())
+    return hashlib.sha256(found.encode()).hexdigest()[:8]
+
+
+@cache
+def _compiled() -> list[tuple[Path, bytes]]:
+    files = sorted(file for folder in FOLDERS for file in folder.glob("*.py"))
+    sources = [(file, file.read_bytes()) for file in files]
+    return [(file, source) for file, source in sources if MARK in source]
+
+
+class _OfAllSources:
+    """Finds a place for machine code of our functions, and none for anybody else's."""
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> Any:
+        if not any(folder in Path(py_file).resolve().parents for folder in OURS):
+            return None
+        return super().from_function(py_func, py_file)  # type: ignore[misc]
+
+    def get_source_stamp(self) -> tuple[Any, bytes]:
+        return super().get_source_stamp(), fingerprint()  # type: ignore[misc]
+
+    def get_disambiguator(self) -> str:
+        return f"{super().get_disambiguator()}-{names()}"  # type: ignore[misc]
+
+
+class UserProvided(_OfAllSources, caching.UserProvidedCacheLocator):
+    """In the folder that NUMBA_CACHE_DIR names."""
+
+
+class InTree(_OfAllSources, caching.InTreeCacheLocator):
+    """Beside the source."""
+
+
+class UserWide(_OfAllSources, caching.UserWideCacheLocator):
+    """In the user's own cache, where the sources' folder cannot be written to."""
+
+
+def keep_by_all_sources() -> None:
+    """Have numba ask for all compiled sources from now on; before the first compiled function."""
+    settings: Any = config  # its values are made when it is imported
+    ours = [f"{__name__}.{one.__name__}" for one in (UserProvided, InTree, UserWide)]
+    if ours[0] in settings.CACHE_LOCATOR_CLASSES:
+        return
+    names = [f"{name}CacheLocator" for name in USUAL]
+    others = settings.CACHE_LOCATOR_CLASSES or ",".join(
+        f"{caching.__name__}.{name}" for name in names if hasattr(caching, name)
+    )
+    settings.CACHE_LOCATOR_CLASSES = ",".join([*ours, others])

@@ -1,0 +1,77 @@
+"""The columns of a log: their names, how many belong together, and which one a misspelt one means.
+
+Names are RTDE's.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Sequence
+
+# name -> number of columns: 0 = one column without index, None = one per joint
+COLUMNS: dict[str, int | None] = {
+    "timestamp": 0,
+    "session": 0,
+    "target_q": None,
+    "actual_q": None,
+    "actual_qd": None,
+    "actual_current_as_torque": None,
+    "joint_temperatures": None,
+    "payload": 0,
+    "payload_cog": 3,
+    "actual_TCP_force": 6,
+    "ft_raw_wrench": 6,
+    "approach": None,
+    "measured_position": 3,
+    "measured_rotation": 3,
+}
+INDEXED = re.compile(r"(.+)_(\d+)$")
+ALIKE = 0.85  # likeness of two names from which one may be the other misspelt
+# RTDE fields that look like a log's columns and are none of them: never a slip of the pen
+OTHERS = {
+    "target_qd", "target_qdd", "target_moment", "target_current", "target_TCP_pose",
+    "target_TCP_speed", "actual_current", "actual_current_window", "actual_TCP_pose",
+    "actual_TCP_speed", "payload_mass", "payload_inertia", "joint_mode", "joint_control_output",
+}  # fmt: skip
+
+
+def is_known(name: str) -> bool:
+    """Return whether a log may hold a column, index included."""
+    match = INDEXED.match(name)
+    return COLUMNS.get(name) == 0 or bool(match and COLUMNS.get(match[1], 0) != 0)
+
+
+def indices(name: str, n: int) -> list[str]:
+    """Return what follows ``name`` in the columns of an arm of n joints: '_0', '_1', ... or ''."""
+    count = COLUMNS[name]
+    return [""] if count == 0 else [f"_{i}" for i in range(n if count is None else count)]
+
+
+def written(name: str, n: int) -> str:
+    """Return a column group as messages write it: ``actual_q_0..5``, ``payload``."""
+    ends = indices(name, n)
+    return f"{name}_0..{len(ends) - 1}" if ends[0] else name
+
+
+def misspelt(unknown: Sequence[str], names: Sequence[str], n: int) -> str:
+    """Return which of the ``unknown`` columns may mean one of ``names``, as a question, or ''."""
+    likeness = [
+        (difflib.SequenceMatcher(None, found.lower(), meant.lower()).ratio(), found, meant)
+        for found in unknown
+        if re.sub(r"_\d+$", "", found) not in OTHERS
+        for meant in (f"{name}{index}" for name in names for index in indices(name, n))
+    ]
+    ratio, found, meant = max(likeness, key=lambda one: one[0], default=(0.0, "", ""))
+    return f"; found {found}; did you mean {meant}?" if ratio >= ALIKE else ""
+
+
+def nearest(names: Sequence[str]) -> str:
+    """Return what a file without any known column may mean, or what was expected."""
+    for name in names:
+        stem = re.sub(r"_\d+$", "", name)
+        near = difflib.get_close_matches(stem, COLUMNS, n=1, cutoff=0.6)
+        if near:
+            return f"; found {name!r}, did you mean {near[0]!r}?"
+    more = ", ..." if len(names) > 6 else ""
+    return f" ({', '.join(names[:6])}{more}), expected RTDE field names"

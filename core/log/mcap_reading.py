@@ -1,0 +1,198 @@
+"""Reading recordings: rows in batches, events, configuration; also of files that were cut."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from google.protobuf.descriptor_pb2 import DescriptorProto
+from numpy.typing import NDArray
+
+from core.errors import LogError
+from core.log import mcap_records as records
+from core.log.mcap_layout import Layout, layout_in
+from core.log.mcap_schema import (
+    CONFIGURATION,
+    CYCLE_CHANNELS,
+    EVENTS,
+    JSON_CHANNELS,
+    LOG,
+    LOOP,
+    MESSAGES,
+    STATE,
+    message_of,
+)
+
+Array = NDArray[np.float64]
+SUFFIX = ".mcap"
+Document = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What one chunk of a recording holds, at most some seconds."""
+
+    columns: Mapping[str, Array]  # (k,) or (k, count) by field name
+    log_time: NDArray[np.int64]  # (k,) ns since 1970
+    documents: tuple[tuple[str, Document], ...]  # (channel, JSON) in order of writing
+    state_names: tuple[str, ...] = ()  # of column "state", from 0 on
+
+    def __len__(self) -> int:
+        return len(self.log_time)
+
+
+def files_of(path: Path) -> list[Path]:
+    """Return the files of a recording, in order.
+
+    ``path``: one file, or a run as a whole: the files' name without ``-001.mcap``. Raises LogError
+    where there is none.
+    """
+    if path.is_file():
+        return [path]
+    name = re.compile(rf"{re.escape(path.name)}-(\d{{3,}}){re.escape(SUFFIX)}")
+    folder = path.parent
+    matches = [name.fullmatch(one.name) for one in folder.iterdir()] if folder.is_dir() else []
+    found = sorted((int(match[1]), match[0]) for match in matches if match)
+    if not found:
+        raise LogError(f"{path}: file not found, expected a recording of the daemon (MCAP)")
+    return [folder / one for _, one in found]
+
+
+def read_batches(path: Path) -> Iterator[Batch]:
+    """Yield what a recording holds, chunk by chunk; see ``files_of``.
+
+    Ends where the file is broken off. Raises LogError where it is no recording.
+    """
+    for file in files_of(path):
+        yield from _read_file(file)
+
+
+def read_documents(path: Path, channel: str = EVENTS) -> list[Document]:
+    """Return all JSON messages of a channel, in order. Raises LogError."""
+    return [
+        document
+        for batch in read_batches(path)
+        for topic, document in batch.documents
+        if topic == channel
+    ]
+
+
+def read_configuration(path: Path) -> Document:
+    """Return the first configuration of a recording. Raises LogError where it has none."""
+    for batch in read_batches(path):
+        for topic, document in batch.documents:
+            if topic == CONFIGURATION:
+                return document
+    raise LogError(f"{path}: found no configuration, expected one at the beginning of a recording")
+
+
+def read_columns(path: Path, told_only: bool = False) -> dict[str, Array]:
+    """Return all cycles of a recording by field name, empty where there are none.
+
+    ``told_only``: without what the controller never told, which is NaN throughout.
+    """
+    batches = [batch.columns for batch in read_batches(path) if len(batch)]
+    names = list(batches[0]) if batches else []
+    found = {name: np.concatenate([columns[name] for columns in batches]) for name in names}
+    return {
+        name: values for name, values in found.items() if not (told_only and np.isnan(values).all())
+    }
+
+
+def last_batch(path: Path) -> Batch | None:
+    """Return the last batch of one file that holds cycles, without reading the whole file."""
+    with path.open("rb") as file:
+        chunks = list(records.chunk_offsets(file, path))
+        decoder = _Decoder(path)
+        if chunks:  # schemas and channels stand in the first one
+            decoder.take(records.read_chunk(file, *chunks[0]))
+        for at, length in reversed(chunks):
+            contents = records.read_chunk(file, at, length)
+            batch = None if contents is None else decoder.take(contents)
+            if batch is not None and len(batch):
+                return batch
+    return None
+
+
+def _read_file(path: Path) -> Iterator[Batch]:
+    with path.open("rb") as file:
+        decoder = _Decoder(path)
+        for at, length in records.chunk_offsets(file, path):
+            contents = records.read_chunk(file, at, length)
+            if contents is None:
+                return
+            batch = decoder.take(contents)
+            if batch is not None:
+                yield batch
+
+
+@dataclass
+class _Decoder:
+    """Knows the channels of one file and makes batches of its chunks."""
+
+    path: Path
+    schemas: dict[int, bytes] = field(default_factory=dict)
+    topics: dict[int, str] = field(default_factory=dict)
+    messages: dict[str, DescriptorProto] = field(default_factory=dict)
+    layouts: dict[str, Layout] = field(default_factory=dict)
+    state_names: tuple[str, ...] = ()
+
+    def take(self, contents: records.Contents | None) -> Batch | None:
+        """Return the batch of a chunk; raises LogError where it is no recording's."""
+        if contents is None:
+            return None
+        try:
+            self._learn(contents)
+            return self._batch(contents)
+        except ValueError as error:
+            raise LogError(f"{self.path}: {error}, expected a recording of the daemon") from None
+
+    def _learn(self, contents: records.Contents) -> None:
+        self.schemas.update((schema.id, schema.data) for schema in contents.schemas)
+        for channel in contents.channels:
+            self.topics[channel.id] = channel.topic
+            if channel.topic not in CYCLE_CHANNELS:
+                continue
+            if channel.message_encoding != "protobuf":
+                raise ValueError(f"found channel {channel.topic} as {channel.message_encoding!r}")
+            message = message_of(self.schemas.get(channel.schema_id, b""))
+            if message.name != MESSAGES[channel.topic]:
+                raise ValueError(f"found channel {channel.topic} to hold {message.name}")
+            self.messages[channel.topic] = message
+            if channel.topic == LOOP and message.enum_type:
+                self.state_names = tuple(value.name for value in message.enum_type[0].value)
+
+    def _batch(self, contents: records.Contents) -> Batch:
+        cycles: dict[str, list[bytes]] = {topic: [] for topic in CYCLE_CHANNELS}
+        documents: list[tuple[str, Document]] = []
+        times: list[int] = []
+        for message in contents.messages:
+            topic = self.topics.get(message.channel, "")
+            if topic in cycles:
+                cycles[topic].append(message.data)
+                if topic == STATE:
+                    times.append(message.log_time)
+            elif topic in JSON_CHANNELS and topic != LOG:
+                documents.append((topic, json.loads(message.data)))
+        columns: dict[str, Array] = {}
+        for topic, data in cycles.items():
+            if len(data) != len(times):
+                raise ValueError(f"found {len(data)} messages on {topic}, {len(times)} on {STATE}")
+            if data:
+                columns.update(self._decode(topic, data))
+        return Batch(columns, np.array(times, np.int64), tuple(documents), self.state_names)
+
+    def _decode(self, topic: str, data: list[bytes]) -> dict[str, Array]:
+        layout = self.layouts.get(topic)
+        if layout is None:
+            layout = self.layouts[topic] = layout_in(self.messages[topic], data[0])
+        width = len(layout.template)
+        joined = np.frombuffer(b"".join(data), np.uint8)
+        if len(joined) != width * len(data):
+            raise ValueError(f"found messages on {topic} of several lengths")
+        return layout.decode(joined.reshape(-1, width))

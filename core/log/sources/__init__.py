@@ -1,0 +1,21 @@
+"""What people have instead of a log, each kind in a file of its own; one table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from core.log.sources.lerobot import LeRobot
+from core.log.sources.recording import Recording
+from core.log.sources.ros_bag import RosBag
+from core.log.sources.source import Converted, Source, SourceOptions
+from core.log.sources.text_recording import Libfranka, UrRecorder
+
+SOURCES: tuple[Source, ...] = (RosBag(), LeRobot(), Libfranka(), UrRecorder(), Recording())
+
+
+def source_of(path: Path) -> Source | None:
+    """Return the kind of source that a path is, None where it is a log (or nothing known)."""
+    return next((source for source in SOURCES if source.holds(path)), None)
+
+
+__all__ = ["SOURCES", "Converted", "Source", "SourceOptions", "source_of"]

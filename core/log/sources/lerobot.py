@@ -1,0 +1,145 @@
+"""LeRobot datasets (v2.1 and v3): ``action`` is target_q, ``observation.state`` is actual_q."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import LogError
+from core.log.sources.joint_order import order_joints
+from core.log.sources.source import Converted, Source, SourceOptions
+
+Array = NDArray[np.float64]
+INFO = Path("meta") / "info.json"
+STEPS = 4095  # of an encoder turn, as LeRobot counts its servos' 4096 positions
+PAUSE = 1.0  # s between two episodes, whose own times all begin at 0
+
+
+class LeRobot(Source):
+    """A dataset of teleoperated or played episodes."""
+
+    identifier = "lerobot"
+    title = "LeRobot dataset (folder with meta/info.json)"
+
+    def holds(self, path: Path) -> bool:
+        """Return whether this is a dataset."""
+        return path.is_dir() and (path / INFO).is_file()
+
+    def read(self, path: Path, arm_joints: Sequence[str], options: SourceOptions) -> Converted:
+        """Return the log of a dataset; see ``Source.read``."""
+        info = _info(path)
+        names = [name.removesuffix(".pos") for name in _names(path, info, "observation.state")]
+        commanded = [name.removesuffix(".pos") for name in _names(path, info, "action")]
+        order = order_joints(path, names, arm_joints, options.joints)
+        for name in order:
+            if name not in commanded:
+                raise LogError(
+                    f"{path}: action: found {', '.join(commanded)}, expected {name} among them"
+                )
+        table = _table(path, options.episode)
+        scale = _scale(path, order, options)
+        columns = {"timestamp": _running_time(table["timestamp"], table["episode_index"])}
+        for column, key, found in (
+            ("target_q", "action", commanded), ("actual_q", "observation.state", names),
+        ):  # fmt: skip
+            columns[column] = table[key][:, [found.index(name) for name in order]] * scale
+        fps = float(info.get("fps", 0)) or 30.0
+        episodes = len(np.unique(table["episode_index"]))
+        notes = [
+            f"timestamp is the frame's number over {fps:g} Hz, not measured: a latency below "
+            f"{1e3 / fps:.0f} ms cannot be told",
+            f"{episodes} episodes in a row, {PAUSE:g} s between two",
+        ]
+        if options.calibration is not None:
+            notes.append("a joint's zero is the middle of its calibrated range, not the model's")
+        return Converted(columns, order, tuple(notes))
+
+
+def _info(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads((path / INFO).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise LogError(f"{path / INFO}: found no readable JSON ({error})") from None
+    if not isinstance(found, dict) or not isinstance(found.get("features"), dict):
+        raise LogError(f"{path / INFO}: features: not found, expected the dataset's columns")
+    return found
+
+
+def _names(path: Path, info: dict[str, Any], feature: str) -> list[str]:
+    """Return the names of a feature's numbers: a list, or a list under one key."""
+    given = info["features"].get(feature)
+    names = given.get("names") if isinstance(given, dict) else None
+    if isinstance(names, dict) and len(names) == 1:
+        names = next(iter(names.values()))
+    if not isinstance(names, list) or not names:
+        raise LogError(
+            f"{path / INFO}: features.{feature}.names: found {names!r}, expected joint names"
+        )
+    return [str(name) for name in names]
+
+
+def _table(path: Path, episode: int | None) -> dict[str, Array]:
+    """Return action, observation.state, timestamp and episode_index of all frames in order."""
+    import pyarrow
+    from pyarrow import parquet
+
+    wanted = ["action", "observation.state", "timestamp", "episode_index"]
+    files = sorted((path / "data").glob("chunk-*/*.parquet"))
+    if not files:
+        raise LogError(f"{path / 'data'}: found no chunk-*/*.parquet, expected the frames")
+    parts: list[dict[str, Array]] = []
+    for file in files:
+        try:
+            frame = parquet.read_table(file, columns=wanted)
+        except (pyarrow.ArrowException, OSError) as error:
+            raise LogError(f"{file}: found no readable frames ({error})") from None
+        if episode is not None:
+            frame = frame.filter(pyarrow.compute.equal(frame["episode_index"], episode))
+        if frame.num_rows:
+            parts.append({
+                name: np.array(frame[name].to_pylist(), dtype=float) for name in wanted
+            })  # fmt: skip
+    if not parts:
+        raise LogError(f"{path}: --episode: found no episode {episode}, expected one that it has")
+    return {name: np.concatenate([part[name] for part in parts]) for name in wanted}
+
+
+def _running_time(time: Array, episode: Array) -> Array:
+    """Return times (N,) that run on from one episode to the next."""
+    begins = np.flatnonzero(np.diff(episode, prepend=np.nan) != 0)
+    found: Array = time - time[0]
+    for begin in begins[1:]:
+        found[begin:] += found[begin - 1] - found[begin] + PAUSE
+    return found
+
+
+def _scale(path: Path, order: Sequence[str], options: SourceOptions) -> Array:
+    """Return what a number of each joint is in rad (n,).
+
+    By the calibration file a joint's numbers go from -100 to 100 over its range of servo steps.
+    """
+    if options.units:
+        return np.full(len(order), {"rad": 1.0, "degrees": np.pi / 180}[options.units])
+    if options.calibration is None:
+        raise LogError(
+            f"{path}: units: found none, expected --calibration FILE (the arm's calibration, in "
+            "which numbers go from -100 to 100) or --units degrees or rad"
+        )
+    file = options.calibration
+    try:
+        given = json.loads(file.read_text(encoding="utf-8"))
+        span = [float(given[name]["range_max"]) - float(given[name]["range_min"]) for name in order]
+    except OSError as error:
+        raise LogError(f"{file}: cannot be read ({error.strerror})") from None
+    except (ValueError, TypeError):
+        raise LogError(f"{file}: found no LeRobot calibration, expected JSON with range_min and "
+                       "range_max of each joint") from None  # fmt: skip
+    except KeyError as error:
+        raise LogError(f"{file}: {error.args[0]}: not found, expected {', '.join(order)} with "
+                       "range_min and range_max") from None  # fmt: skip
+    return np.asarray(np.array(span) / 2 / 100 * 2 * np.pi / STEPS)

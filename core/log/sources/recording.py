@@ -1,0 +1,45 @@
+"""Our own recordings: what a run of the daemon wrote."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from core.errors import LogError
+from core.log.mcap_reading import SUFFIX, files_of, read_batches
+from core.log.pieces import LogPieces
+from core.log.sources.source import Converted, Source, SourceOptions
+
+
+class Recording(Source):
+    """One file of a run, or the run as a whole (its name without ``-001.mcap``)."""
+
+    identifier = "recording"
+    title = "recording of gapbridge run"
+
+    def holds(self, path: Path) -> bool:
+        """Return whether this is one file of a run, or its name."""
+        if path.exists():
+            return path.is_file() and path.suffix.lower() == SUFFIX
+        try:
+            return bool(files_of(path))
+        except LogError:
+            return False
+
+    def read(self, path: Path, arm_joints: Sequence[str], options: SourceOptions) -> Converted:
+        """Return the log; see ``Source.read``."""
+        n = len(arm_joints) or _joints(path)
+        pieces = [piece for file in files_of(path) for piece in LogPieces(file, n)]
+        if not pieces:
+            raise LogError(f"{path}: found no cycles, expected a recording of the daemon")
+        names = set.intersection(*(set(piece.columns) for piece in pieces)) - {"approach"}
+        columns = {name: np.concatenate([p.columns[name] for p in pieces]) for name in names}
+        return Converted(columns, tuple(f"joint_{i + 1}" for i in range(n)))
+
+
+def _joints(path: Path) -> int:
+    """Return how many joints the recorded arm has, 0 where nothing was recorded."""
+    first = next((batch for batch in read_batches(path) if "actual_q" in batch.columns), None)
+    return 0 if first is None else int(first.columns["actual_q"].shape[1])

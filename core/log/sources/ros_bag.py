@@ -1,0 +1,281 @@
+"""ROS bags: ROS 1 ``.bag``, ROS 2 folders and ``.db3``, MCAP files with ROS 2 messages.
+
+Topics are found by their type, times are those of the headers, joints are ordered by name.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from core.errors import LogError
+from core.log.sources.joint_order import order_joints
+from core.log.sources.resampling import Stream, joined
+from core.log.sources.source import Converted, Source, SourceOptions
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+
+Array = NDArray[np.float64]
+TYPES = {  # role -> types of messages
+    "joints": ("sensor_msgs/msg/JointState",),
+    "controller": ("control_msgs/msg/JointTrajectoryControllerState",),
+    "wrench": ("geometry_msgs/msg/WrenchStamped",),
+    "pose": ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped"),
+}
+WRENCHES = ("ft_raw_wrench", "actual_TCP_force")
+
+
+@dataclass
+class _Samples:
+    """What came on one topic: times and, by joint name or field, values."""
+
+    topic: str
+    time: list[float] = field(default_factory=list)
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    received: int = 0  # messages without a header stamp, which count at their time of recording
+    frame: str = ""
+
+
+class RosBag(Source):
+    """A recording of ROS topics."""
+
+    identifier = "ros_bag"
+    title = "ROS 1 or ROS 2 bag, MCAP with ROS 2 messages"
+
+    def holds(self, path: Path) -> bool:
+        """Return whether this is a bag."""
+        if path.is_dir():
+            return (path / "metadata.yaml").is_file()
+        if path.suffix == ".mcap":
+            return path.is_file() and _is_ros_mcap(path)
+        return path.suffix in (".bag", ".db3") and path.is_file()
+
+    def read(self, path: Path, arm_joints: Sequence[str], options: SourceOptions) -> Converted:
+        """Return the log of a bag; see ``Source.read``."""
+        samples = {}
+        notes: list[str] = []
+        with _opened(path) as bag:
+            for role in TYPES:
+                topic = _topic(path, bag, role, options, notes)
+                if topic:
+                    samples[role] = _collect(path, bag, topic)
+        if not samples.keys() & {"joints", "controller"}:
+            raise LogError(
+                f"{path}: topics: found no JointState and no JointTrajectoryControllerState, "
+                "expected one of them"
+            )
+        notes += [
+            f"{one.topic}: {one.received} of {len(one.time)} messages have no stamp in their "
+            "header; the time of recording stands in its place"
+            for one in samples.values()
+            if one.received
+        ]
+        order = order_joints(path, _names(samples), arm_joints, options.joints)
+        streams = _streams(path, samples, order, options, notes)
+        time, columns, more = joined(streams[0], streams[1:])
+        notes += more
+        if "target_q" not in columns:
+            notes.append("target_q: no topic has it, so that tracking cannot be observed")
+        return Converted({"timestamp": time, **columns}, order, tuple(notes))
+
+
+def _is_ros_mcap(path: Path) -> bool:
+    from mcap.exceptions import McapError
+    from mcap.reader import make_reader
+    from mcap.records import Schema
+    from mcap.stream_reader import StreamReader
+
+    try:
+        with path.open("rb") as file:
+            if make_reader(file).get_header().profile == "ros2":
+                return True
+            file.seek(0)
+            for record in StreamReader(file, emit_chunks=False).records:
+                if isinstance(record, Schema):
+                    return record.encoding in ("ros2msg", "ros2idl")
+    except (McapError, OSError):
+        pass
+    return False
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[AnyReader]:
+    try:
+        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise LogError(
+            f"{path}: found a ROS bag, expected rosbags to be installed: pip install "
+            "'gapbridge[ros]'"
+        ) from None
+    try:
+        bag = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        bag.open()
+    except (AnyReaderError, OSError) as error:
+        raise LogError(f"{path}: found no readable bag ({error})") from None
+    with contextlib.closing(bag):
+        yield bag
+
+
+def _topic(
+    path: Path, bag: AnyReader, role: str, options: SourceOptions, notes: list[str]
+) -> str | None:
+    """Return the topic of a role: the one that was asked for, or the only one of its type."""
+    found = sorted({c.topic for c in bag.connections if _type(c.msgtype) in TYPES[role]})
+    asked = options.topics.get(role)
+    if asked is not None:
+        if asked not in found:
+            listed = ", ".join(found) or "none"
+            raise LogError(
+                f"{path}: --topic {role}: found {listed} of type {TYPES[role][0]}, expected {asked}"
+            )
+        return asked
+    if role == "wrench" and found and not options.wrench:
+        notes.append(f"{', '.join(found)}: left out; say what it measures with --wrench "
+                     f"{' or '.join(WRENCHES)}")  # fmt: skip
+        return None
+    if role == "pose" and found:
+        notes.append(f"{', '.join(found)}: left out; name the tracker's topic with --topic "
+                     "pose=TOPIC")  # fmt: skip
+        return None
+    if len(found) > 1:
+        raise LogError(
+            f"{path}: topics: found {len(found)} of type {TYPES[role][0]} ({', '.join(found)}), "
+            f"expected one; name it with --topic {role}=TOPIC"
+        )
+    return found[0] if found else None
+
+
+def _type(name: str) -> str:
+    """Return a message's type in ROS 2's form (ROS 1 in rosbags has it as well)."""
+    return name if "/msg/" in name else name.replace("/", "/msg/")
+
+
+def _collect(path: Path, bag: AnyReader, topic: str) -> _Samples:
+    from rosbags.highlevel import AnyReaderError
+
+    found = _Samples(topic)
+    connections = [c for c in bag.connections if c.topic == topic]
+    try:
+        for connection, received, raw in bag.messages(connections):
+            message: Any = bag.deserialize(raw, connection.msgtype)
+            stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+            if stamp == 0:
+                stamp, found.received = received * 1e-9, found.received + 1
+            found.time.append(stamp)
+            found.rows.append(_values(_type(connection.msgtype), message))
+            found.frame = message.header.frame_id
+    except AnyReaderError as error:
+        raise LogError(f"{path}: topic {topic}: cannot be read ({error})") from None
+    if not found.rows:
+        raise LogError(f"{path}: topic {topic}: found no messages, expected some")
+    return found
+
+
+def _values(kind: str, message: Any) -> dict[str, Any]:
+    """Return what a message says: by joint where it has names."""
+    if kind in TYPES["joints"]:
+        return {
+            "names": tuple(message.name), "actual_q": message.position,
+            "actual_qd": message.velocity, "effort": message.effort,
+        }  # fmt: skip
+    if kind in TYPES["controller"]:
+        target = getattr(message, "reference", None) or getattr(message, "desired", None)
+        actual = getattr(message, "feedback", None) or getattr(message, "actual", None)
+        return {
+            "names": tuple(message.joint_names),
+            "target_q": target.positions if target else (),
+            "actual_q": actual.positions if actual else (),
+            "actual_qd": actual.velocities if actual else (),
+        }
+    if kind in TYPES["wrench"]:
+        force, torque = message.wrench.force, message.wrench.torque
+        return {"wrench": [force.x, force.y, force.z, torque.x, torque.y, torque.z]}
+    pose = getattr(message, "pose", None) or message.transform
+    at = getattr(pose, "position", None) or pose.translation
+    turn = getattr(pose, "orientation", None) or pose.rotation
+    return {
+        "measured_position": [at.x, at.y, at.z],
+        "measured_rotation": [turn.x, turn.y, turn.z, turn.w],
+    }
+
+
+def _names(samples: dict[str, _Samples]) -> tuple[str, ...]:
+    """Return all joint names in the order in which they first came."""
+    found: dict[str, None] = {}
+    for role in ("controller", "joints"):
+        for row in samples[role].rows if role in samples else ():
+            found.update(dict.fromkeys(row["names"]))
+    return tuple(found)
+
+
+def _streams(
+    path: Path, samples: dict[str, _Samples], order: tuple[str, ...], options: SourceOptions,
+    notes: list[str],
+) -> list[Stream]:  # fmt: skip
+    """Return the streams, the one whose times are taken first."""
+    streams = [
+        stream
+        for role in ("controller", "joints")
+        if role in samples
+        for stream in _joint_stream(samples[role], order, options, notes)
+    ]
+    if not streams:
+        raise LogError(
+            f"{path}: joints: found no message that holds all of {', '.join(order)}, expected some"
+        )
+    if "wrench" in samples:
+        one = samples["wrench"]
+        column = options.wrench or WRENCHES[0]
+        values = np.array([row["wrench"] for row in one.rows])
+        streams.append(Stream(one.topic, np.array(one.time), {column: values}).in_order())
+        notes.append(f"{one.topic}: taken as {column}, its axes are those of {one.frame!r}")
+    if "pose" in samples:
+        one = samples["pose"]
+        turns = Rotation.from_quat([row["measured_rotation"] for row in one.rows])
+        columns = {
+            "measured_position": np.array([row["measured_position"] for row in one.rows]),
+            "measured_rotation": turns.as_rotvec(),
+        }
+        streams.append(Stream(one.topic, np.array(one.time), columns).in_order())
+    return streams
+
+
+def _joint_stream(
+    samples: _Samples, order: tuple[str, ...], options: SourceOptions, notes: list[str]
+) -> Iterator[Stream]:
+    """Yield the stream of a topic with joints, if a message of it holds all of them."""
+    whole = [i for i, row in enumerate(samples.rows) if set(order) <= set(row["names"])]
+    if not whole:
+        return
+    columns = {}
+    for source, column in (("target_q",) * 2, ("actual_q",) * 2, ("actual_qd",) * 2,
+                           ("effort", "actual_current_as_torque")):  # fmt: skip
+        lists = [_in_order(samples.rows[i], source, order) for i in whole]
+        if any(values is None for values in lists):
+            continue
+        if source == "effort" and not options.effort_is_torque:
+            notes.append(f"{samples.topic}: effort left out; where it is Nm (some drivers report "
+                         "A) say --effort-is-torque")  # fmt: skip
+            continue
+        columns[column] = np.array(lists, dtype=float)
+    if columns:
+        time = np.array(samples.time)[whole]
+        yield Stream(samples.topic, time, columns).in_order()
+
+
+def _in_order(row: dict[str, Any], key: str, order: tuple[str, ...]) -> list[float] | None:
+    """Return a message's values in the order of the arm's joints, None where it has none."""
+    values = row.get(key)
+    if values is None or len(values) != len(row["names"]):
+        return None
+    by_name = dict(zip(row["names"], values, strict=True))
+    return [float(by_name[name]) for name in order]

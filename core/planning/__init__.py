@@ -1,0 +1,1 @@
+"""Which poses to measure, and in which order."""

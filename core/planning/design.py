@@ -1,0 +1,263 @@
+"""The plan of a calibration session: which poses and loads tell most of the parameters at hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from core.calibration.observables.observable import Observable
+from core.calibration.parameters import Parameters
+from core.calibration.plan import Payload, Plan
+from core.effects import flexibility_effects
+from core.errors import PlanError
+from core.loads import Loads
+from core.planning.candidates import STOPS, Candidates, candidates_of, joined
+from core.planning.exchange import Choice, exchanged, grown, shrunk
+from core.planning.information import Reference, blocks, expectation_of, gathered, inverse
+from core.planning.refinement import Refined, Refiner
+from core.planning.route import Stop, itinerary
+from core.planning.travel import joint_speed, leg_times
+from core.planning.workspace import Space
+from core.planning.worst_places import evened, leaning
+
+Array = NDArray[np.float64]
+REFERENCE = 200  # poses over which the predicted TCP is judged
+BOUGHT_ROUNDS = 3
+BOUGHT = (0.5, 0.75, 1.0, 1.5, 2.0)  # of the poses asked for: what these would give
+SIGHT = "nobody said where the instrument stands: whether it sees the target was not looked at"
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What a session shall be like."""
+
+    poses: int = 30  # to fit
+    held_out: int = 8  # to verify
+    repeats: int = 3  # visits to a pose a second time
+    seed: int = 0
+    sigma: float = 3e-5  # m, 1 sigma of one coordinate: instrument and arm together
+    travel_weight: float = 0.02  # a usual leg more at every pose is worth this share of the std
+    stops: int = STOPS  # candidates
+
+
+def plan(
+    parameters: Parameters,
+    observable: Observable,
+    loads: Sequence[Payload],
+    space: Space,
+    *,
+    poses: int = 30,
+    held_out: int = 8,
+    repeats: int = 3,
+    seed: int = 0,
+    sigma: float = 3e-5,
+    travel_weight: float = 0.02,
+    stops: int = STOPS,
+    progress: Progress | None = None,
+) -> Plan:
+    """Return the poses, loads and approaches that tell most, in the order of travel.
+
+    Chosen so that the TCP predicted by the calibrated model is known best over the whole reachable
+    space and under all ``loads``, the worst places before the others. ``sigma`` (m) is 1 sigma of
+    one coordinate of a reading; ``travel_weight`` the share of the TCP's deviation that a usual leg
+    more at every pose is worth; ``stops`` how many candidate poses are looked at.
+    Raises PlanError where no pose is reachable and seen, or where the poses cannot be enough.
+    """
+    wish = Wish(poses, held_out, repeats, seed, sigma, travel_weight, stops)
+    with threadpool_limits(1, "blas"):  # matrices of this size gain nothing from threads
+        return _planned(parameters, observable, loads, space, wish, progress or _silent)
+
+
+def _silent(text: str, share: float) -> None:
+    """Tell nobody."""
+
+
+def _planned(
+    parameters: Parameters,
+    observable: Observable,
+    loads: Sequence[Payload],
+    space: Space,
+    wish: Wish,
+    tell: Progress,
+) -> Plan:
+    loads = _in_order(parameters, loads)
+    tell("looking for poses", 0.0)
+    space = replace(space, hung=(*space.hung, *(far_end(load) for load in loads)))
+    found = candidates_of(parameters, observable, loads, space, wish.seed, wish.stops)
+    _require_enough(parameters, observable, found, wish)
+    tell("working out what each pose tells", 0.1)
+    rows = blocks(parameters, observable, found.readings, found.nuisance, wish.sigma)
+    reference = reference_of(parameters, loads, space, wish.seed)
+    cost = _cost(parameters, found, wish)
+    choice = Choice.of(rows, reference.weight(rows.shape[2]), cost)
+    chosen = _chosen(choice, wish, lambda share: tell("choosing poses", 0.2 + 0.3 * share))
+    share = leaning(reference, rows[chosen])
+    weight = reference.weight(rows.shape[2], share)
+    chosen = exchanged(Choice.of(rows, weight, cost), chosen)
+    refiner = Refiner(parameters, observable, space, found, weight, wish.sigma)
+    best, weight = evened(
+        refiner, reference, Refined(found.readings[np.array(chosen)], rows[chosen]), share,
+        wish.seed, lambda share: tell("moving poses to where they tell more", 0.5 + 0.2 * share),
+    )  # fmt: skip
+    choice, refiner = Choice.of(rows, weight, cost), replace(refiner, weight=weight)
+    tell("working out what more or fewer poses buy", 0.7)
+    bought = _bought(choice, chosen, wish, refiner, reference)
+    bought[wish.poses] = _rms(reference, best.rows)
+    tell("finding a short way", 0.95)
+    checks = [Stop(row, held_out=True) for row in _held_out(found, chosen, wish)]
+    found = joined(found, best.readings)
+    fit = [Stop(len(rows) + i) for i in range(wish.poses)]
+    way = itinerary(found, fit + checks, space, wish.repeats)
+    again = [stop.row - len(rows) for stop in way.stops if stop.repeat]
+    measured = np.concatenate([best.rows, best.rows[again]])
+    expected = expectation_of(parameters, measured, reference)
+    tell("planned", 1.0)
+    hung = set(found.readings.load[len(rows) :])
+    unseen = () if space.places or observable.unknown else (SIGHT,)
+    notes = (*found.notes, *unseen, *way.notes, *_notes(parameters, loads, hung, expected.std))
+    return Plan(
+        tuple(loads), way.poses(found), expected, tuple(sorted(bought.items())), way.travel, notes
+    )
+
+
+def _in_order(parameters: Parameters, loads: Sequence[Payload]) -> list[Payload]:
+    """Return the loads, the lightest first; raises PlanError for one that the arm cannot carry."""
+    if not loads:
+        raise PlanError("loads: found none, expected at least one (0 kg is one)")
+    rated = parameters.nominal.arm.payload
+    for number, load in enumerate(loads):
+        if not 0 <= load.mass <= rated:
+            raise PlanError(
+                f"load {number + 1}{' ' + load.name if load.name else ''}: found {load.mass:g} kg, "
+                f"expected 0 to the rated {rated:g} kg"
+            )
+    return sorted(loads, key=lambda load: load.mass)
+
+
+def far_end(load: Payload) -> tuple[float, float, float]:
+    """Return how far a load reaches (m, flange axes): as far beyond its middle as before."""
+    return (2 * load.cog[0], 2 * load.cog[1], 2 * load.cog[2])
+
+
+def _require_enough(
+    parameters: Parameters, observable: Observable, found: Candidates, wish: Wish
+) -> None:
+    unknown = len(parameters) + observable.layout(found.readings).size
+    needed = -(-unknown // observable.equations)
+    if wish.poses < needed:
+        raise PlanError(
+            f"poses: found {wish.poses}, expected at least {needed}: {unknown} unknowns, "
+            f"{observable.equations} number(s) a {observable.kind} reading"
+        )
+    if len(found.readings) < wish.poses + wish.held_out:
+        raise PlanError(
+            f"poses: {len(found.readings)} can be reached and seen, expected at least "
+            f"{wish.poses + wish.held_out}; {found.why}"
+        )
+
+
+def reference_of(
+    parameters: Parameters, loads: Sequence[Payload], space: Space, seed: int
+) -> Reference:
+    """Return poses anywhere in the cell, seen by the instrument or not, under the loads in turn."""
+    random = np.random.default_rng(seed + 1)
+    drawn = space.draw(20 * REFERENCE, random)
+    clear = drawn[space.clear(drawn)]
+    q = clear[:REFERENCE] if len(clear) else drawn[:REFERENCE]
+    turn = np.arange(len(q)) % len(loads)
+    approach = random.choice([-1.0, 1.0], q.shape) if parameters.sided() else None
+    mass, cog = np.array([load.mass for load in loads]), np.array([load.cog for load in loads])
+    return Reference.of(parameters, q, Loads(mass[turn], cog[turn], approach=approach))
+
+
+def _cost(
+    parameters: Parameters, found: Candidates, wish: Wish
+) -> Callable[[Sequence[int]], Array]:
+    """Return what adding each candidate costs in travel: its legs to the two nearest stops."""
+    speed = joint_speed(parameters.nominal.arm.limits.velocity)
+    legs = leg_times(found.q, found.q, speed)
+    usual = float(np.median(legs)) or 1.0
+    load, stop = found.readings.load, found.stop
+    unit = wish.travel_weight / (2 * usual * wish.poses)
+
+    def cost(chosen: Sequence[int]) -> Array:
+        extra = np.full(len(load), 2 * usual)
+        for number in range(int(load.max()) + 1):
+            own = [row for row in chosen if load[row] == number]
+            if len(own) > 1:
+                here = load == number
+                near = np.partition(legs[np.ix_(stop[own], stop[here])], 1, axis=0)
+                extra[here] = near[0] + near[1]
+        return unit * extra
+
+    return cost
+
+
+def _rms(reference: Reference, rows: Array) -> float:
+    """Return the expected rms error of the TCP (m) over the reference, each pose alike."""
+    return float(np.sqrt(np.mean(reference.std(inverse(gathered(rows))) ** 2)))
+
+
+def _chosen(choice: Choice, wish: Wish, told: Callable[[float], None]) -> list[int]:
+    size, k = choice.rows.shape[2], choice.rows.shape[1]
+    return exchanged(choice, grown(choice, [], wish.poses, -(-size // k)), told=told)
+
+
+def _bought(
+    choice: Choice, chosen: list[int], wish: Wish, refiner: Refiner, reference: Reference
+) -> dict[int, float]:
+    """Return what fewer and more poses would give, each number's poses chosen anew."""
+    size, k = choice.rows.shape[2], choice.rows.shape[1]
+    fewest = -(-size // k)
+    told: dict[int, float] = {}
+    for count in sorted({max(round(share * wish.poses), fewest) for share in BOUGHT}):
+        if count == len(chosen):
+            continue
+        fewer = count < len(chosen)
+        some = shrunk(choice, chosen, count) if fewer else grown(choice, chosen, count, 0)
+        some = exchanged(choice, some, rounds=1)
+        readings = refiner.found.readings[np.array(some)]
+        random = np.random.default_rng(wish.seed)
+        best = refiner.refined(Refined(readings, choice.rows[some]), BOUGHT_ROUNDS, random)
+        told[len(some)] = _rms(reference, best.rows)
+    return told
+
+
+def _held_out(found: Candidates, chosen: list[int], wish: Wish) -> list[int]:
+    """Return candidates at poses that are not fitted, drawn at random, the fitted loads in turn."""
+    random = np.random.default_rng(wish.seed + 2)
+    used = set(found.stop[chosen])
+    loads = np.unique(found.readings.load[chosen])
+    picked: list[int] = []
+    for row in random.permutation(len(found.readings)):
+        wanted = loads[len(picked) % len(loads)]
+        if len(picked) == wish.held_out:
+            break
+        if found.stop[row] not in used and found.readings.load[row] == wanted:
+            picked.append(int(row))
+            used.add(found.stop[row])
+    return picked
+
+
+def _notes(
+    parameters: Parameters, loads: Sequence[Payload], hung: set[int], std: Array
+) -> list[str]:
+    notes = []
+    vague = [n for n, s in zip(parameters.names, std, strict=True) if not np.isfinite(s)]
+    if vague:
+        notes.append(f"not shown by these poses: {', '.join(vague)}")
+    idle = [f"{load.mass:g} kg" for i, load in enumerate(loads) if i not in hung]
+    if idle:
+        notes.append(f"loads that tell nothing more and need not be hung: {', '.join(idle)}")
+    soft = [e for e in flexibility_effects().values() if parameters.joints(e)]
+    if soft and len(loads) == 1:
+        notes.append(
+            "one load alone: compliance is told from what the arm itself weighs; a second load "
+            "tells it better"
+        )
+    return notes

@@ -1,0 +1,122 @@
+"""Chosen poses moved a little, joint by joint, to where they tell more.
+
+The candidates of a plan are a coarse sample of six or more joints; between them lie better poses.
+Each pose goes down the gradient of the criterion, as far as limits, obstacles and sight allow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.calibration.observables.observable import Observable
+from core.calibration.parameters import Parameters
+from core.calibration.readings import Readings
+from core.planning.candidates import Candidates, readable
+from core.planning.exchange import Choice
+from core.planning.information import blocks, gathered, inverse
+from core.planning.workspace import Space
+
+Array = NDArray[np.float64]
+NUDGE = 0.02  # rad, for the gradient
+LENGTHS = (0.03, 0.06, 0.12, 0.25, 0.5)  # rad, down the gradient
+ASIDE = 0.5  # how far beside the gradient as many more steps go
+SETTLED = 5e-4  # relative gain of a round that ends the search
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Readings at poses that were moved, and their equations."""
+
+    readings: Readings
+    rows: Array  # (N, k, P)
+
+
+@dataclass(frozen=True)
+class Refiner:
+    """What moving a pose needs to know."""
+
+    parameters: Parameters
+    observable: Observable
+    space: Space
+    found: Candidates
+    weight: Array  # (P, P)
+    sigma: float
+
+    def refined(
+        self,
+        now: Refined,
+        rounds: int,
+        random: np.random.Generator,
+        told: Callable[[float], None] | None = None,
+    ) -> Refined:
+        """Return the poses after some rounds of moves."""
+        before = self.value(now.rows)
+        for number in range(rounds):
+            now = self._round(now, random)
+            after = self.value(now.rows)
+            if told:
+                told((number + 1) / rounds)
+            if after > (1 - SETTLED) * before:
+                break
+            before = after
+        return now
+
+    def value(self, rows: Array) -> float:
+        """Return the expected rms error of the TCP (m) that equations (N, k, P) leave."""
+        return float(np.sqrt(np.sum(self.weight * inverse(gathered(rows)))))
+
+    def _rows(self, readings: Readings) -> Array:
+        layout = self.observable.layout(self.found.readings)
+        given = readings, self.found.nuisance, self.sigma, layout
+        return blocks(self.parameters, self.observable, *given)
+
+    def _round(self, now: Refined, random: np.random.Generator) -> Refined:
+        """Return the poses after each was offered some steps, the best taken."""
+        count, n = now.readings.q.shape
+        downhill = -self._gradient(now)
+        downhill /= np.maximum(np.linalg.norm(downhill, axis=1, keepdims=True), 1e-300)
+        beside = downhill[:, None] + ASIDE * random.normal(size=(count, len(LENGTHS), n))
+        ways = np.concatenate([np.repeat(downhill[:, None], len(LENGTHS), axis=1), beside], axis=1)
+        q = now.readings.q[:, None] + np.tile(LENGTHS, 2)[None, :, None] * ways
+        own = np.repeat(np.arange(count), 2 * len(LENGTHS))
+        offered, good = self._moved(now.readings, own, q.reshape(-1, n))
+        own = own[good]
+        rows = np.concatenate([now.rows, self._rows(offered)])
+        choice = Choice.of(rows, self.weight, lambda chosen: np.zeros(len(rows)))
+        best = list(range(count))
+        for place in random.permutation(count):
+            rest = [row for i, row in enumerate(best) if i != place]
+            score = choice.gains(rest)
+            mine = np.concatenate([[place], count + np.flatnonzero(own == place)])
+            best[place] = int(mine[np.argmin(score[mine])])
+        q = np.concatenate([now.readings.q, offered.q])[best]
+        value = np.concatenate([now.readings.value, offered.value])[best]
+        return Refined(replace(now.readings, q=q, value=value), rows[best])
+
+    def _gradient(self, now: Refined) -> Array:
+        """Return d(criterion) / d(joints) (N, n), to first order in each pose alone."""
+        count, n = now.readings.q.shape
+        own = np.repeat(np.arange(count), 2 * n)
+        nudges = NUDGE * np.concatenate([np.eye(n), -np.eye(n)])
+        near = replace(now.readings[own], q=now.readings.q[own] + np.tile(nudges, (count, 1)))
+        S = inverse(gathered(now.rows))
+        pull = now.rows @ (S @ self.weight @ S)
+        fall = np.einsum("nkp,nkp->n", self._rows(near) - now.rows[own], pull[own])
+        one, other = -fall.reshape(count, 2, n).transpose(1, 0, 2)
+        return np.asarray((one - other) / NUDGE)
+
+    def _moved(
+        self, readings: Readings, own: NDArray[np.int64], q: Array
+    ) -> tuple[Readings, NDArray[np.int64]]:
+        """Return readings at moved joints that can be taken, and which of ``own`` they are."""
+        nominal, nuisance = self.parameters.nominal, self.found.nuisance
+        whole = replace(readings[own], q=q)
+        at = self.observable.brought(nominal, q, whole, nuisance)
+        there = np.flatnonzero(np.isfinite(at).all(axis=1))
+        there = there[readable(self.observable, self.space, replace(whole, q=at)[there])]
+        part = replace(whole, q=at)[there]
+        return replace(part, value=self.observable.predict(nominal, part, nuisance)), there

@@ -1,0 +1,245 @@
+"""Where the arm may be measured: joint limits, keep-out boxes, and what the instrument sees.
+
+The arm is taken as capsules between its joint origins, the tool and the load as capsules beyond the
+flange, all at the nominal, rigid shape. Coarse on purpose: what is drawn here still has to be
+looked at before the arm is moved there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from core.errors import PlanError
+from core.model import Model
+from core.planning.capsules import Box, Capsules, below, hidden, in_box, touching
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+THICK = 0.035  # of the arm's stretched length: radius of a link
+TOOL_THICK = 0.03  # of the same: tool and loads
+NEAR_SINGULAR = 0.01  # smallest singular value of the Jacobian, lengths in stretched lengths
+FURTHEST_TURN = np.pi  # rad from zero, where the limits allow more: cables need not wind up
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an instrument stands (or the fixed point, or the sphere), in base."""
+
+    position: tuple[float, float, float]  # m
+    nearest: float = 0.0  # m, range of the instrument
+    farthest: float = np.inf  # m
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The rigid arm at N poses, base axes."""
+
+    origin: Array  # (N, n+2, 3) m: base, joints 1..n, flange
+    axis: Array  # (N, n, 3) of the joints
+    flange: Array  # (N, 3, 3)
+    tcp: Array  # (N, 3) m
+    rotation: Array  # (N, 3, 3) of the TCP
+
+
+@dataclass(frozen=True)
+class Space:
+    """The poses at which measuring is possible. Make it by ``Space.of``."""
+
+    model: Model
+    lower: Array  # (n,) rad
+    upper: Array  # (n,) rad
+    keep_out: tuple[Box, ...]
+    floor: float | None  # m, height in base under which nothing may come
+    places: tuple[Place, ...]
+    targets: Array  # (T, 3) m, TCP axes: balls on the tool; the first is the TCP
+    looks: Array | None  # (T, 3) unit vectors, TCP axes: where each reflector looks; None: all ways
+    acceptance: float  # rad, half the cone in which a reflector is seen
+    radius: Array  # (n+1,) m: links 0 (base to joint 1) to n (last joint to flange)
+    tool_radius: float  # m, of the tool and of what hangs on it
+    hung: tuple[tuple[float, float, float], ...]  # m, flange axes: how far the loads reach
+    singular: float
+    pairs: tuple[tuple[int, int], ...] = field(default=())  # capsules that may hit each other
+
+    @classmethod
+    def of(
+        cls,
+        model: Model,
+        *,
+        lower: Sequence[float] | Array | None = None,
+        upper: Sequence[float] | Array | None = None,
+        keep_out: Sequence[Box] = (),
+        floor: float | None = None,
+        places: Sequence[Place] = (),
+        targets: ArrayLike = ((0.0, 0.0, 0.0),),
+        looks: ArrayLike | None = None,
+        acceptance: float = np.pi,
+        link_radius: float | None = None,
+        tool_radius: float | None = None,
+        hung: Sequence[tuple[float, float, float]] = (),
+        singular: float = NEAR_SINGULAR,
+    ) -> Space:
+        """Return the space of an arm in its cell.
+
+        ``lower``, ``upper`` (n, rad) tighten the arm's own joint limits; ``looks`` is one direction
+        for all targets or one each. Raises PlanError where limits or boxes leave nothing.
+        """
+        low, high = _limits(model, lower, upper)
+        for number, box in enumerate(keep_out, 1):
+            if not all(a < b for a, b in zip(box.lower, box.upper, strict=True)):
+                raise PlanError(
+                    f"keep-out box {number}: found lower {box.lower} and upper {box.upper}, "
+                    "expected lower below upper in x, y and z"
+                )
+        stretched = reach(model)
+        radius = np.full(model.arm.n + 1, THICK * stretched if link_radius is None else link_radius)
+        thick = TOOL_THICK * stretched if tool_radius is None else tool_radius
+        points = np.atleast_2d(np.array(targets, dtype=float))
+        seen_from = None
+        if looks is not None:
+            axes = np.broadcast_to(np.atleast_2d(np.array(looks, dtype=float)), points.shape)
+            seen_from = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+        space = cls(
+            model, low, high, tuple(keep_out), floor, tuple(places), points, seen_from, acceptance,
+            radius, thick, tuple(hung), singular,
+        )  # fmt: skip
+        object.__setattr__(space, "pairs", _pairs(space))
+        return space
+
+    def frames(self, q: Array) -> Frames:
+        """Return where everything is at joints ``q`` (N, n), rigid."""
+        arm, count = self.model.arm, len(q)
+        turn = np.broadcast_to(np.eye(3), (count, 3, 3))
+        at = np.zeros((count, 3))
+        origins, axes = [at], []
+        for i in range(arm.n + 1):
+            link = arm.link_in_link[i]
+            at = at + turn @ link[:3, 3]
+            turn = turn @ link[:3, :3]
+            origins.append(at)
+            if i < arm.n:
+                axes.append(turn[:, :, 2])
+                turn = turn @ _about_z(q[:, i])
+        tool = self.model.tool_in_flange
+        return Frames(
+            np.stack(origins, axis=1), np.stack(axes, axis=1), turn,
+            at + turn @ tool[:3, 3], turn @ tool[:3, :3],
+        )  # fmt: skip
+
+    def capsules(self, frames: Frames) -> Capsules:
+        """Return the links, then the tool, then the loads."""
+        origin, flange = frames.origin, frames.origin[:, -1]
+        ends = [frames.tcp] + [flange + frames.flange @ np.array(point) for point in self.hung]
+        begin = np.concatenate([origin[:, :-1], np.stack([flange] * len(ends), axis=1)], axis=1)
+        end = np.concatenate([origin[:, 1:], np.stack(ends, axis=1)], axis=1)
+        radius = np.concatenate([self.radius, np.full(len(ends), self.tool_radius)])
+        return Capsules(begin, end, radius)
+
+    def clear(self, q: Array) -> Mask:
+        """Return at which joints (N, n) nothing is hit: limits, boxes, floor, the arm itself."""
+        return np.asarray(~np.any(list(self._hits(q, self.frames(q)).values()), axis=0))
+
+    def _hits(self, q: Array, frames: Frames) -> dict[str, Mask]:
+        capsules = self.capsules(frames)
+        out = (q < self.lower - 1e-9) | (q > self.upper + 1e-9)
+        hits: dict[str, Mask] = {"leave the joint limits": np.asarray(out.any(axis=1))}
+        for number, box in enumerate(self.keep_out, 1):
+            hits[f"come into keep-out box {number}"] = in_box(capsules, box)
+        if self.floor is not None:
+            hits["come below the floor"] = below(capsules, self.floor, first=2)
+        hits["come near the arm itself"] = touching(capsules, self.pairs)
+        return hits
+
+    def sees(self, frames: Frames, place: int, target: int) -> dict[str, Mask]:
+        """Return by reason at which poses (N,) a target is not seen from a place."""
+        where = self.places[place]
+        eye = np.array(where.position)
+        ball = frames.tcp + frames.rotation @ self.targets[target]
+        apart = np.linalg.norm(ball - eye, axis=1)
+        from_here = f"from place {place + 1}"
+        out = np.asarray((apart < where.nearest) | (apart > where.farthest))
+        missed: dict[str, Mask] = {f"are out of range {from_here}": out}
+        if self.looks is not None:
+            towards = (eye - ball) / np.maximum(apart, 1e-9)[:, None]
+            cosine = np.einsum("ni,ni->n", towards, frames.rotation @ self.looks[target])
+            turned = np.asarray(cosine < np.cos(self.acceptance))
+            missed[f"turn the reflector away {from_here}"] = turned
+        links = self.capsules(frames)
+        n = self.model.arm.n
+        arm = Capsules(links.begin[:, : n + 1], links.end[:, : n + 1], links.radius[: n + 1])
+        missed[f"hide the target {from_here}"] = hidden(arm, eye, ball)
+        return missed
+
+    def near_singular(self, frames: Frames) -> Mask:
+        """Return at which poses (N,) the arm can hardly move in some direction."""
+        lever = (frames.tcp[:, None] - frames.origin[:, 1:-1]) / reach(self.model)
+        J = np.concatenate([np.cross(frames.axis, lever), frames.axis], axis=2)
+        smallest = np.linalg.svd(J, compute_uv=False)[:, min(6, self.model.arm.n) - 1]
+        return np.asarray(smallest < self.singular)
+
+    def hindrances(self, q: Array) -> dict[str, Mask]:
+        """Return by reason what stands against poses (N, n), whatever the instrument."""
+        frames = self.frames(q)
+        return {**self._hits(q, frames), "are nearly singular": self.near_singular(frames)}
+
+    def draw(self, count: int, random: np.random.Generator) -> Array:
+        """Return joints (count, n) anywhere within the limits."""
+        return random.uniform(self.lower, self.upper, (count, len(self.lower)))
+
+
+def reach(model: Model) -> float:
+    """Return the stretched length of arm and tool (m)."""
+    links = np.linalg.norm(model.arm.link_in_link[:, :3, 3], axis=1).sum()
+    return max(float(links + np.linalg.norm(model.tool_in_flange[:3, 3])), 1e-3)
+
+
+def _limits(
+    model: Model, lower: Sequence[float] | Array | None, upper: Sequence[float] | Array | None
+) -> tuple[Array, Array]:
+    n, limits = model.arm.n, model.arm.limits
+    low, high = limits.lower.copy(), limits.upper.copy()
+    for name, given in (("lower", lower), ("upper", upper)):
+        if given is not None and len(given) != n:
+            raise PlanError(f"joint limits, {name}: found {len(given)} values, expected {n}")
+    if lower is not None:
+        low = np.maximum(low, np.array(lower, dtype=float))
+    if upper is not None:
+        high = np.minimum(high, np.array(upper, dtype=float))
+    # a joint that may turn further than once round needs to go no further than half round
+    round_and_round = (low < -FURTHEST_TURN) & (high > FURTHEST_TURN)
+    low = np.where(round_and_round, -FURTHEST_TURN, low)
+    high = np.where(round_and_round, FURTHEST_TURN, high)
+    low, high = np.maximum(low, -4 * np.pi), np.minimum(high, 4 * np.pi)
+    for i in range(n):
+        if not low[i] < high[i]:
+            raise PlanError(
+                f"joint {i + 1}: found limits {low[i]:.4g} to {high[i]:.4g} rad, expected lower "
+                "below upper"
+            )
+    return low, high
+
+
+def _pairs(space: Space) -> tuple[tuple[int, int], ...]:
+    """Return the capsules far enough along the chain to hit each other in some poses only."""
+    frames = space.frames(np.zeros((1, space.model.arm.n)))
+    capsules = space.capsules(frames)
+    long = np.linalg.norm(capsules.end - capsules.begin, axis=2)[0]
+    n = space.model.arm.n
+    pairs = []
+    for j in range(2, len(long)):
+        for i in range(min(j - 1, n)):
+            between = long[i + 1 : min(j, n + 1)].sum()
+            if between > 1.5 * (capsules.radius[i] + capsules.radius[j]):
+                pairs.append((i, j))
+    return tuple(pairs)
+
+
+def _about_z(angle: Array) -> Array:
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.zeros((len(angle), 3, 3))
+    turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1] = c, -s, s, c
+    turn[:, 2, 2] = 1
+    return turn

@@ -1,0 +1,110 @@
+"""What was fitted and what was not: ranges of joints, loads and temperatures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.log.log import Log
+from core.sessions import sessions_in
+
+Array = NDArray[np.float64]
+Range = Mapping[str, tuple[float, float]]
+MARGIN = 0.05  # of a range's width: so far beyond it nothing is said
+MANY = 0.25  # share of a session's rows beyond the others' from which it is worth a sentence
+LEAST = {"actual_q": 0.05, "payload": 0.1, "joint_temperatures": 2.0, "actual_TCP_force": 5.0}
+UNITS = {"actual_q": "rad", "payload": "kg", "joint_temperatures": "°C", "actual_TCP_force": "N"}
+
+
+def range_of(log: Log) -> dict[str, tuple[float, float]]:
+    """Return the least and largest value of each joint, load and temperature column of a log."""
+    found = {}
+    for name, values in _columns(log).items():
+        kept = values[np.isfinite(values)]
+        if len(kept):
+            found[name] = (float(kept.min()), float(kept.max()))
+    return found
+
+
+def merged(ranges: Iterable[Range]) -> dict[str, tuple[float, float]]:
+    """Return the ranges that hold all of the given ones."""
+    whole: dict[str, tuple[float, float]] = {}
+    for one in ranges:
+        for name, (low, high) in one.items():
+            known = whole.get(name, (low, high))
+            whole[name] = (min(known[0], low), max(known[1], high))
+    return whole
+
+
+def outside(log: Log, fitted: Range) -> list[str]:
+    """Return one sentence for each quantity of a log that lies outside what was fitted."""
+    told = []
+    for name, values in _columns(log).items():
+        if name not in fitted:
+            continue
+        low, high = fitted[name]
+        margin = _margin(name, low, high)
+        beyond = np.flatnonzero((values < low - margin) | (values > high + margin))
+        if len(beyond):
+            worst = beyond[np.argmax(np.abs(values[beyond] - (low + high) / 2))]
+            told.append(
+                f"{name}: {len(beyond)} of {len(values)} rows lie outside what was fitted, "
+                f"{low:.4g} to {high:.4g} {UNITS[_stem(name)]} (row {log.line(worst)}: "
+                f"{values[worst]:.4g})"
+            )
+    return told
+
+
+def outside_findings(log: Log) -> list[str]:
+    """Return where many of a session's rows lie outside what the other sessions hold."""
+    parts = sessions_in(log)
+    ranges, found = [range_of(part) for part in parts], []
+    for s, (name, part) in enumerate(zip(log.session_names, parts, strict=True)):
+        others = merged(one for i, one in enumerate(ranges) if i != s)
+        columns = [c for c, share in _beyond(part, others).items() if share >= MANY]
+        if columns:
+            found.append(
+                f"session {name} goes beyond the other sessions in {', '.join(columns)}: its "
+                "figure as a new session holds for rows unlike those fitted"
+            )
+    return found
+
+
+def _beyond(log: Log, fitted: Range) -> dict[str, float]:
+    """Return the share of rows that lie outside, per column."""
+    found = {}
+    for name, values in _columns(log).items():
+        if name in fitted:
+            low, high = fitted[name]
+            margin = _margin(name, low, high)
+            found[name] = float(np.mean((values < low - margin) | (values > high + margin)))
+    return found
+
+
+def _stem(name: str) -> str:
+    return name if name in UNITS else name.rpartition("_")[0]
+
+
+def _margin(name: str, low: float, high: float) -> float:
+    return max(MARGIN * (high - low), LEAST[_stem(name)])
+
+
+def _columns(log: Log) -> dict[str, Array]:
+    joints = log.get("actual_q")
+    given = {
+        "actual_q": log.get("target_q") if joints is None else joints,
+        "payload": log.get("payload"),
+        "joint_temperatures": log.get("joint_temperatures"),
+        "actual_TCP_force": log.get("actual_TCP_force"),
+    }
+    found: dict[str, Array] = {}
+    for name, column in given.items():
+        if column is None:
+            continue
+        if column.ndim == 1:
+            found[name] = column
+        else:
+            found |= {f"{name}_{i}": column[:, i] for i in range(column.shape[1])}
+    return found

@@ -1,0 +1,169 @@
+"""Frames -> samples: a sample counts only when all its frames belong together.
+
+All of its messages must come within the profile's window, none twice, in order where the profile
+says so, and with the same count where they carry one. Everything else is dropped and counted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.can.codec import Reading
+from drivers.can.profile import CanProfile, Incoming, Key
+
+Vector = NDArray[np.float64]
+
+
+class Sample(NamedTuple):
+    """One complete sample, SI units; (n,) each, NaN where a joint has not told yet.
+
+    All quantities are rows of ``table`` (q, n), the position first, then ``others`` in order. A
+    tuple, because one is made in every cycle.
+    """
+
+    table: Vector
+    position: Vector  # rad
+    others: dict[str, Vector]  # velocity rad/s, torque Nm, temperature °C
+    stamp: float  # s, clock of the bus, of its last frame
+    received: float  # s, time.monotonic() of its last frame
+    began: float  # s, time.monotonic() of its first frame
+
+
+class Assembler:
+    """Takes frames one by one and gives a sample whenever one is complete."""
+
+    def __init__(self, profile: CanProfile) -> None:
+        self._profile = profile
+        self._members = frozenset(profile.sample)
+        # messages that carry nothing but joints are taken apart together, once a sample is whole
+        self._plan = Reading(profile)
+        self._slots = self._plan.slots
+        self._held: dict[Key, dict[str, float] | bytes] = {}
+        self._first = 0.0  # s, bus clock
+        self._began = 0.0  # s, monotonic
+        self._count: float | None = None
+        self._values = self._plan.wire
+        self.dropped: Counter[str] = Counter()  # reason -> frames or sets
+        self.status: dict[tuple[Key, str], tuple[float, str, bool]] = {}
+        self.enabled: dict[tuple[Key, str], bool] = {}
+        self.heard: dict[Key, float] = {}  # s, monotonic, of each message that we read
+        self.troubled: set[tuple[Key, str]] = set()  # members of ``status`` that tell of trouble
+        self._seen: dict[Key, bytes] = {}  # last bytes of messages beside the sample
+
+    @property
+    def broken(self) -> int:
+        """Return how often frames made no sample."""
+        return self.dropped.total()
+
+    @property
+    def missing(self) -> list[str]:
+        """Return the messages that a sample still lacks which has been begun; none: not begun."""
+        if not self._held:
+            return []
+        return [self._profile.incoming[k].name for k in self._profile.sample if k not in self._held]
+
+    def reset(self) -> None:
+        """Forget a sample that has been begun."""
+        self._held.clear()
+
+    def take(self, key: Key, data: bytes, stamp: float, received: float) -> Sample | None:
+        """Take one frame; returns the sample that it completes. Raises nothing.
+
+        ``stamp`` (s) is the bus's clock, ``received`` (s) ours.
+        """
+        incoming = self._profile.incoming.get(key)
+        if incoming is None:
+            return None
+        if self._seen.get(key) == data:  # the same bytes say the same: most of an arm's status
+            self.heard[key] = received
+            return None
+        slot = self._slots.get(key)
+        if slot is not None and len(data) == incoming.length:
+            self.heard[key] = received
+            if key in self._members:
+                return self._collect(incoming, data, stamp, received)
+            self._seen[key] = data
+            self._plan.put(slot, data)
+            return None
+        try:
+            values = incoming.decode(data)
+        except ValueError:
+            self.dropped["malformed"] += 1
+            return None
+        self.heard[key] = received
+        if incoming.checks or incoming.enabled:
+            self._note(incoming, values)
+        if key in self._members:
+            return self._collect(incoming, values, stamp, received)
+        self._seen[key] = data
+        self._read(incoming, values)
+        return None
+
+    def _note(self, incoming: Incoming, values: dict[str, float]) -> None:
+        """Remember what a message says about the arm's health."""
+        for check in incoming.checks:
+            value = values[check.signal]
+            trouble = check.trouble(int(value)) if math.isfinite(value) else check.otherwise
+            place = (incoming.key, check.signal)
+            self.status[place] = (value, trouble, check.while_writing)
+            if trouble:
+                self.troubled.add(place)
+            else:
+                self.troubled.discard(place)
+        for signal in incoming.enabled:
+            self.enabled[incoming.key, signal] = values[signal] in self._profile.enabled_values
+
+    def _read(self, incoming: Incoming, values: dict[str, float]) -> None:
+        for reading in incoming.readings:
+            self._values[reading.quantity][reading.joint] = values[reading.signal]
+
+    def _collect(
+        self, incoming: Incoming, values: dict[str, float] | bytes, stamp: float, received: float
+    ) -> Sample | None:
+        profile, key = self._profile, incoming.key
+        if self._held and self._breaks(incoming, values, stamp):
+            self.dropped["torn"] += 1
+            self._held.clear()
+        if profile.ordered and profile.sample[len(self._held)] != key:
+            self.dropped["out of order"] += 1
+            self._held.clear()
+            return None
+        if not self._held:
+            self._first, self._began = stamp, received
+        self._held[key] = values
+        if len(self._held) < len(self._members):
+            return None
+        held, self._held = self._held, {}
+        if incoming.counter is not None and not isinstance(values, bytes):
+            if values[incoming.counter] == self._count:
+                self.dropped["repeated"] += 1
+                return None
+            self._count = values[incoming.counter]
+        for member, found in held.items():
+            if isinstance(found, bytes):
+                self._plan.put(self._slots[member], found)
+            else:
+                self._read(profile.incoming[member], found)
+        return self._sample(stamp, received)
+
+    def _breaks(self, incoming: Incoming, values: dict[str, float] | bytes, stamp: float) -> bool:
+        """Return whether a frame cannot belong to the sample that has been begun."""
+        if incoming.key in self._held or not 0.0 <= stamp - self._first <= self._profile.window:
+            return True
+        if self._profile.ordered and self._profile.sample[len(self._held)] != incoming.key:
+            return True
+        counter = incoming.counter
+        if counter is None or isinstance(values, bytes):
+            return False
+        count = values[counter]
+        return any(isinstance(v, bytes) or v[counter] != count for v in self._held.values())
+
+    def _sample(self, stamp: float, received: float) -> Sample:
+        table = self._plan.table()
+        others = dict(zip(self._plan.names[1:], table[1:], strict=True))
+        return Sample(table, table[0], others, stamp, received, self._began)

@@ -1,0 +1,1 @@
+"""The CAN bus as all drivers on it see it."""

@@ -1,0 +1,139 @@
+"""A CAN bus by its settings: python-can's interfaces, opened and closed without their traps.
+
+python-can is the top-level package ``can``; this package is ``drivers.can``. It is imported when a
+bus is opened, so that a cell is read without it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import socket
+from typing import TYPE_CHECKING, Any
+
+from pydantic import BaseModel, Field, field_validator
+
+from core.errors import LinkError
+
+if TYPE_CHECKING:
+    import can
+
+SOCKETCAND_PORT = 29536
+REACHABLE = 2.0  # s: a server that has not answered by then is not there
+
+
+class BusSettings(BaseModel):
+    """The keys of a section that say which CAN bus."""
+
+    interface: str = Field(
+        "socketcan", min_length=1,
+        description="python-can's name: socketcan, socketcand, slcan, virtual, pcan, kvaser, ...",
+    )  # fmt: skip
+    channel: str = Field("can0", min_length=1, description="can0, /dev/ttyACM0, ...")
+    host: str = Field("127.0.0.1", min_length=1, description="socketcand: where it is served")
+    port: int = Field(SOCKETCAND_PORT, ge=1, le=65535, description="socketcand: its TCP port")
+    bitrate: int = Field(1_000_000, ge=10_000, le=8_000_000, description="bit/s")
+    options: dict[str, bool | int | float | str] = Field(
+        {}, description="further arguments of python-can's interface"
+    )
+
+    @field_validator("interface")
+    @classmethod
+    def _known(cls, value: str) -> str:
+        """Refuse an interface that python-can does not have."""
+        import can
+
+        if value not in can.VALID_INTERFACES:
+            raise ValueError(f"expected one of {', '.join(sorted(can.VALID_INTERFACES))}")
+        return value
+
+    def where(self) -> str:
+        """Return how messages call this bus."""
+        at = f"@{self.host}:{self.port}" if self.interface == "socketcand" else ""
+        return f"{self.interface} {self.channel}{at}"
+
+
+def open_bus(settings: BusSettings, filters: list[can.typechecking.CanFilter] | None = None) -> Any:
+    """Return an open ``can.BusABC``. Raises LinkError, soon, where the bus is not there.
+
+    ``filters`` are python-can's: in the kernel or the adapter where it can, here elsewhere.
+    """
+    arguments: dict[str, Any] = {"interface": settings.interface, "channel": settings.channel}
+    if settings.interface == "socketcand":
+        return _open_socketcand(settings, filters)
+    if settings.interface not in ("virtual", "socketcan", "udp_multicast"):
+        arguments["bitrate"] = settings.bitrate
+    if settings.interface == "slcan":
+        arguments["sleep_after_open"] = 0.0 if _is_terminal(settings.channel) else 2.0
+    arguments.update(settings.options)
+    return _opened(settings, filters, arguments)
+
+
+def _is_terminal(channel: str) -> bool:
+    """Return whether a pseudo-terminal answers, which need not be waited for like an adapter."""
+    return os.path.realpath(channel).startswith("/dev/pts/")
+
+
+def _opened(settings: BusSettings, filters: Any, arguments: dict[str, Any]) -> Any:
+    import can
+
+    try:
+        bus = can.Bus(can_filters=filters, **arguments)
+    except (
+        can.CanError,
+        OSError,
+        ImportError,
+        TypeError,
+        ValueError,
+        NotImplementedError,
+    ) as error:
+        raise LinkError(f"{settings.where()}: cannot be opened: {first_line(error)}") from None
+    return _without_delay(bus)
+
+
+def _without_delay(bus: Any) -> Any:
+    """Switch off Nagle's delay where a serial adapter is reached over TCP (44 ms otherwise)."""
+    port = getattr(bus, "serialPortOrig", None)
+    link = getattr(port, "_socket", None)
+    if isinstance(link, socket.socket):
+        link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return bus
+
+
+def _open_socketcand(settings: BusSettings, filters: Any) -> Any:
+    """Ask first whether anyone listens: the library would try for ten seconds in a busy loop."""
+    try:
+        socket.create_connection((settings.host, settings.port), timeout=REACHABLE).close()
+    except OSError as error:
+        why = error.strerror or type(error).__name__
+        raise LinkError(f"{settings.where()}: cannot be reached: {why}") from None
+    import can
+
+    from drivers.can_bus.socketcand import SocketcandBus
+
+    options = {"tcp_tune": True, **settings.options}
+    try:
+        return SocketcandBus(  # type: ignore[no-untyped-call]
+            settings.channel, settings.host, settings.port, can_filters=filters, **options
+        )
+    except (can.CanError, OSError, TypeError, ValueError) as error:
+        raise LinkError(f"{settings.where()}: cannot be opened: {first_line(error)}") from None
+
+
+def close_bus(bus: Any) -> None:
+    """Close a bus whatever state it is in; slcan's shutdown raises after the peer's death."""
+    with contextlib.suppress(Exception):
+        bus.shutdown()
+    port = getattr(bus, "serialPortOrig", None)
+    if port is not None:
+        with contextlib.suppress(Exception):
+            port.close()
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of what an error says, or its kind."""
+    if isinstance(error, OSError) and error.errno in errno.errorcode:
+        return error.strerror or type(error).__name__
+    lines = str(error).strip().splitlines()
+    return lines[0].strip() if lines else type(error).__name__

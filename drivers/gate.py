@@ -1,0 +1,262 @@
+"""The last check before the wire: every setpoint of every driver passes it, whatever computed it.
+
+It shares no code and no memory with the limiter (core/limits.py): joint limits, the TCP's offset by
+forward kinematics of its own, and the step against what was last sent, over this machine's clock.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from core.errors import GateError
+from core.kernels.reference import JIT
+from core.model import Model
+from core.setpoint import Setpoint
+
+Vector = NDArray[np.float64]
+GAP = 5.0  # cycles: no step is larger than this many cycles' allowance
+HELD = 0.04  # s for which a wire may hold setpoints back and then hand them on at once
+DRIFT = 1.02  # how much faster than ours a controller's clock may be
+START = 0.05  # rad: a first setpoint is where the arm was when it was armed, or gave since
+SECOND_ORDER = 1.05  # an offset shared out by joints is its own length to first order only
+USUAL_VELOCITY = math.pi  # rad/s: of joints whose limit is not known
+GRAIN = 1e-9  # rad, m
+OUTERMOST, OUTERMOST_TURN = 0.1, 0.5  # m, rad: the largest offset that any cell may allow
+
+FINE, NOT_FINITE, OUTSIDE, FAR_OFFSET, FAR_TURN, JOINT_OFFSET, STEP, RATE, AWAY = range(9)
+
+
+@dataclass(frozen=True)
+class GateBounds:
+    """What no setpoint passes: m, rad, m/s, rad/s. The defaults are those of a cell file."""
+
+    offset: float = 0.010
+    offset_rotation: float = 0.02
+    offset_rate: float = 0.05
+    offset_rotation_rate: float = 0.1
+    joint_offset: float = 0.05
+    joint_velocity: float | None = None
+    velocity_share: float = 1.0
+
+
+@njit(**JIT)
+def _place(links, q, frame, turn):  # type: ignore[no-untyped-def]
+    """Write the TCP's frame (3, 4) at joints q (n,); ``links`` (n + 1, 3, 4) end with the tool."""
+    frame[:] = links[0]
+    for i in range(q.shape[0]):
+        c, s = math.cos(q[i]), math.sin(q[i])
+        for a in range(3):
+            x, y = frame[a, 0], frame[a, 1]
+            frame[a, 0] = c * x + s * y
+            frame[a, 1] = c * y - s * x
+        for a in range(3):
+            for b in range(4):
+                turn[a, b] = frame[a, 3] if b == 3 else 0.0
+                for k in range(3):
+                    turn[a, b] += frame[a, k] * links[i + 1, k, b]
+        frame[:] = turn
+
+
+@njit(**JIT)
+def _gap(a, b):  # type: ignore[no-untyped-def]
+    """Return how far two frames (3, 4) are apart: m, rad."""
+    square = trace = 0.0
+    for k in range(3):
+        square += (a[k, 3] - b[k, 3]) ** 2
+    sine = 0.0
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        component = 0.0
+        for m in range(3):
+            component += a[j, m] * b[i, m] - a[i, m] * b[j, m]
+            trace += a[k, m] * b[k, m]
+        sine += component * component
+    return math.sqrt(square), math.atan2(math.sqrt(sine), trace - 1.0)
+
+
+@njit(**JIT)
+def _length(vector, first):  # type: ignore[no-untyped-def]
+    return math.sqrt(vector[first] ** 2 + vector[first + 1] ** 2 + vector[first + 2] ** 2)
+
+
+@njit(**JIT)
+def _judge(links, joints, offsets, numbers, budget, moves):  # type: ignore[no-untyped-def]
+    """Return (reason, joint, found, s of travel that the step takes).
+
+    joints (6, n): q, nominal, last q, lower, upper, velocity. offsets (2, 6): this, last. numbers:
+    envelope, its rotation, its rates, joint offset, longest step (s).
+    """
+    n, travel = joints.shape[1], 0.0
+    q, nominal, last = joints[0], joints[1], joints[2]
+    for i in range(n):
+        if not (math.isfinite(q[i]) and math.isfinite(nominal[i])):
+            return NOT_FINITE, i, q[i], 0.0
+    for k in range(6):
+        if not math.isfinite(offsets[0, k]):
+            return NOT_FINITE, -1, offsets[0, k], 0.0
+    for i in range(n):
+        if not joints[3, i] - GRAIN <= q[i] <= joints[4, i] + GRAIN:
+            return OUTSIDE, i, q[i], 0.0
+    length, turn = _length(offsets[0], 0), _length(offsets[0], 3)
+    if moves:
+        if length > OUTERMOST * SECOND_ORDER:
+            return FAR_OFFSET, -1, length, 0.0
+        if turn > OUTERMOST_TURN * SECOND_ORDER:
+            return FAR_TURN, -1, turn, 0.0
+        here, there, was = np.empty((3, 4)), np.empty((3, 4)), np.empty((3, 4))
+        scratch = np.empty((3, 4))
+        _place(links, q, here, scratch)
+        _place(links, nominal, there, scratch)
+        length, turn = _gap(here, there)
+        nearer = True
+        for i in range(n):
+            lag = abs(last[i] - nominal[i])
+            nearer = nearer and abs(q[i] - nominal[i]) <= lag + GRAIN
+            if abs(q[i] - nominal[i]) > max(numbers[4], lag) + GRAIN:
+                return JOINT_OFFSET, i, abs(q[i] - nominal[i]), 0.0
+            travel = max(travel, (abs(q[i] - last[i]) - GRAIN) / joints[5, i])
+        if not nearer and (
+            length > numbers[0] * SECOND_ORDER + GRAIN or turn > numbers[1] * SECOND_ORDER + GRAIN
+        ):
+            # a command that its joints' speed holds back may be far from where it goes to,
+            # but it does not go farther
+            _place(links, last, was, scratch)
+            far, turned = _gap(was, there)
+            if length > max(numbers[0] * SECOND_ORDER, far) + GRAIN:
+                return FAR_OFFSET, -1, length, 0.0
+            if turn > max(numbers[1] * SECOND_ORDER, turned) + GRAIN:
+                return FAR_TURN, -1, turn, 0.0
+    else:
+        if length > numbers[0] * (1.0 + GRAIN) + GRAIN:
+            return FAR_OFFSET, -1, length, 0.0
+        if turn > numbers[1] * (1.0 + GRAIN) + GRAIN:
+            return FAR_TURN, -1, turn, 0.0
+        shift, angle = 0.0, 0.0
+        for k in range(3):
+            shift += (offsets[0, k] - offsets[1, k]) ** 2
+            angle += (offsets[0, 3 + k] - offsets[1, 3 + k]) ** 2
+        travel = max(
+            (math.sqrt(shift) - GRAIN) / numbers[2], (math.sqrt(angle) - GRAIN) / numbers[3]
+        )
+    if travel > numbers[5] * (1.0 + GRAIN):
+        return STEP, -1, travel, 0.0
+    if travel > budget:
+        return RATE, -1, travel, 0.0
+    return FINE, -1, 0.0, max(travel, 0.0)
+
+
+class Gate:
+    """Judges one link's setpoints; ``begin`` opens it and ``end`` shuts it.
+
+    ``clock`` gives the time over which steps count, s. Some microseconds a setpoint.
+    """
+
+    def __init__(self, rate: float, model: Model, moves_arm: bool) -> None:
+        arm = model.arm
+        n = arm.n
+        self._shapes = ((n,), (n,), (6,))
+        links = np.array(arm.link_in_link[:, :3, :], dtype=float)
+        links[n] = (arm.link_in_link[n] @ model.tool_in_flange)[:3, :]
+        self._links = np.ascontiguousarray(links)
+        self._own_velocity = np.where(
+            np.isfinite(arm.limits.velocity), arm.limits.velocity, USUAL_VELOCITY
+        )
+        self._joints = np.zeros((6, n))
+        self._joints[3], self._joints[4] = arm.limits.lower, arm.limits.upper
+        self._offsets, self._numbers = np.zeros((2, 6)), np.zeros(6)
+        self._moves_arm = moves_arm
+        self._longest = GAP / rate  # s
+        self._most = self._longest + max(HELD, GAP / rate)  # s
+        self._started: tuple[Vector, Vector] | None = None  # rad, where the arm was when armed
+        self._open = False
+        self._budget = self._at = self._travel = 0.0  # s
+        self.clock: Callable[[], float] = time.monotonic
+        self.bounds = GateBounds()
+        self.hold_to(self.bounds)
+        self._judged(0.0)  # compiled here: the first setpoint must not wait for a compiler
+
+    def hold_to(self, bounds: GateBounds) -> None:
+        """Judge by these bounds from now on."""
+        self.bounds = bounds
+        velocity = bounds.velocity_share * self._own_velocity
+        if bounds.joint_velocity is not None:
+            velocity = np.minimum(velocity, bounds.joint_velocity)
+        self._joints[5] = velocity
+        self._numbers[:] = (
+            bounds.offset, bounds.offset_rotation, bounds.offset_rate, bounds.offset_rotation_rate,
+            bounds.joint_offset, self._longest,
+        )  # fmt: skip
+
+    def begin(self, *stands: Vector) -> None:
+        """Open for a stream that begins without an offset where the arm stands, (n,) rad each."""
+        self._started = (stands[0].copy(), stands[-1].copy())
+        self._offsets[:] = 0.0
+        self._open, self._budget, self._at = True, self._most, self.clock()
+
+    def end(self) -> None:
+        """Let nothing pass until ``begin``."""
+        self._open, self._started = False, None
+
+    def check(self, setpoint: Setpoint) -> None:
+        """Raise GateError, a WriteError, for a setpoint that must not leave."""
+        if not self._open:
+            raise GateError("found a setpoint, expected arm() first")
+        joints, offsets = self._joints, self._offsets
+        shapes = setpoint.q.shape, setpoint.nominal_q.shape, setpoint.offset_in_base.shape
+        if shapes != self._shapes:
+            raise GateError(f"gate: found shapes {shapes}, expected {self._shapes}")
+        joints[0], joints[1] = setpoint.q, setpoint.nominal_q
+        offsets[0] = setpoint.offset_in_base
+        if self._started is not None:
+            self._check_start(joints[0])
+        budget = min(self._budget + DRIFT * max(self.clock() - self._at, 0.0), self._most)
+        code, joint, found, self._travel = self._judged(budget)
+        if code != FINE:
+            raise GateError(self._reason(code, joint, found))
+
+    def _judged(self, budget: float) -> tuple[int, int, float, float]:
+        code, joint, found, travel = _judge(
+            self._links, self._joints, self._offsets, self._numbers, budget, self._moves_arm
+        )
+        return int(code), int(joint), float(found), float(travel)
+
+    def _check_start(self, q: Vector) -> None:
+        assert self._started is not None
+        if self._moves_arm:
+            away = np.minimum(*(np.abs(q - stood) for stood in self._started))
+            if not (away <= START).all():  # NaN is not
+                raise GateError(self._reason(AWAY, int(np.argmax(away)), float(away.max())))
+        self._joints[2] = q
+
+    def sent(self) -> None:
+        """Take note that the setpoint that was checked has left."""
+        now = self.clock()
+        self._budget = min(self._budget + DRIFT * max(now - self._at, 0.0), self._most)
+        self._budget, self._at, self._travel = self._budget - self._travel, now, 0.0
+        self._joints[2], self._offsets[1] = self._joints[0], self._offsets[0]
+        self._started = None
+
+    def _reason(self, code: int, joint: int, found: float) -> str:
+        where = f"gate: joint {joint + 1}: " if joint >= 0 else "gate: "
+        lower, upper = self._joints[3, joint], self._joints[4, joint]
+        bounds, takes = self.bounds, f"found a step that takes {1e3 * found:.1f} ms at the rates"
+        words = {
+            NOT_FINITE: f"found {found}, expected a finite number",
+            OUTSIDE: f"found {found:.4f} rad, expected {lower:.4f} to {upper:.4f}",
+            FAR_OFFSET: f"found an offset of {found:.6f} m, expected at most {bounds.offset:g}",
+            FAR_TURN: f"found an offset of {found:.6f} rad, expected at most "
+            f"{bounds.offset_rotation:g}",
+            JOINT_OFFSET: f"found {found:.4f} rad from its nominal setpoint, expected at most "
+            f"{bounds.joint_offset:g}",
+            STEP: f"{takes}, expected at most {1e3 * self._longest:.1f} ms",
+            RATE: f"{takes}, more than has passed",
+            AWAY: f"found a first setpoint {found:.4f} rad from the arm, expected at most {START}",
+        }
+        return where + words[code]

@@ -1,0 +1,48 @@
+"""Offset mode: from the robot's target joints, which hold the offset, back to what it wants itself.
+
+The robot's program adds the applied offset to the pose of its own motion and turns the sum into
+joints; a sample carries both the sum (``target_q``) and the offset applied in that cycle. The
+nominal joints are those near ``target_q`` at which the rigid arm's TCP is that offset short of it.
+The model must have the TCP that is set in the controller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import InvalidStateError
+from core.kernels.packed import arm_block
+from core.kernels.single import NEARER, SCRATCH, take_out
+from core.model import Model
+
+Vector = NDArray[np.float64]
+
+
+class Nominal:
+    """Takes offsets out of target joints; keeps its buffers, for one thread."""
+
+    def __init__(self, model: Model) -> None:
+        self._n = n = model.arm.n
+        rigid = arm_block(model.without_terms().chain())
+        self._block = np.concatenate([rigid, np.zeros(n + SCRATCH + 12 + n + 6)])
+        self._target, self._offset = self._block[-n - 6 : -6], self._block[-6:]
+        # compiled here: the loop's first offset must not wait for a compiler
+        self.without(np.zeros(n), np.zeros(6))
+
+    def without(self, target_q: Vector, offset_in_base: Vector | Sequence[float]) -> Vector:
+        """Return the joints (n,) whose TCP, moved by the offset (6,), is that of ``target_q``.
+
+        Raises InvalidStateError where there are none nearby (at a singularity).
+        """
+        nominal: Vector = np.empty(self._n)
+        self._target[:], self._offset[:] = target_q, offset_in_base
+        distance = take_out(self._block, nominal)
+        if not distance < NEARER:
+            raise InvalidStateError(
+                f"target_q: found no joints {distance:.1e} m nearer to the robot's own path "
+                f"without the offset {np.array2string(self._offset, precision=5)}"
+            )
+        return nominal

@@ -1,0 +1,1 @@
+"""The simulated controller's server: links, clock and process."""

@@ -1,0 +1,247 @@
+"""The bench on port 30100: what a person and a laser tracker do beside a real cell.
+
+One command a line, one line back; `help` lists them. None of it is known to the controller.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from drivers.simulated.peer.connection import Connection
+from drivers.simulated.plant.kinematics import pose_of
+from drivers.simulated.plant.plant import Load, Plant
+from drivers.simulated.plant.plant_arm import place
+from drivers.simulated.plant.rotations import compose, from_vector, to_vector
+
+if TYPE_CHECKING:
+    from drivers.simulated.plant.plant_arm import Frame
+
+log = logging.getLogger("drivers.simulated")
+
+HEAVIEST = 200.0  # kg
+LONGEST_LINE = 1000  # characters
+
+Joints = tuple[float, ...]
+Command = tuple[int, Callable[[list[float]], str], str]
+"""How many numbers a command takes, what it does, and what help says of it."""
+
+
+class BenchError(ValueError):
+    """A command that cannot be done; the message goes back to the person."""
+
+
+class BenchSubject(Protocol):
+    """The controller beside the bench: a UR controller or a Peer."""
+
+    plant: Plant
+    memory: dict[str, Any]
+    frozen: bool
+    largest_servo_step: float
+
+    def stall(self, seconds: float) -> None:
+        """Send and answer nothing for a while."""
+        ...
+
+    def protective_stop(self) -> None:
+        """Stop as after a collision."""
+        ...
+
+    def unlock(self) -> None:
+        """Clear a protective stop."""
+        ...
+
+    def emergency_stop(self) -> None:
+        """Stop as after a push of the button."""
+        ...
+
+    def release_emergency_stop(self) -> None:
+        """Let the button go."""
+        ...
+
+
+class BenchServer:
+    """Answers bench commands on one plant.
+
+    `move_own` has the robot's own program move to joints (n, rad) and raises BenchError where it
+    cannot; `further` commands are those of one protocol.
+    """
+
+    def __init__(
+        self,
+        controller: BenchSubject,
+        drop_clients: Callable[[], None],
+        move_own: Callable[[Joints], None],
+        further: Mapping[str, Command] | None = None,
+    ) -> None:
+        self._controller = controller
+        self._drop_clients, self._move_own = drop_clients, move_own
+        self._random = np.random.default_rng((controller.plant.settings.seed, 2))
+        n = len(controller.plant.q)
+        self._commands: dict[str, Command] = {
+            "measure": (0, self._measure, "timestamp,x,y,z,rx,ry,rz of the true TCP, with noise"),
+            "payload": (4, self._payload, "MASS CX CY CZ: hang a load on the flange, kg, m"),
+            "wrench": (6, self._wrench, "FX FY FZ TX TY TZ: pull at the TCP, base axes, N, Nm"),
+            "move": (n, self._move, f"Q1..Q{n}: the robot's own program moves there, rad"),
+            "protective_stop": (0, self._protective_stop, "as a collision would"),
+            "emergency_stop": (0, self._emergency_stop, "press the button"),
+            "release": (0, self._release, "release the emergency stop button"),
+            "unlock": (0, self._unlock, "clear a protective stop, after a look at its cause"),
+            "freeze": (0, self._freeze, "the controller's clock stands still, packets go on"),
+            "thaw": (0, self._thaw, "the clock goes on"),
+            "stall": (1, self._stall, "SECONDS: the controller sends and answers nothing"),
+            "drop": (0, self._drop, "close every client's connection"),
+            "truth": (0, self._truth, "the hidden plant as JSON, for scoring only"),
+            "help": (0, self._help, "this list"),
+            **(further or {}),
+        }
+
+    def handle(self, connection: Connection) -> None:
+        """Answer every whole line."""
+        while connection.open and b"\n" in connection.received:
+            end = connection.received.index(b"\n")
+            line = connection.received[:end].decode("utf-8", "replace").strip()
+            del connection.received[: end + 1]
+            if line:
+                connection.send(self.answer(line).encode() + b"\n")
+
+    def answer(self, line: str) -> str:
+        """Return the reply to one command; a mistake is told as ``error: ...``."""
+        name, *words = line[:LONGEST_LINE].split()
+        try:
+            if name not in self._commands:
+                raise BenchError(f"unknown command {name!r}, try help")
+            count, action, _ = self._commands[name]
+            return action(_numbers(name, words, count))
+        except BenchError as error:
+            return f"error: {error}"
+
+    # -- the tracker ------------------------------------------------------------------------------
+
+    def _measure(self, _: list[float]) -> str:
+        controller = self._controller
+        s = controller.plant.settings
+        tcp = controller.plant.true_tcp()
+        shift = self._random.normal(0.0, s.tracker_noise, 3)
+        turn = self._random.normal(0.0, s.tracker_rotation_noise, 3)
+        position = [a + float(b) for a, b in zip(tcp.origin, shift, strict=True)]
+        rotation = to_vector(compose(from_vector([float(v) for v in turn]), tcp.rotation))
+        values = (controller.memory["timestamp"], *position, *rotation)
+        return ",".join(f"{v:.9g}" for v in values)
+
+    # -- hands ------------------------------------------------------------------------------------
+
+    def _payload(self, numbers: list[float]) -> str:
+        mass, x, y, z = numbers
+        if not 0.0 <= mass <= HEAVIEST:
+            raise BenchError(f"payload: found {mass:g} kg, expected 0 to {HEAVIEST:g}")
+        load = self._controller.plant.load
+        self._controller.plant.load = Load(mass, (x, y, z), load.force, load.torque)
+        return "ok"
+
+    def _wrench(self, numbers: list[float]) -> str:
+        fx, fy, fz, tx, ty, tz = numbers
+        load = self._controller.plant.load
+        self._controller.plant.load = Load(load.mass, load.cog, (fx, fy, fz), (tx, ty, tz))
+        return "ok"
+
+    def _move(self, numbers: list[float]) -> str:
+        self._move_own(tuple(numbers))
+        return "ok"
+
+    def _protective_stop(self, _: list[float]) -> str:
+        self._controller.protective_stop()
+        return "ok"
+
+    def _emergency_stop(self, _: list[float]) -> str:
+        self._controller.emergency_stop()
+        return "ok"
+
+    def _release(self, _: list[float]) -> str:
+        self._controller.release_emergency_stop()
+        return "ok"
+
+    def _unlock(self, _: list[float]) -> str:
+        self._controller.unlock()
+        return "ok"
+
+    # -- faults of the link -----------------------------------------------------------------------
+
+    def _freeze(self, _: list[float]) -> str:
+        self._controller.frozen = True
+        return "ok"
+
+    def _thaw(self, _: list[float]) -> str:
+        self._controller.frozen = False
+        return "ok"
+
+    def _stall(self, numbers: list[float]) -> str:
+        self._controller.stall(max(numbers[0], 0.0))
+        return "ok"
+
+    def _drop(self, _: list[float]) -> str:
+        self._drop_clients()
+        return "ok"
+
+    # -- for scoring ------------------------------------------------------------------------------
+
+    def _truth(self, _: list[float]) -> str:
+        plant = self._controller.plant
+        s, load = plant.settings, plant.load
+        rigid = place(plant.arm.flange(plant.q), plant.tool)
+        return json.dumps(
+            {
+                "compliance": {"axial": s.axial, "radial": s.radial},
+                "payload": {"mass": load.mass, "cog": load.cog},
+                "wrench": [*load.force, *load.torque],
+                "tcp": s.tcp,
+                "joint_error": plant.scatter,
+                "joint_scatter": s.joint_scatter,
+                "repeatability": tcp_scatter(self._controller),
+                "placements": plant.placements,
+                "largest_servo_step": self._controller.largest_servo_step,
+                "true_tcp": pose_of(plant.true_tcp()),
+                "rigid_tcp": pose_of(rigid),
+                "sensor_bias": s.sensor_bias,
+                "servo_lag": s.servo_lag,
+                "tracker_noise": s.tracker_noise,
+                "seed": s.seed,
+            }
+        )
+
+    def _help(self, _: list[float]) -> str:
+        return "; ".join(f"{name}: {text}" for name, (_n, _a, text) in self._commands.items())
+
+
+def tcp_scatter(controller: BenchSubject) -> float:
+    """Return the rms length (m) of the TCP's placement error at the present joints."""
+    plant = controller.plant
+    step = 1e-6
+
+    def tip(q: tuple[float, ...]) -> Frame:
+        return place(plant.arm.flange(q), plant.tool)
+
+    here = tip(plant.q).origin
+    total = 0.0
+    for i, sigma in enumerate(plant.settings.joint_scatter):
+        q = (*plant.q[:i], plant.q[i] + step, *plant.q[i + 1 :])
+        total += (math.dist(tip(q).origin, here) / step * sigma) ** 2
+    return math.sqrt(total)
+
+
+def _numbers(name: str, words: list[str], count: int) -> list[float]:
+    """Return exactly `count` finite numbers."""
+    if len(words) != count:
+        raise BenchError(f"{name}: found {len(words)} numbers, expected {count}")
+    try:
+        found = [float(word) for word in words]
+    except ValueError:
+        raise BenchError(f"{name}: found {' '.join(words)!r}, expected numbers") from None
+    if not all(map(math.isfinite, found)):
+        raise BenchError(f"{name}: found {' '.join(words)!r}, expected finite numbers")
+    return found

@@ -1,0 +1,222 @@
+"""Running a Peer: one select() loop with absolute deadlines, its protocol servers and the bench."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import select
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import TracebackType
+from typing import Protocol, Self
+
+from core.errors import LinkError
+from drivers.simulated.peer.bench import BenchServer, Command
+from drivers.simulated.peer.connection import Connection, listen
+from drivers.simulated.peer.peer import Peer
+from drivers.simulated.peer.real_time import become_punctual
+
+LATE = 0.1  # s: behind by more than this, the missed cycles are left out
+COLLECT_EVERY = 2.0  # s
+
+
+class Waitable(Protocol):
+    """Anything that select() can wait for."""
+
+    def fileno(self) -> int:
+        """Return the descriptor."""
+        ...
+
+
+class PeerServer:
+    """One protocol of a peer. Every method is called from the peer's loop, and must not block."""
+
+    name = "server"
+
+    def open(self, peer: Peer) -> None:
+        """Open ports. Raises OSError or LinkError where that fails."""
+
+    def cycle(self, peer: Peer) -> None:
+        """Take what clients have sent, command the peer, publish its state; after each cycle."""
+
+    def sockets(self) -> Iterable[Waitable]:
+        """Return what to wait for between cycles; none where ``cycle`` polls."""
+        return ()
+
+    def serve(self, ready: Waitable, peer: Peer) -> None:
+        """Serve one of ``sockets()`` that is readable."""
+
+    def commands(self, peer: Peer) -> Mapping[str, Command]:
+        """Return further bench commands, for faults of this protocol."""
+        return {}
+
+    def drop(self) -> None:
+        """Close every client's connection."""
+
+    def close(self) -> None:
+        """Close everything; may be repeated."""
+
+
+class PeerLoop:
+    """A peer with its servers and its bench port, cycled at absolute deadlines."""
+
+    def __init__(
+        self, peer: Peer, servers: Sequence[PeerServer], host: str, bench_port: int
+    ) -> None:
+        self.peer, self.servers, self.host = peer, servers, host
+        self._port = bench_port
+        self._listener: socket.socket | None = None
+        self._clients: list[Connection] = []
+        further: dict[str, Command] = {}
+        for server in servers:
+            further.update(server.commands(peer))
+        self._bench = BenchServer(peer, self._drop, peer.move_own, further)
+
+    @property
+    def bench_port(self) -> int:
+        """Return the port of the bench, once open."""
+        return int(self._listener.getsockname()[1]) if self._listener else self._port
+
+    def open(self) -> None:
+        """Open every port. Raises LinkError where one is taken."""
+        try:
+            self._listener = listen(self.host, self._port)
+            for server in self.servers:
+                server.open(self.peer)
+        except OSError as error:
+            self.close()
+            raise LinkError(
+                f"simulated controller on {self.host}: {error.strerror or error}"
+            ) from None
+        except LinkError:
+            self.close()
+            raise
+
+    def run(self, stop: Callable[[], bool]) -> None:
+        """Serve until `stop()` is true; it is asked once per cycle."""
+        peer = self.peer
+        deadline = time.monotonic()
+        while not stop():
+            deadline += peer.period
+            self._serve_until(deadline)
+            now = time.monotonic()
+            if now - deadline > LATE:
+                deadline = now
+            peer.cycle()
+            for server in self.servers:
+                server.cycle(peer)
+            peer.sensors.after_cycle(peer.clock)
+
+    def _serve_until(self, deadline: float) -> None:
+        while True:
+            left = deadline - time.monotonic()
+            owners = {s.fileno(): (server, s) for server in self.servers for s in server.sockets()}
+            clients = {c.fileno(): c for c in self._clients}
+            listener = [self._listener.fileno()] if self._listener else []
+            ready, _, _ = select.select([*listener, *clients, *owners], [], [], max(left, 0.0))
+            for number in ready:
+                if number in owners:
+                    server, waited = owners[number]
+                    server.serve(waited, self.peer)
+                elif number in clients:
+                    clients[number].read()
+                    self._bench.handle(clients[number])
+                else:
+                    self._accept()
+            self._clients = [c for c in self._clients if c.open]
+            if left <= 0.0 or not ready:
+                return
+
+    def _accept(self) -> None:
+        assert self._listener is not None
+        with contextlib.suppress(OSError):
+            self._clients.append(Connection(self._listener.accept()[0]))
+
+    def _drop(self) -> None:
+        for server in self.servers:
+            server.drop()
+
+    def close(self) -> None:
+        """Close every port; may be repeated."""
+        for server in self.servers:
+            server.close()
+        for client in self._clients:
+            client.close()
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None
+
+
+def serve_peer(
+    peer: Peer,
+    servers: Sequence[PeerServer],
+    host: str,
+    bench_port: int,
+    stop: Callable[[], bool] | None = None,
+) -> None:
+    """Serve a peer in this process until `stop()` is true (never, where it is left out).
+
+    Prints ``ready <host>`` to stdout when every port listens. Raises LinkError where one is taken.
+    """
+    loop = PeerLoop(peer, servers, host, bench_port)
+    loop.open()
+    become_punctual()  # from here on nothing is collected by itself
+    collected = time.monotonic()
+
+    def over() -> bool:
+        nonlocal collected
+        if time.monotonic() - collected > COLLECT_EVERY:
+            collected = time.monotonic()
+            gc.collect(1)
+        return stop is not None and stop()
+
+    sys.stdout.write(f"ready {host}\n")
+    sys.stdout.flush()
+    try:
+        loop.run(over)
+    finally:
+        loop.close()
+
+
+class PeerThread:
+    """A peer served by a thread of this process while the `with` block lasts."""
+
+    def __init__(
+        self, peer: Peer, servers: Sequence[PeerServer], host: str, bench_port: int = 0
+    ) -> None:
+        self.peer = peer
+        self.loop = PeerLoop(peer, servers, host, bench_port)
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Open every port and start the thread. Raises LinkError."""
+        self.loop.open()
+        self._ended.clear()
+        self._thread = threading.Thread(
+            target=self.loop.run, args=(self._ended.is_set,), daemon=True, name="simulated peer"
+        )
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread and close every port; the peer's state stays for another ``start``."""
+        self._ended.set()
+        if self._thread is not None:
+            self._thread.join(5.0)
+            self._thread = None
+        self.loop.close()
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()

@@ -1,0 +1,1 @@
+"""The simulated arm: what a real one would do."""

@@ -1,0 +1,26 @@
+"""What the controller has been told: tool, payload, gravity. The plant may be another thing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from drivers.simulated.plant.kinematics import frame_of
+from drivers.simulated.plant.plant_arm import BASE, Frame
+from drivers.simulated.plant.plant_settings import Vector6
+from drivers.simulated.plant.rotations import Vector3
+
+
+@dataclass(slots=True)
+class Declared:
+    """The controller's own settings, changed by scripts."""
+
+    tcp: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # m, rad: TCP in the flange frame
+    tool: Frame = BASE  # the same as a frame
+    payload_mass: float = 0.0  # kg
+    payload_cog: Vector3 = (0.0, 0.0, 0.0)  # m, in the flange frame
+    payload_inertia: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # kg m^2
+    gravity: Vector3 = (0.0, 0.0, 9.80665)  # m/s^2, as set_gravity takes it: upward is positive
+
+    def set_tcp(self, tcp: Vector6) -> None:
+        """Declare the TCP."""
+        self.tcp, self.tool = tcp, frame_of(tcp)

@@ -1,0 +1,124 @@
+"""The arm that the plant and its controller are made of: plain numbers, no mathematics of core."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from core.arm import Arm, builtin_arm
+from core.errors import ArmError
+from drivers.simulated.plant.rotations import (
+    IDENTITY,
+    Rotation,
+    Vector3,
+    add,
+    compose,
+    rotate,
+    turn_z,
+)
+
+FASTEST = 6.2831853  # rad/s, for an arm without velocity limits
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A frame seen from base: rotation and origin (m)."""
+
+    rotation: Rotation
+    origin: Vector3
+
+
+BASE = Frame(IDENTITY, (0.0, 0.0, 0.0))
+
+
+def place(outer: Frame, inner: Frame) -> Frame:
+    """Return `inner`, which is given in `outer`, as seen from where `outer` is seen."""
+    return Frame(
+        compose(outer.rotation, inner.rotation),
+        add(outer.origin, rotate(outer.rotation, inner.origin)),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class PlantArm:
+    """An arm of any number of turning joints.
+
+    ``links`` are n + 1 fixed frames: base to joint 1 at zero, link i to joint i + 1, link n to
+    flange; every joint turns about its own z. ``cog`` (m) is in the link's own joint frame.
+    """
+
+    name: str
+    links: tuple[Frame, ...]
+    mass: tuple[float, ...]  # kg
+    cog: tuple[Vector3, ...]  # m
+    lower: tuple[float, ...]  # rad
+    upper: tuple[float, ...]  # rad
+    velocity: tuple[float, ...]  # rad/s
+    effort: tuple[float, ...]  # Nm
+    payload: float  # kg, rated
+
+    @property
+    def reach(self) -> float:
+        """Length of the stretched chain, m."""
+        return sum(math.dist(link.origin, (0.0, 0.0, 0.0)) for link in self.links)
+
+    def frames(self, q: Sequence[float]) -> list[Frame]:
+        """Return the n joint frames (after their own rotation) and the flange, rigid, in base."""
+        found: list[Frame] = []
+        rotation, origin = IDENTITY, (0.0, 0.0, 0.0)
+        for i, link in enumerate(self.links):
+            origin = add(origin, rotate(rotation, link.origin))
+            rotation = compose(rotation, link.rotation)
+            if i < len(q):
+                rotation = turn_z(rotation, q[i])
+            found.append(Frame(rotation, origin))
+        return found
+
+    def flange(self, q: Sequence[float]) -> Frame:
+        """Return the flange of the rigid arm in base."""
+        rotation, origin = IDENTITY, (0.0, 0.0, 0.0)
+        for link, angle in zip(self.links, q, strict=False):
+            origin = add(origin, rotate(rotation, link.origin))
+            rotation = turn_z(compose(rotation, link.rotation), angle)
+        last = self.links[-1]
+        return Frame(compose(rotation, last.rotation), add(origin, rotate(rotation, last.origin)))
+
+
+def _vector3(values: Sequence[float]) -> Vector3:
+    x, y, z = (float(v) for v in values)
+    return (x, y, z)
+
+
+def _frame(matrix: Sequence[Sequence[float]]) -> Frame:
+    """Return the frame of a 4 x 4 transform."""
+    r = [[float(v) for v in row] for row in matrix]
+    rotation: Rotation = (
+        r[0][0], r[0][1], r[0][2], r[1][0], r[1][1], r[1][2], r[2][0], r[2][1], r[2][2],
+    )  # fmt: skip
+    return Frame(rotation, (r[0][3], r[1][3], r[2][3]))
+
+
+def plant_arm(arm: Arm | str, joints: int | None = None) -> PlantArm:
+    """Return the plant's arm from the data of a nominal arm, or of a built-in one by its name.
+
+    Raises ArmError where it has not `joints` joints (None: any number will do).
+    """
+    if isinstance(arm, str):
+        arm = builtin_arm(arm)
+    if joints is not None and arm.n != joints:
+        raise ArmError(f"robot: found {arm.n} joints, expected {joints}: the controller has those")
+    limits = arm.limits
+    return PlantArm(
+        name=arm.name,
+        links=tuple(_frame(matrix) for matrix in arm.link_in_link.tolist()),
+        mass=tuple(arm.mass.tolist()),
+        cog=tuple(_vector3(row) for row in arm.cog.tolist()),
+        lower=tuple(limits.lower.tolist()),
+        upper=tuple(limits.upper.tolist()),
+        velocity=tuple(np.minimum(limits.velocity, FASTEST).tolist()),
+        effort=tuple(limits.effort.tolist()),
+        payload=float(arm.payload),
+    )

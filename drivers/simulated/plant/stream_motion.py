@@ -1,0 +1,103 @@
+"""Streamed motions: servo and speed commands, which follow what the client sends every cycle."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from drivers.simulated.plant.kinematics import Joints, jacobian
+from drivers.simulated.plant.motion import Stateless
+from drivers.simulated.plant.plant_arm import Frame, PlantArm
+
+SERVO_ACCELERATION = 40.0  # rad/s^2
+
+
+class Servo(Stateless):
+    """servoJ: follow a target that may change every cycle, smoothed over the lookahead time."""
+
+    scaled = False
+    done = False
+
+    def __init__(self, arm: PlantArm, goal: Joints, lookahead: float) -> None:
+        self.goal = goal
+        self.lookahead = lookahead
+        self._limits = arm.velocity
+
+    def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
+        """Return the next joint target."""
+        share = dt / max(0.25 * self.lookahead, dt)
+        most = SERVO_ACCELERATION * dt
+        found = []
+        for now, speed, goal, limit in zip(q, qd, self.goal, self._limits, strict=True):
+            left = goal - now
+            if abs(left) < 1e-9 and abs(speed) < 2.0 * most:
+                found.append(goal)
+                continue
+            # Never faster than what can still be braked before the goal.
+            brake = math.sqrt(1.6 * SERVO_ACCELERATION * abs(left))
+            wanted = min(max(left * share / dt, -brake, -limit), brake, limit)
+            wanted = min(max(wanted, speed - most), speed + most)
+            found.append(now + wanted * dt)
+        return tuple(found)
+
+
+class SpeedJoints:
+    """speedJ: joints approach a velocity with an acceleration (leading joint)."""
+
+    failed = False
+    scaled = False
+    done = False
+
+    def __init__(self, goal: Sequence[float], acceleration: float) -> None:
+        self.goal = tuple(float(v) for v in goal)
+        self.acceleration = acceleration
+        self._now: Joints | None = None
+
+    def restart(self, q: Joints) -> None:
+        """Gather speed anew."""
+        self._now = (0.0,) * len(q)
+
+    def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
+        """Return the next joint target."""
+        now = qd if self._now is None else self._now
+        most = self.acceleration * dt
+        self._now = tuple(
+            v + min(max(g - v, -most), most) for v, g in zip(now, self.goal, strict=True)
+        )
+        return tuple(a + v * dt for a, v in zip(q, self._now, strict=True))
+
+
+class SpeedTool:
+    """speedL: the TCP approaches a velocity in base axes (m/s, rad/s)."""
+
+    failed = False
+    scaled = False
+    done = False
+
+    def __init__(
+        self, arm: PlantArm, tool: Frame, goal: Sequence[float], acceleration: float
+    ) -> None:
+        self.goal = tuple(float(v) for v in goal)
+        self.acceleration = acceleration
+        self._arm, self._tool = arm, tool
+        self._now: Joints = (0.0,) * 6
+
+    def restart(self, q: Joints) -> None:
+        """Gather speed anew."""
+        self._now = (0.0,) * 6
+
+    def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
+        """Return the next joint target."""
+        most = self.acceleration * dt
+        self._now = tuple(
+            v + min(max(g - v, -most), most) for v, g in zip(self._now, self.goal, strict=True)
+        )
+        J = jacobian(self._arm, q, self._tool)
+        rates = J.T @ np.linalg.solve(J @ J.T + 1e-6 * np.eye(6), self._now)
+        largest = max(
+            abs(float(r)) / limit for r, limit in zip(rates, self._arm.velocity, strict=True)
+        )
+        rates = rates / max(1.0, largest)
+        return tuple(a + float(v) * dt for a, v in zip(q, rates, strict=True))

@@ -1,0 +1,1 @@
+"""The simulated controller of Universal Robots."""

@@ -1,0 +1,113 @@
+"""What a simulated controller is made of: addresses, arm, plant, and how it starts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from core.arm import Arm
+from core.errors import ArmError
+from drivers.simulated.plant.declared import Declared
+from drivers.simulated.plant.kinematics import within_limits
+from drivers.simulated.plant.plant import Plant
+from drivers.simulated.plant.plant_arm import Frame, PlantArm, plant_arm
+from drivers.simulated.plant.plant_settings import PlantSettings, draw_plant_settings
+from drivers.simulated.ur.controller import Controller
+
+START_Q = (0.0, -1.5, 1.8, -1.87, -1.57, 0.0)  # rad: elbow up, tool pointing down
+UR_JOINTS = 6  # the fields of its protocols hold six
+RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, BENCH_PORT = 30004, 29999, 30003, 30100
+
+
+@dataclass(frozen=True, slots=True)
+class ServerSettings:
+    """One simulated controller.
+
+    start_q: joints at power-on (6,), rad.
+    declare: whether the controller is told the plant's true TCP and payload at the start.
+    version: announced to clients: major, minor, bugfix.
+    """
+
+    arm: PlantArm
+    plant: PlantSettings
+    host: str = "127.0.0.2"
+    start_q: tuple[float, ...] = START_Q
+    declare: bool = True
+    version: tuple[int, int, int] = (5, 15, 0)
+    serial: str = "20215500001"
+    rtde_port: int = RTDE_PORT
+    dashboard_port: int = DASHBOARD_PORT
+    script_port: int = SCRIPT_PORT
+    bench_port: int = BENCH_PORT
+
+
+def simulated_cell(
+    arm: Arm | str,
+    host: str = "127.0.0.2",
+    seed: int = 0,
+    start_q: Sequence[float] | None = None,
+    **plant: Any,
+) -> ServerSettings:
+    """Return a controller whose plant is drawn from `seed`.
+
+    `plant` sets single fields of PlantSettings (tcp, payload_mass, payload_cog, gravity, ...).
+    Without `start_q` (6,) (rad) the arm starts elbow up, tool down, within its joint limits.
+    Raises ArmError for an arm that is unknown or has not six joints.
+    """
+    plant_arm(arm, UR_JOINTS)
+    table, drawn, start = simulated_arm(arm, seed, start_q, **plant)
+    return ServerSettings(table, drawn, host, start)
+
+
+def simulated_arm(
+    arm: Arm | str, seed: int = 0, start_q: Sequence[float] | None = None, **plant: Any
+) -> tuple[PlantArm, PlantSettings, tuple[float, ...]]:
+    """Return an arm of any number of joints, its plant drawn from `seed`, and where it starts.
+
+    `plant` sets single fields of PlantSettings. Without `start_q` (n,) (rad) the arm starts as
+    START_Q says, further joints at zero, all within its limits. Raises ArmError.
+    """
+    table = plant_arm(arm)
+    n = len(table.mass)
+    given = [*START_Q, *[0.0] * n][:n] if start_q is None else [float(q) for q in start_q]
+    if len(given) != n:
+        raise ArmError(f"start_q: found {len(given)} values, expected {n}")
+    if start_q is None:
+        limits = zip(given, table.lower, table.upper, strict=True)
+        given = [min(max(q, lo), hi) for q, lo, hi in limits]
+    if not within_limits(table, given):
+        raise ArmError(f"start_q: found {given}, expected joints within the arm's limits")
+    return table, replace(draw_plant_settings(table, seed), **plant), tuple(given)
+
+
+def make_controller(settings: ServerSettings) -> Controller:
+    """Return the controller at rest in its start position, brakes released."""
+    declared = Declared()
+    if settings.declare:
+        declared.set_tcp(settings.plant.tcp)
+        declared.payload_mass = settings.plant.payload_mass
+        declared.payload_cog = settings.plant.payload_cog
+    return Controller(Plant(settings.arm, settings.plant, settings.start_q), declared)
+
+
+def to_json(settings: ServerSettings) -> dict[str, Any]:
+    """Return the settings as JSON-able data, for a server in another process."""
+    return asdict(settings)
+
+
+def from_json(data: dict[str, Any]) -> ServerSettings:
+    """Return the settings that `to_json` has written."""
+    arm = dict(data["arm"])
+    arm["links"] = [Frame(_tuple(f["rotation"]), _tuple(f["origin"])) for f in arm["links"]]
+    rest = {k: _tuple(v) for k, v in data.items() if k not in ("arm", "plant")}
+    return ServerSettings(
+        arm=PlantArm(**{k: _tuple(v) for k, v in arm.items()}),
+        plant=PlantSettings(**{k: _tuple(v) for k, v in data["plant"].items()}),
+        **rest,
+    )
+
+
+def _tuple(value: Any) -> Any:
+    """Return nested lists as nested tuples, anything else as it is."""
+    return tuple(_tuple(v) for v in value) if isinstance(value, list | tuple) else value

@@ -1,0 +1,97 @@
+"""The plain linear fit against scipy on stored rows, and to first order against the exact arm."""
+
+from __future__ import annotations
+
+import tracemalloc
+
+import numpy as np
+import pytest
+from scipy.linalg import lstsq
+
+from benchmarks.speed.first_order import block_of, first_order
+from benchmarks.speed.linear_fit import fit_linear
+from core.arm import builtin_arm
+from core.compensation import correct
+from core.effects import Site, Term
+from core.errors import InputError
+from core.kernels.packed import pack
+from core.loads import Loads
+from core.model import Model
+
+
+def model_of() -> Model:
+    tool = np.eye(4)
+    tool[:3, 3] = (0.04, -0.03, 0.15)
+    return Model(builtin_arm("ur10e"), tool, 4.0, np.array([0.0, 0.02, 0.1]))
+
+
+def rows_of(count: int, spread: float = 2.5) -> tuple[np.ndarray, Loads, np.ndarray]:
+    rng = np.random.default_rng(1)
+    q = np.array([0.0, -1.2, 1.5, -1.8, -1.5, 0.3]) + rng.uniform(-spread, spread, (count, 6))
+    loads = Loads(wrench=rng.normal(0, 30, (count, 6)))
+    form = model_of().linear_form(q, loads).regressor[:, :3]
+    gap = form @ rng.uniform(1e-6, 1e-5, 12) + rng.normal(0, 2e-5, (count, 3))
+    return q, loads, gap
+
+
+@pytest.mark.parametrize("factored", [None, False, True])
+def test_the_fit_is_that_of_the_stored_rows(factored):
+    q, loads, gap = rows_of(1003)
+    found = fit_linear(model_of(), q, loads, gap, factored=factored)
+    stored = model_of().linear_form(q, loads).regressor[:, :3].reshape(-1, 12)
+    expected = lstsq(stored, gap.ravel())[0]
+    np.testing.assert_allclose(found.flexibility, expected, rtol=1e-9)
+    assert found.rank == 12
+    assert found.note == ""
+
+
+def test_rows_that_hardly_differ_are_factored_and_told():
+    q, loads, gap = rows_of(800, spread=2e-4)
+    assert loads.wrench is not None
+    loads = Loads(wrench=1e-3 * loads.wrench)
+    found = fit_linear(model_of(), q, loads, gap)
+    assert found.factored
+    assert "hardly tell" in found.note
+    stored = model_of().linear_form(q, loads).regressor[:, :3].reshape(-1, 12)
+    unit = 1 / np.linalg.norm(stored, axis=0)
+    expected = unit * lstsq(stored * unit, gap.ravel())[0]
+    np.testing.assert_allclose(found.flexibility, expected, rtol=1e-6)
+
+
+def test_what_no_row_shows_is_zero():
+    q, _, gap = rows_of(300)
+    found = fit_linear(model_of(), q, Loads(), gap)  # gravity never turns the first joint
+    assert found.rank == 11
+    assert found.flexibility[0] == 0.0
+
+
+def test_memory_does_not_grow_with_the_rows():
+    q, loads, gap = rows_of(60_000)
+    fit_linear(model_of(), q[:100], loads[:100], gap[:100])
+    tracemalloc.start()
+    fit_linear(model_of(), q, loads, gap)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 10e6
+
+
+def test_links_that_bend_are_refused():
+    q, loads, gap = rows_of(10)
+    bent = model_of().with_terms([Term("link_flexibility", Site(2), (1e-6,))])
+    with pytest.raises(InputError, match="link that bends itself"):
+        fit_linear(bent, q, loads, gap)
+
+
+def test_first_order_is_the_linear_form_and_near_the_exact_correction():
+    soft = model_of().with_compliance([3e-6] * 6, [1e-6] * 6)
+    q, loads, _ = rows_of(1, spread=0.2)
+    rows, found = soft.rows(q, loads), np.empty(9)
+    first_order(block_of(pack(soft.chain()), pack(rows), 6), q[0], 1e-6, found)
+    form = model_of().linear_form(q, loads)
+    deflection = form.regressor[0, :3] @ np.repeat([3e-6, 1e-6], 6)
+    np.testing.assert_allclose(found[6:], deflection, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(form.jacobian[0, :3] @ found[:6], -deflection, atol=1e-10)
+    # the exact one keeps the orientation too: compare where the tool point goes
+    exact = correct(soft, q, loads)
+    moved = form.jacobian[0, :3] @ (exact.q[0] - q[0])
+    np.testing.assert_allclose(moved, -deflection, atol=0.03 * np.linalg.norm(deflection))

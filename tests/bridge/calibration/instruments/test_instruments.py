@@ -1,0 +1,212 @@
+"""Instruments: numbers as people and tracker software write them, in SI afterwards."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import TypeAdapter
+
+from bridge.calibration.instruments import INSTRUMENTS, make_instrument
+from bridge.calibration.instruments.instrument import (
+    AnyInstrument,
+    ReadingError,
+    Surroundings,
+    Where,
+)
+from bridge.calibration.instruments.numbers import numbers
+from bridge.cell.settings.instruments import InstrumentSettings
+from core.errors import InputError, LinkError
+
+SETTINGS: TypeAdapter[InstrumentSettings] = TypeAdapter(InstrumentSettings)
+
+
+def instrument(kind: str, *lines: str, since: float = 0.0, **keys: Any) -> AnyInstrument:
+    """Return an instrument at a terminal where these lines are typed."""
+    typed = iter(lines)
+    around = Surroundings(ask=lambda question: next(typed), since=since)
+    return make_instrument(SETTINGS.validate_python({"kind": kind, **keys}), around)
+
+
+def test_every_kind_that_a_cell_may_name_has_an_instrument() -> None:
+    kinds = set(SETTINGS.json_schema()["discriminator"]["mapping"])
+    assert kinds == set(INSTRUMENTS)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "1234.5 -67.25 890", "1234.5, -67.25, 890", "1234,5; -67,25; 890", "1234,5\t-67,25\t890",
+        "X=1234.5 Y=-67.25 Z=890", "1234.5 mm, -67.25 mm, 890 mm", "  1234.5,-67.25,890.0  ",
+        "x: 1.2345e3, y: -67.25, z: 890", "1234,5 -67,25 890,0",
+    ],
+)  # fmt: skip
+def test_a_point_is_understood_however_it_is_written(line: str) -> None:
+    found = instrument("typed", line, unit="mm").read(Where()).values
+    np.testing.assert_allclose(found, [[1.2345, -0.06725, 0.890]], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("1 2", "found 2 numbers in '1 2', expected 3"),
+        ("1 2 3 4", "found 4 numbers"),
+        ("1 2 x", "found 'x', expected a number"),
+        ("1 2 nan", "expected finite numbers"),
+        ("1 m 2 m 3 m", "found m, expected mm"),
+        ("", "found 0 numbers"),
+        ("1e9 2 3", "is the unit right?"),
+    ],
+)
+def test_what_is_no_point_is_told_with_the_reason(line: str, words: str) -> None:
+    with pytest.raises(ReadingError, match=words.replace("?", r"\?")):
+        instrument("typed", line, unit="mm").read(Where())
+
+
+@settings(deadline=None)
+@given(st.lists(st.floats(-9e4, 9e4), min_size=3, max_size=3), st.sampled_from([" ", ", ", "; "]))
+def test_numbers_read_back_exactly_whatever_stands_between_them(
+    values: list[float], between: str
+) -> None:
+    assert numbers(between.join(repr(v) for v in values), 3) == values
+
+
+@pytest.mark.parametrize(
+    ("keys", "line"),
+    [
+        ({"rotation": "rotation_vector"}, "1 2 3 0 0 90"),
+        ({"rotation": "rpy"}, "1 2 3 0 0 90"),
+        ({"rotation": "quaternion"}, f"1 2 3 0 0 {0.5**0.5} {0.5**0.5}"),
+        ({"rotation": "rpy", "angle_unit": "rad"}, f"1 2 3 0 0 {np.pi / 2}"),
+    ],
+)
+def test_a_pose_is_the_same_however_its_rotation_is_told(keys: dict[str, str], line: str) -> None:
+    found = instrument("typed", line, unit="m", pose=True, **keys).read(Where()).values[0]
+    np.testing.assert_allclose(found, [1, 2, 3, 0, 0, np.pi / 2], atol=1e-9)
+
+
+def test_degrees_in_radians_clothes_are_refused() -> None:
+    with pytest.raises(ReadingError, match="is the unit right"):
+        instrument("typed", "1 2 3 0 0 90", unit="m", pose=True, angle_unit="rad").read(Where())
+
+
+def test_a_dial_gauge_counts_from_its_zero() -> None:
+    found = instrument("dial_gauge", "0,25 mm", unit="mm", zero=500.0).read(Where()).values
+    np.testing.assert_allclose(found, [[0.50025]])
+
+
+def test_two_balls_give_their_difference_and_one_ball_twice_is_refused() -> None:
+    found = instrument("two_balls", "1 2 3", "101 2 3", unit="mm").read(Where()).values
+    np.testing.assert_allclose(found, [[0.1, 0.0, 0.0]], atol=1e-12)
+    with pytest.raises(ReadingError, match="same place"):
+        instrument("two_balls", "1 2 3", "1 2 3", unit="mm").read(Where())
+
+
+def test_a_sphere_needs_no_number() -> None:
+    assert instrument("sphere", "").read(Where()).values.shape == (1, 0)
+
+
+def test_a_file_gives_row_after_row_and_waits_for_the_next(tmp_path: Path) -> None:
+    file = tmp_path / "readings.csv"
+    file.write_text("time;x;y;z\n1;100,5;2;3\n2;200;2;3\n3;300;2", encoding="utf-8")
+    found = instrument("file", unit="mm", file=str(file), timeout=5.0)
+    first = found.read(Where())
+    np.testing.assert_allclose(first.values, [[0.1005, 0.002, 0.003]])
+    second = found.read(Where(used=frozenset({first.source})))
+    assert second.values[0, 0] == pytest.approx(0.2)
+    used = frozenset({first.source, second.source})
+    threading.Timer(0.2, lambda: file.open("a").write(";3\n")).start()
+    assert found.read(Where(used=used)).values[0, 0] == pytest.approx(0.3)
+
+
+def test_a_file_with_stops_gives_each_stop_its_last_row(tmp_path: Path) -> None:
+    file = tmp_path / "readings.csv"
+    file.write_text("stop,x,y,z\n1,1,0,0\n2,2,0,0\n1,3,0,0\n", encoding="utf-8")
+    found = instrument("file", unit="m", file=str(file), timeout=0.2)
+    assert found.read(Where(stop=1)).values[0, 0] == 3.0
+    assert found.read(Where(stop=2)).values[0, 0] == 2.0
+    with pytest.raises(ReadingError, match=r"no new row .* expected stop 3"):
+        found.read(Where(stop=3))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("1,2\n", "row 1: found 2 numbers"), ("x,y,z\n1,2,q\n", "row 2: found 'q'")],
+)
+def test_a_bad_row_is_named(tmp_path: Path, text: str, words: str) -> None:
+    file = tmp_path / "readings.csv"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(ReadingError, match=words):
+        instrument("file", unit="m", file=str(file)).read(Where())
+
+
+def test_columns_are_found_by_name_and_a_missing_one_is_told(tmp_path: Path) -> None:
+    file = tmp_path / "readings.csv"
+    file.write_text("z,y,x,rms\n3,2,1,0.1\n", encoding="utf-8")
+    keys = {"unit": "m", "file": str(file)}
+    found = instrument("file", columns=("x", "y", "z"), **keys).read(Where())
+    np.testing.assert_allclose(found.values, [[1, 2, 3]])
+    with pytest.raises(InputError, match="column w: found none"):
+        instrument("file", columns=("w", "y", "z"), **keys).read(Where())
+
+
+def test_a_watched_folder_gives_whole_new_files_oldest_first(tmp_path: Path) -> None:
+    now = time.time()
+    for name, age, text in (
+        ("old", 100.0, "9 9 9"), ("b", 5.0, "1 0 0\n2 0 0"), ("a", 2.0, "4,5;0;0"),
+    ):  # fmt: skip
+        path = tmp_path / f"{name}.csv"
+        path.write_text(text, encoding="utf-8")
+        os.utime(path, (now - age, now - age))
+    found = instrument("folder", unit="m", folder=str(tmp_path), timeout=0.4, since=now - 50)
+    first = found.read(Where())
+    np.testing.assert_allclose(first.values, [[1, 0, 0], [2, 0, 0]])
+    second = found.read(Where(used=frozenset({first.source})))
+    np.testing.assert_allclose(second.values, [[4.5, 0, 0]])
+    with pytest.raises(ReadingError, match="no new file"):
+        found.read(Where(used=frozenset({first.source, second.source})))
+
+
+def _serve(answers: list[bytes]) -> int:
+    """Serve one connection after the other with these bytes; returns the port."""
+    listener = socket.create_server(("127.0.0.1", 0))
+
+    def run() -> None:
+        for answer in answers:
+            link, _ = listener.accept()
+            with link:
+                link.sendall(answer)
+        listener.close()
+
+    threading.Thread(target=run, daemon=True).start()
+    return int(listener.getsockname()[1])
+
+
+def test_a_line_feed_averages_lines_and_tells_when_it_hangs_up() -> None:
+    port = _serve([b"", b"1 2 3\r\n\n3 2 3\n", b"1 2 3\n"])
+    found = instrument("line_feed", unit="m", port=port)
+    found.open()
+    np.testing.assert_allclose(found.read(Where(samples=2)).values, [[1, 2, 3], [3, 2, 3]])
+    with pytest.raises(LinkError, match="hung up"):
+        found.read(Where(samples=2))
+
+
+def test_an_instrument_that_is_not_there_is_told(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    with pytest.raises(LinkError, match="expected the tracker's software"):
+        instrument("line_feed", unit="m", port=port).open()
+    with pytest.raises(LinkError, match="gapbridge simulate"):
+        instrument("simulated_tracker", host="127.0.0.1", port=port).open()
+    with pytest.raises(InputError, match="no such folder"):
+        instrument("folder", unit="m", folder=str(tmp_path / "none")).open()
+    with pytest.raises(InputError, match="no such file"):
+        instrument("file", unit="m", file=str(tmp_path / "none" / "x.csv")).open()

@@ -1,0 +1,75 @@
+"""The short session of a new tool, from joint angles that a person types."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from played import plan_in, play, write_cell
+
+from bridge.cell import load_cell
+from core.arm import builtin_arm
+from core.calibration.observables import Nuisance, fixed_at, make_observable
+from core.calibration.observables.foreseen import empty_readings
+from core.loads import Loads
+from core.model import Model
+
+BEGIN = np.array([0.2, -1.4, 1.6, -1.8, -1.5, 0.3])
+
+
+def told(q: np.ndarray) -> str:
+    return " ".join(f"{v:.5f}" for v in np.degrees(q))
+
+
+def test_the_tip_of_a_new_tool_is_found_and_written_after_a_yes(tmp_path: Path) -> None:
+    cell, session = write_cell(tmp_path, joints="typed"), tmp_path / "s"
+    played = play(cell, "--tool-only", "--plan-only", "--session", session, lines=[told(BEGIN)])
+    assert played.code == 0, played.err
+    plan = plan_in(session)
+    tool = np.eye(4)
+    tool[:3, 3] = 0.012, -0.008, 0.15
+    true = replace(Model(builtin_arm("ur10e")), tool_in_flange=tool)
+    q = np.array([p.q for p in plan.poses])
+    observable = make_observable("point")
+    readings = empty_readings("point", q, Loads())
+    point = true.predict(BEGIN[None]).position[0]
+    touching = observable.brought(  # type: ignore[attr-defined]
+        true, q, readings, Nuisance((fixed_at(point),), np.zeros((1, 3)), np.zeros(1))
+    )
+    lines = [""]
+    for pose in touching:
+        lines += ["", told(pose)]
+    new = tmp_path / "new.yaml"
+    played = play(
+        cell, "--tool-only", "--session", session, "--apply", new,
+        lines=[*lines, "yes"],
+    )  # fmt: skip
+    assert played.code == 0, played.err + played.out[-1500:]
+    found = load_cell(new).model.tool_in_flange
+    np.testing.assert_allclose(found[:3, 3], tool[:3, 3], atol=5e-5)
+    assert (session / "tool.html").exists()
+
+
+def test_joints_in_radians_are_taken_for_a_mistake(tmp_path: Path) -> None:
+    cell = write_cell(tmp_path, joints="typed")
+    radians = " ".join(f"{v:.4f}" for v in BEGIN)
+    played = play(
+        cell, "--tool-only", "--session", tmp_path / "s", lines=["1 2 3", "", told(BEGIN), "", "",
+                                                                  radians, "quit"],
+    )  # fmt: skip
+    assert played.code == 0
+    assert "found 3 numbers" in played.out
+    assert "expected where the arm stands now" in played.out
+    assert "look like radians" in played.out
+
+
+@pytest.mark.parametrize("arguments", [["--tool-only"], ["--payload-only"]])
+def test_short_sessions_need_to_know_where_the_arm_stands(
+    tmp_path: Path, arguments: list[str]
+) -> None:
+    played = play(write_cell(tmp_path), *arguments, "--session", tmp_path / "s")
+    assert played.code == 2
+    assert "calibration.joints" in played.err
+    assert played.err.count("\n") == 1

@@ -1,0 +1,141 @@
+"""Mistakes of people are seen while they can be put right, and good readings are not doubted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bridge.calibration.session.reading_check import Foresight, Verdict
+from core.arm import builtin_arm
+from core.calibration.parameters import DEFAULT
+from core.calibration.plan import Payload
+from core.calibration.readings import Readings
+from core.effects import Site, Term
+from core.estimation.registration import Registration
+from core.loads import Loads
+from core.metrology import Metrology
+from core.model import Model
+from core.rotation import rotation_matrix
+
+LOADS = (Payload(1.5, (0.0, 0.0, 0.05), "reflector"), Payload(9.5, (0.0, 0.0, 0.09), "plate"))
+NOMINAL = Model(builtin_arm("ur10e"))
+FRAME = Registration(rotation_matrix(np.array([0.1, -0.2, 1.0])), np.array([2.0, -1.0, 0.4]))
+METROLOGY = Metrology(registered=False, sigma=2e-5)
+
+
+def truth(seed: int) -> Model:
+    rng = np.random.default_rng(seed)
+    terms = [Term("joint_offset", Site(j), (float(rng.normal(0, 1e-3)),)) for j in range(1, 7)]
+    soft = rng.uniform(1e-6, 2e-5, (2, 6))
+    return NOMINAL.with_terms(terms).with_compliance(soft[0], soft[1] * 0.2)
+
+
+def session(count: int, seed: int, registered: bool = False) -> Readings:
+    """Return readings of a hidden arm, taken from somewhere in the hall."""
+    rng = np.random.default_rng((seed, 3))
+    q = np.array([0, -1.5, 1.5, -1.8, -1.5, 0]) + rng.uniform(-0.9, 0.9, (count, 6))
+    load = np.arange(count) % 2
+    loads = Loads(
+        payload_mass=np.array([LOADS[k].mass for k in load]),
+        payload_cog=np.array([LOADS[k].cog for k in load]),
+    )
+    position = truth(seed).predict(q, loads).position
+    if not registered:
+        position = position @ FRAME.rotation.T + FRAME.position
+    value = position + rng.normal(0, 5e-5, (count, 3))
+    zero = np.zeros(count, dtype=np.int64)
+    return Readings(
+        "position", q, value, np.full(count, np.nan), loads, load, zero, zero,
+        np.zeros(count, dtype=bool), np.arange(count),
+    )  # fmt: skip
+
+
+def judged(
+    readings: Readings, metrology: Metrology = METROLOGY, typed: bool = True, joints: bool = False
+) -> Verdict:
+    """Judge the last of some readings by those before it."""
+    found = Foresight(NOMINAL, metrology, "position", metrology.sigma, DEFAULT, LOADS)
+    last = np.arange(len(readings)) == len(readings) - 1
+    return found.judge(readings[~last], readings[last], typed, joints)
+
+
+def with_last(readings: Readings, value: list[float] | np.ndarray) -> Readings:
+    values = readings.value.copy()
+    values[-1] = value
+    return replace(readings, value=values)
+
+
+@pytest.mark.parametrize("registered", [True, False])
+def test_good_readings_are_not_doubted(registered: bool) -> None:
+    metrology = replace(METROLOGY, registered=registered)
+    found = Foresight(NOMINAL, metrology, "position", 2e-5, DEFAULT, LOADS)
+    seen = []
+    for seed in range(3):
+        readings = session(12, seed, registered)
+        for k in range(12):
+            rows = np.arange(12)
+            seen.append(found.judge(readings[rows < k], readings[rows == k], True, False))
+    assert not any(v.doubted for v in seen)
+    assert sum(np.isfinite(v.off) for v in seen) >= 3 * (12 if registered else 8)
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"), [(1e3, "millimetres"), (1e-3, "metres"), (25.4, "25.4")]
+)
+def test_a_wrong_unit_is_named_and_put_right(factor: float, words: str) -> None:
+    readings = session(10, 1)
+    found = judged(with_last(readings, readings.value[-1] * factor))
+    assert found.doubted
+    assert words in found.reasons[0]
+    np.testing.assert_allclose(found.instead, readings.value[-1])
+
+
+def test_a_mistyped_coordinate_is_named() -> None:
+    readings = session(12, 2)
+    wrong = readings.value[-1].copy()
+    wrong[1] += 0.09
+    found = judged(with_last(readings, wrong))
+    assert found.doubted
+    assert any(reason.startswith("y alone is off") for reason in found.reasons)
+
+
+def test_exchanged_axes_and_a_lost_sign_are_named() -> None:
+    readings = session(12, 3)
+    x, y, z = readings.value[-1]
+    assert any("z y x" in r for r in judged(with_last(readings, [z, y, x])).reasons)
+    assert any("sign of x" in r for r in judged(with_last(readings, [-x, y, z])).reasons)
+
+
+def test_a_load_that_was_not_changed_is_named() -> None:
+    readings = session(40, 4)
+    swapped = replace(readings.loads, payload_mass=readings.loads.payload_mass.copy())  # type: ignore[union-attr]
+    assert swapped.payload_mass is not None
+    swapped.payload_mass[-1] = LOADS[0].mass  # declared: reflector; it was the plate
+    load = readings.load.copy()
+    load[-1] = 0
+    found = judged(replace(readings, loads=swapped, load=load))
+    assert found.doubted
+    assert any("plate hangs on the flange" in reason for reason in found.reasons)
+
+
+def test_a_knocked_tracker_is_seen() -> None:
+    readings = session(40, 5)
+    found = judged(with_last(readings, readings.value[-1] + [0.0015, -0.001, 0.002]))
+    assert found.doubted
+    assert 1e-3 < found.off < 4e-3
+    assert found.allowed < 1e-3
+
+
+def test_a_mistyped_joint_is_named() -> None:
+    readings = session(20, 6)
+    q = readings.q.copy()
+    q[-1, 2] += np.radians(10.0)
+    found = judged(replace(readings, q=q), typed=False, joints=True)
+    assert found.doubted
+    assert any("joint 3" in reason for reason in found.reasons)
+
+
+def test_the_first_readings_of_an_unregistered_instrument_tell_nothing_yet() -> None:
+    assert not np.isfinite(judged(session(2, 0)).off)

@@ -1,0 +1,153 @@
+"""The journal survives a power cut: no entry that was written is lost, none is believed half."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bridge.calibration.session.journal import FILE, Journal, plain, read_entries
+from bridge.calibration.session.plan_document import plan_entry, plan_of
+from bridge.calibration.session.reading import Taken
+from bridge.calibration.session.session import Book
+from core.calibration.plan import Expectation, Payload, Plan, PlannedPose
+from core.errors import InputError
+
+
+def small_plan(stops: int = 4) -> Plan:
+    free = np.zeros(6)
+    poses = tuple(
+        PlannedPose(i, np.full(6, 0.1 * i), i // 2, free, held_out=i == 1) for i in range(stops)
+    )
+    loads = (Payload(1.0, (0.0, 0.0, 0.1), "light"), Payload(5.0))
+    expected = Expectation(("a",), ("m",), np.array([np.inf]), np.array([1e-3]), 1e-4, 2e-4)
+    return Plan(loads, poses, expected, ((6, 1e-4),), 12.0, ("a note",))
+
+
+def taken(stop: int, **changed: object) -> Taken:
+    given: dict[str, object] = {
+        "stop": stop, "q": np.full(6, 0.1 * stop), "value": np.array([1.0, 2.0, 3.0 + stop]),
+        "scatter": float("nan"), "samples": 1, "load": stop // 2, "station": 0, "target": 0,
+        "approach": np.zeros(6),
+    }  # fmt: skip
+    return Taken(**{**given, **changed})  # type: ignore[arg-type]
+
+
+def test_a_plan_reads_back_as_it_was_written(tmp_path: Path) -> None:
+    plan = small_plan()
+    found = plan_of(json.loads(json.dumps(plain(plan_entry(plan)), allow_nan=False)))
+    assert found.loads == plan.loads
+    assert found.bought == plan.bought
+    assert np.isinf(found.expected.std[0])
+    for one, other in zip(found.poses, plan.poses, strict=True):
+        np.testing.assert_array_equal(one.q, other.q)
+        assert (one.load, one.held_out, one.number) == (other.load, other.held_out, other.number)
+
+
+def test_a_book_stands_where_its_journal_left_it(tmp_path: Path) -> None:
+    with Journal(tmp_path) as journal:
+        book = Book.of(journal)
+        book.add("begun", version=1)
+        book.keep_plan(small_plan())
+        book.add("mounted", load=0)
+        for stop in (0, 1, 2):
+            book.add("reading", **taken(stop, source=f"row {stop}").entry())
+        book.add("undo", stop=2)
+        book.add("skip", stop=3)
+        book.add("rejected", stop=2, source="row 9")
+        book.add("note", text="door opened")
+    with Journal(tmp_path) as journal:
+        again = Book.of(journal)
+    assert [t.stop for t in again.taken] == [0, 1]
+    assert again.next == 2
+    assert (again.left, again.undone, again.mounted) == (1, 1, 0)
+    assert again.used == {"row 0", "row 1", "row 2", "row 9"}
+    assert again.notes == ["door opened"]
+    assert np.isnan(again.taken[0].scatter)
+    readings = again.readings("position")
+    np.testing.assert_array_equal(readings.held_out, [False, True])
+    assert readings.value.shape == (2, 3)
+
+
+def test_readings_after_a_knock_belong_to_the_new_place(tmp_path: Path) -> None:
+    with Journal(tmp_path) as journal:
+        book = Book.of(journal)
+        book.keep_plan(small_plan())
+        for stop in (0, 1, 2):
+            book.add("reading", **taken(stop).entry())
+        book.add("moved", station=1, target=0, since=1)
+    with Journal(tmp_path) as journal:
+        again = Book.of(journal)
+    assert [t.station for t in again.taken] == [0, 1, 1]
+
+
+@given(st.integers(0, 400))
+@settings(max_examples=40, deadline=None)
+def test_a_journal_that_is_cut_anywhere_keeps_every_whole_line(cut: int) -> None:
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        with Journal(folder) as journal:
+            for i in range(8):
+                journal.add("note", text=f"entry {i}")
+        whole = (folder / FILE).read_bytes()
+        (folder / FILE).write_bytes(whole[:cut])
+        expected = whole[:cut].count(b"\n")
+        with Journal(folder) as journal:
+            assert len(journal.entries) == expected
+            assert journal.torn == (
+                cut < len(whole) and not whole[:cut].endswith(b"\n") and cut > 0
+            )
+            journal.add("note", text="after")
+        assert len(read_entries(folder / FILE)) == expected + 1
+
+
+def test_a_damaged_line_in_the_middle_is_named(tmp_path: Path) -> None:
+    (tmp_path / FILE).write_text('{"kind": "begun"}\nrubbish\n{"kind": "note"}\n')
+    with pytest.raises(InputError, match="row 2: found 'rubbish'"):
+        Journal(tmp_path).open()
+
+
+def test_two_terminals_do_not_share_a_session(tmp_path: Path) -> None:
+    with Journal(tmp_path), pytest.raises(InputError, match="going on in another terminal"):
+        Journal(tmp_path).open()
+
+
+def _write_forever(folder: str, told: int) -> None:
+    with Journal(Path(folder)) as journal:
+        for i in range(10**6):
+            journal.add("note", number=i)
+            os.write(told, b".")  # the next step: only now may anybody rely on it
+
+
+def test_what_was_acknowledged_before_a_kill_is_there_afterwards(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        read, write = os.pipe()
+        writer = multiprocessing.get_context("fork").Process(
+            target=_write_forever, args=(str(tmp_path), write)
+        )
+        before = len(read_entries(tmp_path / FILE)) if (tmp_path / FILE).exists() else 0
+        writer.start()
+        os.close(write)
+        time.sleep(float(rng.uniform(0.05, 0.3)))
+        assert writer.pid is not None
+        os.kill(writer.pid, signal.SIGKILL)
+        writer.join()
+        acknowledged = 0
+        while data := os.read(read, 65536):
+            acknowledged += len(data)
+        os.close(read)
+        with Journal(tmp_path) as journal:
+            new = journal.entries[before:]
+        assert len(new) in (acknowledged, acknowledged + 1)
+        assert [e["number"] for e in new] == list(range(len(new)))

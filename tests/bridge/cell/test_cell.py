@@ -1,0 +1,249 @@
+"""Reading cell files: what they mean, and one line for every mistake."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bridge.cell import load_cell
+from core.errors import ArmError, CellError
+from core.rotation import rotation_matrix
+
+CONFIG = Path(__file__).parents[3] / "config"
+DATA = Path(__file__).parents[4] / "shared" / "data"
+ARM = "robot: {model: ur10e}\n"
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "cell.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def told(folder: Path, text: str) -> str:
+    """The one line that a cell is refused with."""
+    with pytest.raises((CellError, ArmError)) as caught:
+        load_cell(written(folder, text))
+    line = str(caught.value)
+    assert "\n" not in line
+    assert str(folder / "cell.yaml") in line
+    return line
+
+
+@pytest.mark.parametrize("path", sorted(CONFIG.glob("*.yaml")), ids=lambda p: p.stem)
+def test_ready_cells_load_without_a_warning(path: Path) -> None:
+    cell = load_cell(path)
+    assert cell.warnings == ()
+    assert cell.arm.n == (7 if "seven" in path.stem else 6)
+
+
+@pytest.mark.parametrize("name", ["barrett_wam_grid", "ipa_ur10_a", "rad_ur3e_rtde"])
+def test_cells_of_measured_data_load(name: str) -> None:
+    path = DATA / name / "cell.yaml"
+    if not path.exists():
+        pytest.skip(f"no measured data at {path}")
+    assert load_cell(path).arm.n in (6, 7)
+
+
+def test_every_key_reaches_the_model(tmp_path: Path) -> None:
+    cell = load_cell(written(tmp_path, """
+robot: {model: ur10e}
+tool: {tcp: {xyz: [0.1, 0.2, 0.3], rpy: [0.1, -0.2, 0.3]}}
+payload: {mass: 4.5, cog: [0.01, 0.02, 0.03]}
+gravity: [0.0, 9.80665, 0.0]
+reference_temperature: 21
+compliance: {axial: [1e-6, 2e-6, 3e-6, 4e-6, 5e-6, 6e-6], radial: [6e-7, 0, 4e-7, 3e-7, 2e-7, 1e-7]}
+effects:
+  - {effect: backlash, joint: 3, parameters: {value: 2e-4}}
+  - {effect: transmission_error, joint: 2, order: 2.0, parameters: {sine: 1e-4, cosine: -3e-5}}
+metrology: {registered: true, sigma: 3.0e-5, repeatability: 1.5e-5}
+"""))  # fmt: skip
+    model = cell.model
+    cr, sr, cp, sp, cy, sy = (
+        f(a) for a in (0.1, -0.2, 0.3) for f in (np.cos, np.sin)
+    )  # fmt: skip
+    Rx = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    Ry = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    Rz = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    np.testing.assert_allclose(model.tool_in_flange[:3, :3], Rz @ Ry @ Rx, atol=1e-15)
+    np.testing.assert_array_equal(model.tool_in_flange[:3, 3], [0.1, 0.2, 0.3])
+    assert model.payload_mass == 4.5
+    np.testing.assert_array_equal(model.payload_cog, [0.01, 0.02, 0.03])
+    np.testing.assert_array_equal(model.gravity, [0, 9.80665, 0])
+    assert model.reference_temperature == 21.0
+    axial, radial = model.compliance()
+    np.testing.assert_array_equal(axial, [1e-6, 2e-6, 3e-6, 4e-6, 5e-6, 6e-6])
+    np.testing.assert_array_equal(radial, [6e-7, 0, 4e-7, 3e-7, 2e-7, 1e-7])
+    backlash, wave = model.terms[-2:]
+    assert (backlash.effect, backlash.site.joint, backlash.values) == ("backlash", 3, (2e-4,))
+    assert (wave.site.order, wave.values) == (2.0, (1e-4, -3e-5))
+    metrology = cell.metrology
+    assert (metrology.registered, metrology.sigma, metrology.repeatability) == (True, 3e-5, 1.5e-5)
+
+
+def test_defaults_are_those_of_the_contract(tmp_path: Path) -> None:
+    cell = load_cell(written(tmp_path, ARM))
+    assert cell.model.terms == ()
+    assert cell.model.payload_mass == 0.0
+    assert cell.model.reference_temperature == 25.0
+    np.testing.assert_array_equal(cell.model.gravity, [0, 0, -9.80665])
+    assert (cell.metrology.registered, cell.metrology.sigma) == (False, 2e-5)
+    assert cell.metrology.repeatability is None
+
+
+def test_keys_with_nothing_behind_them_count_as_left_out(tmp_path: Path) -> None:
+    assert load_cell(written(tmp_path, ARM + "payload:\neffects:\n")).model.payload_mass == 0.0
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("robot: {modle: ur10e}", "'modle' 'model'"),
+        (ARM + "efects: []", "'efects' 'effects'"),
+        (ARM + "payload: {mas: 5}", "payload.mas 'mass'"),
+        (ARM + "limits: {ofset: 0.01}", "limits.ofset 'offset'"),
+        (ARM + "link: {driver: ur_rtde, hst: 127.0.0.2}", "link.hst 'host'"),
+        (ARM + "recording: {foldr: x}", "recording.foldr 'folder'"),
+        ("robot: {dh: [{a: 1, alpha: 0, d: 0, of: 1}]}", "'of' 'offset'"),
+        ("robot: {model: ur10e, calibration: {delta_thet: [1]}}", "delta_thet 'delta_theta'"),
+    ],
+)
+def test_an_unknown_key_is_named_with_the_nearest_known(
+    tmp_path: Path, text: str, words: str
+) -> None:
+    line = told(tmp_path, text)
+    assert "unknown key" in line
+    for word in words.split():
+        assert word in line
+
+
+@pytest.mark.parametrize(
+    ("text", "found", "expected"),
+    [
+        ("robot: {model: ur10f}", "'ur10f'", "ur10e"),
+        ("robot: {model: ur10e, urdf: a.urdf}", "model and urdf", "one of model, urdf, dh"),
+        ("robot: {}", "none of them", "one of model, urdf, dh"),
+        ("robot: {dh: []}", "no rows", "one row"),
+        ("robot: {dh: [{a: 1, alpha: 0}]}", "robot.dh entry 1.d: found nothing", "expected m"),
+        ("robot: {dh: [{a: 1, alpha: 0, d: x}]}", "'x'", "a number"),
+        ("robot: {urdf: none.urdf}", "none.urdf", "URDF"),
+        ("robot: ur10e", "'ur10e'", "keys with values"),
+        ("tool: {}", "robot: found nothing", "model, urdf or dh"),
+        (ARM + "payload: {mass: -1}", "payload.mass: found -1", "0 or more (kg)"),
+        (ARM + "payload: {mass: 500}", "500 kg, out of range", "0 to 12.5 kg"),
+        (ARM + "payload: {mass: .nan}", "nan", "a finite number"),
+        (ARM + "payload: {mass: true}", "True", "a number"),
+        (ARM + "payload: {mass: heavy}", "'heavy'", "a number"),
+        (ARM + "payload: {cog: [0, 0]}", "2 values", "3 values"),
+        (ARM + "gravity: 9.81", "9.81", "a list"),
+        (ARM + "tool: {tcp: {xyz: [0, 0, .inf]}}", "tool.tcp.xyz entry 3: found inf", "finite"),
+        (ARM + "compliance: {axial: [1e-6, 1e-6]}", "2 values", "6: the arm (ur10e)"),
+        (ARM + "compliance: {axial: [0, 0, -1e-6, 0, 0, 0]}", "entry 3: found -1e-06", "0 or more"),
+        (ARM + "effects: [{effect: backlsh}]", "'backlsh'", "'backlash'"),
+        (ARM + "effects: [{effect: backlash, joint: 7}]", "found 7", "joint of 1 to 6"),
+        (ARM + "effects: [{effect: backlash, joint: 1.5}]", "1.5", "a whole number"),
+        (ARM + "effects: [{effect: payload, joint: 2}]", "found 2", "no joint"),
+        (ARM + "effects: [{effect: backlash, joint: 2}]", "found nothing", "expected rad"),
+        (
+            ARM + "effects: [{effect: link_geometry, joint: 1, parameters: {alfa: 1}}]",
+            "parameters.alfa", "'alpha'",
+        ),
+        (
+            ARM + "effects: [{effect: backlash, joint: 2, order: 2, parameters: {value: 1}}]",
+            "order: found 2", "none for backlash",
+        ),
+        (ARM + "effects: [{effect: transmission_error, joint: 2}]", "found none", "per turn"),
+        (ARM + "metrology: {registered: 1}", "found 1", "true or false"),
+        (ARM + "metrology: {sigma: -1}", "found -1", "0 or more"),
+        (ARM + "link: {host: '10.0.0.2:30004'}", "'10.0.0.2:30004'", "without a port"),
+        (ARM + "limits: {offset: 3}", "limits.offset: found 3", "0.1 or less"),
+        ("robot: {model: ur10e, calibration: {delta_a: [1]}}", "1 values", "6"),
+        ("robot: {model: ur10e, calibration: c.conf}", "file not found", "calibration.conf"),
+        ("5: 6\nrobot: {model: ur10e}", "a key 5", "a word"),
+    ],
+)  # fmt: skip
+def test_a_wrong_value_is_told_with_what_was_expected(
+    tmp_path: Path, text: str, found: str, expected: str
+) -> None:
+    line = told(tmp_path, text)
+    assert found in line
+    assert expected in line
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("robot: [1, 2", "line 1"),
+        (ARM + "tool:\n\txyz: 1", "line 3"),
+        (ARM + "tool: {}\nrobot: 5", "line 3: robot: found twice"),
+        ("", "empty"),
+        ("just words", "no keys"),
+        ("robot: !!python/object:os.system []", "line 1"),
+        ("robot: &a [*a]", "robot"),
+    ],
+)
+def test_broken_yaml_is_told_with_its_line(tmp_path: Path, text: str, words: str) -> None:
+    assert words in told(tmp_path, text)
+
+
+def test_a_missing_file_a_folder_and_bytes_are_told(tmp_path: Path) -> None:
+    (tmp_path / "bytes.yaml").write_bytes(b"\xff\xfe\x00\x81")
+    for path, words in (
+        (tmp_path / "none.yaml", "file not found"),
+        (tmp_path, "found a folder"),
+        (tmp_path / "bytes.yaml", "no text"),
+    ):
+        with pytest.raises(CellError, match=words):
+            load_cell(path)
+
+
+def test_numbers_without_a_point_are_numbers(tmp_path: Path) -> None:
+    text = ARM + "metrology: {sigma: 2e-5}\nreference_temperature: 1E1\n"
+    cell = load_cell(written(tmp_path, text))
+    assert cell.metrology.sigma == 2e-5
+    assert cell.model.reference_temperature == 10.0
+
+
+def test_a_payload_above_the_rated_one_is_warned_of(tmp_path: Path) -> None:
+    (warning,) = load_cell(written(tmp_path, ARM + "payload: {mass: 14}")).warnings
+    assert "14 kg" in warning
+    assert "12.5 kg" in warning
+
+
+def test_a_urdf_is_found_beside_the_cell(tmp_path: Path) -> None:
+    (tmp_path / "deeper").mkdir()
+    robot = (CONFIG / "seven_axis.urdf").read_text(encoding="utf-8")
+    (tmp_path / "deeper" / "arm.urdf").write_text(robot, encoding="utf-8")
+    cell = load_cell(written(tmp_path, "robot: {urdf: deeper/arm.urdf, tip: link_7}"))
+    assert cell.arm.n == 7
+    assert np.allclose(cell.arm.link_in_link[7], np.eye(4))
+
+
+def test_a_factory_calibration_moves_the_arm_as_its_deltas_say(tmp_path: Path) -> None:
+    (tmp_path / "calibration.conf").write_text(
+        "[mounting]\n"
+        "delta_theta = [ 0.001, 0.0, 0.0, 0.0, 0.0, 0.0 ]\n"
+        "delta_a = [ 0.0, 0.0, 0.0, 0.0, 0.0, 0.0 ]\n"
+        "delta_d = [ 0.002, 0.0, 0.0, 0.0, 0.0, 0.0 ]\n"
+        "delta_alpha = [ 0.0, 0.0, 0.0, 0.0, 0.0, 0.0 ]\n"
+        "calibration_status = 0\njoint_checksum = [ 0x1, 0x2 ]\n"
+    )
+    inline = "{delta_theta: [0.001, 0, 0, 0, 0, 0], delta_d: [0.002, 0, 0, 0, 0, 0]}"
+    q = np.array([[0.3, -1.2, 1.4, -0.5, 0.8, 0.1]])
+    nominal = load_cell(written(tmp_path, ARM)).model.rigid_pose(q).position[0]
+    expected = rotation_matrix(np.array([0, 0, 0.001])) @ nominal + [0, 0, 0.002]
+    for value in ("calibration.conf", inline):
+        text = f"robot: {{model: ur10e, calibration: {value}}}"
+        moved = load_cell(written(tmp_path, text)).model.rigid_pose(q).position[0]
+        np.testing.assert_allclose(moved, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("no ini", "cannot be read"), ("[a]\nb = 1", "none of"), ("[a]\ndelta_a = x", "a list")],
+)
+def test_a_calibration_that_cannot_be_used_is_told(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "c.conf").write_text(text)
+    assert words in told(tmp_path, "robot: {model: ur10e, calibration: c.conf}")

@@ -1,0 +1,380 @@
+"""The commands, run as people run them."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from bridge.cell import load_cell
+from bridge.cli import main
+from bridge.cli.table import COMMANDS
+from core.compensation import correct
+from core.effects import CATALOGUE
+from core.loads import Loads
+from core.log.log import read_log
+from core.model import Model
+
+CELL = "robot: {model: ur10e}\ntool: {tcp: {xyz: [0, 0, 0.18]}}\nmetrology: {registered: true}\n"
+SOFT = (
+    CELL
+    + """
+compliance:
+  axial: [3e-6, 4e-6, 5e-6, 8e-6, 1e-5, 1e-5]
+  radial: [5e-7, 6e-7, 8e-7, 1e-6, 2e-6, 2e-6]
+"""
+)
+
+
+class Ran(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+
+class Desk:
+    """A folder with a cell and a log in it, and the command line."""
+
+    def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        self.folder = folder
+        self._capsys = capsys
+        self.write("cell.yaml", SOFT)
+        self.write("rigid.yaml", CELL)
+
+    def write(self, name: str, text: str) -> Path:
+        path = self.folder / name
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    def run(self, *words: str) -> Ran:
+        arguments = [str(self.folder / w[1:]) if w.startswith("@") else w for w in words]
+        with pytest.raises(SystemExit) as left:
+            main(arguments)
+        out, err = self._capsys.readouterr()
+        code = left.value.code
+        return Ran(code if isinstance(code, int) else 0, out, err)
+
+    def refuses(self, *words: str) -> str:
+        """Run what must be refused; returns the one line on stderr."""
+        ran = self.run(*words)
+        assert ran.code == 2, ran
+        assert "Traceback" not in ran.err
+        assert ran.err.count("\n") == 1
+        assert ran.out == ""
+        return ran.err
+
+
+@pytest.fixture
+def desk(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Desk:
+    return Desk(tmp_path, capsys)
+
+
+def poses(count: int, seed: int = 0) -> np.ndarray:
+    home = np.array([0.0, -1.5, 1.8, -1.87, -1.57, 0.0])
+    return home + np.random.default_rng(seed).uniform(-0.6, 0.6, (count, 6))
+
+
+def csv(**columns: np.ndarray) -> str:
+    names, parts = [], []
+    for name, values in columns.items():
+        values = np.asarray(values, dtype=float)
+        names += [name] if values.ndim == 1 else [f"{name}_{i}" for i in range(values.shape[1])]
+        parts.append(values.reshape(len(values), -1))
+    rows = [",".join(f"{v:.17g}" for v in row) for row in np.hstack(parts)]
+    return "\n".join([",".join(names), *rows]) + "\n"
+
+
+def measured_log(model: Model, count: int = 40, noise: float = 2e-5) -> str:
+    random, q = np.random.default_rng(1), poses(count)
+    mass = np.tile([0.0, 5.0, 10.0], count)[:count]
+    cog = np.tile([0.0, 0.0, 0.06], (count, 1))
+    real = model.predict(q, Loads(payload_mass=mass, payload_cog=cog)).position
+    real = real + random.normal(0, noise, real.shape)
+    return csv(actual_q=q, payload=mass, payload_cog=cog, measured_position=real)
+
+
+# -- the table ---------------------------------------------------------------------------------
+
+
+def test_help_names_every_command_and_imports_none(desk: Desk) -> None:
+    code = (
+        "import sys\nfrom bridge.cli import main\ntry:\n    main(['--help'])\n"
+        "except SystemExit:\n    assert 'numba' not in sys.modules, 'numba was imported'\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    for name, (_, line) in COMMANDS.items():
+        assert name in ran.stdout
+        assert line in ran.stdout
+
+
+@pytest.mark.parametrize("name", ["predict", "diagnose", "fit", "run"])
+def test_a_command_waits_for_no_solver_before_it_has_work(desk: Desk, name: str) -> None:
+    code = (
+        f"import sys\nimport bridge.cli.{name}\n"
+        "found = {'scipy.optimize', 'scipy.linalg', 'scipy.stats'} & set(sys.modules)\n"
+        "assert not found, found\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_help_with_an_example(desk: Desk, name: str) -> None:
+    ran = desk.run(name, "--help")
+    assert ran.code == 0
+    assert "Example" in ran.out or name == "blind"  # its help is the benchmark's own
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_line_of_a_command_is_the_first_of_its_help(name: str) -> None:
+    module, attribute = COMMANDS[name][0].split(":")
+    command = getattr(importlib.import_module(module), attribute)
+    assert command.name == name
+    line, told = COMMANDS[name][1].rstrip("."), " ".join(command.help.split())
+    assert told.startswith(line) or name in ("diagnose", "blind")
+
+
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [
+        (["predct", "x"], "'predict'"),
+        (["fit"], "Missing argument 'LOG'"),
+        (["fit", "x", "--cel", "y"], "--cell"),
+        (["predict", "@log.csv", "--cell", "@cell.yaml"], "--out"),
+    ],
+)
+def test_a_slip_on_the_command_line_is_told_in_one_line(
+    desk: Desk, words: list[str], hint: str
+) -> None:
+    assert hint in desk.refuses(*words)
+
+
+def test_version_is_told(desk: Desk) -> None:
+    ran = desk.run("--version")
+    assert ran.code == 0
+    assert ran.out.startswith("gapbridge")
+
+
+# -- predict and compensate ---------------------------------------------------------------------
+
+
+def test_predict_writes_the_columns_of_the_contract(desk: Desk) -> None:
+    q = poses(5)
+    wrench = np.random.default_rng(2).normal(0, 20, (5, 6))
+    columns = {"actual_TCP_force": wrench, "payload": np.arange(5.0), "moon": np.ones(5)}
+    desk.write("log.csv", csv(target_q=q + 1, actual_q=q, **columns))
+    ran = desk.run("predict", "@log.csv", "--cell", "@cell.yaml", "--out", "@out.csv")
+    assert (ran.code, ran.err) == (0, "")
+    header, *_ = (desk.folder / "out.csv").read_text().splitlines()
+    assert header == ",".join(
+        f"predicted_{kind}_{i}" for kind in ("position", "rotation") for i in range(3)
+    )
+    table = np.loadtxt(desk.folder / "out.csv", delimiter=",", skiprows=1)
+    model = load_cell(desk.folder / "cell.yaml").model
+    expected = model.predict(q, read_log(desk.folder / "log.csv", 6).loads())
+    np.testing.assert_array_equal(table[:, :3], expected.position)
+    np.testing.assert_array_equal(table[:, 3:], expected.rotation_vector)
+
+
+def test_compensate_takes_targets_and_meets_the_wanted_pose(desk: Desk) -> None:
+    q = poses(7)
+    desk.write("log.csv", csv(target_q=q, actual_q=q + 0.2, payload=np.full(7, 5.0)))
+    ran = desk.run("compensate", "@log.csv", "--cell", "@cell.yaml", "--out", "@out.csv")
+    assert (ran.code, ran.err) == (0, "")
+    lines = (desk.folder / "out.csv").read_text().splitlines()
+    assert lines[0] == ",".join(f"corrected_q_{i}" for i in range(6))
+    corrected = np.loadtxt(lines[1:], delimiter=",")
+    model = load_cell(desk.folder / "cell.yaml").model
+    loads = read_log(desk.folder / "log.csv", 6).loads()
+    reached, wanted = model.predict(corrected, loads), model.rigid_pose(q)
+    assert np.abs(reached.position - wanted.position).max() < 1e-8
+    assert np.abs(model.predict(q, loads).position - wanted.position).max() > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("command", "column"), [("predict", "target_q"), ("compensate", "actual_q")]
+)
+def test_the_other_joints_are_taken_where_the_first_are_missing(
+    desk: Desk, command: str, column: str
+) -> None:
+    q = poses(3)
+    desk.write("log.csv", csv(**{column: q}))
+    assert desk.run(command, "@log.csv", "--cell", "@cell.yaml", "--out", "@o.csv").code == 0
+    table = np.loadtxt(desk.folder / "o.csv", delimiter=",", skiprows=1)
+    model = load_cell(desk.folder / "cell.yaml").model
+    expected = model.predict(q).position if command == "predict" else correct(model, q).q
+    np.testing.assert_allclose(table[:, : expected.shape[1]], expected, atol=1e-12)
+
+
+def test_a_rigid_cell_corrects_nothing(desk: Desk) -> None:
+    q = poses(4)
+    desk.write("log.csv", csv(target_q=q))
+    desk.run("compensate", "@log.csv", "--cell", "@rigid.yaml", "--out", "@o.csv")
+    np.testing.assert_array_equal(np.loadtxt(desk.folder / "o.csv", delimiter=",", skiprows=1), q)
+
+
+def test_a_pose_out_of_reach_is_told_and_the_rest_written(desk: Desk) -> None:
+    stretched = np.zeros((1, 6))
+    q = np.vstack([poses(2), stretched])
+    desk.write("log.csv", csv(target_q=q, payload=np.full(3, 12.0)))
+    ran = desk.run("compensate", "@log.csv", "--cell", "@cell.yaml", "--out", "@o.csv")
+    assert ran.code == 0
+    assert "row 4 misses it most" in ran.err
+    assert np.isfinite(np.loadtxt(desk.folder / "o.csv", delimiter=",", skiprows=1)).all()
+
+
+# -- what a user can get wrong ------------------------------------------------------------------
+
+TRACKER = ",".join(f"measured_position_{i}" for i in range(3))
+Q1 = f"{TRACKER}," + ",".join(f"actual_q_{i}" for i in range(6))
+ROW = ",".join(["0.1"] * 9)
+BAD_Q2 = "0,0,0,0.1,0.1,{},0.1,0.1,0.1"
+
+
+@pytest.mark.parametrize(
+    ("log", "words"),
+    [
+        ("", ["log.csv", "empty"]),
+        (f"{Q1}\n", ["log.csv", "no data rows"]),
+        ("a,b\n1,2\n", ["log.csv", "columns"]),
+        ("payload\n1\n", ["log.csv", "actual_q", "target_q"]),
+        (f"{Q1.replace(',actual_q_3', '')}\n0,0,0,0,0,0,0,0\n", ["actual_q_3", "not found"]),
+        (f"{Q1},actual_q_6\n{ROW},0\n", ["actual_q_6", "6-joint arm"]),
+        (f"{Q1}\n{ROW}\n{ROW},7\n", ["row 3", "10 cells", "expected 9"]),
+        (f"{Q1}\n{ROW}\n{BAD_Q2.format('nan')}\n", ["row 3", "actual_q_2", "nan"]),
+        (f"{Q1}\n{ROW}\n{BAD_Q2.format('x')}\n", ["row 3", "actual_q_2", "'x'"]),
+        (f"{Q1}\n{BAD_Q2.format('inf')}\n", ["row 2", "actual_q_2", "inf"]),
+        (f"{Q1},payload\n{ROW},-1\n", ["row 2", "payload", "-1"]),
+        (f"{Q1},payload\n{ROW},1\n{ROW},400\n", ["row 3", "400 kg", "out of range", "12.5 kg"]),
+        (f"{Q1},payload\n{ROW},nan\n", ["row 2", "payload", "nan"]),
+        (f"{Q1},payload_cog_0\n{ROW},0\n", ["payload_cog_1", "not found"]),
+    ],
+)
+@pytest.mark.parametrize("command", ["predict", "compensate", "fit"])
+def test_an_unusable_log_is_refused_in_one_line(
+    desk: Desk, command: str, log: str, words: list[str]
+) -> None:
+    desk.write("log.csv", log)
+    line = desk.refuses(command, "@log.csv", "--cell", "@cell.yaml", "--out", "@out.csv")
+    for word in words:
+        assert word in line
+    assert not (desk.folder / "out.csv").exists()
+
+
+@pytest.mark.parametrize("command", ["predict", "compensate", "fit"])
+def test_unusable_paths_are_refused_in_one_line(desk: Desk, command: str) -> None:
+    desk.write("log.csv", f"{Q1}\n{ROW}\n")
+    for words, told in (
+        (("@none.csv", "--cell", "@cell.yaml", "--out", "@o.csv"), "none.csv: file not found"),
+        (("@log.csv", "--cell", "@none.yaml", "--out", "@o.csv"), "none.yaml: file not found"),
+        (("@log.csv", "--cell", "@cell.yaml", "--out", "@none/o.csv"), "found no folder"),
+        (("@log.csv", "--cell", "@cell.yaml", "--out", "@log.csv"), "output to be the input"),
+        (("@log.csv", "--cell", "@cell.yaml", "--out", "@cell.yaml"), "output to be the input"),
+        (("@log.csv", "--cell", "@cell.yaml", "--out", "@"), "found a folder"),
+    ):
+        assert told in desk.refuses(command, *words)
+
+
+def test_an_unknown_key_of_a_cell_is_told_by_the_real_command(desk: Desk) -> None:
+    desk.write("cell.yaml", CELL + "payloda: {mass: 5}\n")
+    desk.write("log.csv", f"{Q1}\n{ROW}\n")
+    command = [sys.executable, "-m", "bridge.cli", "predict", "log.csv", "--cell", "cell.yaml"]
+    ran = subprocess.run(
+        [*command, "--out", "o.csv"], capture_output=True, text=True, check=False, cwd=desk.folder,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
+    )  # fmt: skip
+    assert ran.returncode == 2
+    assert ran.stderr == (
+        "error: cell.yaml, line 4: payloda: found an unknown key 'payloda', expected one that is "
+        "known; did you mean 'payload'?\n"
+    )
+
+
+def test_an_unforeseen_failure_is_one_line_and_a_file(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("by nothing")
+
+    monkeypatch.setattr("bridge.cli.predict.open_cell", broken)
+    ran = desk.run("predict", "@log.csv", "--cell", "@cell.yaml", "--out", "@o.csv")
+    assert ran.code == 1
+    assert ran.err.startswith("error: ZeroDivisionError: by nothing (details: ")
+    details = Path(ran.err.rsplit(" ", 1)[1].rstrip(")\n"))
+    assert "Traceback" in details.read_text()
+    details.unlink()
+
+
+# -- fit ----------------------------------------------------------------------------------------
+
+
+def test_fit_finds_the_compliance_and_writes_a_cell_that_predicts(desk: Desk) -> None:
+    real = load_cell(desk.folder / "cell.yaml").model
+    desk.write("log.csv", measured_log(real, 60))
+    ran = desk.run("fit", "@log.csv", "--cell", "@rigid.yaml", "--out", "@new.yaml")
+    assert (ran.code, ran.err) == (0, "")
+    assert "joint flexibility" in ran.out
+    found = load_cell(desk.folder / "new.yaml").model
+    q = poses(20, seed=9)
+    gap = found.predict(q).position - real.predict(q).position
+    before = real.without_terms().predict(q).position - real.predict(q).position
+    assert np.abs(gap).max() < 5e-5 < np.abs(before).max()
+
+
+def test_fit_declines_with_the_reason_where_nothing_bends_the_arm(desk: Desk) -> None:
+    desk.write("dh.yaml", "robot: {dh: [{a: 0.5, alpha: 0, d: 0}, {a: 0.4, alpha: 0, d: 0}]}\n")
+    q = np.random.default_rng(0).uniform(-1, 1, (20, 2))
+    position = load_cell(desk.folder / "dh.yaml").model.predict(q).position
+    desk.write("log.csv", csv(actual_q=q, measured_position=position))
+    line = desk.refuses("fit", "@log.csv", "--cell", "@dh.yaml", "--out", "@new.yaml")
+    assert "log.csv" in line
+    assert "payload" in line
+    assert not (desk.folder / "new.yaml").exists()
+
+
+# -- explain and simulate -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_every_effect_is_explained_with_its_parameters(desk: Desk, name: str) -> None:
+    ran = desk.run("explain", name)
+    assert ran.code == 0
+    assert ran.out.startswith(name)
+    assert "parameters in a cell file:" in ran.out
+
+
+def test_explain_lists_the_catalogue_and_names_the_nearest(desk: Desk) -> None:
+    assert all(name in desk.run("explain").out for name in CATALOGUE)
+    assert "'backlash'" in desk.refuses("explain", "backlsh")
+
+
+def test_simulate_serves_until_it_is_told_to_stop(desk: Desk) -> None:
+    host = f"127.{1 + os.getpid() // 250 % 250}.{os.getpid() % 250}.77"
+    desk.write("cell.yaml", SOFT + f"simulation: {{host: {host}, seed: 3}}\n")
+    command = [sys.executable, "-m", "bridge.cli", "simulate", str(desk.folder / "cell.yaml")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None
+        told = [server.stdout.readline() for _ in range(2)]
+        with socket.create_connection((host, 30100), timeout=5) as bench:
+            bench.sendall(b"measure\n")
+            assert len(bench.recv(4096).split(b",")) == 7
+        start = time.monotonic()
+        server.send_signal(signal.SIGTERM)
+        assert server.wait(10) == 0
+    assert time.monotonic() - start < 3
+    assert host in told[0]
+    assert told[1] == f"ready {host}\n"
+
+
+def test_simulate_is_never_served_to_others(desk: Desk) -> None:
+    desk.write("cell.yaml", CELL + "link: {host: 192.168.0.3}\n")
+    assert "loopback" in desk.refuses("simulate", "@cell.yaml")

@@ -1,0 +1,85 @@
+"""``gapbridge convert``, and commands that take a source where they take a log."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pyarrow import parquet
+
+CELL = """
+robot: {model: ur5e}
+metrology: {registered: true, sigma: 2.0e-5}
+"""
+
+
+def gapbridge(*words: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "bridge.cli", *map(str, words)], capture_output=True, text=True,
+        timeout=120, check=False,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """Return an RTDE recording with spaces between its columns, and a cell beside it."""
+    (tmp_path / "cell.yaml").write_text(CELL)
+    rng = np.random.default_rng(4)
+    q = rng.uniform(-1, 1, (8, 6))
+    names = ["timestamp", *(f"actual_q_{i}" for i in range(6)), "robot_mode"]
+    rows = np.hstack([np.arange(8)[:, None] * 0.1, q, np.full((8, 1), 7)])
+    text = "\n".join([" ".join(names), *(" ".join(f"{v:.17g}" for v in row) for row in rows)])
+    (tmp_path / "robot.csv").write_text(text + "\n")
+    return tmp_path / "robot.csv"
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_a_recording_becomes_a_log(recording: Path, suffix: str) -> None:
+    out = recording.with_name(f"log{suffix}")
+    done = gapbridge("convert", recording, "--cell", recording.with_name("cell.yaml"), "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert "8 rows" in done.stdout
+    if suffix == ".csv":
+        assert out.read_text().startswith("timestamp,actual_q_0,")
+    else:
+        assert parquet.read_table(out).num_rows == 8
+
+
+def test_predict_takes_the_source_itself(recording: Path) -> None:
+    cell, folder = recording.with_name("cell.yaml"), recording.parent
+    gapbridge("convert", recording, "--cell", cell, "--out", folder / "log.csv")
+    for given, out in ((recording, "a.csv"), (folder / "log.csv", "b.csv")):
+        done = gapbridge("predict", given, "--cell", cell, "--out", folder / out)
+        assert done.returncode == 0, done.stderr
+    assert (folder / "a.csv").read_text() == (folder / "b.csv").read_text()
+
+
+def test_predictions_under_a_parquet_name_are_parquet(recording: Path) -> None:
+    out = recording.with_name("predicted.parquet")
+    done = gapbridge("predict", recording, "--cell", recording.with_name("cell.yaml"),
+                     "--out", out)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert parquet.read_table(out).column_names[0] == "predicted_position_0"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["nowhere.bag", "--out", "log.csv"], "nowhere.bag: not found"),
+        (["cell.yaml", "--out", "log.csv"], "found no known kind of recording"),
+        (["robot.csv", "--out", "log.txt"], "expected .csv or .parquet"),
+        (["robot.csv", "--out", "log.csv", "--topic", "joint=x"], "--topic: found 'joint=x'"),
+        (["robot.csv", "--out", "robot.csv"], "found the output to be the input"),
+    ],
+)
+def test_what_cannot_be_converted_is_one_line(recording: Path, words: list[str], said: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "bridge.cli", "convert", *words], capture_output=True, text=True,
+        timeout=120, check=False, cwd=recording.parent,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1

@@ -1,0 +1,75 @@
+"""Logs that are too long for one piece, through the command."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from cli_runs import bent_model, cell_in, columns_of, gapbridge, measured, poses_and_loads, refused
+from pyarrow import parquet
+
+from bridge.cell import load_cell
+from bridge.cli import large_log
+from core.log.pieces import LogPieces
+
+Columns = dict[str, np.ndarray]
+
+
+def parquet_in(folder: Path, columns: Columns) -> Path:
+    parquet.write_table(pa.table(columns), folder / "log.parquet")
+    return folder / "log.parquet"
+
+
+def session(rows: int) -> Columns:
+    q, loads = poses_and_loads(rows)
+    return columns_of(q, loads) | measured(bent_model(), q, loads, noise=2e-5)
+
+
+def test_a_large_log_gives_what_it_gives_in_one_piece(tmp_path, monkeypatch):
+    log, cell = parquet_in(tmp_path, session(900)), cell_in(tmp_path)
+    whole = gapbridge("fit", log, "--cell", cell, "--out", tmp_path / "whole.yaml")
+    assert whole.code == 0, whole.err
+    monkeypatch.setattr(large_log, "LARGE", 500)
+    monkeypatch.setattr(large_log, "LogPieces", lambda path, n: LogPieces(path, n, 200))
+    parts = gapbridge("fit", log, "--cell", cell, "--out", tmp_path / "parts.yaml")
+    assert parts.code == 0, parts.err
+    one, other = (load_cell(tmp_path / f"{name}.yaml").model for name in ("whole", "parts"))
+    for a, b in zip(one.compliance(), other.compliance(), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9)
+
+
+def test_a_fault_far_down_a_large_log_names_its_row(tmp_path, monkeypatch):
+    columns = session(900)
+    columns["payload"][777] = 500.0
+    log, cell = parquet_in(tmp_path, columns), cell_in(tmp_path)
+    monkeypatch.setattr(large_log, "LARGE", 500)
+    text = refused("fit", log, "--cell", cell, "--out", tmp_path / "new.yaml")
+    assert "row 779, column payload: found 500 kg" in text
+
+
+@pytest.mark.parametrize(("rows", "large"), [(20_000, False), (20_001, True)])
+def test_a_log_is_large_from_its_number_of_rows_on(tmp_path, rows, large):
+    log = parquet_in(tmp_path, {"payload": np.zeros(rows)})
+    assert large_log.is_large(log) == large
+
+
+def test_a_recording_that_holds_no_measured_poses_says_so(tmp_path):
+    from bridge.cell.settings.recording import RecordingSettings
+    from bridge.ipc.shared_memory import Page
+    from bridge.recording.recorder import Recorder
+
+    page = Page(6)
+    settings = RecordingSettings(folder=tmp_path, keep_free=0.0)
+    recorder = Recorder(settings, "run-20260101-000000", page, {"joints": 6}, lambda told: None)
+    for number in range(40):
+        row = page.next_row()
+        row[1:] = 0.1
+        row[page.slices["timestamp"]] = 0.002 * number
+        page.publish()
+    recorder.step(flush=True)
+    recorder.close()
+    run = tmp_path / "run-20260101-000000-001.mcap"
+    text = refused("fit", run, "--cell", cell_in(tmp_path), "--out", tmp_path / "new.yaml")
+    assert "found no measured_position_0..2" in text

@@ -1,0 +1,85 @@
+"""The commands run, demo and blind: what they pass on, and parts that are missing."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from cli_runs import cell_in, gapbridge, refused
+
+from bridge.cell import Cell
+from bridge.cli.blind import benchmark
+from bridge.cli.optional import member
+from core.errors import LinkError, RunError
+
+
+def daemon(monkeypatch: pytest.MonkeyPatch, run_cell: object) -> None:
+    module = ModuleType("bridge.daemon.run")
+    module.run_cell = run_cell  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "bridge.daemon.run", module)
+
+
+def test_run_hands_the_cell_and_its_options_to_the_daemon(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[Cell, dict[str, object]]] = []
+    daemon(monkeypatch, lambda cell, **options: seen.append((cell, options)))
+    path = cell_in(tmp_path)
+    assert gapbridge("run", path, "--observe", "--duration", "1.5").code == 0
+    ((cell, options),) = seen
+    assert cell.path == path
+    assert options == {"observe": True, "arm": False, "duration": 1.5, "log": None}
+
+
+def test_a_broken_link_is_one_line_and_a_failure_at_run_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run_cell(cell: Cell, **_: object) -> int:
+        raise LinkError("127.0.0.2: cannot be reached")
+
+    daemon(monkeypatch, run_cell)
+    answer = gapbridge("run", cell_in(tmp_path))
+    assert (answer.code, answer.err) == (1, "error: 127.0.0.2: cannot be reached\n")
+
+
+def test_an_interrupt_ends_without_a_traceback(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run_cell(cell: Cell, **_: object) -> int:
+        raise KeyboardInterrupt
+
+    daemon(monkeypatch, run_cell)
+    answer = gapbridge("run", cell_in(tmp_path))
+    assert (answer.code, answer.err.strip()) == (1, "error: interrupted")
+
+
+def test_observing_and_writing_exclude_each_other(tmp_path: Path) -> None:
+    line = refused("run", cell_in(tmp_path), "--observe", "--arm")
+    assert "--observe: found beside --arm" in line
+
+
+@pytest.mark.parametrize("duration", ["0", "-1", "soon"])
+def test_a_duration_must_be_a_time(tmp_path: Path, duration: str) -> None:
+    assert "--duration" in refused("run", cell_in(tmp_path), "--duration", duration)
+
+
+def test_demo_wants_a_folder(tmp_path: Path) -> None:
+    path = cell_in(tmp_path)
+    assert "expected a folder" in refused("demo", "--out", path)
+
+
+def test_a_missing_part_is_told_by_name_and_a_broken_one_is_not_taken_for_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(RunError, match=r"demo: found no module bridge\.nowhere"):
+        member("bridge.nowhere", "run", "demo")
+    (tmp_path / "halfpart.py").write_text("import not_to_be_found_anywhere\n", encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ModuleNotFoundError, match="not_to_be_found_anywhere"):
+        member("halfpart", "run", "demo")
+
+
+def test_the_benchmark_of_a_checkout_is_found() -> None:
+    assert {"seeds", "quick"} <= {parameter.name for parameter in benchmark().params}

@@ -1,0 +1,87 @@
+"""A cell edited while the daemon runs changes nothing, whatever becomes of the loop."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from daemon_cell import Robot, Run, offsets, wait_for
+
+from bridge.cell.run_settings import read_configuration
+from bridge.loop.supervisor import State
+
+PATIENT = ", state_timeout: 0.25"
+
+
+def granted(run: Run) -> list[str]:
+    """Return the hash of the cell that each process of the loop runs."""
+    return [e["hash"] for e in run.daemon.events_since(0) if e["kind"] == "granted"]
+
+
+def test_a_loop_that_is_started_anew_runs_the_cell_that_runs_not_the_edited_one(
+    tmp_path: Path,
+) -> None:
+    with Robot(tmp_path) as robot:
+        cell = robot.cell(PATIENT)
+        text = cell.read_text()
+        with Run(cell) as run:
+            run.wait(State.OBSERVING, 90.0)
+            before = granted(run)
+            run.compensate()
+            wait_for(lambda: run.daemon.tally.written > 400, 30.0, "a ramp")
+            # an arm ten times as soft as the one that stands there: the model is what is read anew
+            soft = [10.0 * c for c in robot.settings.plant.axial]
+            axial = str(list(robot.settings.plant.axial))
+            assert axial in text
+            cell.write_text(text.replace(axial, str(soft)))
+            pid = run.daemon.loop_pid
+            assert pid is not None
+            os.kill(pid, 9)
+            run.wait(State.DISCONNECTED, 10.0)
+            run.wait(State.OBSERVING, 90.0)
+            written = run.daemon.tally.written
+            run.compensate()
+            wait_for(lambda: run.daemon.tally.written > written + 400, 30.0, "a ramp")
+            assert run.daemon.configuration.text == text
+            assert granted(run)[-1] == before[-1] == run.daemon.configuration.hash
+            run.daemon.reload()  # and a reload does take it
+            wait_for(lambda: run.daemon.configuration.text != text, 30.0, "the edited cell")
+            wait_for(lambda: len(granted(run)) >= 3, 90.0, "its loop")
+            assert granted(run)[-1] != before[-1]
+            run.end()
+        cycles = run.cycles()
+    size = np.linalg.norm(offsets(cycles)[:, :3], axis=1)
+    first, second = (size[cycles["loop"] == k].max() for k in (0, 1))
+    assert first > 3e-4
+    assert abs(second - first) < 0.1 * first
+
+
+def test_a_loop_reads_none_of_the_files_that_a_cell_names_from_the_disk(tmp_path: Path) -> None:
+    """The files are gone while the loop is started anew, and it runs on."""
+    with Robot(tmp_path) as robot:
+        start = np.array(robot.settings.start_q)
+        rows = np.column_stack([[0.0, 5.0], [start, start]])
+        header = ",".join(["timestamp", *(f"target_q_{i}" for i in range(6))])
+        way = tmp_path / "way.csv"
+        np.savetxt(way, rows, "%.9g", ",", header=header, comments="")
+        cell = robot.cell(PATIENT, setpoints="{source: trajectory, file: way.csv}")
+        with Run(cell) as run:
+            run.wait(State.OBSERVING, 90.0)
+            way.unlink()
+            cell.unlink()
+            pid = run.daemon.loop_pid
+            assert pid is not None
+            os.kill(pid, 9)
+            run.wait(State.DISCONNECTED, 10.0)
+            run.wait(State.OBSERVING, 90.0)
+            run.compensate()
+
+
+def test_every_file_that_a_cell_names_belongs_to_its_configuration(tmp_path: Path) -> None:
+    """Profile, DBC and EDS are read with the cell, whatever the link."""
+    path = tmp_path / "cell.yaml"
+    text = "robot: {{model: ur10e}}\nlink: {{driver: modbus, profile: ur, host: 127.0.0.1}}\n"
+    path.write_text(text.format())
+    names = {Path(name).name for name in read_configuration(path).files}
+    assert names == {"cell.yaml", "ur.yaml"}

@@ -1,0 +1,295 @@
+"""The local socket: who may open it, what it answers, and what it never does."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import stat
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from daemon_cell import Robot, Run, gapbridge, wait_for
+
+from bridge.cell.runtime_folder import cell_key, runtime_folder
+from bridge.daemon import control
+from bridge.ipc import control_socket
+from bridge.ipc.control_client import ask, ask_socket, running
+from bridge.ipc.control_socket import ControlSocket, Peer
+from bridge.ipc.shared_memory import Phase
+from bridge.loop.supervisor import State
+from core.errors import InputError, RunError
+
+PATIENT = ", state_timeout: 0.25"  # a busy machine holds the simulated controller up
+
+
+@pytest.fixture(autouse=True)
+def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    return tmp_path / "gapbridge"
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Iterator[Robot]:
+    with Robot(tmp_path) as found:
+        yield found
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[tuple[Path, list[tuple[str, Peer]]]]:
+    asked: list[tuple[str, Peer]] = []
+
+    def answer(command: str, peer: Peer) -> dict[str, Any]:
+        asked.append((command, peer))
+        return {"ok": True, "answer": command}
+
+    path = tmp_path / "x.sock"
+    with ControlSocket(path, answer):
+        yield path, asked
+
+
+def talk(path: Path, data: bytes) -> dict[str, Any]:
+    with socket.socket(socket.AF_UNIX) as link:
+        link.settimeout(10)
+        link.connect(str(path))
+        link.sendall(data)
+        link.shutdown(socket.SHUT_WR)
+        found: dict[str, Any] = json.loads(link.makefile().readline())
+        return found
+
+
+def test_a_command_is_answered_and_its_sender_known(
+    served: tuple[Path, list[tuple[str, Peer]]],
+) -> None:
+    path, asked = served
+    assert ask_socket(path, "status") == "status"
+    assert asked == [("status", Peer(os.getpid(), os.getuid()))]
+
+
+def test_only_its_owner_can_open_it(served: tuple[Path, list[Any]], runtime: Path) -> None:
+    path, _ = served
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert stat.S_IMODE(runtime_folder().stat().st_mode) == 0o700
+    assert runtime_folder() == runtime
+
+
+def test_another_user_is_refused_though_the_socket_were_open(
+    served: tuple[Path, list[Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, asked = served
+    monkeypatch.setattr(control_socket, "peer_of", lambda _: Peer(1, os.geteuid() + 1))
+    reply = talk(path, b'{"command": "arm"}\n')
+    assert not reply["ok"]
+    assert "found user" in reply["error"]
+    assert asked == []
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can become somebody else")
+def test_somebody_else_cannot_even_connect(served: tuple[Path, list[Any]]) -> None:
+    path, asked = served
+    code = f"""
+import os, socket
+os.setuid(65534)
+try:
+    socket.socket(socket.AF_UNIX).connect({str(path)!r})
+except PermissionError:
+    raise SystemExit(7)
+"""
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 7
+    assert asked == []
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"\n", b"arm\n", b"[]\n", b"{}\n", b'{"command": 3}\n', b'{"command": "reboot"}\n',
+     b"\xff\xfe\n", b"{" * 4000, b"x" * 100_000],
+)  # fmt: skip
+def test_nonsense_is_refused_in_one_line(served: tuple[Path, list[Any]], data: bytes) -> None:
+    path, asked = served
+    try:
+        reply = talk(path, data)
+    except (BrokenPipeError, ConnectionResetError, ValueError):
+        reply = {"ok": False, "error": "expected"}  # it has hung up in the middle of too much
+    assert not reply["ok"]
+    assert "expected" in reply["error"]
+    assert asked == []
+    assert ask_socket(path, "status") == "status"
+
+
+def test_a_folder_of_somebody_else_is_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "gapbridge").symlink_to(tmp_path / "elsewhere")
+    assert runtime_folder() != tmp_path / "gapbridge"
+
+
+def test_a_cell_that_nobody_runs_is_one_line(tmp_path: Path) -> None:
+    cell = tmp_path / "cell.yaml"
+    with pytest.raises(InputError, match="file not found"):
+        ask(cell, "status")
+    cell.write_text("robot: {model: ur10e}\n")
+    with pytest.raises(InputError, match="found no running daemon"):
+        ask(cell, "status")
+
+
+def test_a_person_arms_and_disarms_a_running_daemon(robot: Robot) -> None:
+    cell = robot.cell(PATIENT)
+    with Run(cell) as run:
+        run.wait(State.OBSERVING)
+        assert ask(cell, "disarm") == "is observing already"
+        assert ask(cell, "arm") == "compensating"
+        status = ask(cell, "status")
+        assert status["state"] == "compensating"
+        assert f"pid {os.getpid()}" in status["armed_by"]
+        assert status["cell"] == str(cell)
+        assert status["sides"]["recorder"]["pid"]
+        assert status["session"] in [each["session"] for each in running()]
+        assert ask(cell, "arm") == "is compensating already"
+        assert ask(cell, "disarm") == "observing"
+        assert ask(cell, "status")["armed_by"] == ""
+
+        def told() -> list[dict[str, Any]]:
+            return [e for e in run.daemon.events_since(0) if e["kind"] == "control"]
+
+        wait_for(lambda: len(told()) == 4, 2.0, "the last request's event")
+        events = told()
+    assert [(e["command"], e["uid"], e["ok"]) for e in events] == [
+        (command, os.getuid(), True) for command in ("disarm", "arm", "arm", "disarm")
+    ]
+    assert not any(runtime_folder().glob("*.sock"))
+
+
+def test_a_fault_waits_for_a_person_and_arming_is_refused_until_then(robot: Robot) -> None:
+    cell = robot.cell(PATIENT)
+    with Run(cell, arm=True) as run:
+        run.wait(State.COMPENSATING)
+        robot.bench("protective_stop")
+        run.wait(State.FAULT, 2.0)
+        with pytest.raises(RunError, match=r"a fault is latched: robot not ready.*safety_mode 3"):
+            ask(cell, "arm")
+        assert "as soon as the robot is fine" in ask(cell, "disarm")
+        assert run.daemon.state == State.FAULT
+        robot.bench("unlock")
+        run.wait(State.OBSERVING, 5.0)
+        assert ask(cell, "status")["latched"] == ""
+
+
+def test_a_latched_fault_outlives_the_loop_that_found_it(robot: Robot) -> None:
+    with Run(robot.cell(PATIENT), arm=True) as run:
+        run.wait(State.COMPENSATING)
+        robot.bench("protective_stop")
+        run.wait(State.FAULT, 2.0)
+        pid = run.daemon.loop_pid
+        assert pid is not None
+        os.kill(pid, 9)
+        run.wait(State.DISCONNECTED, 5.0)
+        run.wait(State.FAULT)
+        assert "safety_mode 3" in run.daemon.latched
+        robot.bench("unlock")
+        run.daemon.disarm()
+        run.wait(State.OBSERVING, 5.0)
+
+
+def test_a_daemon_that_only_observes_cannot_be_armed(robot: Robot) -> None:
+    cell = robot.cell(PATIENT)
+    with Run(cell, observe=True) as run:
+        run.wait(State.OBSERVING)
+        with pytest.raises(RunError, match="--observe"):
+            ask(cell, "arm")
+
+
+@pytest.mark.slow
+def test_the_commands_tell_in_a_line_and_as_json(robot: Robot) -> None:
+    cell = robot.cell(PATIENT)
+    with Run(cell) as run:
+        run.wait(State.OBSERVING)
+
+        def told(*words: object) -> tuple[int, str, str]:
+            done = gapbridge(*words, folder=robot.folder)
+            out, err = done.communicate(timeout=60)
+            return done.returncode, out, err
+
+        code, out, err = told("status", cell)
+        assert (code, err) == (0, "")
+        assert f"{cell}: observing since" in out
+        assert "Hz" in out
+        assert json.loads(told("status", cell, "--json")[1])["schema"] == "gapbridge.status/1"
+        every = json.loads(told("status", "--json")[1])
+        assert str(cell) in [each["cell"] for each in every]
+        assert told("arm", cell) == (0, "compensating\n", "")
+        assert told("disarm", cell) == (0, "observing\n", ""), run.said
+    code, out, err = told("arm", cell)
+    assert (code, out) == (2, "")
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+
+
+def test_the_same_cell_has_the_same_name_from_everywhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cell_key(Path("cell.yaml")) == cell_key(tmp_path / "cell.yaml")
+    assert cell_key(tmp_path / "cell.yaml") != cell_key(tmp_path / "a" / "cell.yaml")
+
+
+def test_a_disarming_between_two_loops_is_kept_and_answered_by_the_next(robot: Robot) -> None:
+    cell = robot.cell(PATIENT)
+    with Run(cell, arm=True) as run:
+        run.wait(State.COMPENSATING, 60.0)
+        robot.bench("protective_stop")
+        run.wait(State.FAULT, 5.0)
+        robot.bench("unlock")
+        pid = run.daemon.loop_pid
+        assert pid is not None
+        os.kill(pid, 9)
+        run.wait(State.DISCONNECTED, 5.0)
+        assert run.daemon.latched
+        taken = run.daemon.taken
+        assert "acknowledged" in ask(cell, "disarm")  # by a person, while no loop is there
+        assert run.daemon.taken > taken
+        run.wait(State.OBSERVING, 60.0)
+        assert run.daemon.latched == ""
+
+
+class NoLoop:
+    """A daemon between two processes of the loop, of which no next one comes."""
+
+    state, phase, latched, may_write, sequence = State.DISCONNECTED, Phase.STARTING, "x", True, 0
+    taken, asked = 3, 3
+
+    def disarm(self, by: str) -> int:
+        self.asked += 1
+        return self.asked
+
+    def arm(self, by: str) -> int:
+        return 0
+
+    def note(self, event: dict[str, Any]) -> None:
+        self.event = event
+
+
+def test_a_disarming_that_no_loop_has_taken_is_not_called_done(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(control, "LONGEST_TAKING", 0.1)
+    daemon = NoLoop()
+    reply = control.Control(daemon).answer("disarm", Peer(1, 2))  # type: ignore[arg-type]
+    assert not reply["ok"]
+    assert "no loop has taken it" in reply["error"]
+    assert "kept for the next one" in reply["error"]
+    assert daemon.asked == 4
+
+
+def test_a_disarming_is_asked_for_though_the_arm_seems_to_observe() -> None:
+    """A person's arming may be on its way: what is asked for after it stands."""
+    daemon = NoLoop()
+    daemon.state, daemon.latched, daemon.taken = State.OBSERVING, "", 9
+    reply = control.Control(daemon).answer("disarm", Peer(1, 2))  # type: ignore[arg-type]
+    assert reply == {"ok": True, "answer": "is observing already"}
+    assert daemon.asked == 4

@@ -1,0 +1,262 @@
+"""What the daemon survives, and that it never comes back writing."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from daemon_cell import Robot, Run, gapbridge, offsets, only_recording, read_cycles, wait_for
+
+from bridge.loop.supervisor import State
+from core.errors import CellError, InputError, LinkError
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Iterator[Robot]:
+    with Robot(tmp_path) as found:
+        yield found
+
+
+def assert_came_back_observing(run: Run, robot: Robot) -> None:
+    """The last words for every fault: observing again, and not a setpoint since."""
+    run.wait(State.OBSERVING)
+    time.sleep(0.5)
+    assert run.daemon.state == State.OBSERVING
+    summary = run.end()
+    cycles = run.cycles()
+    writing = np.flatnonzero(cycles["written"] > 0)
+    assert len(writing) > 50
+    assert cycles["state"][-1] == "observing"
+    assert len(cycles["written"]) - writing[-1] > 100
+    assert summary.faults
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
+def test_a_loop_that_dies_comes_back_observing(robot: Robot, number: signal.Signals) -> None:
+    with Run(robot.cell(), arm=True) as run:
+        run.wait(State.COMPENSATING)
+        time.sleep(0.3)
+        pid = run.daemon.loop_pid
+        assert pid is not None
+        os.kill(pid, number)
+        wait_for(lambda: run.daemon.loop_pid not in (None, pid), 10.0, "a new loop")
+        assert_came_back_observing(run, robot)
+    assert run.summary is not None
+    assert run.summary.restarts == 1
+    assert run.summary.exit_code == 0
+    assert any(number.name in line for line in run.summary.faults)
+    # the robot's own watchdog has ended the script meanwhile
+    assert "watchdog" in robot.controller.log()
+
+
+def test_a_loop_that_hangs_is_ended_and_comes_back_observing(robot: Robot) -> None:
+    with Run(robot.cell(), arm=True) as run:
+        run.wait(State.COMPENSATING)
+        time.sleep(0.3)
+        pid = run.daemon.loop_pid
+        assert pid is not None
+        os.kill(pid, signal.SIGSTOP)
+        waited = wait_for(lambda: run.daemon.loop_pid != pid, 5.0, "the end of the hanging loop")
+        assert waited < 2.0
+        assert_came_back_observing(run, robot)
+    assert run.summary is not None
+    assert any("stood still" in line for line in run.summary.faults)
+
+
+def test_a_controller_that_stands_still_is_a_fault(robot: Robot) -> None:
+    with Run(robot.cell(), arm=True) as run:
+        run.wait(State.COMPENSATING)
+        time.sleep(0.3)
+        os.kill(robot.controller.pid, signal.SIGSTOP)
+        try:
+            run.wait(State.DISCONNECTED, 3.0)
+        finally:
+            os.kill(robot.controller.pid, signal.SIGCONT)
+        assert_came_back_observing(run, robot)
+    assert any("clock has stood still" in line for line in run.said)
+
+
+def test_a_clock_that_stands_still_is_seen_though_packets_flow(robot: Robot) -> None:
+    with Run(robot.cell()) as run:
+        run.wait(State.OBSERVING)
+        robot.bench("freeze")
+        assert run.wait(State.FAULT, 2.0) < 0.6
+        robot.bench("thaw")
+        time.sleep(0.5)
+        assert run.daemon.state == State.FAULT  # it stays, until a person has seen it
+        assert "silence" in run.daemon.latched
+        run.daemon.disarm()
+        run.wait(State.OBSERVING, 2.0)
+        assert run.daemon.latched == ""
+        summary = run.end()
+    assert summary.restarts == 0
+    assert summary.exit_code == 0
+
+
+def test_a_short_stall_ramps_out_and_does_not_ramp_in_again(robot: Robot) -> None:
+    with Run(robot.cell(), arm=True) as run:
+        run.wait(State.COMPENSATING)
+        time.sleep(0.8)
+        robot.bench("stall 0.08")
+        run.wait(State.OBSERVING, 5.0)
+        assert_came_back_observing(run, robot)
+    moved = offsets(run.cycles())
+    steps = np.linalg.norm(np.diff(moved[:, :3], axis=0), axis=1)
+    assert steps.max() <= 0.05 * 0.002 * 5.001
+
+
+def test_a_dropped_connection_is_replaced_by_a_new_process(robot: Robot) -> None:
+    with Run(robot.cell(), arm=True) as run:
+        run.wait(State.COMPENSATING)
+        time.sleep(0.3)
+        robot.bench("drop")
+        wait_for(lambda: run.daemon.state != State.COMPENSATING, 2.0, "the fault")
+        assert_came_back_observing(run, robot)
+
+
+def test_a_controller_that_is_started_anew_is_found_again(tmp_path: Path) -> None:
+    with Robot(tmp_path) as robot, Run(robot.cell(), arm=True) as run:
+        run.wait(State.COMPENSATING)
+        time.sleep(0.3)
+        os.kill(robot.controller.pid, signal.SIGKILL)
+        wait_for(lambda: run.daemon.state == State.DISCONNECTED, 5.0, "the loss of the link")
+        robot.controller.stop()
+        robot.controller.start()
+        assert_came_back_observing(run, robot)
+    assert run.summary is not None
+    assert run.summary.restarts >= 1
+
+
+def test_a_protective_stop_is_a_fault_and_nobody_writes_after_it(robot: Robot) -> None:
+    with Run(robot.cell(), arm=True) as run:
+        run.wait(State.COMPENSATING)
+        time.sleep(0.3)
+        robot.bench("protective_stop")
+        run.wait(State.FAULT, 1.0)
+        time.sleep(0.5)
+        assert run.daemon.state == State.FAULT
+        summary = run.end()
+    assert summary.exit_code == 1
+    assert any("safety_mode 3" in line for line in summary.faults)
+    cycles = run.cycles()
+    fault = cycles["state"].index("fault")
+    assert not cycles["written"][fault:].any()
+
+
+def test_a_stopped_robot_cannot_be_armed(robot: Robot) -> None:
+    robot.bench("emergency_stop")
+    with Run(robot.cell(), arm=True, duration=0.5) as run:
+        summary = run.join()
+    assert summary.exit_code == 1
+    assert summary.setpoints_written == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ramps_out_and_ends_in_time(robot: Robot, number: signal.Signals) -> None:
+    run = gapbridge("run", robot.cell(), "--arm", folder=robot.folder)
+    assert run.stdout is not None
+    while "compensating" not in run.stdout.readline():
+        assert run.poll() is None
+    time.sleep(1.0)
+    begun = time.monotonic()
+    run.send_signal(number)
+    out, err = run.communicate(timeout=10)
+    assert time.monotonic() - begun < 1.5
+    assert run.returncode == 0, err
+    assert err == ""
+    assert "setpoints written" in out
+    recording = only_recording(robot.folder / "recordings")
+    moved = np.linalg.norm(offsets(read_cycles(recording))[:, :3], axis=1)
+    assert moved.max() > 4e-4
+    assert moved[-1] == 0.0
+    assert np.abs(np.diff(moved)).max() <= 0.05 * 0.002 * 5.001
+
+
+def test_when_the_daemon_is_killed_its_loop_ramps_out_and_the_recording_is_whole(
+    robot: Robot,
+) -> None:
+    run = gapbridge("run", robot.cell(), "--arm", folder=robot.folder)
+    assert run.stdout is not None
+    while "compensating" not in run.stdout.readline():
+        assert run.poll() is None
+    time.sleep(0.7)
+    killed = time.monotonic()
+    run.kill()
+    run.wait()
+    wait_for(lambda: "rtde_control ended" in robot.controller.log(), 3.0, "the end of the loop")
+    assert "watchdog" not in robot.controller.log()  # it ended by itself
+    recording = only_recording(robot.folder / "recordings")
+    time.sleep(1.5)  # the recorder outlives the loop by a moment
+    cycles = read_cycles(recording)
+    span = cycles["timestamp"][-1] - cycles["timestamp"][0]
+    assert span > 0.7
+    now = float(robot.bench("measure").split(",")[0])  # s, controller clock
+    assert now - cycles["timestamp"][-1] < time.monotonic() - killed + 0.1
+
+
+def test_a_robot_that_is_not_there_is_one_line(tmp_path: Path) -> None:
+    robot = Robot(tmp_path)
+    run = gapbridge("run", robot.cell(), folder=tmp_path)
+    out, err = run.communicate(timeout=30)
+    assert run.returncode == 1
+    assert err.count("\n") == 1
+    assert robot.host in err
+    assert "Traceback" not in out + err
+
+
+@contextmanager
+def mute_server(host: str) -> Iterator[None]:
+    """Something that takes connections on the RTDE port and never says a word."""
+    taken = []
+    with socket.create_server((host, 30004)) as listener:
+
+        def accept() -> None:
+            while True:
+                try:
+                    taken.append(listener.accept())
+                except OSError:
+                    return
+
+        threading.Thread(target=accept, daemon=True).start()
+        yield
+        listener.shutdown(socket.SHUT_RDWR)
+    for connection, _ in taken:
+        connection.close()
+
+
+def test_a_controller_that_never_answers_does_not_hang_the_daemon(tmp_path: Path) -> None:
+    robot = Robot(tmp_path)
+    with mute_server(robot.host), Run(robot.cell(link=", connect_timeout: 1.0")) as run:
+        wait_for(lambda: run.error is not None, 20.0, "the end of the run")
+    assert isinstance(run.error, LinkError)
+
+
+def test_a_cell_without_a_link_cannot_run(tmp_path: Path) -> None:
+    path = tmp_path / "cell.yaml"
+    path.write_text("robot: {model: ur10e}\n", encoding="utf-8")
+    with pytest.raises(CellError, match="link: found nothing"):
+        Run(path)
+
+
+def test_motion_of_two_masters_is_refused(tmp_path: Path) -> None:
+    robot = Robot(tmp_path)
+    cell = robot.cell(link=", mode: offset", setpoints="{source: trajectory, file: way.csv}")
+    with pytest.raises(CellError, match="the robot's own program moves the arm"):
+        Run(cell)
+
+
+def test_a_trajectory_that_is_not_there_is_unusable_input(tmp_path: Path) -> None:
+    with Robot(tmp_path) as robot:
+        cell = robot.cell(setpoints="{source: trajectory, file: nowhere.csv}")
+        with Run(cell, arm=True) as run:
+            wait_for(lambda: run.error is not None, 20.0, "the end of the run")
+    assert isinstance(run.error, InputError)
+    assert "nowhere.csv: file not found" in str(run.error)

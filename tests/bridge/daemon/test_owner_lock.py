@@ -1,0 +1,150 @@
+"""One owner per controller, and nothing to tidy after a crash."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from daemon_cell import Robot, Run, gapbridge, wait_for
+
+from bridge.cell.sections import link_settings
+from bridge.daemon.host import OwnerLock
+from bridge.ipc.control_client import ask
+from bridge.loop.supervisor import State
+from core.errors import InputError
+from drivers.controller_address import address_of
+
+
+@pytest.fixture(autouse=True)
+def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Iterator[Robot]:
+    with Robot(tmp_path) as found:
+        yield found
+
+
+CELL = Path("cell.yaml")
+HOLD = """
+import sys, time
+from pathlib import Path
+from bridge.daemon.host import OwnerLock
+OwnerLock("host 192.0.2.7", Path("first.yaml")).acquire()
+print("held", flush=True)
+time.sleep(1000)
+"""
+
+
+def test_a_second_owner_is_refused_in_one_line_and_the_kernel_frees_the_lock() -> None:
+    holder = subprocess.Popen([sys.executable, "-c", HOLD], stdout=subprocess.PIPE, text=True)
+    assert holder.stdout is not None
+    assert holder.stdout.readline() == "held\n"
+    with pytest.raises(InputError) as told:
+        OwnerLock("host 192.0.2.7", CELL).acquire()
+    words = str(told.value)
+    assert "\n" not in words
+    assert "cell.yaml: link: host 192.0.2.7 is in use by another daemon" in words
+    assert f"process {holder.pid}, first.yaml" in words
+    OwnerLock("host 192.0.2.8", CELL).acquire()
+    holder.kill()
+    holder.wait()
+    with OwnerLock("host 192.0.2.7", CELL) as lock:
+        assert lock.before["pid"] == holder.pid  # it did not end in order
+    with OwnerLock("host 192.0.2.7", CELL) as lock:
+        assert lock.before == {}
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ({"host": "10.0.0.5"}, {"host": "10.0.0.5", "rate": 125.0}, True),
+        ({"host": "10.0.0.5"}, {"driver": "modbus", "profile": "ur", "host": "10.0.0.5"}, True),
+        ({"host": "10.0.0.5"}, {"host": "10.0.0.6"}, False),
+        ({"host": "Robot"}, {"host": "robot"}, True),
+        ({"host": "localhost"}, {"host": "127.0.0.1"}, True),
+        (
+            {"driver": "modbus", "profile": "ur", "host": "10.0.0.5", "port": 5021},
+            {"driver": "modbus", "profile": "ur", "host": "10.0.0.5", "port": 5022},
+            False,
+        ),
+        (
+            {"driver": "modbus", "profile": "ur", "host": "10.0.0.5", "port": 502},
+            {"host": "10.0.0.5"},
+            True,
+        ),
+        (
+            {"driver": "can", "profile": "piper", "interface": "socketcan", "channel": "can0"},
+            {"driver": "can", "profile": "piper", "interface": "socketcan", "channel": "can1"},
+            False,
+        ),
+    ],
+)
+def test_the_same_controller_is_known_by_its_address(
+    one: dict[str, Any], other: dict[str, Any], same: bool
+) -> None:
+    found = address_of(link_settings(**one)) == address_of(link_settings(**other))
+    assert found == same
+
+
+def test_two_daemons_on_one_robot_the_second_leaves_with_two(robot: Robot) -> None:
+    cell = robot.cell()
+    with Run(cell) as run:
+        run.wait(State.OBSERVING)
+        other = robot.folder / "other.yaml"
+        other.write_text(cell.read_text())
+        second = gapbridge("run", other, folder=robot.folder)
+        out, err = second.communicate(timeout=60)
+        assert second.returncode == 2
+        assert out == ""
+        assert err.startswith("error: ")
+        assert err.count("\n") == 1
+        assert "in use by another daemon" in err
+        assert str(cell) in err
+        time.sleep(0.2)
+        assert run.daemon.state == State.OBSERVING
+        assert run.end().restarts == 0
+
+
+@pytest.mark.slow
+def test_after_kill_nine_the_next_start_works_and_does_not_arm_by_itself(robot: Robot) -> None:
+    cell = robot.cell(setpoints="{arm: true}")
+    first = gapbridge("run", cell, folder=robot.folder)
+    assert first.stdout is not None
+    while "compensating" not in first.stdout.readline():
+        assert first.poll() is None
+    loop = ask(cell, "status")["loop"]["pid"]
+    sides = [side["pid"] for side in ask(cell, "status")["sides"].values()]
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+    for pid in [loop, *sides]:
+        wait_for(lambda pid=pid: not alive(pid), 10.0, f"the end of {pid}")
+    second = gapbridge("run", cell, "--duration", "2", folder=robot.folder)
+    out, err = second.communicate(timeout=60)
+    assert err == ""
+    assert "did not end in order: not arming by itself" in out
+    assert "compensating" not in out
+    third = gapbridge("run", cell, "--duration", "5", folder=robot.folder)
+    assert "compensating" in third.communicate(timeout=60)[0]  # the second ended in order
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_the_lock_tells_who_holds_it(tmp_path: Path) -> None:
+    with OwnerLock("host 192.0.2.9", CELL):
+        (path,) = (tmp_path / "gapbridge").glob("*.lock")
+        assert json.loads(path.read_text())["cell"] == "cell.yaml"
+        assert path.stat().st_mode & 0o777 == 0o600

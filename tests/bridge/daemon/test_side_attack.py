@@ -1,0 +1,99 @@
+"""No side process can arm, whatever it does with what it is given and with what /proc shows."""
+
+from __future__ import annotations
+
+import contextlib
+import mmap
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+from daemon_cell import Robot, Run, wait_for
+from watched_feed import free_port
+
+from bridge.daemon import sides as daemon_sides
+from bridge.ipc.control_client import ask
+from bridge.loop.supervisor import State
+
+SIDES = tuple(daemon_sides.SIDES)
+
+
+def armings(events: list[dict[str, Any]]) -> list[int]:
+    return [k for k, e in enumerate(events) if e.get("to") == State.ARMED.name]
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_a_side_process_cannot_arm(
+    side: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    _, wanted = daemon_sides.SIDES[side]
+    monkeypatch.setitem(daemon_sides.SIDES, side, ("side_attacker", wanted))
+    with Robot(tmp_path) as robot:
+        cell = robot.cell(
+            ", state_timeout: 0.25", web=f"{{port: {free_port()}}}",
+            metrics=f"{{port: {free_port()}}}",
+            setpoints=f"{{source: modbus, port: {free_port()}}}",
+        )  # fmt: skip
+        with Run(cell) as run:
+            run.wait(State.OBSERVING, 60.0)
+
+            def attacks() -> list[dict[str, Any]]:
+                return [e for e in run.daemon.events_since(0) if "attack" in e]
+
+            wait_for(lambda: len(attacks()) >= 3, 60.0, "three attacks")
+            found = attacks()[-1]["attack"]
+            assert found["loop"]
+            # cycles of this loop and what is shown of them, requests, and a PLC's two
+            assert found["memories"] >= 5, found
+            assert found["written"] == []
+            assert found["sockets"] == []
+            events = run.daemon.events_since(0)
+            assert {e["kind"] for e in attacks()} == {side}  # and of the others' kind: none
+            assert any("not its to tell of" in str(e.get("detail")) for e in events)
+            assert not armings(events)
+            assert not [e for e in events if e["kind"] in ("request", "control")]
+            assert run.daemon.state == State.OBSERVING
+            status = run.daemon.status()
+            assert status["link"]["written"] == 0
+            assert status["armed_by"] == ""
+
+
+def test_every_arming_stands_behind_the_event_that_says_who_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    with Robot(tmp_path) as robot:
+        cell = robot.cell(", state_timeout: 0.25")
+        with Run(cell, arm=True) as run:
+            run.wait(State.COMPENSATING, 60.0)
+            assert "pid" in run.daemon.status()["armed_by"]
+            assert ask(cell, "disarm") == "observing"
+            assert ask(cell, "arm") == "compensating"
+            assert f"uid {os.getuid()}, pid {os.getpid()}" in ask(cell, "status")["armed_by"]
+            ask(cell, "disarm")
+            run.daemon.arm()
+            run.wait(State.COMPENSATING, 30.0)
+        events = run.daemon.events_since(0)
+    asked = [e for e in events if e["kind"] == "request" and e["command"] == "arm"]
+    assert len(armings(events)) == len(asked) == 3
+    assert all(e["by"] and e["number"] for e in asked)
+    for at, request in zip(armings(events), asked, strict=True):
+        assert request["sequence"] < events[at]["sequence"]
+
+
+def test_the_memory_of_a_running_daemon_is_sealed(tmp_path: Path) -> None:
+    """Also from within the daemon itself: it can only read what its loop writes."""
+    with Robot(tmp_path) as robot, Run(robot.cell()) as run:
+        run.wait(State.OBSERVING, 60.0)
+        for fd in (run.daemon.page.fd, run.daemon.page.open_for_reading()):
+            again = os.open(f"/proc/self/fd/{fd}", os.O_RDWR)
+            with pytest.raises(PermissionError):
+                mmap.mmap(again, 4096)
+            with contextlib.suppress(PermissionError):
+                os.pwrite(again, b"x", 0)
+                pytest.fail("written")
+            os.close(again)

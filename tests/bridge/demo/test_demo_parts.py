@@ -1,0 +1,247 @@
+"""The demo's parts, each on numbers whose answer is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from bridge.cell import load_cell
+from bridge.demo.page import page
+from bridge.demo.picture import picture
+from bridge.demo.poses import CALIBRATION_LOADS, TEST_LOADS, candidates, plan
+from bridge.demo.rests import Rests, joined, rests, write_log
+from bridge.demo.result import LoopFigures, Result, repeatability
+from bridge.demo.session import Session
+from bridge.demo.terminal import bar
+from bridge.demo.trajectory import ACCELERATION, PERIOD, SPEED, visits, write_trajectory
+from core.arm import builtin_arm
+from core.compensation import correct
+from core.errors import RunError
+from core.estimation.identification import identify_compliance
+from core.log.log import read_log
+from core.metrology import Metrology
+from core.model import Model
+from core.rotation import rotation_vector, transform
+
+HOME = np.array([0.0, -1.5, 1.8, -1.87, -1.57, 0.0])
+MODEL = Model(builtin_arm("ur10e"), transform(np.eye(3), np.array([0, 0, 0.18])))
+SOFT = MODEL.with_compliance(
+    [4e-6, 6e-6, 6e-6, 9e-6, 1e-5, 1e-5], [6e-7, 8e-7, 1e-6, 1e-6, 2e-6, 3e-6]
+)
+
+
+def measured(q: np.ndarray, nominal: np.ndarray, load: int, scatter: float, seed: int) -> Rests:
+    """What a tracker would see of a bending arm at encoder angles q."""
+    random = np.random.default_rng(seed)
+    loads = TEST_LOADS[load].rows(len(q))
+    poses = SOFT.predict(q, loads)
+    position = poses.position + random.normal(0, scatter, (len(q), 3))
+    assert loads.payload_mass is not None
+    assert loads.payload_cog is not None
+    assert loads.wrench is not None
+    return Rests(
+        np.arange(len(q)) * 1.0, nominal, q, loads.payload_mass, loads.payload_cog, loads.wrench,
+        position, rotation_vector(poses.rotation),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    """A whole demo on paper: the arm's answers come from the model, with scatter."""
+    given = plan(MODEL, HOME, 4)
+    scatter = 1e-5
+    runs = [
+        measured(np.vstack([q, q]), np.vstack([q, q]), k % 2, scatter, k)
+        for k, q in enumerate((*given.calibration, *given.test))
+    ]
+    path = tmp_path_factory.mktemp("demo") / "log.csv"
+    write_log(path, joined(runs))
+    found = identify_compliance(MODEL, read_log(path, 6), Metrology(True, scatter))
+    twice = [np.vstack([q, q]) for q in given.test]
+    corrected = [correct(found.model, q, TEST_LOADS[k].rows(len(q))).q for k, q in enumerate(twice)]
+    return Result(
+        link="ur_rtde", seed=4, identification=found, model=found.model,
+        without=joined([measured(q, q, k, scatter, 20 + k) for k, q in enumerate(twice)]),
+        compensated=joined(
+            [measured(c, q, k, scatter, 30 + k)
+             for k, (c, q) in enumerate(zip(corrected, twice, strict=True))]
+        ),
+        loads=tuple(load.name for load, q in zip(TEST_LOADS, twice, strict=True) for _ in q),
+        setpoints_written=1000, loop=LoopFigures(500.0, 1, 1000, 2100.0), duration=1.0,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", [0, 1, 7])
+def test_planned_poses_are_free_and_none_is_tested_that_was_fitted(seed: int) -> None:
+    given = plan(MODEL, HOME, seed)
+    assert len(given.calibration) == len(CALIBRATION_LOADS)
+    fitted, tested = np.vstack(given.calibration), np.vstack(given.test)
+    position = MODEL.rigid_pose(np.vstack([fitted, tested])).position
+    assert position[:, 2].min() > 0.15
+    for pose in tested:
+        assert np.abs(fitted - pose).max(axis=1).min() > 0.02
+    assert len(np.unique(tested, axis=0)) == len(tested)
+
+
+def test_another_seed_draws_other_poses() -> None:
+    assert not np.array_equal(candidates(MODEL, 1)[:5], candidates(MODEL, 2)[:5])
+
+
+def test_a_trajectory_rests_at_every_pose_and_keeps_its_limits(tmp_path: Path) -> None:
+    poses = plan(MODEL, HOME, 1).calibration[0]
+    q = visits(HOME, poses)
+    speed = np.diff(q, axis=0) / PERIOD
+    assert np.abs(speed).max() < 1.05 * SPEED
+    assert np.abs(np.diff(speed, axis=0)).max() / PERIOD < 1.2 * ACCELERATION
+    np.testing.assert_array_equal(q[[0, -1]], [HOME, HOME])
+    for pose in poses:
+        assert (q == pose).all(axis=1).sum() * PERIOD > 0.4
+    duration = write_trajectory(tmp_path / "t.csv", q)
+    log = read_log(tmp_path / "t.csv", 6)
+    assert duration == pytest.approx((len(q) - 1) * PERIOD)
+    np.testing.assert_array_equal(log.require("target_q"), q)
+
+
+def recording(q: np.ndarray, start: float = 100.0) -> dict[str, np.ndarray]:
+    return {
+        "timestamp": start + np.arange(len(q)) * PERIOD,
+        "actual_q": q,
+        "actual_qd": np.gradient(q, PERIOD, axis=0),
+        "payload": np.full(len(q), 5.0),
+        "payload_cog": np.zeros((len(q), 3)),
+        "actual_TCP_force": np.zeros((len(q), 6)),
+    }
+
+
+def test_rests_take_what_was_measured_after_settling_and_nothing_else() -> None:
+    poses = HOME + np.array([[0.3, 0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0, 0], [0.3, 0, 0, 0, 0, 0]])
+    given = recording(visits(HOME, poses))
+    t = given["timestamp"][::5]
+    readings = np.zeros((len(t), 7))
+    readings[:, 0] = t
+    readings[:, 1:4] = given["actual_q"][::5, :3]
+    flips = np.where(np.arange(len(t)) % 2, 1, -1)[:, None]  # one rotation, near pi, told two ways
+    readings[:, 4:] = flips * [np.pi - 1e-9, 0, 0]
+    found = rests(given, readings, poses)
+    np.testing.assert_allclose(found.actual_q, poses, atol=1e-7)
+    np.testing.assert_allclose(found.position, poses[:, :3], atol=1e-7)
+    np.testing.assert_allclose(np.abs(found.rotation), np.tile([np.pi, 0, 0], (3, 1)), atol=1e-6)
+
+
+def test_a_visit_that_never_happened_is_told() -> None:
+    given = recording(visits(HOME, HOME + np.array([[0.3, 0, 0, 0, 0, 0]])))
+    readings = np.zeros((10, 7))
+    with pytest.raises(RunError, match="visit 1 of 1: the arm never rested there"):
+        rests(given, readings, HOME + np.array([[0, 0.5, 0, 0, 0, 0]]))
+    with pytest.raises(RunError, match="visit 1: found 0 readings"):
+        rests(given, readings, HOME + np.array([[0.3, 0, 0, 0, 0, 0]]))
+
+
+def test_repeatability_is_that_of_the_scatter() -> None:
+    random = np.random.default_rng(3)
+    q = np.repeat(random.uniform(-1, 1, (200, 6)), 2, axis=0)
+    position = np.repeat(random.uniform(-1, 1, (200, 3)), 2, axis=0)
+    position = position + random.normal(0, 2e-5, position.shape)
+    empty = np.zeros((len(q), 6))
+    run = Rests(empty[:, 0], q, q, empty[:, 0], empty[:, :3], empty, position, empty[:, :3])
+    found = repeatability([run], ("a",) * len(q))
+    assert found == pytest.approx(2e-5 * np.sqrt(3), rel=0.15)
+
+
+def test_the_summary_holds_what_was_measured(result: Result) -> None:
+    summary = result.summary()
+    assert set(summary) >= {
+        "link", "samples", "tcp_error_mm", "repeatability_mm", "setpoints_written", "loop"
+    }  # fmt: skip
+    wanted = MODEL.rigid_pose(result.without.nominal_q).position
+    distance = np.linalg.norm(result.without.position - wanted, axis=1) * 1e3
+    assert summary["tcp_error_mm"]["without"]["max"] == pytest.approx(distance.max())
+    assert summary["tcp_error_mm"]["without"]["rms"] == pytest.approx(np.sqrt(np.mean(distance**2)))
+    assert summary["tcp_error_mm"]["without"]["rms"] > 20 * summary["tcp_error_mm"]["with"]["rms"]
+    assert summary["tcp_error_mm"]["with"]["rms"] < 1.5 * summary["repeatability_mm"]
+
+
+def test_the_picture_is_sound_xml_and_shows_every_pose(result: Result) -> None:
+    root = ElementTree.fromstring(picture(result))
+    texts = [e.text for e in root.iter("{http://www.w3.org/2000/svg}text")]
+    poses = len(np.unique(result.without.nominal_q, axis=0))
+    assert sum(str(t).startswith("pose ") for t in texts) == poses
+    bars = [
+        e for e in root.iter("{http://www.w3.org/2000/svg}rect") if float(e.get("height", 0)) > 9
+    ]
+    assert len(bars) > 2 * poses
+
+
+def test_the_page_needs_nothing_from_elsewhere(result: Result) -> None:
+    text = page(result, "verdict: <explained>")
+    assert "verdict: &lt;explained&gt;" in text
+    assert "<script src" not in text
+    assert "<link" not in text
+
+
+def test_bars_grow_with_their_share() -> None:
+    lengths = [len(bar(share, 10)) for share in (0.0, 0.31, 0.5, 1.0, 7.0)]
+    assert lengths == sorted(lengths)
+    assert bar(1.0, 10) == "█" * 10
+    assert bar(0.0, 10) != ""
+
+
+class Slow(Session):
+    """A machine that keeps a quarter of the rate only."""
+
+    def __init__(self, kept: float, tell) -> None:
+        super().__init__(None, Path(), tell)
+        self.rates: list[float] = []
+        self.kept = kept
+
+    def _run(self, cell, load, poses, longest):
+        link = self._settings(cell).link
+        self.rates.append(link.rate)
+        if link.rate > self.kept:
+            raise RunError("compensating -> holding (deadlines missed): 28 of 500 cycles missed")
+        return "measured"
+
+
+class Hall:
+    """The link as far as a visit asks for it."""
+
+    home = HOME
+
+    def declared(self, cell, load):
+        return cell
+
+    def prepare(self, folder, poses):
+        return 1.0
+
+    def bench(self):
+        return self
+
+    def hang(self, load): ...
+
+    def go(self, q): ...
+
+    def close(self): ...
+
+
+@pytest.mark.parametrize(("kept", "rates"), [(500, [500]), (125, [500, 250, 125])])
+def test_a_machine_that_misses_deadlines_goes_on_at_a_lower_rate(kept, rates):
+    cell = load_cell(Path(__file__).parents[3] / "config" / "ur10e_simulated.yaml")
+    told: list[str] = []
+    session = Slow(kept, told.append)
+    session._link = Hall()
+    for expected in (rates, rates[-1:]):  # the second visit begins where the first ended
+        session.rates.clear()
+        assert session.visit(cell, TEST_LOADS[0], HOME[None]) == "measured"
+        assert session.rates == expected
+    assert len(told) == len(rates) - 1
+
+
+def test_a_machine_that_cannot_keep_a_fourth_of_the_rate_is_told():
+    cell = load_cell(Path(__file__).parents[3] / "config" / "ur10e_simulated.yaml")
+    session = Slow(50, lambda text: None)
+    session._link = Hall()
+    with pytest.raises(RunError, match="deadlines missed"):
+        session.visit(cell, TEST_LOADS[0], HOME[None])

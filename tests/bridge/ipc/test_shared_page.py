@@ -1,0 +1,149 @@
+"""The page that outlives the loop's processes, and its readers."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from bridge.ipc.counts import Count
+from bridge.ipc.shared_memory import ROWS, FollowedPage, Page, Phase, RunPage
+
+
+@pytest.fixture
+def page() -> Iterator[Page]:
+    found = Page(2)
+    yield found
+    found.close()
+
+
+def put(page: Page, timestamp: float) -> None:
+    page.next_row()[1:] = timestamp
+    page.publish()
+
+
+def test_each_reader_has_its_own_place(page: Page) -> None:
+    early = page.reader()
+    put(page, 0.0)
+    assert early.drain()[:, 1].tolist() == [0]
+    put(page, 1.0)
+    late = page.reader(first=1)
+    assert early.drain()[:, 1].tolist() == [1]
+    assert late.drain()[:, 1].tolist() == [1]
+    assert early.lost == late.lost == 0
+
+
+def loop_of(run: RunPage) -> Page:
+    """Return the page as the next process of the loop joins it."""
+    run.renew()
+    return Page(2, os.dup(run.fd))
+
+
+@pytest.fixture
+def run() -> Iterator[RunPage]:
+    found = RunPage(2)
+    yield found
+    found.close()
+
+
+def test_a_new_process_of_the_loop_goes_on_counting_and_nothing_else_stays(run: RunPage) -> None:
+    reader, loop = run.reader(), loop_of(run)
+    loop.enter(Phase.RUNNING)
+    loop.tell_state(3)
+    loop.tell_seen()
+    loop.tell_ended()
+    loop.tell_taken(7)
+    loop.count(Count.LATE, 4)
+    put(loop, 0.0)
+    loop.next_row()[1] = 99.0  # killed here
+    loop.close()
+    loop = loop_of(run)
+    assert (run.phase, run.state, run.seen, run.ended) == (Phase.STARTING, 0, False, False)
+    assert run.silence == 0.0
+    assert run.taken == 7
+    loop.count(Count.LATE)
+    put(loop, 1.0)
+    assert reader.drain()[:, 1].tolist() == [0, 1]
+    assert run.written == 2
+    assert run.counts()[Count.LATE.words] == 5
+    loop.close()
+
+
+def test_a_page_is_shown_once_its_loop_alone_can_write_to_it(run: RunPage) -> None:
+    assert not run.promote()
+    first = run.open_for_reading()
+    run.renew()
+    assert not run.promote()  # its loop is still starting
+    assert os.path.sameopenfile(first, run.open_for_reading())
+    loop = Page(2, os.dup(run.fd))
+    assert run.promote()
+    assert not run.promote()
+    assert os.path.sameopenfile(run.fd, run.open_for_reading())
+    with pytest.raises(PermissionError):
+        Page(2, os.dup(run.fd))
+    loop.close()
+
+
+def test_who_reads_along_changes_over_and_misses_nothing(run: RunPage) -> None:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    side = FollowedPage(2, run.open_for_reading(), theirs)
+    reader = side.reader()
+    for k in range(3):
+        loop = loop_of(run)
+        put(loop, 2.0 * k)
+        assert run.promote()
+        fd = run.open_for_reading()
+        socket.send_fds(ours, [b"p"], [fd])
+        os.close(fd)
+        put(loop, 2.0 * k + 1)
+        if k != 1:  # it may be slow, and two pages come at once
+            assert reader.drain()[-1, 1] == 2.0 * k + 1
+        loop.tell_state(k)
+        loop.close()
+    assert reader.next == 6
+    assert reader.lost == 0
+    assert side.state == 2
+    ours.close()
+    assert len(reader.drain()) == 0
+    side.close()
+
+
+def test_a_reader_that_starts_late_counts_what_is_gone(page: Page) -> None:
+    for k in range(ROWS + 10):
+        put(page, float(k))
+    reader = page.reader(first=5)
+    rows = reader.drain()
+    assert len(rows) + reader.lost == ROWS + 5
+    assert (np.diff(rows[:, 0]) == 1).all()
+
+
+def test_who_only_reads_cannot_write(page: Page) -> None:
+    put(page, 7.0)
+    fd = page.open_for_reading()
+    code = f"""
+import mmap, os
+from bridge.ipc.shared_memory import Page
+page = Page(2, {fd}, writable=False)
+assert page.reader().drain()[:, 1].tolist() == [7.0]
+again = os.open("/proc/self/fd/{fd}", os.O_RDWR)
+ways = (lambda: page.tell_state(3), lambda: os.write({fd}, b"x"), lambda: mmap.mmap({fd}, 64),
+        lambda: os.pwrite(again, b"x", 0), lambda: mmap.mmap(again, 64),
+        lambda: os.ftruncate(again, 0), lambda: Page(2, again))
+for way in ways:
+    try:
+        way()
+    except (OSError, ValueError):
+        continue
+    raise SystemExit("written")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], pass_fds=[fd], check=False, stderr=subprocess.PIPE
+    )
+    os.close(fd)
+    assert done.returncode == 0, done.stderr
+    assert page.state == 0

@@ -1,0 +1,214 @@
+"""Side processes read along; the daemon never waits for them, whatever they do."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bridge.cell.daemon_settings import DaemonSettings
+from bridge.ipc import side_process
+from bridge.ipc.shared_memory import Page
+from bridge.ipc.side_process import SideProcess
+
+ECHO = """
+    import os
+    from bridge.ipc.side_main import take_order
+
+    order = take_order()
+    reader = order.page.reader()
+    order.tell({"kind": "hello", "session": order.session, "extra": order.extra,
+                "cell": str(order.settings.cell), "n": order.n})
+    while not order.events.closed:
+        order.events.wait(0.05)
+        for event in order.events.poll():
+            event.pop("filling", None)
+            order.tell({"kind": "heard", "of": event})
+        rows = reader.drain()
+        if len(rows):
+            order.tell({"kind": "rows", "timestamps": rows[:, 1].tolist()})
+    open(order.extra["last"], "w").write("finished")
+"""
+DEAF = """
+    import time
+    from bridge.ipc.side_main import take_order
+
+    order = take_order()
+    order.events.poll()
+    order.tell({"kind": "hello"})
+    time.sleep(1000)
+"""
+
+
+def wait_for(what: Callable[[], Any], limit: float = 20.0) -> Any:
+    begun = time.monotonic()
+    while not (found := what()):
+        assert time.monotonic() - begun < limit
+        time.sleep(0.02)
+    return found
+
+
+@pytest.fixture
+def page() -> Iterator[Page]:
+    found = Page(2)
+    yield found
+    found.close()
+
+
+@pytest.fixture
+def order(tmp_path: Path) -> dict[str, Any]:
+    settings = DaemonSettings(cell=tmp_path / "cell.yaml")
+    return {
+        "settings": settings.model_dump(mode="json"), "n": 2, "session": "run-1",
+        "extra": {"last": str(tmp_path / "last")},
+    }  # fmt: skip
+
+
+@pytest.fixture
+def start(
+    page: Page, order: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[[str], SideProcess]]:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    started: list[SideProcess] = []
+
+    def begin(text: str) -> SideProcess:
+        (tmp_path / "side_under_test.py").write_text(textwrap.dedent(text), encoding="utf-8")
+        started.append(SideProcess("side_under_test", order, page, sys.stderr))
+        return started[-1]
+
+    yield begin
+    for side in started:
+        side.close(0.0)
+
+
+def hear(side: SideProcess, kind: str) -> dict[str, Any]:
+    found: list[dict[str, Any]] = []
+
+    def heard() -> bool:
+        found.extend(event for event in side.events() if event["kind"] == kind)
+        return bool(found)
+
+    wait_for(heard)
+    return found[0]
+
+
+def test_it_gets_its_order_the_cycles_and_the_events_and_answers(
+    start: Callable[[str], SideProcess], page: Page, tmp_path: Path
+) -> None:
+    side = start(ECHO)
+    hello = hear(side, "hello")
+    assert (hello["session"], hello["n"]) == ("run-1", 2)
+    assert hello["cell"] == str(tmp_path / "cell.yaml")
+    assert abs(hello["time"] - time.time()) < 60
+    page.next_row()[1:] = 5.0
+    page.publish()
+    assert hear(side, "rows")["timestamps"] == [5.0]
+    side.tell({"kind": "transition", "to": "armed"})
+    assert hear(side, "heard")["of"] == {"kind": "transition", "to": "armed"}
+    assert side.check() is None
+    side.close()
+    assert (tmp_path / "last").read_text() == "finished"
+    assert side.pid is None
+
+
+def test_one_that_is_killed_comes_back_and_the_later_the_more_often(
+    start: Callable[[str], SideProcess],
+) -> None:
+    side = start(ECHO)
+    hear(side, "hello")
+    waits = []
+    for _ in range(3):
+        assert side.pid is not None
+        os.kill(side.pid, signal.SIGKILL)
+        assert "ended with -9" in wait_for(side.check)
+        gone = time.monotonic()
+        side.tell({"kind": "lost"})  # to nobody, and nobody waits
+        wait_for(lambda: side.check() or side.pid)
+        waits.append(time.monotonic() - gone)
+    hear(side, "hello")
+    assert side.restarts == 3
+    assert side.dropped == 3
+    assert waits[0] < waits[1] < waits[2]
+
+
+def test_one_that_does_not_read_loses_events_holds_up_nothing_and_is_ended(
+    start: Callable[[str], SideProcess], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    side = start(DEAF)
+    hear(side, "hello")
+    begun = time.monotonic()
+    for _ in range(2000):
+        side.tell({"kind": "status", "filling": "x" * 1000})
+    assert time.monotonic() - begun < 2.0
+    assert side.dropped > 1000
+    monkeypatch.setattr(side_process, "STALLED", 0.3)
+    monkeypatch.setattr(side_process, "STARTING", 0.3)
+    assert "stood still" in wait_for(side.check, 5.0)
+    assert side.stalls == 1
+    wait_for(lambda: side.check() is None and side.restarts, 5.0)
+
+
+def test_a_line_is_never_torn_though_the_pipe_was_full(
+    start: Callable[[str], SideProcess],
+) -> None:
+    side = start(ECHO)
+    hear(side, "hello")
+    assert side.pid is not None
+    os.kill(side.pid, signal.SIGSTOP)
+    for k in range(400):
+        side.tell({"kind": "status", "number": k, "filling": "x" * 3001})
+    dropped = side.dropped
+    assert dropped > 0
+    os.kill(side.pid, signal.SIGCONT)
+    heard: list[int] = []
+
+    def all_of_them() -> bool:
+        side.tell({"kind": "poke", "number": -1})
+        heard.extend(e["of"]["number"] for e in side.events() if e["kind"] == "heard")
+        return len([k for k in heard if k >= 0]) == 400 - dropped
+
+    wait_for(all_of_them)
+    numbers = [k for k in heard if k >= 0]
+    assert numbers == list(range(400 - dropped))
+
+
+@pytest.mark.parametrize("text", [ECHO, DEAF])
+def test_when_the_daemon_is_killed_they_end(
+    text: str, order: dict[str, Any], tmp_path: Path
+) -> None:
+    (tmp_path / "side_under_test.py").write_text(textwrap.dedent(text), encoding="utf-8")
+    daemon = f"""
+import json, sys, time
+sys.path.insert(0, {str(tmp_path)!r})
+from bridge.ipc import side_main
+from bridge.ipc.shared_memory import Page
+from bridge.ipc.side_process import SideProcess
+side = SideProcess("side_under_test", json.loads({json.dumps(order)!r}), Page(2))
+while not side.events():
+    time.sleep(0.02)
+print(side.pid, flush=True)
+time.sleep(1000)
+"""
+    parent = subprocess.Popen([sys.executable, "-c", daemon], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    pid = int(parent.stdout.readline())
+    parent.kill()
+    parent.wait()
+    wait_for(lambda: not alive(pid), 8.0)
+
+
+def alive(pid: int) -> bool:
+    """Return whether a process runs; one that nobody has waited for yet does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False

@@ -1,0 +1,377 @@
+"""The checks of every cycle: what is dropped, what holds, what is told, and each only once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bridge.ipc.counts import Count
+from bridge.ipc.shared_memory import Page
+from bridge.loop.checks import DEGRADED, LATE, LoopChecks
+from bridge.loop.frozen_watch import FrozenWatch
+from bridge.loop.link_monitor import StateWatch, hold_time
+from bridge.loop.overrun_watch import OverrunWatch
+from bridge.loop.sample_check import SampleCheck
+from bridge.loop.saturation_watch import SaturationWatch
+from bridge.loop.supervisor import State, Supervisor
+from core.arm import builtin_arm
+from core.errors import InvalidStateError, StaleStateError
+from core.limits import ENVELOPE, RATE
+from core.model import Model
+from core.state import RobotState
+from drivers.driver import Driver
+
+ARM = builtin_arm("ur10e")
+Q = np.array([0.0, -1.5, 1.8, -1.87, -1.57, 0.0])
+T = 0.002
+
+
+def state(at: float, q: np.ndarray = Q, **more: Any) -> RobotState:
+    given = {"actual_TCP_force": np.zeros(6), "target_q": q, **more}
+    return RobotState(at, 0.0, q, given.pop("actual_qd", np.zeros(6)), **given)
+
+
+# -- samples ---------------------------------------------------------------------------------------
+
+
+def changed(index: int, value: float) -> np.ndarray:
+    found = Q.copy()
+    found[index] = value
+    return found
+
+
+@pytest.mark.parametrize(
+    ("bad", "count"),
+    [
+        ({"q": changed(2, np.nan)}, Count.DROPPED_NOT_FINITE),
+        ({"q": changed(2, np.inf)}, Count.DROPPED_NOT_FINITE),
+        ({"target_q": changed(0, np.nan)}, Count.DROPPED_NOT_FINITE),
+        ({"actual_qd": changed(0, np.nan)}, Count.DROPPED_NOT_FINITE),
+        ({"actual_TCP_force": np.full(6, np.nan)}, Count.DROPPED_NOT_FINITE),
+        ({"actual_TCP_force": np.full(6, 1e5)}, Count.DROPPED_IMPLAUSIBLE),
+        ({"q": changed(1, 8.0)}, Count.DROPPED_IMPLAUSIBLE),
+        ({"q": changed(1, -1.4)}, Count.DROPPED_STEP),
+    ],
+)
+def test_a_sample_that_cannot_be_is_dropped_with_its_reason(
+    bad: dict[str, Any], count: Count
+) -> None:
+    check = SampleCheck(ARM)
+    assert check.doubt(state(1.0)) is None
+    found = check.doubt(state(1.0 + T, **bad))
+    assert found is not None
+    assert found.count == count
+    assert check.doubt(state(1.0 + 2 * T)) is None  # the next good one is believed
+
+
+def test_a_clock_that_goes_back_is_no_sample_and_a_lost_force_is_no_reason_to_drop() -> None:
+    check = SampleCheck(ARM)
+    assert check.doubt(state(1.0)) is None
+    back = check.doubt(state(0.9))
+    assert back is not None
+    assert back.count == Count.DROPPED_BACKWARDS
+    lost = state(1.1, actual_TCP_force=np.full(6, np.nan), sensor_lost="silent")
+    assert check.doubt(lost) is None
+
+
+@given(st.lists(st.floats(-1.0, 1.0), min_size=6, max_size=6), st.floats(1e-3, 0.2))
+def test_what_an_arm_can_do_is_never_dropped(share: list[float], gap: float) -> None:
+    check = SampleCheck(ARM)
+    assert check.doubt(state(1.0)) is None
+    moved = Q + np.array(share) * ARM.limits.velocity * gap
+    assert check.doubt(state(1.0 + gap, moved)) is None
+
+
+# -- watches ---------------------------------------------------------------------------------------
+
+
+def test_values_that_stand_still_under_a_moving_command_are_frozen_after_a_second() -> None:
+    watch = FrozenWatch()
+    told = [watch.update(state(k * T), Q + 1e-5 * k) for k in range(1000)]
+    first = next(k for k, words in enumerate(told) if words)
+    assert 500 <= first <= 505
+
+
+def test_an_arm_at_rest_or_one_that_moves_is_not_frozen() -> None:
+    watch = FrozenWatch()
+    assert not any(watch.update(state(k * T), Q) for k in range(2000))
+    moving = FrozenWatch()
+    assert not any(moving.update(state(k * T, Q + 1e-6 * k), Q + 1e-5 * k) for k in range(2000))
+
+
+def test_joints_that_say_they_turn_and_do_not_change_are_frozen() -> None:
+    watch = FrozenWatch()
+    turning = np.full(6, 0.1)
+    assert any(watch.update(state(k * T, actual_qd=turning), Q) for k in range(600))
+
+
+def test_more_than_a_twentieth_of_the_cycles_missed_is_an_overrun() -> None:
+    fine, bad = OverrunWatch(500.0), OverrunWatch(500.0)
+    assert not any(fine.update(k * T, k % 25 == 0) for k in range(2000))
+    assert any(bad.update(k * T, k % 15 == 0) for k in range(2000))
+    single = OverrunWatch(500.0)
+    assert single.update(1.0, 100) is None
+
+
+def test_an_offset_at_its_limit_for_a_second_is_saturated_and_a_ramp_is_not() -> None:
+    watch = SaturationWatch()
+    told = [watch.update(k * T, 1 << ENVELOPE) for k in range(600)]
+    assert not any(told[:500])
+    assert all(told[502:])
+    assert watch.update(2.0, 0) is None
+    assert not any(watch.update(3 + k * T, 1 << RATE) for k in range(1000))
+
+
+# -- together --------------------------------------------------------------------------------------
+
+
+class Bench:
+    """Checks with a supervisor in a state, and what they have told."""
+
+    def __init__(self, page: Page, at: State) -> None:
+        self.told: list[dict[str, Any]] = []
+        self.page = page
+        self.supervisor = Supervisor(lambda *change: self.changes.append(change))
+        self.changes: list[Any] = []
+        self.supervisor.state = at
+        self.checks = LoopChecks(500.0, self.supervisor, page, self.told.append)
+
+
+@pytest.fixture
+def page() -> Iterator[Page]:
+    found = Page(6)
+    yield found
+    found.close()
+
+
+def test_a_stop_of_the_robot_is_a_fault_counted_and_told_once(page: Page) -> None:
+    bench = Bench(page, State.COMPENSATING)
+    bench.checks.begin(state(1.0), 0)
+    for k in range(100):
+        bench.checks.begin(state(1.0 + T * (k + 1), safety_mode=3), 0)
+    assert bench.supervisor.state == State.FAULT
+    assert len(bench.changes) == 1
+    assert bench.told == []
+    assert page.counts()["unsafe"] == 1
+    assert "safety_mode 3" in bench.checks.robot
+    bench.checks.begin(state(2.0), 0)
+    assert bench.checks.fine
+
+
+def test_a_gap_of_more_than_ten_cycles_and_the_hold_time_begins_anew(page: Page) -> None:
+    bench = Bench(page, State.COMPENSATING)
+    assert not bench.checks.begin(state(1.0), 0)
+    assert not bench.checks.begin(state(1.03), 14)
+    assert bench.supervisor.state == State.COMPENSATING
+    assert bench.checks.begin(state(1.10), 34)
+    assert bench.supervisor.state == State.HOLDING
+    assert not bench.checks.begin(state(1.102), 0)
+    assert page.counts()["resync"] == 1
+    assert page.counts()["late"] == 48
+
+
+def test_a_lost_sensor_is_flagged_in_every_cycle_and_told_twice(page: Page) -> None:
+    bench = Bench(page, State.COMPENSATING)
+    for k in range(10):
+        bench.checks.begin(state(1.0 + k * T, sensor_lost="silent" if 3 <= k < 7 else ""), k == 5)
+        flags = (DEGRADED if 3 <= k < 7 else 0) | (LATE if k == 5 else 0)
+        assert bench.checks.flags == flags
+    assert [event["detail"] for event in bench.told] == ["silent", "the sensor is back"]
+    assert bench.supervisor.state == State.COMPENSATING
+    assert page.counts()["sensor_lost"] == 1
+
+
+def test_while_only_observing_a_finding_is_told_and_changes_nothing(page: Page) -> None:
+    bench = Bench(page, State.OBSERVING)
+    for k in range(2000):
+        bench.checks.end(state(k * T), Q + 1e-5 * k, 0, 1e-4)
+    assert bench.supervisor.state == State.OBSERVING
+    assert [event["what"] for event in bench.told] == ["frozen"]
+    assert page.counts()["frozen"] == 1
+
+
+class Scripted(Driver):
+    """A driver that does what it is told to; no wire could be so exact about three in a row."""
+
+    def __init__(self) -> None:
+        super().__init__(500.0, Model(ARM))
+        self.next: RobotState | Exception = state(0.0)
+
+    def connect(self) -> None: ...
+
+    def read_state(self) -> RobotState:
+        if isinstance(self.next, Exception):
+            raise self.next
+        self.next = self.next._replace(timestamp=self.next.timestamp + T)
+        return self.next
+
+    def _send(self, setpoint: object) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def watched(page: Page) -> tuple[Scripted, Supervisor, StateWatch, list[dict[str, Any]]]:
+    told: list[dict[str, Any]] = []
+    driver, supervisor = Scripted(), Supervisor(lambda *_: None)
+    supervisor.state = State.COMPENSATING
+    watch = StateWatch(driver, ARM, supervisor, page, told.append, lambda _: None)
+    return driver, supervisor, watch, told
+
+
+def test_two_bad_samples_are_dropped_and_three_in_a_row_hold(page: Page) -> None:
+    driver, supervisor, watch, told = watched(page)
+    good = driver.next
+    for times, after in ((2, State.COMPENSATING), (3, State.HOLDING)):
+        driver.next = InvalidStateError("torn")
+        for _ in range(times):
+            assert watch.next() is None
+        assert supervisor.state == after
+        driver.next = good
+        assert watch.next() is not None
+        watch.believe()
+    assert page.counts()["dropped_torn"] == 5
+    assert [event["what"] for event in told] == ["dropped_torn"]  # not five times
+
+
+def test_a_state_that_is_late_is_counted_and_only_a_stale_one_holds(
+    page: Page, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = [100.0]
+    monkeypatch.setattr("bridge.loop.link_monitor.time.monotonic", lambda: clock[0])
+    driver, supervisor, watch, _ = watched(page)
+    driver.next = StaleStateError("the clock stands still")
+    seen = []
+    for _ in range(30):
+        clock[0] += 0.0101
+        assert watch.next() is None
+        seen.append(supervisor.state)
+    held = seen.index(State.HOLDING)
+    assert hold_time(500.0) < 0.0101 * (held + 1) <= hold_time(500.0) + 0.0101
+    fault = seen.index(State.FAULT)
+    assert 0.2 < 0.0101 * (fault + 1) <= 0.22
+    counts = page.counts()
+    assert (counts["late"], counts["stale"], counts["silence"]) == (held, 1, 1)
+
+
+@pytest.mark.parametrize(("rate", "hold"), [(500, 0.04), (125, 0.04), (50, 0.1), (10, 0.2)])
+def test_the_hold_time_is_five_cycles_or_forty_milliseconds(rate: float, hold: float) -> None:
+    assert hold_time(rate) == pytest.approx(hold)
+
+
+# -- while observing, and what a robot says beside its modes ---------------------------------------
+
+
+@pytest.mark.parametrize("bits", [1 << bit for bit in range(2, 11)])
+def test_a_stop_in_the_safety_bits_alone_is_a_fault(page: Page, bits: int) -> None:
+    bench = Bench(page, State.COMPENSATING)
+    bench.checks.begin(state(1.0), 0)
+    bench.checks.begin(state(1.0 + T, safety_status_bits=1 | bits), 0)
+    assert bench.supervisor.state == State.FAULT
+    assert not bench.checks.fine
+    assert f"safety_status_bits {1 | bits:#b}" in bench.checks.robot
+
+
+@pytest.mark.parametrize("bits", [1, 2])
+def test_normal_and_reduced_mode_are_no_stop(page: Page, bits: int) -> None:
+    bench = Bench(page, State.COMPENSATING)
+    bench.checks.begin(state(1.0, safety_status_bits=bits), 0)
+    assert bench.supervisor.state == State.COMPENSATING
+
+
+@pytest.mark.parametrize(
+    ("found", "moves_arm", "holds"),
+    [
+        ({"runtime_state": 4}, True, True),
+        ({"runtime_state": 4}, False, True),
+        ({"speed_scaling": 0.5}, True, True),
+        ({"speed_scaling": 0.5}, False, False),  # the robot's own motion, at its own speed
+        ({"speed_scaling": np.nan}, False, True),
+        ({"speed_scaling": 50.0}, False, True),
+        ({"speed_scaling": 1.0}, True, False),
+    ],
+)
+def test_a_robot_that_does_not_follow_for_the_hold_time_is_held(
+    page: Page, found: dict[str, Any], moves_arm: bool, holds: bool
+) -> None:
+    bench = Bench(page, State.COMPENSATING)
+    bench.checks = LoopChecks(500.0, bench.supervisor, page, bench.told.append, moves_arm=moves_arm)
+    for k in range(40):
+        bench.checks.begin(state(1.0 + k * T, **(found if k >= 10 else {})), 0)
+        if k == 10 + round(0.9 * hold_time(500.0) / T):
+            assert bench.supervisor.state == State.COMPENSATING  # a moment is none
+    assert (bench.supervisor.state == State.HOLDING) == holds
+    assert page.counts()["not_following"] == holds
+
+
+def test_a_program_that_does_not_play_is_nobodys_fault_while_nothing_is_written(
+    page: Page,
+) -> None:
+    bench = Bench(page, State.OBSERVING)
+    for k in range(100):
+        bench.checks.begin(state(1.0 + k * T, runtime_state=1), 0)
+    assert page.counts()["not_following"] == 0
+    bench.supervisor.state = State.COMPENSATING  # as it was armed: the program has just begun
+    bench.checks.begin(state(1.0 + 100 * T, runtime_state=1), 0)
+    bench.checks.begin(state(1.0 + 101 * T), 0)
+    assert bench.supervisor.state == State.COMPENSATING
+
+
+def test_a_load_that_cannot_be_holds_and_is_told_with_its_reason(page: Page) -> None:
+    bench = Bench(page, State.COMPENSATING)
+    for _ in range(3):
+        bench.checks.judge_loads("payload: found 400 kg, expected 0 to 7.5 kg")
+    assert bench.supervisor.state == State.HOLDING
+    assert bench.changes[0][3] == "payload: found 400 kg, expected 0 to 7.5 kg"
+    assert page.counts()["load"] == 1
+
+
+class Otherwise(Scripted):
+    """A driver whose controller is set otherwise, from some moment on."""
+
+    asked, words = 0, ""
+
+    def mismatch(self) -> str | None:
+        self.asked += 1
+        return self.words or None
+
+
+def test_the_controllers_settings_are_compared_every_second_while_armed(page: Page) -> None:
+    bench, driver = Bench(page, State.OBSERVING), Otherwise()
+    for k in range(1000):
+        bench.checks.judge_settings(state(1.0 + k * T), driver)
+    assert driver.asked == 0
+    bench.supervisor.state = State.COMPENSATING
+    for k in range(1000):
+        bench.checks.judge_settings(state(3.0 + k * T), driver)
+    assert driver.asked == 2
+    driver.words = "the controller's TCP is 50.0 mm from the cell's"
+    for k in range(501):
+        bench.checks.judge_settings(state(5.0 + k * T), driver)
+    assert bench.supervisor.state == State.HOLDING
+    assert bench.changes[0][3] == driver.words
+
+
+def test_a_hiccup_while_observing_latches_no_fault(
+    page: Page, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = [100.0]
+    monkeypatch.setattr("bridge.loop.link_monitor.time.monotonic", lambda: clock[0])
+    driver, supervisor, watch, told = watched(page)
+    supervisor.state = State.OBSERVING
+    good = driver.next
+    driver.next = StaleStateError("the clock stands still")
+    for _ in range(30):
+        clock[0] += 0.0101
+        assert watch.next() is None
+    assert supervisor.state == State.OBSERVING
+    assert page.counts()["silence"] == 1
+    assert [event["what"] for event in told] == ["stale"]
+    driver.next = good
+    assert watch.next() is not None
+    watch.believe()
+    assert supervisor.state == State.OBSERVING

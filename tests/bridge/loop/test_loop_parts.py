@@ -1,0 +1,238 @@
+"""Parts of the loop by themselves: loads of a state, the controller's clock, shared memory."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from bridge.ipc.cycle_row import fill_row
+from bridge.ipc.shared_memory import ROWS, Page, Phase, RunPage
+from bridge.loop.controller_clock import ControllerClock
+from bridge.loop.live_loads import LiveLoads
+from core.load_bounds import LoadBounds
+from core.state import RobotState
+
+Q = np.array([0.0, -1.5, 1.8])
+
+
+def state(at: float, received: float = 0.0, q: np.ndarray = Q, **more: object) -> RobotState:
+    given = {"actual_TCP_force": np.zeros(6)} | more
+    return RobotState(at, received, q, np.zeros(3), q, **given)  # type: ignore[arg-type]
+
+
+def test_the_first_force_counts_at_once_and_later_ones_come_slowly() -> None:
+    loads = LiveLoads(3, use_force=True, time_constant=0.05)
+    pull = np.array([10.0, 0, 0, 0, 0, 0])
+    assert loads.update(state(1.0, actual_TCP_force=pull)).wrench[0] == pytest.approx(pull)
+    after = loads.update(state(1.05, actual_TCP_force=0 * pull)).wrench[0, 0]
+    assert after == pytest.approx(10 / np.e)
+
+
+def test_force_is_left_out_where_the_cell_says_so() -> None:
+    loads = LiveLoads(3, use_force=False, time_constant=0.0)
+    assert loads.update(state(1.0, actual_TCP_force=np.ones(6))).wrench is None
+
+
+def test_the_controllers_payload_stands_instead_of_the_models() -> None:
+    loads = LiveLoads(3, True, 0.0)
+    assert loads.update(state(1.0)).payload_mass is None
+    found = loads.update(state(1.1, payload=4.0, payload_cog=np.array([0, 0, 0.1])))
+    assert found.payload_mass == pytest.approx([4.0])
+    assert found.payload_cog == pytest.approx(np.array([[0, 0, 0.1]]))
+    assert loads.update(state(1.2, payload=4.0)).payload_mass is None
+
+
+def test_a_load_beyond_the_arms_bounds_is_not_taken_and_the_last_one_stays() -> None:
+    loads = LiveLoads(3, True, 0.0, LoadBounds(5.0))
+    cog = np.array([0, 0, 0.1])
+    pull = np.array([0.0, 0, -30, 0, 0, 0])
+    for at, mass, force, doubt in (
+        (1.0, 4.0, pull, None),
+        (1.1, 400.0, pull, "payload: found 400 kg"),
+        (1.2, 4.0, 300 * pull, "force: found 9000 N"),
+        (1.3, 40.0, 300 * pull, "payload"),
+        (1.4, 4.0, pull, None),
+    ):
+        found = loads.update(state(at, payload=mass, payload_cog=cog, actual_TCP_force=force))
+        assert found.payload_mass == pytest.approx([4.0])
+        assert found.wrench[0] == pytest.approx(pull)
+        assert (loads.doubt is None) == (doubt is None)
+        assert (doubt or "") in (loads.doubt or "")
+
+
+def test_a_first_payload_that_cannot_be_leaves_the_models_own() -> None:
+    loads = LiveLoads(3, True, 0.0, LoadBounds(5.0))
+    assert loads.update(state(1.0, payload=40.0, payload_cog=Q * 0)).payload_mass is None
+
+
+def test_a_force_that_does_not_count_is_not_doubted() -> None:
+    loads = LiveLoads(3, False, 0.0, LoadBounds(5.0))
+    loads.update(state(1.0, actual_TCP_force=np.full(6, 9e3)))
+    assert loads.doubt is None
+
+
+def test_approach_is_the_last_motion_and_noise_is_none() -> None:
+    loads = LiveLoads(3, True, 0.0)
+    way = np.array([1e-4, -1e-4, 0.0])
+    noise = np.random.default_rng(0).normal(0, 1e-6, (200, 3))
+    for k in range(200):
+        found = loads.update(state(0.002 * k, q=Q + noise[k]))
+    assert found.approach == pytest.approx(np.zeros((1, 3)))
+    for k in range(200):
+        found = loads.update(state(1 + 0.002 * k, q=Q + k * way))
+    assert found.approach == pytest.approx(np.array([[1, -1, 0]]))
+    for k in range(200):
+        found = loads.update(state(2 + 0.002 * k, q=Q + 200 * way + noise[k]))
+    assert found.approach == pytest.approx(np.array([[1, -1, 0]]))
+
+
+def test_temperatures_are_passed_on() -> None:
+    loads = LiveLoads(3, True, 0.0)
+    assert loads.update(state(1.0)).temperature is None
+    warm = np.array([30.0, 31, 32])
+    assert loads.update(state(1.1, joint_temperatures=warm)).temperature[0] == pytest.approx(warm)
+
+
+def test_missed_cycles_are_counted_by_the_controllers_clock() -> None:
+    clock = ControllerClock(500.0)
+    missed = [clock.take(state(t)) for t in (1.0, 1.002, 1.004, 1.010, 1.012)]
+    assert missed == [0, 0, 0, 2, 0]
+    clock.skip()
+    assert clock.take(state(3.0)) == 0
+    assert clock.take(state(3.004)) == 1
+
+
+def test_age_counts_from_when_the_sample_could_have_been_here() -> None:
+    clock = ControllerClock(500.0)
+    now = time.monotonic()
+    clock.take(state(1.0, now))
+    clock.take(state(1.002, now + 0.002))
+    late = state(1.004, now + 0.004 + 0.0015)
+    clock.take(late)
+    before = time.monotonic()
+    age = clock.age(late)
+    assert before - now - 0.004 - 3e-5 <= age <= time.monotonic() - now - 0.004 + 1e-6
+
+
+def test_a_clock_that_drifts_is_followed() -> None:
+    clock = ControllerClock(500.0)
+    for k in range(100_000):
+        clock.take(state(0.002 * k, 0.002 * k * (1 + 5e-5)))
+    last = state(0.002 * 99_999, 0.002 * 99_999 * (1 + 5e-5))
+    before = time.monotonic()
+    age = clock.age(last)
+    assert before - last.received - 1e-9 <= age <= time.monotonic() - last.received + 1e-4
+
+
+def test_a_clock_that_stood_still_is_tied_anew_once_nothing_younger_comes() -> None:
+    clock = ControllerClock(500.0, hold=0.04)
+    now = time.monotonic()
+    clock.take(state(1.0, now - 0.3))
+    for k in range(25):  # its clock stood still for 0.25 s, as it seems
+        late = state(1.0 + 0.002 * k, now - 0.05 + 0.002 * k)
+        clock.take(late)
+        if not 19 <= k <= 21:
+            assert (clock.expiry(late) < late.received) == (k < 20)
+
+
+def test_while_writing_samples_that_come_later_for_good_stay_old() -> None:
+    clock = ControllerClock(500.0, hold=0.04)
+    now = time.monotonic()
+    clock.take(state(1.0, now - 3.0), writes=True)
+    for k in range(1, 1000):  # from then on 0.21 s later than before
+        late = state(1.0 + 0.002 * k, now - 3.0 + 0.21 + 0.002 * k)
+        clock.take(late, writes=True)
+        assert clock.expiry(late) < late.received
+    clock.take(state(3.0, now - 0.79), writes=False)  # nothing is written any more
+    late = state(3.002, now - 0.788)
+    clock.take(late)
+    assert clock.expiry(late) > late.received
+
+
+def test_what_a_stalled_link_hands_on_at_once_is_old_until_the_newest_has_come() -> None:
+    clock = ControllerClock(500.0, hold=0.04)
+    now = time.monotonic()
+    clock.take(state(1.0, now - 0.1))
+    fresh = []
+    for k in range(1, 51):  # of 0.1 s, all within 1 ms
+        burst = state(1.0 + 0.002 * k, now + 2e-5 * k)
+        clock.take(burst)
+        fresh.append(clock.expiry(burst) > burst.received)
+    assert not any(fresh[:29])
+    assert all(fresh[31:])
+
+
+@pytest.fixture
+def page():
+    found = Page(3)
+    yield found
+    found.close()
+
+
+def put(page: Page, timestamp: float) -> None:
+    row = page.next_row()
+    fill_row(row, page.slices, state(timestamp), Q, Q + 1, np.arange(6.0))
+    row[2:9] = 0
+    page.publish()
+
+
+def test_rows_come_through_once_and_in_order(page: Page) -> None:
+    reader = page.reader()
+    for k in range(5):
+        put(page, float(k))
+    rows = reader.drain()
+    assert rows[:, 1].tolist() == [0, 1, 2, 3, 4]
+    assert rows[0, page.slices["corrected_q"]] == pytest.approx(Q + 1)
+    assert rows[0, page.slices["offset"]] == pytest.approx(np.arange(6))
+    assert np.isnan(rows[0, page.slices["ft_raw_wrench"]]).all()
+    assert np.isnan(rows[0, page.slices["payload"]]).all()
+    assert len(reader.drain()) == 0
+    put(page, 5.0)
+    assert reader.drain()[:, 1].tolist() == [5]
+
+
+def test_rows_that_were_overwritten_are_counted_not_invented(page: Page) -> None:
+    reader = page.reader()
+    for k in range(2 * ROWS):
+        put(page, float(k))
+    rows = reader.drain()
+    assert rows[-1, 1] == 2 * ROWS - 1
+    assert (np.diff(rows[:, 1]) == 1).all()
+    assert len(rows) + reader.lost == 2 * ROWS
+
+
+def test_a_row_that_was_not_finished_is_not_read(page: Page) -> None:
+    reader = page.reader()
+    put(page, 1.0)
+    page.next_row()[1] = 99.0  # the loop was killed here
+    assert reader.drain()[:, 1].tolist() == [1]
+
+
+def test_another_process_sees_the_same_page_and_its_death_leaves_it_whole() -> None:
+    page = RunPage(3)
+    page.renew()
+    code = f"""
+import os, time
+from bridge.ipc.shared_memory import Page, Phase
+page = Page(3, {page.fd})
+page.enter(Phase.RUNNING)
+page.tell_state(3)
+page.tell_seen()
+for k in range(10):
+    page.next_row()[1] = k
+    page.publish()
+page.next_row()[1] = 77
+os.abort()
+"""
+    done = subprocess.run([sys.executable, "-c", code], pass_fds=[page.fd], check=False)
+    assert done.returncode == -6
+    assert (page.phase, page.state, page.seen, page.ended) == (Phase.RUNNING, 3, True, False)
+    assert page.reader().drain()[:, 1].tolist() == list(range(10))
+    assert 0 < page.silence < 30
+    assert os.fstat(page.fd).st_nlink == 0
+    page.close()

@@ -1,0 +1,394 @@
+"""What the loop does with setpoints that must not, cannot or did not leave."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bridge.cell.sections import LimitSettings, SetpointSettings
+from bridge.ipc.shared_memory import Page
+from bridge.loop.live_loads import LiveLoads
+from bridge.loop.offset_in_force import OffsetInForce
+from bridge.loop.setpoint_stream import SetpointStream
+from bridge.loop.supervisor import Cause, State, Supervisor
+from bridge.loop.writing import PARTS_IN_A_ROW, Writing
+from bridge.setpoint_source import make_source
+from core.arm import builtin_arm
+from core.compensation import Correction
+from core.errors import (
+    ForeignCommandError,
+    IneffectiveWriteError,
+    LinkError,
+    PartialWriteError,
+    WriteError,
+)
+from core.loads import Loads
+from core.model import Model
+from core.setpoint import Setpoint
+from core.state import RobotState
+from drivers.driver import Driver
+
+Q = np.array([0.0, -1.5, 1.8, -1.87, -1.57, 0.0])
+T = 0.002
+MODEL = Model(builtin_arm("ur10e")).with_compliance([1e-6] * 6, [1e-6] * 6)
+
+
+class Failing(Driver):
+    """A driver whose writes fail as they are told to; no wire fails so exactly."""
+
+    def __init__(self) -> None:
+        super().__init__(500.0, MODEL)
+        self.error: LinkError | None = None
+        self.sent: list[np.ndarray] = []
+        self.released = 0
+        self.taken: float | None = None  # s, of a question and its answer
+
+    def round_trip(self) -> float | None:
+        return self.taken
+
+    def connect(self) -> None: ...
+
+    def read_state(self) -> RobotState:
+        raise NotImplementedError
+
+    def _send(self, setpoint: Setpoint) -> None:
+        if self.error is not None:
+            raise self.error
+        self.sent.append(setpoint.q.copy())
+
+    def _let_go(self) -> None:
+        self.released += 1
+
+    def close(self) -> None: ...
+
+
+class Stream(SetpointStream):
+    """A stream whose model can be made to give no numbers."""
+
+    broken = False
+    unsolvable = 0.0  # m: the residual instead
+
+    def correct(self, nominal_q: np.ndarray, loads: Loads) -> Correction:
+        found = super().correct(nominal_q, loads)
+        if self.broken:
+            self.residual, self.finite = np.nan, False
+        self.residual = self.unsolvable or self.residual
+        return found
+
+
+class Bench:
+    """A loop's writing half, compensating."""
+
+    def __init__(self, page: Page) -> None:
+        self.page, self.driver, self.lost = page, Failing(), list[str]()
+        self.changes: list[tuple[str, str]] = []  # cause and detail
+        self.supervisor = Supervisor(lambda *change: self.changes.append(change[2:]))
+        self.supervisor.state = State.ARMED
+        self.stream = Stream(MODEL, LimitSettings(), 500.0)
+        self.loads = LiveLoads(6, True, 0.0)
+        settings = SetpointSettings()
+        source = make_source(settings, 6, True, Path())
+        told: list[dict[str, Any]] = []
+        self.writing = Writing(
+            settings, self.driver, source, self.stream, self.supervisor, page, told.append,
+            lambda: None, self.lost.append,
+        )  # fmt: skip
+        self.at, self.q = 1.0, Q
+        self.writing.start(self.state(), Q)
+        self.writing.start(self.state(), Q)
+        assert self.supervisor.state == State.COMPENSATING
+
+    def state(self) -> RobotState:
+        self.at += T
+        return RobotState(self.at, 0.0, self.q, np.zeros(6), self.q, np.zeros(6))
+
+    def rearm(self) -> None:
+        """Arm once more where the arm was left."""
+        self.supervisor.state = State.ARMED
+        for _ in range(2):
+            self.writing.start(self.state(), self.q)
+        assert self.supervisor.state == State.COMPENSATING
+
+    def cycles(self, count: int) -> None:
+        for _ in range(count):
+            state = self.state()
+            if self.supervisor.state.writes:
+                self.writing.write(state, self.q, self.loads.update(state))
+                self.driver.gate.clock = lambda: self.at
+
+    def count(self, name: str) -> int:
+        return self.page.counts()[name]
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    page = Page(6)
+    yield Bench(page)
+    page.close()
+
+
+def test_a_correction_that_is_no_number_never_leaves_and_is_a_fault(bench: Bench) -> None:
+    bench.cycles(50)
+    sent = len(bench.driver.sent)
+    assert sent == 50
+    bench.stream.broken = True
+    bench.cycles(50)
+    assert bench.supervisor.state == State.FAULT
+    assert len(bench.driver.sent) == sent
+    assert bench.driver.released == 1
+    assert bench.count("bad_output") == 1
+
+
+@pytest.mark.parametrize("residual", [np.inf, 1e-3])
+def test_an_unsolved_correction_ends_the_motion_and_its_offset_is_ramped_out(
+    bench: Bench, residual: float
+) -> None:
+    bench.cycles(400)
+    before = len(bench.driver.sent)
+    assert np.abs(bench.stream.limiter.offset_in_base[:3]).max() > 5e-5
+    bench.stream.unsolvable = residual
+    bench.cycles(1)
+    assert bench.supervisor.state == State.HOLDING
+    assert "correction unsolved" in bench.changes[-1][0]
+    assert ("no equilibrium" if np.isinf(residual) else "1 mm from") in bench.changes[-1][1]
+    assert bench.count("unsolved") == 1
+    offsets = []
+    for _ in range(400):
+        bench.cycles(1)
+        offsets.append(bench.stream.limiter.offset_in_base.copy())
+    assert bench.stream.is_bare
+    assert len(bench.driver.sent) == before + 401  # ramped out, not dropped
+    assert np.abs(bench.driver.sent[-1] - Q).max() < 1e-12
+    lengths = np.linalg.norm(offsets, axis=1)
+    assert lengths[200] > 0.1 * lengths[0]  # over the ramp's time
+    assert np.abs(np.diff(lengths)).max() < 1.1 * lengths[0] / 250
+
+
+def test_nothing_leaves_that_is_made_of_an_old_state_and_the_next_step_is_no_larger(
+    bench: Bench,
+) -> None:
+    bench.cycles(50)
+    sent, offset = len(bench.driver.sent), bench.stream.limiter.offset_in_base
+    state = bench.state()
+    for expiry in (-np.inf, time.monotonic() - 1e-6):
+        assert bench.writing.write(state, Q, bench.loads.update(state), expiry) is None
+    assert len(bench.driver.sent) == sent
+    assert (bench.stream.limiter.offset_in_base == offset).all()
+    bench.cycles(1)
+    assert len(bench.driver.sent) == sent + 1
+    assert bench.supervisor.state == State.COMPENSATING
+
+
+def test_what_takes_the_watchdog_too_long_to_hear_lets_nothing_old_leave(bench: Bench) -> None:
+    bench.driver.keep_alive = lambda: time.sleep(0.03)  # type: ignore[method-assign]
+    state = bench.state()
+    expiry = time.monotonic() + 0.02
+    assert bench.writing.write(state, Q, bench.loads.update(state), expiry) is None
+    assert not bench.driver.sent
+    assert bench.count("late") == 1
+
+
+def test_a_process_that_was_stopped_after_the_judgement_sends_nothing_old(bench: Bench) -> None:
+    bench.cycles(50)
+    sent, limit = len(bench.driver.sent), bench.stream.limiter.limit
+
+    def stopped_after(*given: Any) -> Any:
+        found = limit(*given)
+        time.sleep(0.03)
+        return found
+
+    bench.stream.limiter.limit = stopped_after  # type: ignore[method-assign]
+    state = bench.state()
+    expiry = time.monotonic() + 0.02
+    assert bench.writing.write(state, Q, bench.loads.update(state), expiry) is None
+    assert bench.writing.unsent is not None
+    assert len(bench.driver.sent) == sent
+    assert bench.count("late") == 1
+    assert bench.supervisor.state == State.COMPENSATING
+    bench.stream.limiter.limit = limit  # type: ignore[method-assign]
+    bench.cycles(1)
+    assert len(bench.driver.sent) == sent + 1
+
+
+def test_a_process_that_was_stopped_while_it_sent_says_so_and_ends_the_motion(
+    bench: Bench,
+) -> None:
+    bench.driver._send = lambda _: time.sleep(0.03)  # type: ignore[method-assign]
+    state = bench.state()
+    expiry = time.monotonic() + 0.02
+    assert bench.writing.write(state, Q, bench.loads.update(state), expiry) is not None
+    assert bench.supervisor.state == State.HOLDING
+    assert bench.count("overrun") == 1
+
+
+def test_a_setpoint_that_left_in_part_is_followed_by_a_whole_one(bench: Bench) -> None:
+    bench.cycles(10)
+    bench.driver.error = PartialWriteError("1 of 3 frames")
+    bench.cycles(PARTS_IN_A_ROW - 1)
+    bench.driver.error = None
+    bench.cycles(10)
+    assert bench.supervisor.state == State.COMPENSATING
+    assert len(bench.driver.sent) == 20
+    assert bench.count("write_partial") == PARTS_IN_A_ROW - 1
+    assert bench.count("write_ineffective") == 0
+
+
+@pytest.mark.parametrize(
+    ("error", "cycles", "counter"),
+    [
+        (PartialWriteError("1 of 3"), PARTS_IN_A_ROW, "write_ineffective"),
+        (IneffectiveWriteError("no echo"), 1, "write_ineffective"),
+        (ForeignCommandError("two masters"), 1, "foreign"),
+    ],
+)
+def test_what_a_live_link_does_not_take_holds_and_then_is_a_fault(
+    bench: Bench, error: LinkError, cycles: int, counter: str
+) -> None:
+    bench.driver.error = error
+    bench.cycles(cycles)
+    assert bench.supervisor.state == State.HOLDING
+    assert bench.count(counter) == 1
+    bench.cycles(cycles)
+    assert bench.supervisor.state == State.FAULT
+    assert bench.driver.released == 1
+    assert bench.lost == []
+    bench.cycles(10)
+    assert bench.driver.sent == []
+
+
+def test_a_write_that_fails_gives_the_link_up(bench: Bench) -> None:
+    bench.driver.error = WriteError("the script has ended")
+    bench.cycles(3)
+    assert bench.supervisor.state == State.FAULT
+    assert bench.lost == ["the script has ended"]
+    assert bench.count("write_failed") == 1
+
+
+def test_holding_brings_the_offset_to_nothing_and_no_step_is_too_large(bench: Bench) -> None:
+    bench.cycles(500)
+    last = bench.stream.limiter.offset_in_base
+    assert np.abs(last).max() > 0.0
+    bench.driver.error = IneffectiveWriteError("no echo")
+    bench.cycles(1)
+    bench.driver.error = None
+    bench.cycles(600)
+    assert bench.supervisor.state == State.HOLDING
+    assert not bench.stream.limiter.offset_in_base.any()
+
+
+@pytest.mark.parametrize(("taken", "armed"), [(None, True), (0.03, True), (0.21, False)])
+def test_a_long_way_to_the_controller_is_refused_at_arming(
+    bench: Bench, taken: float | None, armed: bool
+) -> None:
+    bench.writing.release()
+    bench.supervisor.state = State.ARMED
+    bench.driver.taken = taken
+    bench.writing.start(bench.state(), Q)
+    assert bench.writing.ready == armed
+    assert (bench.supervisor.state == State.ARMED) == armed
+    if not armed:
+        assert bench.changes[-1][1].startswith("link: a question and its answer take 210 ms")
+
+
+def tcp_of(q: np.ndarray) -> np.ndarray:
+    return MODEL.rigid_pose(q[None]).position[0]
+
+
+def test_faults_and_armings_in_turn_do_not_add_up(bench: Bench) -> None:
+    """The arm is left at its offset each time; what its program wanted stays where it was."""
+    shifts = []
+    for _ in range(4):
+        bench.cycles(700)
+        shifts.append(np.linalg.norm(tcp_of(bench.driver.sent[-1]) - tcp_of(Q)))
+        bench.supervisor.take(Cause.SILENCE)
+        bench.writing.release()
+        assert bench.supervisor.state == State.FAULT
+        bench.q = bench.driver.sent[-1].copy()
+        bench.rearm()
+    assert shifts[0] > 1e-4
+    assert shifts == pytest.approx([shifts[0]] * 4, rel=1e-3)
+
+
+def test_a_beginning_with_an_offset_in_force_makes_no_step(bench: Bench) -> None:
+    bench.cycles(100)  # in the middle of the ramp
+    bench.supervisor.take(Cause.SILENCE)
+    bench.writing.release()
+    bench.q = bench.driver.sent[-1].copy()
+    bench.rearm()
+    bench.cycles(700)
+    joints = np.array(bench.driver.sent)
+    steps = np.linalg.norm(np.diff([tcp_of(q) for q in joints], axis=0), axis=1)
+    assert steps.max() <= 0.05 * T * 1.01
+
+
+def test_an_arm_that_somebody_has_moved_begins_without_an_offset(bench: Bench) -> None:
+    bench.cycles(700)
+    bench.supervisor.take(Cause.SILENCE)
+    bench.writing.release()
+    bench.q = bench.driver.sent[-1] + 0.1
+    bench.rearm()
+    bench.cycles(1)
+    assert bench.driver.sent[-1] == pytest.approx(bench.q, abs=1e-5)
+    assert np.linalg.norm(bench.stream.limiter.offset_in_base) < 1e-5
+
+
+def test_an_offset_in_force_outlives_the_process_that_left_it(tmp_path: Path) -> None:
+    path = tmp_path / "arm.offset"
+    delta, offset = np.full(6, 1e-3), np.full(6, 2e-3)
+    code = (
+        "import sys, os, numpy as np; from pathlib import Path\n"
+        "from bridge.loop.offset_in_force import OffsetInForce\n"
+        f"kept = OffsetInForce(6, Path({str(path)!r}))\n"
+        "for k in range(5): kept.note(np.full(6, 0.1 * k), np.full(6, 1e-3), np.full(6, 2e-3))\n"
+        "os.kill(os.getpid(), 9)\n"
+    )
+    paths = os.pathsep.join(p for p in sys.path if p)
+    subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": paths})
+    kept = OffsetInForce(6, path)
+    found = kept.at(np.full(6, 0.4))
+    assert found is not None
+    assert (found.delta == delta).all() and (found.offset_in_base == offset).all()
+    assert kept.at(np.full(6, 0.3)) is None
+    assert path.stat().st_mode & 0o777 == 0o600
+    kept.note(np.full(6, 0.4), np.zeros(6), np.zeros(6))
+    assert kept.at(np.full(6, 0.4)) is None
+    assert OffsetInForce(7, path).at(np.zeros(7)) is None  # another arm
+
+
+def test_a_clock_that_goes_back_withdraws_the_offset_step_by_step(bench: Bench) -> None:
+    bench.cycles(700)
+    offset = [bench.stream.limiter.offset_in_base]
+    assert np.linalg.norm(offset[0]) > 1e-4
+    bench.supervisor.take(Cause.IMPLAUSIBLE)  # what the watch over states makes of it
+    bench.at -= 5.0
+    bench.driver.gate.clock = time.monotonic
+    for _ in range(700):
+        bench.cycles(1)
+        offset.append(bench.stream.limiter.offset_in_base)
+    assert bench.supervisor.state == State.HOLDING
+    assert not offset[-1].any()
+    assert np.linalg.norm(np.diff(offset, axis=0)[:, :3], axis=1).max() <= 0.05 * T * 1.001
+
+
+def test_what_the_gate_refuses_holds_and_then_is_a_fault(bench: Bench) -> None:
+    """The limiter's memory is written over: nothing of it leaves."""
+    bench.cycles(50)
+    sent = len(bench.driver.sent)
+    limiter = bench.stream.limiter
+    limiter._q[:] = Q + 0.3
+    limiter.limits.__dict__["following"] = 10.0
+    bench.cycles(1)
+    assert len(bench.driver.sent) == sent
+    assert bench.supervisor.state == State.HOLDING
+    bench.cycles(1)
+    assert bench.supervisor.state == State.FAULT
+    assert len(bench.driver.sent) == sent
+    assert bench.count("setpoint_refused") == 2

@@ -1,0 +1,112 @@
+"""Replay of what seldom happens: setpoints refused or sent in part, gaps, a sensor that is lost."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from test_replayed_loop import assert_same_bits
+
+from bridge.cell import load_cell
+from bridge.cell.daemon_settings import DaemonSettings
+from bridge.cell.sections import SetpointSettings
+from bridge.cell.settings.recording import RecordingSettings
+from bridge.ipc.command_page import Command, CommandPage, Commands
+from bridge.ipc.shared_memory import Page
+from bridge.loop.loop import Exit, Loop
+from bridge.loop.main import _compile
+from bridge.loop.replay import ReplayedLoop
+from bridge.recording.recorder import Recorder
+from bridge.setpoint_source.target import TargetSource
+from core.errors import LinkError, PartialWriteError
+from core.log.mcap_reading import read_columns
+from core.model import Model
+from core.setpoint import Setpoint
+from core.state import RobotState
+from drivers.driver import Driver
+from drivers.replay import ReplayDriver, ReplaySettings
+
+N = 6
+CELL = """\
+robot: {model: ur5e}
+compliance: {axial: [8e-6, 8e-6, 8e-6, 8e-6, 8e-6, 8e-6], radial: [0, 0, 0, 0, 0, 0]}
+"""
+HOME = np.array([0.3, -1.2, 1.4, -0.6, 0.4, 0.2])
+
+
+class Scripted(Driver):
+    """A controller whose own program swings the arm, with mishaps at known cycles."""
+
+    def __init__(self, cycles: int, commands: CommandPage, model: Model) -> None:
+        super().__init__(20.0, model, moves_arm=False)  # no deadline that a busy machine misses
+        self._now = 0.0  # s, of the script
+        self.gate.clock = lambda: self._now
+        self._count = iter(range(cycles))
+        self._commands = commands
+        self._writes = itertools.count(1)
+        self._random = np.random.default_rng(3)
+
+    def connect(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    def read_state(self) -> RobotState:
+        k = next(self._count, None)
+        if k is None:
+            raise LinkError("the script has come to its end")
+        if k in (700, 1500):
+            self._commands.ask(Command.DISARM)
+        if k in (20, 900):
+            self._commands.ask(Command.ARM)
+        t = self._now = 0.002 * k + (3.0 if k > 1300 else 0.0)  # a gap
+        q = HOME + 0.2 * np.sin(t + np.arange(N))
+        target = q + (0.1 if 400 <= k < 402 else 0.0)  # a jump
+        force = self._random.normal(0.0, 8.0, 6)
+        lost = "unplugged" if 1000 <= k < 1050 else ""
+        return RobotState(
+            timestamp=t, received=time.monotonic(), actual_q=q, actual_qd=np.zeros(N),
+            target_q=target, actual_TCP_force=np.full(6, np.nan) if lost else force, payload=4.0,
+            payload_cog=np.array([0.0, 0.0, 0.06]), sensor_lost=lost,
+        )  # fmt: skip
+
+    def _send(self, setpoint: Setpoint) -> None:
+        if next(self._writes) % 53 == 0:
+            raise PartialWriteError("half of it")
+
+
+def run(loop: Loop, page: Page, commands: CommandPage, folder: Path, name: str) -> dict[str, Any]:
+    settings = RecordingSettings(folder=folder, keep_free=0.0)
+    recorder = Recorder(settings, name, page, {}, lambda _: None)
+    assert loop.run(Commands(commands.fd), True) in (Exit.LINK, Exit.DONE)
+    recorder.close()
+    return read_columns(folder / name)
+
+
+def test_refused_and_half_sent_setpoints_gaps_and_lost_sensors_are_replayed(tmp_path: Path) -> None:
+    cell = tmp_path / "cell.yaml"
+    cell.write_text(CELL)
+    model = load_cell(cell).model
+    settings = DaemonSettings(cell=cell)
+    page, commands, told = Page(N), CommandPage(), []
+    source = TargetSource(SetpointSettings(), N, False, tmp_path, 20.0)
+    loop = Loop(settings, model, Scripted(1800, commands, model), source, page, told.append)
+    _compile(settings, model)  # else the first cycles are late
+    then = run(loop, page, commands, tmp_path, "then")
+    flags = then["flags"].astype(int)
+    assert {0.0, 1.0, 2.0} == set(then["attempted"])
+    refused = (then["attempted"] == 1) & (then["written"] == 0)
+    assert refused.any(), told
+    assert (flags & 1).any()  # sensor lost
+    assert (flags & 4).any()  # gap
+    assert (flags & 8).any()  # ramping out
+    assert then["written"].sum() > 500
+
+    page, commands = Page(N), CommandPage()
+    driver = ReplayDriver(ReplaySettings(file=tmp_path / "then", speed=100.0), model)
+    again = ReplayedLoop(settings, model, driver, source, page, lambda _: None)
+    assert_same_bits(run(again, page, commands, tmp_path, "again"), then, len(then["number"]))

@@ -1,0 +1,154 @@
+"""From a nominal setpoint to what may leave: led over, corrected, ramped, limited, braked."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bridge.cell.sections import LimitSettings
+from bridge.loop.nominal_stream import DECELERATION, NominalStream
+from bridge.loop.setpoint_stream import SetpointStream, limits_of
+from core.arm import builtin_arm
+from core.compensation import correct
+from core.errors import LimitError
+from core.loads import Loads
+from core.model import Model
+from core.setpoint import Setpoint
+from core.state import RobotState
+
+Q = np.array([0.0, -1.5, 1.8, -1.87, -1.57, 0.0])
+CYCLE = 0.002
+LIGHT = Loads(payload_mass=np.array([5.0]), payload_cog=np.array([[0.0, 0.0, 0.06]]))
+
+
+def model(soft: float = 5e-6) -> Model:
+    found = Model(builtin_arm("ur10e"), payload_mass=5.0)
+    return found.with_compliance(axial=np.full(6, soft), radial=np.full(6, soft / 5))
+
+
+def state(at: float, q: np.ndarray = Q) -> RobotState:
+    return RobotState(at, at, q, np.zeros(6), q, np.zeros(6))
+
+
+class Run:
+    """Drives a stream as the loop does, with an arm that follows at once."""
+
+    def __init__(self, soft: float = 5e-6, **limits: float) -> None:
+        self.stream = SetpointStream(model(soft), LimitSettings(**limits), 500.0)
+        self.at, self.q = 100.0, Q.copy()
+        self.sent: list[Setpoint] = []
+        self.stream.start(Q, self.at)
+
+    def cycles(
+        self, count: int, source: np.ndarray | None = Q, goal: float = 1.0, gap: float = CYCLE
+    ) -> Setpoint:
+        for _ in range(count):
+            found = self.stream.advance(state(self.at, self.q), source, LIGHT, goal)
+            self.q = found.q.copy()
+            copy = found.offset_in_base.copy()
+            self.sent.append(Setpoint(self.q, found.nominal_q.copy(), copy, self.at, self.at))
+            self.at += gap
+        return self.sent[-1]
+
+    def steps(self) -> np.ndarray:
+        return np.diff([Q, *(s.q for s in self.sent)], axis=0)
+
+
+def test_the_offset_ramps_in_to_the_whole_correction_and_out_to_none() -> None:
+    run = Run()
+    first = run.cycles(1)
+    assert np.abs(first.q - Q).max() < 1e-5
+    whole = run.cycles(400)
+    wanted = correct(model(), Q[None], LIGHT)
+    assert whole.q == pytest.approx(wanted.q[0], abs=1e-12)
+    assert whole.offset_in_base == pytest.approx(wanted.offset_in_base[0], abs=1e-12)
+    assert np.linalg.norm(whole.offset_in_base[:3]) > 3e-4
+    lengths = [np.linalg.norm(s.offset_in_base) for s in run.sent]
+    assert np.diff(lengths).min() > -1e-9
+    end = run.cycles(400, goal=0.0)
+    assert end.q == pytest.approx(Q, abs=1e-15)
+    assert run.stream.rests
+    assert np.abs(run.steps()).max() < 1e-4
+
+
+def test_a_first_setpoint_beside_the_arm_is_led_over_to_without_a_jump() -> None:
+    run = Run(soft=1e-9)
+    beside = Q + np.array([0.019, -0.019, 0.01, 0.0, 0.015, -0.019])
+    end = run.cycles(400, source=beside)
+    assert end.nominal_q == pytest.approx(beside, abs=1e-12)
+    assert np.abs(run.steps()).max() < 1.6 * 0.019 / 250
+    assert run.stream.limiter.counts.sum() == 0
+
+
+def test_a_source_that_dries_up_in_motion_brakes_smoothly_and_comes_to_rest() -> None:
+    run = Run(soft=1e-9)
+    speed = np.array([0.8, -0.4, 0.2, 0.0, 0.0, 0.1])
+    run.cycles(300)
+    for k in range(1, 200):
+        run.cycles(1, source=Q + speed * k * CYCLE)
+    assert not run.stream.rests
+    run.cycles(400, source=None, goal=0.0)
+    assert run.stream.rests
+    acceleration = np.diff(run.steps(), axis=0)[520:] / CYCLE**2
+    assert np.abs(acceleration).max() < 1.2 * DECELERATION
+    way = run.sent[-1].q - Q
+    assert way == pytest.approx(way[0] / speed[0] * speed, abs=1e-6)
+
+
+def test_numbers_that_are_not_finite_never_leave() -> None:
+    run = Run()
+    before = run.cycles(400)
+    with pytest.raises(LimitError):
+        run.cycles(1, source=np.array([0.0, np.nan, 0.0, 0.0, 0.0, 0.0]))
+    with pytest.raises(LimitError):
+        run.cycles(1, source=np.full(6, np.inf))
+    after = run.cycles(1)
+    assert after.q == pytest.approx(before.q, abs=1e-9)
+
+
+def test_a_jump_of_the_source_is_refused() -> None:
+    run = Run()
+    run.cycles(400)
+    with pytest.raises(LimitError, match="joint 2 jumps"):
+        run.cycles(1, source=Q + np.array([0, 0.2, 0, 0, 0, 0]))
+
+
+def test_a_clock_that_stands_still_is_refused() -> None:
+    run = Run()
+    run.cycles(10)
+    run.at -= CYCLE
+    with pytest.raises(LimitError, match="gap"):
+        run.cycles(1)
+
+
+def test_the_envelope_holds_back_what_a_wrong_model_wants() -> None:
+    run = Run(soft=2e-4, offset=0.002)
+    end = run.cycles(500)
+    assert np.linalg.norm(end.offset_in_base[:3]) == pytest.approx(0.002, rel=1e-6)
+    assert run.stream.clamped
+    lengths = [np.linalg.norm(s.offset_in_base[:3]) for s in run.sent]
+    assert np.diff(lengths, prepend=0).max() <= 0.05 * CYCLE * 1.0001
+
+
+def test_limits_come_from_the_arm_and_the_cell() -> None:
+    arm = builtin_arm("ur10e")
+    limits = limits_of(LimitSettings(joint_margin=0.1, joint_velocity=1.0), arm, 250.0)
+    assert limits.lower == pytest.approx(arm.limits.lower + 0.1)
+    assert limits.upper == pytest.approx(arm.limits.upper - 0.1)
+    assert limits.velocity == pytest.approx(np.minimum(arm.limits.velocity, 1.0))
+    assert limits.cycle == pytest.approx(0.004)
+
+
+def test_braking_keeps_the_direction_and_ends_after_the_right_way() -> None:
+    speed = np.array([1.0, -0.5])
+    stream = NominalStream(np.full(2, 3.0))
+    stream.start(np.zeros(2))
+    for k in range(1, 200):
+        stream.follow(speed * k * CYCLE, CYCLE)
+    begin = stream.q.copy()
+    while not stream.rests:
+        stream.brake(CYCLE)
+    way = stream.q - begin
+    assert way[0] == pytest.approx(1.0 / (2 * DECELERATION), rel=0.03)
+    assert way[1] == pytest.approx(-0.5 * way[0], rel=1e-6)
+    assert stream.brake(CYCLE) == pytest.approx(stream.q)

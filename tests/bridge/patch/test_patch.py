@@ -1,0 +1,210 @@
+"""Patched models against the product's own prediction: MuJoCo and Pinocchio run them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bridge.patch import PatchOptions, changes_of, format_of
+from core.arm import builtin_arm
+from core.effects import Site, Term
+from core.errors import InputError
+from core.model import Model
+from tests.bridge.patch.arms_written import BASE_AT, BASE_TURN, UR_JOINTS, mjcf, urdf
+
+mujoco = pytest.importorskip("mujoco")
+pinocchio = pytest.importorskip("pinocchio")
+
+ARM = builtin_arm("ur10e")
+TOOL = np.eye(4)
+TOOL[2, 3] = 0.1
+NOMINAL = Model(ARM, TOOL)
+GEOMETRY = (
+    Term("joint_offset", Site(3), (0.004,)),
+    Term("link_geometry", Site(1), (1e-3, -2e-3, 3e-3)),
+    Term("link_geometry", Site(2), (2e-3, 1e-3, -1e-3, 2e-3)),
+    Term("link_geometry", Site(4), (-1e-3, 2e-3, 1e-3)),
+    Term("tool_frame", Site(), (1e-3, 2e-3, -1e-3, 0.0, 0.0, 0.0)),
+)
+SIX_DIGITS = 5e-6  # of MuJoCo's own writer
+SOME_Q = np.random.default_rng(5).uniform(-2, 2, (12, 6))
+
+
+def patched(path: Path, text: str, model: Model, tcp: str) -> tuple[str, list[str], list[str]]:
+    path.write_text(text)
+    found = format_of(path).patch(path, changes_of(model), PatchOptions(tcp=tcp), ["a note"])
+    return found.text, list(found.changed), list(found.not_held)
+
+
+def fitting(terms: tuple[Term, ...]) -> tuple[Term, ...]:
+    """Return the terms with as many values as their effects have."""
+    from core.effects import CATALOGUE
+
+    return tuple(
+        Term(t.effect, t.site, t.values[: len(CATALOGUE[t.effect].parameters(ARM, t.site))])
+        for t in terms
+    )
+
+
+def in_base(position: np.ndarray) -> np.ndarray:
+    return BASE_TURN.inv().apply(position - BASE_AT)
+
+
+def test_a_patched_urdf_is_where_predict_is(tmp_path: Path) -> None:
+    model = NOMINAL.with_terms(fitting(GEOMETRY))
+    text, _, missing = patched(tmp_path / "a.urdf", urdf(ARM, UR_JOINTS), model, "tool")
+    (tmp_path / "b.urdf").write_text(text)
+    robot = pinocchio.buildModelFromUrdf(str(tmp_path / "b.urdf"))
+    data, frame = robot.createData(), robot.getFrameId("tool")
+    expected = model.predict(SOME_Q)
+    for k, q in enumerate(SOME_Q):
+        pinocchio.framesForwardKinematics(robot, data, q)
+        found = data.oMf[frame]
+        assert np.allclose(found.translation, expected.position[k], rtol=0, atol=1e-9)
+        assert np.allclose(found.rotation, expected.rotation[k], rtol=0, atol=1e-9)
+    assert not missing
+
+
+def test_a_urdf_keeps_its_comments_order_and_what_does_not_change(tmp_path: Path) -> None:
+    given = urdf(ARM, UR_JOINTS)
+    model = NOMINAL.with_terms([Term("joint_offset", Site(3), (0.004,)),
+                                Term("coulomb_friction", Site(2), (4.0,))])  # fmt: skip
+    text, _, _ = patched(tmp_path / "a.urdf", given, model, "")
+    before, after = given.splitlines(), text.splitlines()
+    new = [line for line in after if line not in before]
+    gone = [line for line in before if line not in after]
+    assert len(gone) == 1
+    assert "<origin" in gone[0]
+    assert sum("<dynamics" in line for line in new) == 1
+    assert "<!-- kept -->" in text
+    assert '<!-- origin xyz="9 9 9" -->' in text
+
+
+def test_a_patched_mjcf_is_where_predict_is(tmp_path: Path) -> None:
+    model = NOMINAL.with_terms(fitting(GEOMETRY))
+    text, _, missing = patched(tmp_path / "a.xml", mjcf(ARM, UR_JOINTS), model, "tcp")
+    compiled = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(compiled)
+    expected = model.predict(SOME_Q)
+    for k, q in enumerate(SOME_Q):
+        data.qpos[:] = q
+        mujoco.mj_forward(compiled, data)
+        found = data.site("tcp")
+        assert np.allclose(in_base(found.xpos), expected.position[k], rtol=0, atol=SIX_DIGITS)
+        turned = BASE_TURN.as_matrix().T @ found.xmat.reshape(3, 3)
+        assert np.allclose(turned, expected.rotation[k], rtol=0, atol=SIX_DIGITS)
+    assert not missing
+
+
+def settled(text: str, q: np.ndarray) -> np.ndarray:
+    """Return where the TCP of an MJCF model rests in base, its named joints held at q."""
+    compiled = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(compiled)
+    for name, angle in zip(UR_JOINTS, q, strict=True):
+        joint = compiled.joint(name)
+        data.qpos[joint.qposadr[0]] = angle
+        compiled.dof_armature[joint.dofadr[0]] = 1e12  # a rotor that nothing turns
+    for _ in range(3000):
+        mujoco.mj_step(compiled, data)
+    return in_base(data.site("tcp").xpos)
+
+
+@pytest.mark.parametrize(
+    "terms",
+    [
+        [Term("axial_compliance", Site(2), (2e-5,)), Term("axial_compliance", Site(3), (4e-5,))],
+        [Term("radial_compliance", Site(2), (2e-5,)), Term("radial_compliance", Site(4), (5e-5,))],
+        [Term("stiffness_nonlinearity", Site(2), (2e-5, 1 / 900.0**2))],
+    ],
+    ids=["axial", "radial", "nonlinear"],
+)
+def test_springs_bend_as_predicted(tmp_path: Path, terms: list[Term]) -> None:
+    model = NOMINAL.with_terms(terms)
+    text, changed, _ = patched(tmp_path / "a.xml", mjcf(ARM, UR_JOINTS), model, "tcp")
+    q = np.array([0.3, -0.6, 0.9, -0.4, 1.1, 0.2])
+    bent, rigid = model.predict(q[None]).position[0], NOMINAL.predict(q[None]).position[0]
+    found = settled(text, q)
+    assert np.linalg.norm(found - bent) < 0.01 * np.linalg.norm(bent - rigid)
+    assert any("nq is" in line for line in changed)
+
+
+def test_keyframes_still_hold_the_joints_angles(tmp_path: Path) -> None:
+    model = NOMINAL.with_terms([Term("radial_compliance", Site(2), (2e-5,))])
+    text, _, _ = patched(tmp_path / "a.xml", mjcf(ARM, UR_JOINTS), model, "tcp")
+    compiled = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(compiled)
+    mujoco.mj_resetDataKeyframe(compiled, data, 0)
+    at = [data.joint(name).qpos[0] for name in UR_JOINTS]
+    assert np.allclose(at, 0.1 * np.arange(6))
+
+
+def test_moving_effects_become_the_joints_and_actuators_own(tmp_path: Path) -> None:
+    model = NOMINAL.with_terms([
+        Term("coulomb_friction", Site(1), (3.0,)), Term("viscous_friction", Site(2), (5.0,)),
+        Term("rotor_inertia", Site(3), (0.4,)), Term("latency", Site(4), (0.02,)),
+        Term("tracking_lag", Site(5), (0.05,)), Term("backlash", Site(6), (0.002,)),
+        Term("link_inertia", Site(2), (0.1,)), Term("payload", Site(), (1.5,)),
+    ])  # fmt: skip
+    given = mjcf(ARM, UR_JOINTS, kp=1e4)
+    text, _, missing = patched(tmp_path / "a.xml", given, model, "tcp")
+    compiled, before = (mujoco.MjModel.from_xml_string(t) for t in (text, given))
+    dof = [compiled.joint(name).dofadr[0] for name in UR_JOINTS]
+    assert compiled.dof_frictionloss[dof[0]] == pytest.approx(3.0)
+    assert np.ravel(compiled.dof_damping[dof[1]])[0] == pytest.approx(5.0)
+    assert compiled.dof_armature[dof[2]] == pytest.approx(0.4)
+    assert compiled.actuator_dynprm[4, 0] == pytest.approx(0.05)
+    play = compiled.joint("wrist_3_joint_backlash")
+    assert np.allclose(play.range, [-0.001, 0.001])
+    ratio = compiled.body("link_2").mass[0] / before.body("link_2").mass[0]
+    assert ratio == pytest.approx(1.1)
+    assert compiled.body("payload_difference").mass[0] == pytest.approx(1.5)
+    assert not missing
+
+
+def test_a_delayed_actuator_moves_later(tmp_path: Path) -> None:
+    model = NOMINAL.with_terms([Term("latency", Site(1), (0.02,))])
+    text, _, _ = patched(tmp_path / "a.xml", mjcf(ARM, UR_JOINTS, kp=1e5), model, "tcp")
+    compiled = mujoco.MjModel.from_xml_string(text)
+    compiled.opt.gravity[:] = 0
+    data = mujoco.MjData(compiled)
+    data.ctrl[0] = 0.1
+    moved = []
+    for _ in range(40):
+        mujoco.mj_step(compiled, data)
+        moved.append(abs(data.joint(UR_JOINTS[0]).qpos[0]) > 1e-9)
+    assert 19 <= moved.index(True) <= 23
+
+
+def test_what_no_format_holds_is_listed_with_what_people_do(tmp_path: Path) -> None:
+    wave = Term("transmission_error", Site(1, 2.0), (1e-4, 2e-4))
+    model = NOMINAL.with_terms([wave, Term("tool_frame", Site(), (1e-3, 0.0, 0.0, 0.0, 0.0, 0.0))])
+    text, _, missing = patched(tmp_path / "a.urdf", urdf(ARM, UR_JOINTS), model, "")
+    assert any("transmission_error" in line and "sin" in line for line in missing)
+    assert any("- -tcp" in line or "--tcp" in line for line in missing)
+    assert "transmission_error" in text
+
+
+def test_another_arm_is_refused_by_the_joint_that_does_not_agree(tmp_path: Path) -> None:
+    (tmp_path / "a.urdf").write_text(urdf(builtin_arm("ur5e"), UR_JOINTS))
+    with pytest.raises(InputError, match=r"joint \w+: found its axis .* off the cell's"):
+        format_of(tmp_path / "a.urdf").patch(
+            tmp_path / "a.urdf", changes_of(NOMINAL), PatchOptions(), []
+        )
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("a.urdf", "<robot", "broken XML"),
+        ("a.urdf", "<sdf/>", "found <sdf>"),
+        ("a.xml", "<mujoco><worldbody><body/></worldbody></mujoco", "no MJCF that compiles"),
+        ("a.urdf", "<robot name='x'><link name='a'/></robot>", "joints: found"),
+    ],
+)
+def test_what_is_no_model_is_one_line(tmp_path: Path, name: str, text: str, said: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=said) as error:
+        format_of(tmp_path / name).patch(tmp_path / name, changes_of(NOMINAL), PatchOptions(), [])
+    assert "\n" not in str(error.value)

@@ -1,0 +1,23 @@
+"""The documentation's catalogue is what the effects say of themselves."""
+
+import inspect
+
+from bridge.report.catalogue_page import PAGE, catalogue_page, main
+from core.effects import CATALOGUE
+
+
+def test_the_committed_page_is_fresh():
+    assert PAGE.read_text(encoding="utf-8") == catalogue_page(), (
+        "run python -m bridge.report.catalogue_page"
+    )
+
+
+def test_every_effect_stands_on_the_page_with_its_docstring():
+    page = catalogue_page()
+    for name, effect in CATALOGUE.items():
+        assert f"### {name}\n\n{inspect.getdoc(effect)}\n" in page
+
+
+def test_the_page_is_written_where_it_is_asked_for(tmp_path):
+    assert main([str(tmp_path / "page.md")]) == 0
+    assert (tmp_path / "page.md").read_text(encoding="utf-8") == catalogue_page()

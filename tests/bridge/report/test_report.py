@@ -1,0 +1,138 @@
+"""The report: one file for every verdict, plain words, nothing in it that could run."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from report_cases import CASES, diagnosed
+
+from bridge.report import SECTIONS, write_report
+from bridge.report.arm_view import joint_origins
+from bridge.report.material import SHOWN, shares, thinned, unexplained
+from bridge.report.parameters import _decimals
+from bridge.report.words import (
+    VERDICTS,
+    joints_words,
+    likelihood,
+    listed,
+    number,
+    percent,
+    quantity_words,
+    told,
+)  # fmt: skip
+from core.arm import builtin_arm
+from core.effects import CATALOGUE
+from core.model import Model
+from core.rotation import rpy_matrix, transform
+
+
+@pytest.fixture(scope="module", params=list(CASES))
+def case(request):
+    return request.param, diagnosed(request.param)
+
+
+def test_every_verdict_is_among_the_cases():
+    assert {diagnosed(name).diagnosis.verdict for name in CASES} == set(VERDICTS)
+
+
+def test_a_report_is_one_small_file_with_every_section(case, tmp_path):
+    _, c = case
+    path = write_report(c.diagnosis, "Cell 7", c.log, c.model, tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+    assert path.stat().st_size < 6e6
+    text = path.read_text(encoding="utf-8")
+    for key, section in SECTIONS.items():
+        assert f'<section id="{key}"><h2>{section.title}</h2>' in text
+
+
+def test_nothing_is_loaded_from_outside(case, tmp_path):
+    _, c = case
+    text = write_report(c.diagnosis, "Cell 7", c.log, c.model, tmp_path).read_text("utf-8")
+    assert not re.findall(r"<(?:script|img|iframe|link)[^>]*(?:src|href)=[\"']?https?:", text)
+
+
+def test_the_figures_of_the_diagnosis_stand_in_the_report(case, tmp_path):
+    _, c = case
+    text = write_report(c.diagnosis, "Cell 7", c.log, c.model, tmp_path).read_text("utf-8")
+    for channel in c.diagnosis.channels:
+        assert told(channel.gap_rms, channel.unit) in text
+        for cause in channel.causes:
+            assert CATALOGUE[cause.effect].title in text
+            for parameter in cause.parameters:
+                assert f"<code>{parameter.name}</code>" in text
+        for considered in channel.considered:
+            assert f"<code>{considered.effect}</code>" in text
+    for hidden in c.diagnosis.not_observable:
+        assert ", ".join(hidden.needs) in text
+
+
+def test_text_of_the_user_cannot_become_markup(tmp_path):
+    c = diagnosed("no gap")
+    name = '<script>alert(1)</script> & "quotes"'
+    text = write_report(c.diagnosis, name, c.log, c.model, tmp_path).read_text("utf-8")
+    assert "<script>alert(1)" not in text
+    assert "&lt;script&gt;alert(1)&lt;/script&gt; &amp;" in text
+
+
+def test_the_same_diagnosis_gives_the_same_file(tmp_path):
+    c = diagnosed("no gap")
+    (tmp_path / "again").mkdir()
+    one = write_report(c.diagnosis, "Cell", c.log, c.model, tmp_path).read_bytes()
+    assert one == write_report(c.diagnosis, "Cell", c.log, c.model, tmp_path / "again").read_bytes()
+
+
+def test_shares_add_up_to_one(case):
+    for channel in case[1].diagnosis.channels:
+        part = shares(channel)
+        assert part.explained + part.noise + part.unexplained == pytest.approx(1.0)
+        assert min(part.explained, part.noise, part.unexplained) >= 0
+
+
+def test_what_a_quantity_foretells_is_not_called_noise():
+    channel = diagnosed("partly explained").diagnosis.channels[0]
+    blind = replace(channel, noise_floor_rms=channel.gap_rms, unexplained_rms=0.0)
+    assert shares(blind).unexplained > 0
+    assert unexplained(blind) > 0
+
+
+def test_a_path_to_a_cell_is_told_by_its_file(tmp_path):
+    c = diagnosed("no gap")
+    text = write_report(c.diagnosis, "a/b/line4.yaml", c.log, c.model, tmp_path).read_text("utf-8")
+    assert "<h1>line4: " in text
+
+
+def test_the_drawn_arm_ends_at_the_rigid_tcp():
+    model = Model(builtin_arm("ur10e"), transform(rpy_matrix(np.zeros(3)), np.array([0, 0, 0.2])))
+    q = np.array([0.3, -1.2, 1.1, -0.4, 0.9, 0.2])
+    points = joint_origins(model, q)
+    assert points.shape == (model.arm.n + 3, 3)
+    np.testing.assert_allclose(points[-1], model.rigid_pose(q[None]).position[0], atol=1e-12)
+
+
+def test_long_logs_are_thinned_but_keep_their_worst_samples():
+    score = np.random.default_rng(1).random(12000)
+    keep = thinned(score)
+    assert len(keep) <= SHOWN
+    assert int(np.argmax(score)) in keep
+    assert len(thinned(score[:20])) == 20
+
+
+def test_every_effect_of_the_catalogue_has_plain_words():
+    assert all(effect.title for effect in CATALOGUE.values())
+
+
+@pytest.mark.parametrize(("text", "wanted"), [
+    (told(4.1e-4, "m"), "0.410 mm"), (told(-2.5e-3, "rad"), "−2.50 mrad"),
+    (told(None, "m"), "unknown"), (told(12.0, "Nm"), "12.0 Nm"), (number(0.0), "0"),
+    (percent(-0.001), "0 %"), (likelihood(0.99999), "over 99.9 %"), (joints_words((2, 3)),
+     "joints 2 and 3"), (listed(["a", "b", "c"], "or"), "a, b or c"),
+    (quantity_words("actual_q_2"), "angle of joint 3"),
+    (quantity_words("joint_temperatures_0"), "temperature of joint 1"),
+])  # fmt: skip
+def test_values_are_told_in_the_units_that_people_use(text, wanted):
+    assert text == wanted
+
+
+def test_an_interval_is_told_with_two_digits_of_its_width():
+    assert (_decimals(0.0123), _decimals(1.23), _decimals(250.0)) == (3, 1, 0)

@@ -1,0 +1,430 @@
+"""Where setpoints come from: own target, trajectory, planner's lines."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import stat
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bridge.cell import load_cell
+from bridge.cell.run_settings import settings_of
+from bridge.cell.sections import SetpointSettings
+from bridge.ipc.control_socket import Peer
+from bridge.setpoint_source import make_source
+from bridge.setpoint_source.planner import PlannerSource
+from bridge.setpoint_source.source import Source, SourceDryError
+from bridge.setpoint_source.target import TargetSource
+from bridge.setpoint_source.tcp import TcpSource
+from bridge.setpoint_source.trajectory import TrajectorySource
+from core.errors import CellError, InputError, LogError, RunError
+
+HERE = np.array([0.1, 0.2, 0.3])
+
+
+def trajectory(tmp_path: Path, text: str) -> Source:
+    (tmp_path / "way.csv").write_text(text, encoding="utf-8")
+    settings = SetpointSettings(source="trajectory", file=Path("way.csv"))
+    return make_source(settings, 3, True, tmp_path)
+
+
+WAY = """timestamp,target_q_0,target_q_1,target_q_2
+5.0,0.0,0.0,1.0
+5.5,1.0,-1.0,1.0
+6.0,1.0,-1.0,2.0
+"""
+
+
+def test_each_name_gives_its_source(tmp_path: Path) -> None:
+    assert isinstance(trajectory(tmp_path, WAY), TrajectorySource)
+    made = make_source(SetpointSettings(source="target"), 3, True, tmp_path)
+    assert isinstance(made, TargetSource)
+    for name, kind in (("planner", PlannerSource), ("tcp", TcpSource)):
+        settings = SetpointSettings(source=name, token_file=tmp_path / "token")
+        assert type(make_source(settings, 3, True, tmp_path)) is kind
+
+
+def test_a_trajectory_is_replayed_at_the_controllers_clock_and_held_at_its_end(
+    tmp_path: Path,
+) -> None:
+    source = trajectory(tmp_path, WAY)
+    assert source.first(HERE) == pytest.approx([0, 0, 1])
+    source.begin(1000.0, HERE)
+    assert source.sample(1000.0, HERE) == pytest.approx([0, 0, 1])
+    assert source.sample(1000.25, HERE) == pytest.approx([0.5, -0.5, 1])
+    assert source.sample(1000.5, HERE) == pytest.approx([1, -1, 1])
+    assert source.sample(1000.875, HERE) == pytest.approx([1, -1, 1.75])
+    assert not source.ended
+    assert source.sample(1001.0, HERE) == pytest.approx([1, -1, 2])
+    assert source.ended
+    assert source.sample(2000.0, HERE) == pytest.approx([1, -1, 2])
+
+
+def test_a_trajectory_can_be_begun_again(tmp_path: Path) -> None:
+    source = trajectory(tmp_path, WAY)
+    source.begin(10.0, HERE)
+    source.sample(99.0, HERE)
+    source.begin(200.0, HERE)
+    assert not source.ended
+    assert source.sample(200.25, HERE) == pytest.approx([0.5, -0.5, 1])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("5.5,", "4.5,", "row 3, column timestamp"),
+        ("-1.0,1.0\n", "nan,1.0\n", "column target_q_1"),
+        ("target_q_2", "other", "target_q"),
+    ],
+)
+def test_a_bad_trajectory_is_one_line(old: str, new: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=words) as refusal:
+        trajectory(tmp_path, WAY.replace(old, new, 1))
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_missing_trajectory_is_named(tmp_path: Path) -> None:
+    settings = SetpointSettings(source="trajectory", file=Path("nowhere.csv"))
+    with pytest.raises(InputError, match=r"nowhere\.csv"):
+        make_source(settings, 3, True, tmp_path)
+
+
+def test_the_own_target_is_where_the_arm_stood_or_what_its_program_wants(tmp_path: Path) -> None:
+    standing = make_source(SetpointSettings(), 3, True, tmp_path)
+    standing.begin(0.0, HERE)
+    assert standing.sample(1.0, HERE + 0.1) == pytest.approx(HERE)
+    riding = make_source(SetpointSettings(), 3, False, tmp_path)
+    riding.begin(0.0, HERE)
+    assert riding.sample(1.0, HERE + 0.1) == pytest.approx(HERE + 0.1)
+
+
+TOKEN = "5f0b6ad1c2e94d7788f1a3b0c6d2e4f7"
+RATE = 500.0  # Hz
+
+
+@pytest.fixture
+def feed(tmp_path: Path) -> Iterator[PlannerSource]:
+    settings = SetpointSettings(source="planner", socket=tmp_path / "p.sock", timeout=0.15)
+    source = PlannerSource(settings, 3, True, Path(), RATE)
+    source.open()
+    yield source
+    source.close()
+
+
+@pytest.fixture
+def tcp(tmp_path: Path) -> Iterator[TcpSource]:
+    token = tmp_path / "token"
+    token.write_text(TOKEN + "\n")
+    token.chmod(0o600)
+    settings = SetpointSettings(source="tcp", token_file=token, port=0, timeout=0.15)
+    source = TcpSource(settings, 3, True, Path(), RATE)
+    source.open()
+    yield source
+    source.close()
+
+
+def planner(feed: PlannerSource) -> socket.socket:
+    if isinstance(feed, TcpSource):
+        found = socket.create_connection(("127.0.0.1", feed.port), timeout=2)
+    else:
+        found = socket.socket(socket.AF_UNIX)
+        found.connect(str(feed.settings.socket))
+    found.settimeout(2)
+    return found
+
+
+def first_of(feed: PlannerSource, seconds: float = 1.0) -> np.ndarray | None:
+    until = time.monotonic() + seconds
+    while (found := feed.first(HERE)) is None and time.monotonic() < until:
+        time.sleep(0.002)
+    return found
+
+
+def turn(feed: PlannerSource, seconds: float = 0.05) -> None:
+    """Have the loop look a few times."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        feed.first(HERE)
+        time.sleep(0.002)
+
+
+def answer(link: socket.socket) -> bytes:
+    """Return all that comes until the other side closes."""
+    found = b""
+    try:
+        while piece := link.recv(4096):
+            found += piece
+    except ConnectionResetError:
+        pass
+    return found
+
+
+@pytest.mark.parametrize("line", ["0.1,0.2,0.3", '{"q": [0.1, 0.2, 0.3]}', " 0.1 , 0.2,0.3 \r"])
+def test_a_line_is_a_setpoint(line: str, feed: PlannerSource) -> None:
+    with planner(feed) as socket_:
+        assert feed.first(HERE) is None
+        socket_.sendall(line.encode() + b"\n")
+        assert first_of(feed) == pytest.approx([0.1, 0.2, 0.3])
+        feed.begin(0.0, HERE)
+        assert feed.sample(0.002, HERE) == pytest.approx([0.1, 0.2, 0.3])
+
+
+def test_joints_glide_between_lines(feed: PlannerSource) -> None:
+    with planner(feed) as socket_:
+        socket_.sendall(b"0,0,0\n")
+        first_of(feed)
+        feed.begin(0.0, np.zeros(3))
+        time.sleep(0.06)
+        socket_.sendall(b"0.06,0,0\n")
+        seen, until = [], time.monotonic() + 0.08
+        while time.monotonic() < until:
+            seen.append(feed.sample(0.0, HERE)[0])
+            time.sleep(0.002)
+    assert seen[-1] == pytest.approx(0.06)
+    assert np.diff(seen).min() >= 0
+    assert np.diff(seen).max() < 0.03
+    assert any(0.01 < v < 0.05 for v in seen)
+
+
+def test_a_feed_that_falls_silent_is_dry_and_may_come_back(feed: PlannerSource) -> None:
+    with planner(feed) as socket_:
+        socket_.sendall(b"0,0,0\n")
+        first_of(feed)
+        feed.begin(0.0, HERE)
+        time.sleep(0.2)
+        with pytest.raises(SourceDryError, match="no line for"):
+            feed.sample(0.0, HERE)
+        assert feed.first(HERE) is None
+        socket_.sendall(b"0,0,0.5\n")
+        assert first_of(feed) == pytest.approx([0, 0, 0.5])
+
+
+GOOD = json.dumps({"q": [0, 0, 0]}).encode() + b"\n"
+BAD = ["1,2", "1,2,3,4", "1,2,nan", "1,2,inf", "a,b,c", '{"p": 1}', '{"q": 5}', "{", "[" * 99,
+       "GET / HTTP/1.1", "POST / HTTP/1.1\r\nHost: 127.0.0.1\r\n", "\x16\x03\x01"]  # fmt: skip
+
+
+@pytest.mark.parametrize("line", BAD)
+def test_the_first_bad_line_ends_the_connection_and_nothing_after_it_counts(
+    line: str, feed: PlannerSource
+) -> None:
+    with planner(feed) as socket_:
+        socket_.sendall(line.encode() + b"\n" + 5 * GOOD)
+        assert first_of(feed, 0.1) is None
+        said = answer(socket_)
+        assert said.startswith(b"error: ")
+        assert said.count(b"\n") == 1
+    assert feed.refused == 1
+    with planner(feed) as socket_:  # and the feed is free for another one
+        socket_.sendall(GOOD)
+        assert first_of(feed) is not None
+
+
+def test_a_line_without_end_does_not_fill_the_memory(feed: PlannerSource) -> None:
+    with planner(feed) as socket_:
+        socket_.sendall(b"1" * 20_000)
+        turn(feed)
+        assert b"a line without end" in answer(socket_)
+    assert first_of(feed, 0.02) is None
+
+
+def test_more_lines_than_the_robot_has_cycles_end_the_connection(feed: PlannerSource) -> None:
+    with planner(feed) as socket_:
+        begun, sent = time.monotonic(), 0
+        socket_.settimeout(0.01)
+        with pytest.raises((BrokenPipeError, ConnectionResetError)):  # noqa: PT012
+            while time.monotonic() - begun < 20.0:
+                with contextlib.suppress(TimeoutError):
+                    socket_.sendall(50 * b"0,0,0\n")
+                    sent += 50
+                for _ in range(8):
+                    feed.first(HERE)
+        took = time.monotonic() - begun
+        assert b"the robot's rate" in answer(socket_)
+    assert sent >= 2 * RATE  # what a loop that was away for a moment finds is taken
+    assert took < 20.0
+
+
+def test_a_cycle_takes_a_few_lines_however_many_there_are(feed: PlannerSource) -> None:
+    with planner(feed) as socket_:
+        socket_.sendall(b"".join(f"{k},0,0\n".encode() for k in range(100)))
+        time.sleep(0.02)
+        seen = []
+        for _ in range(30):
+            found = feed.first(HERE)
+            assert found is not None
+            seen.append(found[0])
+    assert seen[0] <= 8
+    assert seen[-1] == 99
+    assert np.diff(seen).max() <= 8
+
+
+def test_a_second_planner_is_turned_away_and_the_next_one_is_not(feed: PlannerSource) -> None:
+    with planner(feed) as one:
+        one.sendall(b"0,0,0\n")
+        first_of(feed)
+        with planner(feed) as two:
+            two.sendall(b"0,0,9\n")
+            until = time.monotonic() + 0.3
+            while time.monotonic() < until:
+                one.sendall(b"0,0,0\n")
+                assert feed.first(HERE) == pytest.approx(np.zeros(3))
+                time.sleep(0.01)
+            assert answer(two) == b"error: another planner is connected\n"
+    turn(feed)
+    with planner(feed) as three:
+        three.sendall(b"0,0,0.1\n")
+        until = time.monotonic() + 1
+        while (found := feed.first(HERE)) is None or found[2] != 0.1:
+            assert time.monotonic() < until
+            time.sleep(0.002)
+
+
+def test_connections_that_say_nothing_keep_no_planner_out(feed: PlannerSource) -> None:
+    silent = []
+    for _ in range(12):
+        silent.append(planner(feed))
+        feed.first(HERE)
+    with planner(feed) as one:
+        one.sendall(b"0,0,0.2\n")
+        assert first_of(feed) == pytest.approx([0, 0, 0.2])
+    assert b"too many connections" in answer(silent[0])
+    for link in silent:
+        link.close()
+
+
+def test_one_that_fell_silent_gives_way_and_hears_of_it(feed: PlannerSource) -> None:
+    with planner(feed) as one, planner(feed) as two:
+        one.sendall(b"0,0,0\n")
+        first_of(feed)
+        time.sleep(0.2)  # longer than the timeout: the feed is dry
+        two.sendall(b"0,0,0.3\n")
+        assert first_of(feed) == pytest.approx([0, 0, 0.3])
+        turn(feed)
+        assert b"another planner has taken the feed" in answer(one)
+
+
+def test_the_socket_is_its_owners_and_goes_with_the_source(feed: PlannerSource) -> None:
+    path = feed.settings.socket
+    assert path is not None
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    feed.close()
+    assert not path.exists()
+
+
+def test_the_socket_of_a_loop_that_was_killed_is_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "p.sock"
+    with socket.socket(socket.AF_UNIX) as left:
+        left.bind(str(path))
+    settings = SetpointSettings(source="planner", socket=path)
+    source = PlannerSource(settings, 3, True, Path(), RATE)
+    source.open()
+    with planner(source) as link:
+        link.sendall(GOOD)
+        assert first_of(source) is not None
+    source.close()
+
+
+def test_another_users_process_is_refused(
+    feed: PlannerSource, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stranger = Peer(1, os.geteuid() + 1)
+    monkeypatch.setattr("bridge.setpoint_source.planner.peer_of", lambda _: stranger)
+    with planner(feed) as link:
+        link.sendall(GOOD)
+        assert first_of(feed, 0.1) is None
+        assert b"another user" in answer(link)
+
+
+@pytest.mark.parametrize(
+    "line", ["", GOOD.decode(), "token", "token ", f"token {TOKEN[:-1]}", f"token {TOKEN}0",
+             TOKEN, f"Token {TOKEN}", f"POST / HTTP/1.1\r\nx: token {TOKEN}"],
+)  # fmt: skip
+def test_over_tcp_nothing_counts_before_the_token(line: str, tcp: TcpSource) -> None:
+    with planner(tcp) as link:
+        link.sendall(line.encode() + b"\n" + GOOD)
+        assert first_of(tcp, 0.1) is None
+        said = answer(link)
+        assert b"expected the token in the first line" in said
+        assert TOKEN.encode() not in said
+
+
+def test_over_tcp_the_token_opens_the_feed(tcp: TcpSource) -> None:
+    with planner(tcp) as link:
+        link.sendall(f"token {TOKEN}\r\n".encode() + GOOD)
+        assert first_of(tcp) == pytest.approx(np.zeros(3))
+
+
+def test_over_tcp_a_token_that_does_not_come_ends_the_connection(
+    tcp: TcpSource, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bridge.setpoint_source.tcp.FIRST_LINE", 0.1)
+    with planner(tcp) as link:
+        turn(tcp, 0.2)
+        assert b"no token within" in answer(link)
+
+
+def test_a_taken_address_is_one_line(tcp: TcpSource, tmp_path: Path) -> None:
+    settings = tcp.settings.model_copy(update={"port": tcp.port})
+    with pytest.raises(RunError, match="cannot listen on"):
+        TcpSource(settings, 3, True, Path(), RATE).open()
+    settings = SetpointSettings(source="planner", socket=tmp_path / "no" / "p.sock")
+    with pytest.raises(RunError, match="cannot listen on"):
+        PlannerSource(settings, 3, True, Path(), RATE).open()
+
+
+@pytest.mark.parametrize(
+    "host", ["0.0.0.0", "127.0.0.1.evil.example", "127.evil.example", "127.1", "robot", "::", ""]
+)
+def test_a_feed_that_others_could_reach_is_refused(host: str) -> None:
+    with pytest.raises(ValueError, match="loopback"):
+        SetpointSettings(source="modbus", host=host)
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.9.8.7", "::1", "localhost"])
+def test_a_loopback_address_is_taken(host: str) -> None:
+    assert SetpointSettings(source="modbus", host=host).host == host
+
+
+def test_a_cell_with_a_port_and_no_token_is_refused_and_says_what_to_set(tmp_path: Path) -> None:
+    path = tmp_path / "cell.yaml"
+    path.write_text(
+        "robot: {model: ur10e}\nlink: {host: 127.0.0.1}\nsetpoints: {source: tcp, port: 30310}\n"
+    )
+    with pytest.raises(CellError, match=r"token_file.*source: planner") as refusal:
+        load_cell(path)
+    assert str(refusal.value).startswith(f"{path}, line 3: ")
+    assert "\n" not in str(refusal.value)
+    token = tmp_path / "token"
+    path.write_text(path.read_text().replace("port: 30310", "token_file: token"))
+    with pytest.raises(CellError, match=r"setpoints\.token_file: .*expected a file with a token"):
+        settings_of(load_cell(path))
+    token.write_text(TOKEN)
+    token.chmod(0o644)
+    with pytest.raises(CellError, match="found mode 0644, expected 0600"):
+        settings_of(load_cell(path))
+    token.chmod(0o600)
+    assert settings_of(load_cell(path)).setpoints.token_file == token
+
+
+def test_a_planners_socket_is_in_the_runtime_folder_unless_the_cell_names_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    path = tmp_path / "cell.yaml"
+    text = "robot: {model: ur10e}\nlink: {host: 127.0.0.1}\nsetpoints: {source: planner}\n"
+    path.write_text(text)
+    found = settings_of(load_cell(path)).setpoints.socket
+    assert found is not None
+    assert found.parent == tmp_path / "gapbridge"
+    assert stat.S_IMODE(found.parent.stat().st_mode) == 0o700
+    path.write_text(text.replace("planner}", "planner, socket: here.sock}"))
+    assert settings_of(load_cell(path)).setpoints.socket == tmp_path / "here.sock"

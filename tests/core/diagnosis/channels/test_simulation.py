@@ -1,0 +1,105 @@
+"""The user's own simulator in place of the model: what it knows is no gap any more."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import small_arm as small
+
+from core.diagnosis.channels.position import observe
+from core.diagnosis.channels.simulation import joined, predicted_by
+from core.diagnosis.diagnosis import diagnose
+from core.effects import Site, Term
+from core.errors import LogError
+from core.log.log import Log
+from core.metrology import Metrology
+
+METROLOGY = Metrology(registered=True, sigma=small.SIGMA)
+SESSION = small.session_of(0)
+BOTH = replace(
+    small.REAL["backlash"], tool_position=small.REAL["tool_frame"].tool_position
+)  # a tool that stands elsewhere, and a joint with play
+
+
+def simulated(real) -> Log:
+    """Return what a simulator of this arm says, row by row."""
+    return Log("sim.csv", {"measured_position": small.stand(real, SESSION).tcp}, 3)
+
+
+def log_of(real) -> Log:
+    return small.log_of(SESSION, small.readings(real, SESSION))
+
+
+def causes_of(real, simulator):
+    found = diagnose(small.model_of(), log_of(real), METROLOGY, simulated=simulated(simulator))
+    return [c.effect for c in found.channels[0].causes], found
+
+
+def test_a_simulator_that_knows_everything_leaves_no_gap():
+    named, found = causes_of(BOTH, BOTH)
+    assert (named, found.verdict) == ([], "no_gap")
+    assert found.channels[0].gap_rms == pytest.approx(small.FLOOR, rel=0.15)
+
+
+def test_only_what_the_simulator_does_not_know_is_a_cause():
+    named, found = causes_of(BOTH, small.REAL["tool_frame"])
+    assert named == ["backlash"]
+    (told,) = found.channels[0].causes[0].parameters
+    assert abs(told.value - 9e-4) < 4 * told.std
+
+
+def test_a_simulator_that_says_what_the_model_says_changes_nothing():
+    named, found = causes_of(small.REAL["backlash"], small.NOMINAL)
+    plain = small.diagnosed("backlash")
+    assert named == ["backlash"]
+    assert found.channels[0].gap_rms == pytest.approx(plain.channels[0].gap_rms)
+    mine, theirs = (f.channels[0].causes[0].parameters[0].value for f in (found, plain))
+    assert mine == pytest.approx(theirs, rel=1e-4)
+
+
+def test_an_effect_changes_the_simulators_values_as_it_changes_the_models():
+    log, term = log_of(small.NOMINAL), Term("joint_offset", Site(2), (0.01,))
+    seen = predicted_by("position", observe)(
+        small.model_of(), joined(log, simulated(BOTH)), METROLOGY
+    )
+    own = observe(small.model_of(), log, METROLOGY)
+    assert np.array_equal(seen.predict(()), simulated(BOTH).require("measured_position"))
+    change = seen.predict([term]) - seen.predict(())
+    assert np.allclose(change, own.predict([term]) - own.predict(()))
+    assert np.abs(change).max() > 1e-3
+
+
+def test_rows_stay_together_where_some_have_no_reading():
+    log = log_of(small.NOMINAL)
+    read = log.require("measured_position").copy()
+    read[[0, 7]] = np.nan
+    log = replace(log, columns={**log.columns, "measured_position": read})
+    seen = predicted_by("position", observe)(
+        small.model_of(), joined(log, simulated(small.NOMINAL)), METROLOGY
+    )
+    assert len(seen.measured) == 58
+    assert np.abs(seen.measured - seen.predict(())).max() < 5 * small.FLOOR
+
+
+@pytest.mark.parametrize(
+    ("columns", "words"),
+    [
+        ({"measured_position": np.zeros((4, 3))}, "sim.csv: found 4 rows, expected 60"),
+        ({"payload": np.zeros(60)}, "found no prediction, expected one of measured_position_0"),
+        ({"measured_position": np.full((60, 3), np.nan)}, "sim.csv: row 2, .* found nan"),
+    ],
+)
+def test_a_simulators_log_that_does_not_fit_is_refused(columns, words):
+    with pytest.raises(LogError, match=words):
+        diagnose(small.model_of(), log_of(BOTH), METROLOGY, simulated=Log("sim.csv", columns, 3))
+
+
+def test_a_channel_that_the_simulator_lacks_is_not_observable():
+    wrench = np.random.default_rng(0).normal(size=(60, 6))
+    log = log_of(small.NOMINAL)
+    log = replace(log, columns={**log.columns, "ft_raw_wrench": wrench})
+    found = diagnose(small.model_of(), log, METROLOGY, simulated=simulated(small.NOMINAL))
+    (hidden,) = [h for h in found.not_observable if h.channel == "wrench"]
+    assert hidden.needs == ("ft_raw_wrench (in the simulator's log)",)

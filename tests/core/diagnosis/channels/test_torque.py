@@ -1,0 +1,207 @@
+"""The torque channel on Pinocchio's torques: each effect is recovered, with the right sign."""
+
+from __future__ import annotations
+
+import time
+
+import moving_truth as truth
+import numpy as np
+import pytest
+
+from core.diagnosis.channels.torque import observe
+from core.diagnosis.diagnosis import diagnose
+from core.diagnosis.observation import NotObservable, Observation, thinned
+from core.effects import Site, Term
+from core.metrology import Metrology
+
+METROLOGY = Metrology()
+N = 6
+COURSE = truth.course(N, 2)
+NOISE = 0.2  # Nm
+FRICTION = np.array([8, 9, 6, 3, 2, 1.5])
+
+
+@pytest.fixture(scope="module")
+def plant(tmp_path_factory):
+    return truth.plant(tmp_path_factory.mktemp("arm"), N, 1)
+
+
+@pytest.fixture(scope="module")
+def recorded(plant):
+    t = np.arange(5000) / 250
+    q, qd, qdd = (COURSE.at(t, order) for order in (0, 1, 2))
+    return t, q, qd, qdd, plant.dynamics(q, qd, qdd, payload=2.0)[0]
+
+
+def log_of(recorded, torque, seed=0, **more):
+    t, q, qd, *_ = recorded
+    rng = np.random.default_rng(seed)
+    return truth.log_of(
+        N, timestamp=t, actual_q=np.round(q / 1.2e-5) * 1.2e-5,
+        actual_qd=qd + rng.normal(0, 1e-3, qd.shape),
+        actual_current_as_torque=torque + rng.normal(0, NOISE, torque.shape), **more,
+    )  # fmt: skip
+
+
+def term(effect, joint=None):
+    return Term(effect, Site(joint), (0.0,))
+
+
+CASES = {
+    "coulomb_friction": (3, 6.0),
+    "viscous_friction": (3, 3.0),
+    "rotor_inertia": (4, 0.3),
+    "link_inertia": (3, 0.1),
+    "torque_constant": (2, 0.04),
+    "payload": (None, 0.7),
+}
+
+
+def torque_with(plant, recorded, effect, joint, value):
+    _, q, qd, qdd, nominal = recorded
+    here = np.arange(N) == (joint or 0) - 1
+    if effect == "payload":
+        return plant.dynamics(q, qd, qdd, payload=2.0 + value)[0]
+    if effect == "link_inertia":
+        return plant.dynamics(q, qd, qdd, payload=2.0, link=joint, more=value)[0]
+    if effect == "torque_constant":
+        return nominal * (1 + value * here)
+    along = {"coulomb_friction": np.sign(qd), "viscous_friction": qd, "rotor_inertia": qdd}
+    return nominal + value * here * along[effect]
+
+
+@pytest.mark.parametrize("effect", CASES)
+def test_an_effect_is_recovered_and_leaves_the_noise_alone(plant, recorded, effect):
+    joint, value = CASES[effect]
+    log = log_of(recorded, torque_with(plant, recorded, effect, joint, value))
+    seen = observe(plant.model(2.0), log, METROLOGY)
+    (found,), spread = truth.fit(plant.arm, seen, [term(effect, joint)])
+    assert abs(found.values[0] - value) < 3.5 * spread[0]
+    assert spread[0] < 0.1 * abs(value)
+    left = (seen.measured - seen.predict([found])).std()
+    assert left == pytest.approx(NOISE, rel=0.05)
+
+
+def test_many_effects_together_are_recovered(plant, recorded):
+    _, q, qd, qdd, _ = recorded
+    torque = plant.dynamics(q, qd, qdd, payload=2.5)[0] + FRICTION * np.sign(qd) + 2.0 * qd
+    torque[:, 1] *= 1.03
+    log = log_of(recorded, torque)
+    terms = [term("coulomb_friction", j + 1) for j in range(N)]
+    terms += [term("viscous_friction", j + 1) for j in range(N)]
+    terms += [term("payload"), term("torque_constant", 2)]
+    seen = observe(plant.model(2.0), log, METROLOGY)
+    found, spread = truth.fit(plant.arm, seen, terms)
+    values = np.concatenate([t.values for t in found])
+    expected = np.concatenate([FRICTION, np.full(N, 2.0), [0.5, 0.03]])
+    assert np.abs((values - expected) / spread).max() < 4
+
+
+def test_a_clean_log_leaves_the_noise(plant, recorded):
+    seen = observe(plant.model(2.0), log_of(recorded, recorded[4]), METROLOGY)
+    left = seen.measured - seen.predict(())
+    assert left.std() == pytest.approx(NOISE, rel=0.03)
+    assert np.abs(left.mean(axis=0)).max() < 0.02
+
+
+def test_poses_at_rest_are_observed_without_friction(plant):
+    q = truth.poses(N, 40, 3)
+    torque, _ = plant.dynamics(q, 0 * q, 0 * q, payload=2.6)
+    noisy = torque + np.random.default_rng(0).normal(0, 0.05, torque.shape)
+    log = truth.log_of(N, actual_q=q, actual_current_as_torque=noisy)
+    seen = observe(plant.model(2.0), log, METROLOGY)
+    (found,), spread = truth.fit(plant.arm, seen, [term("payload")])
+    assert abs(found.values[0] - 0.6) < 3.5 * spread[0]
+    assert len(np.unique(seen.groups)) == 40
+    assert not seen.order_in_time
+    friction = term("coulomb_friction", 2).with_values(np.array([1.0]))
+    assert np.array_equal(seen.predict([friction]), seen.predict(()))
+
+
+def test_an_outside_pull_is_no_gap(plant):
+    q = truth.poses(N, 40, 3)
+    pull = np.random.default_rng(1).uniform(-30, 30, (40, 6))
+    torque, _ = plant.dynamics(q, 0 * q, 0 * q, pull=pull, payload=2.0)
+    log = truth.log_of(N, actual_q=q, actual_current_as_torque=torque, actual_TCP_force=pull)
+    seen = observe(plant.model(2.0), log, METROLOGY)
+    assert np.abs(seen.measured - seen.predict(())).max() < 1e-8
+
+
+def test_rows_in_which_a_joint_turns_round_are_left_out(plant, recorded):
+    seen = observe(plant.model(2.0), log_of(recorded, recorded[4]), METROLOGY)
+    speed = np.abs(recorded[2][seen.rows])
+    assert speed.min() > 1e-3
+
+
+def test_joints_that_move_one_at_a_time_keep_their_rows(plant):
+    t = np.arange(6000) / 250
+    wave = np.sin(2 * np.pi * 0.5 * t) ** 3 * 0.4
+    turn = (t // 4).astype(int) % N
+    q = np.where(turn[:, None] == np.arange(N), wave[:, None], 0.0)
+    torque = np.zeros_like(q)
+    log = truth.log_of(N, timestamp=t, actual_q=q, actual_current_as_torque=torque)
+    seen = observe(plant.model(2.0), log, METROLOGY)
+    assert len(seen.rows) > 2000
+
+
+def test_a_long_log_is_looked_at_whole_and_held_out_by_stretches_of_time(plant):
+    t = np.arange(15000) / 500
+    log = truth.log_of(N, timestamp=t, actual_q=COURSE.at(t),
+                       actual_current_as_torque=np.zeros((15000, N)),
+                       joint_temperatures=np.tile(t[:, None], N) + 20)  # fmt: skip
+    begin = time.perf_counter()
+    seen = observe(plant.model(2.0), log, METROLOGY)
+    assert time.perf_counter() - begin < 3
+    assert isinstance(seen, Observation)
+    assert len(seen.measured) == len(seen.rows) == len(seen.groups) > 12000
+    assert np.all(np.diff(seen.groups) >= 0)
+    assert len(np.unique(seen.groups)) >= 20
+    assert {"timestamp", "actual_q_0", "actual_qd_5", "joint_temperatures_3"} <= set(
+        seen.quantities
+    )
+    assert all(len(v) == len(seen.rows) for v in seen.quantities.values())
+    few = thinned(seen, 300)
+    assert len(few.rows) == len(few.predict(())) == 300
+    assert np.array_equal(few.predict(()), seen.predict(())[np.isin(seen.rows, few.rows)])
+
+
+def test_readings_that_are_missing_are_left_out(plant, recorded):
+    torque = recorded[4].copy()
+    torque[100:200, 2] = np.nan
+    log = log_of(recorded, torque)
+    seen = observe(plant.model(2.0), log, METROLOGY)
+    assert np.isfinite(seen.measured).all()
+    assert not np.isin(np.arange(100, 200), seen.rows).any()
+
+
+def test_what_is_lacking_is_named(plant):
+    q = np.zeros((3, N))
+    none = observe(plant.model(), truth.log_of(N, actual_q=q), METROLOGY)
+    assert none == NotObservable("torque", ("actual_current_as_torque",))
+    blind = observe(plant.model(), truth.log_of(N, actual_current_as_torque=q), METROLOGY)
+    assert blind == NotObservable("torque", ("actual_q",))
+
+
+def faded(plant, recorded):
+    """Friction of joint 3 that was identified warm: more at first, less in the end."""
+    t, _, qd, _, nominal = recorded
+    here = np.arange(N) == 2
+    fading = 0.25 - 0.5 * t / t[-1]
+    return nominal + 6.0 * np.sign(qd) * here * fading[:, None]
+
+
+def test_friction_that_fades_is_owned_up_to_and_depends_on_time(plant, recorded):
+    found = diagnose(plant.model(2.0), log_of(recorded, faded(plant, recorded)))
+    (torque,) = (c for c in found.channels if c.channel == "torque")
+    assert torque.structured
+    assert "timestamp" in [name for name, _ in torque.depends_on[:3]]
+
+
+@pytest.mark.parametrize("effect", ["link_inertia", "torque_constant"])
+def test_what_bears_weight_is_not_blamed_for_one_another(plant, recorded, effect):
+    joint, value = CASES[effect]
+    log = log_of(recorded, torque_with(plant, recorded, effect, joint, value))
+    found = diagnose(plant.model(2.0), log, withhold=(effect,))
+    (torque,) = (c for c in found.channels if c.channel == "torque")
+    assert torque.structured
+    assert not torque.causes

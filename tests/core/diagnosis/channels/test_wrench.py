@@ -1,0 +1,144 @@
+"""The wrench channel on Pinocchio's flange wrenches, at rest and moving."""
+
+from __future__ import annotations
+
+import moving_truth as truth
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from core.diagnosis.channels.wrench import observe, torque_weight
+from core.diagnosis.observation import NotObservable
+from core.effects import Site, Term
+from core.metrology import Metrology
+
+METROLOGY = Metrology()
+N, ROWS = 7, 70
+NOISE = np.repeat([0.3, 0.01], 3)  # N, Nm
+TURN = np.array([0.02, -0.03, 0.05])  # rad
+BIAS = np.array([1, -2, 3, 0.1, 0.2, -0.1])
+GAIN = np.array([0.02, -0.01, 0.03, 0.02, 0.01, -0.03])
+
+
+@pytest.fixture(scope="module")
+def plant(tmp_path_factory):
+    return truth.plant(tmp_path_factory.mktemp("arm"), N, 1)
+
+
+@pytest.fixture(scope="module")
+def session(plant):
+    rng = np.random.default_rng(5)
+    q, mass = truth.poses(N, ROWS, 5), rng.choice([2.0, 4.0], ROWS)
+    pull = np.zeros((ROWS, 6))
+    pull[::3] = rng.normal(0, 10, pull[::3].shape) * [1, 1, 1, 0.1, 0.1, 0.1]
+    return q, mass, pull, plant.dynamics(q, 0 * q, 0 * q, pull, mass)[1]
+
+
+def log_of(session, wrench, seed=0):
+    q, mass, pull, _ = session
+    noise = np.random.default_rng(seed).normal(0, 1, wrench.shape) * NOISE
+    return truth.log_of(
+        N, timestamp=np.arange(ROWS) * 20.0, actual_q=q, payload=mass,
+        payload_cog=np.tile(truth.COG, (ROWS, 1)), actual_TCP_force=pull,
+        ft_raw_wrench=wrench + noise,
+    )  # fmt: skip
+
+
+def truth_of(plant, session, effect):
+    """Return the reading with an effect, and its parameters."""
+    q, mass, pull, wrench = session
+    if effect == "payload":
+        return plant.dynamics(q, 0 * q, 0 * q, pull, mass + 0.4)[1], np.array([0.4])
+    if effect == "ft_misalignment":
+        sensor = Rotation.from_rotvec(TURN).inv()
+        turned = [sensor.apply(wrench[:, :3]), sensor.apply(wrench[:, 3:])]
+        return np.hstack(turned), TURN
+    if effect == "ft_drift":
+        return wrench + np.outer(np.arange(ROWS) * 20.0, BIAS * 1e-3), BIAS * 1e-3
+    return (wrench + BIAS, BIAS) if effect == "ft_bias" else (wrench * (1 + GAIN), GAIN)
+
+
+EFFECTS = ("ft_bias", "ft_drift", "ft_gain", "ft_misalignment", "payload")
+
+
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_an_effect_is_recovered(plant, session, effect):
+    reading, expected = truth_of(plant, session, effect)
+    scores = []
+    for seed in range(5):
+        seen = observe(plant.model(), log_of(session, reading, seed), METROLOGY)
+        start = Term(effect, Site(), (0.0,) * len(expected))
+        (found,), spread = truth.fit(plant.arm, seen, [start])
+        scores.append((np.array(found.values) - expected) / spread)
+    assert np.abs(scores).max() < 4.5
+    assert np.sqrt(np.mean(np.square(scores))) < 1.5
+    left = (seen.measured - seen.predict([found])) / NOISE
+    assert left.std() == pytest.approx(1, abs=0.12)
+
+
+def test_a_clean_session_leaves_the_noise_with_comparable_axes(plant, session):
+    seen = observe(plant.model(), log_of(session, session[3]), METROLOGY)
+    left = (seen.measured - seen.predict(())) * seen.weight
+    assert seen.weight[5] == pytest.approx(30, rel=0.4)
+    assert left.std() == pytest.approx(0.3, rel=0.2)
+    assert len(np.unique(seen.groups)) == ROWS
+
+
+def test_pairs_that_look_alike_are_told_apart_by_pulls_and_payloads(plant, session):
+    q, mass, pull, _ = session
+    heavier = plant.dynamics(q, 0 * q, 0 * q, pull, mass + 0.4)[1]
+    reading = (heavier @ np.diag(1 + GAIN)) + BIAS
+    terms = [Term("payload", Site(), (0.0,)), Term("ft_gain", Site(), (0.0,) * 6),
+             Term("ft_bias", Site(), (0.0,) * 6)]  # fmt: skip
+    seen = observe(plant.model(), log_of(session, reading), METROLOGY)
+    found, spread = truth.fit(plant.arm, seen, terms)
+    values = np.concatenate([t.values for t in found])
+    assert np.abs((values - np.concatenate([[0.4], GAIN, BIAS])) / spread).max() < 4
+
+
+def test_equal_gains_and_one_payload_are_the_same(plant):
+    q = truth.poses(N, 40, 5)
+    log = truth.log_of(N, actual_q=q, ft_raw_wrench=np.zeros((40, 6)))
+    seen = observe(plant.model(2.0), log, METROLOGY)
+    heavier = seen.predict([Term("payload", Site(), (0.1,))])
+    scaled = seen.predict([Term("ft_gain", Site(), (0.05,) * 6)])
+    assert np.allclose(heavier, scaled, atol=1e-12)
+
+
+def test_a_moving_payload_shows_its_inertia(plant):
+    course = truth.course(N, 6)
+    t = np.arange(4000) / 500
+    q, qd, qdd = (course.at(t, order) for order in (0, 1, 2))
+    _, wrench = plant.dynamics(q, qd, qdd, payload=2.5)
+    rng = np.random.default_rng(0)
+    reading = wrench + BIAS + rng.normal(0, 1, wrench.shape) * NOISE
+    angles = np.round(q / 1.2e-5) * 1.2e-5
+    log = truth.log_of(N, timestamp=t, actual_q=angles, ft_raw_wrench=reading)
+    seen = observe(plant.model(2.0), log, METROLOGY)
+    terms = [Term("payload", Site(), (0.0,)), Term("ft_bias", Site(), (0.0,) * 6)]
+    found, spread = truth.fit(plant.arm, seen, terms)
+    values = np.concatenate([term.values for term in found])
+    assert np.abs((values - np.concatenate([[0.5], BIAS])) / spread).max() < 4
+    assert ((seen.measured - seen.predict(found)) / NOISE).std() == pytest.approx(1, abs=0.03)
+    assert seen.weight[3] == pytest.approx(30, rel=0.05)
+    assert seen.order_in_time
+
+
+def test_few_poses_with_many_loads_are_held_out_by_load(plant):
+    q = np.repeat(truth.poses(N, 2, 0), 12, axis=0)
+    mass = np.tile(np.arange(6.0), 4)
+    log = truth.log_of(N, actual_q=q, payload=mass, ft_raw_wrench=np.zeros((24, 6)))
+    seen = observe(plant.model(), log, METROLOGY)
+    assert len(np.unique(seen.groups)) == 12
+
+
+def test_readings_without_noise_get_a_usual_weight():
+    assert torque_weight(np.zeros(6), np.ones((5, 6))) == 10.0
+    assert torque_weight(np.repeat([0.5, 0.01], 3), np.ones((5, 6))) == pytest.approx(50)
+
+
+def test_what_is_lacking_is_named(plant):
+    q = np.zeros((3, N))
+    assert observe(plant.model(), truth.log_of(N, actual_q=q), METROLOGY) == NotObservable(
+        "wrench", ("ft_raw_wrench",)
+    )

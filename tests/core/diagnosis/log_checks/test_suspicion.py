@@ -1,0 +1,239 @@
+"""Mistakes of units, names, clocks, frames and signs are called by their name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import moving_truth as truth
+import numpy as np
+import pytest
+import small_arm as small
+from scipy.spatial.transform import Rotation
+
+from core.diagnosis.log_checks.units_and_clocks import check_units, findings
+from core.errors import LogError
+from core.log.log import Log
+from core.metrology import Metrology
+
+MODEL = small.model_of()
+SESSION = small.session_of()
+AXIAL = replace(small.NOMINAL, axial=np.array(small.KIND.axial))
+READ = small.readings(AXIAL, SESSION)
+LOG = small.log_of(SESSION, READ)
+REGISTERED = Metrology(registered=True, sigma=small.SIGMA)
+FREE = Metrology(sigma=small.SIGMA)
+
+
+def with_columns(**more) -> Log:
+    return small.log_of(SESSION, READ, **more)
+
+
+def told(log: Log, metrology: Metrology = REGISTERED) -> str:
+    return "\n".join(findings(log, MODEL, metrology))
+
+
+def rotations() -> Rotation:
+    return Rotation.from_matrix(MODEL.rigid_pose(SESSION.q).rotation)
+
+
+def test_a_sound_log_is_not_suspected():
+    log = with_columns(measured_rotation=rotations().as_rotvec())
+    check_units(MODEL, log)
+    assert findings(log, MODEL, REGISTERED) == []
+    assert findings(log, MODEL, FREE) == []
+
+
+WRONG_UNITS = {
+    "actual_q": (np.degrees(SESSION.q), "degrees"),
+    "target_q": (np.degrees(SESSION.q), "degrees"),
+    "measured_position": (READ * 1e3, "millimetres"),
+    "measured_rotation": (rotations().as_rotvec(degrees=True), "degrees"),
+    "payload": (SESSION.payload_mass * 1e3, "grams"),
+    "payload_cog": (SESSION.payload_cog * 1e3, "mm"),
+    "joint_temperatures": (SESSION.temperature + 273.15, "kelvin"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG_UNITS)
+def test_a_wrong_unit_is_refused_by_name(name):
+    values, unit = WRONG_UNITS[name]
+    with pytest.raises(LogError, match=rf"small.csv: columns? {name}.*found .*{unit}, expected"):
+        check_units(MODEL, with_columns(**{name: values}))
+
+
+def test_degrees_within_a_few_turns_of_the_range_are_still_degrees():
+    small_angles = np.degrees(SESSION.q) / 10  # at most 15: as radians beyond any limit
+    with pytest.raises(LogError, match="degrees"):
+        check_units(MODEL, with_columns(actual_q=small_angles))
+
+
+def test_one_slip_in_a_column_is_no_unit():
+    payload, warm = SESSION.payload_mass.copy(), SESSION.temperature.copy()
+    payload[3], warm[3] = 5000.0, 300.0
+    check_units(MODEL, with_columns(payload=payload, joint_temperatures=warm))
+
+
+def test_an_empty_column_is_no_unit():
+    nothing = np.full_like(READ, np.nan)
+    check_units(MODEL, with_columns(measured_position=nothing, payload_cog=nothing))
+
+
+def test_an_arm_without_rated_payload_knows_grams_by_its_own_weight():
+    unrated = replace(MODEL, arm=replace(MODEL.arm, payload=np.inf))
+    check_units(unrated, LOG)
+    with pytest.raises(LogError, match="grams"):
+        check_units(unrated, with_columns(payload=SESSION.payload_mass * 1e3))
+    weightless = replace(unrated, arm=replace(unrated.arm, mass=np.zeros(3)))
+    check_units(weightless, with_columns(payload=SESSION.payload_mass * 1e3))
+
+
+def test_fahrenheit_is_told():
+    assert "Fahrenheit" in told(with_columns(joint_temperatures=SESSION.temperature * 1.8 + 70))
+
+
+def test_a_misspelt_column_is_told_with_what_it_may_mean():
+    log = replace(with_columns(payload=None), unknown=("paylod", "comment", "payload_mass"))
+    (line,) = findings(log, MODEL, REGISTERED)
+    assert "paylod" in line
+    assert "did you mean payload?" in line
+
+
+def test_repeated_and_backward_timestamps_are_counted():
+    time = SESSION.time.copy()
+    time[5], time[10] = time[4], time[8]
+    lines = findings(with_columns(timestamp=time))
+    assert lines == [
+        "1 timestamp(s) are repeated",
+        "1 timestamp(s) run backwards: rows should be in time order",
+    ]
+
+
+def test_the_clock_of_a_recording_that_repeats_is_told():
+    t = np.arange(500) / 100
+    q = np.outer(np.sin(t), [0.3, 0.2, 0.1])
+    columns = {"timestamp": np.round(t, 1), "actual_q": q}
+    (line,) = findings(Log("moving.csv", columns, 3))
+    assert "rounded to 0.1 s" in line
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("measured_position", "measured position"), ("ft_raw_wrench", "wrench")],
+)
+def test_rows_without_a_reading_are_counted(name, words):
+    values = READ.copy() if name == "measured_position" else np.zeros((len(READ), 6))
+    values[[3, 7], 0] = np.nan
+    assert f"2 row(s) have no {words} and were left out" in findings(with_columns(**{name: values}))
+
+
+def test_positions_that_stand_still_and_few_poses_are_told():
+    assert "hardly move" in told(with_columns(measured_position=np.ones_like(READ)))
+    few = LOG.select(np.arange(5))
+    assert "5 different pose(s) are few" in told(few)
+    assert "are few" not in told(LOG.select(np.arange(40)))
+
+
+def test_joints_beyond_the_limits_are_told():
+    q = SESSION.q.copy()
+    q[0, 1] = 3.0
+    assert "joint(s) 2 stand beyond" in told(with_columns(actual_q=q))
+
+
+def flipped(joint: int):
+    q = SESSION.q.copy()
+    q[:, joint - 1] *= -1
+    return q
+
+
+FRAMES = {
+    "mirrored": ({"measured_position": READ * [1, -1, 1]}, "mirrored"),
+    "sign of a joint": ({"actual_q": flipped(2)}, "joint 2 looks turned round in sign"),
+    "order of the joints": ({"actual_q": SESSION.q[:, ::-1]}, "turned round in order"),
+    "rows late": ({"measured_position": np.roll(READ, 1, axis=0)}, "one row too late"),
+    "rows early": ({"measured_position": np.roll(READ, -1, axis=0)}, "one row too early"),
+    "inches": ({"measured_position": READ / 0.0254}, "look like inches"),
+    "centimetres": ({"measured_position": READ * 100}, "look like centimetres"),
+    "another arm": ({"measured_position": np.cos(3 * READ)}, "is it the right arm"),
+}
+
+
+@pytest.mark.parametrize("mistake", FRAMES)
+def test_poses_that_cannot_be_the_arms_are_told_with_the_likely_mistake(mistake):
+    columns, words = FRAMES[mistake]
+    assert words in told(with_columns(**columns), FREE)
+
+
+def test_positions_in_another_frame_than_declared_are_told():
+    elsewhere = small.readings(AXIAL, SESSION, registered=False)
+    log = with_columns(measured_position=elsewhere)
+    assert "set metrology.registered to false" in told(log)
+    assert told(log, FREE) == ""
+
+
+def test_angles_in_place_of_rotation_vectors_are_told():
+    euler = rotations().as_euler("xyz")
+    assert "roll, pitch and yaw" in told(with_columns(measured_rotation=euler))
+    shuffled = rotations().as_rotvec()[::-1]
+    assert "rotations do not follow" in told(with_columns(measured_rotation=shuffled))
+    aside = (rotations() * Rotation.from_euler("x", 90, degrees=True)).as_rotvec()
+    assert "turned by 1.57 rad" in told(with_columns(measured_rotation=aside))
+
+
+def in_tool(pull):
+    hand = rotations().inv()
+    return np.hstack([hand.apply(pull[:, :3]), hand.apply(pull[:, 3:])])
+
+
+PULLS = {
+    "turned round in sign": -SESSION.tcp_wrench,
+    "given in tool axes": in_tool(SESSION.tcp_wrench),
+    "turned round in sign and given in tool axes": -in_tool(SESSION.tcp_wrench),
+}
+
+
+@pytest.mark.parametrize("mistake", PULLS)
+@pytest.mark.parametrize("nominal", [small.NOMINAL, AXIAL], ids=["rigid model", "soft model"])
+def test_a_pull_that_the_arm_gives_way_against_is_suspected(mistake, nominal):
+    log = with_columns(actual_TCP_force=PULLS[mistake])
+    (line,) = findings(log, small.model_of(nominal), FREE)
+    assert line.startswith(f"actual_TCP_force looks {mistake};")
+
+
+def test_a_rigid_arm_shows_no_sign_of_a_pull():
+    read = small.readings(small.NOMINAL, SESSION)
+    log = small.log_of(SESSION, read, actual_TCP_force=-SESSION.tcp_wrench)
+    assert findings(log, MODEL, REGISTERED) == []
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory):
+    """Poses of an arm of Pinocchio's with a flange sensor and joint torques."""
+    plant = truth.plant(tmp_path_factory.mktemp("arm"), 7, 1)
+    rng = np.random.default_rng(5)
+    q, mass = truth.poses(7, 40, 5), rng.choice([2.0, 4.0], 40)
+    pull = np.zeros((40, 6))
+    pull[::2] = rng.normal(0, 30, (20, 6)) * [1, 1, 1, 0.1, 0.1, 0.1]
+    torque, wrench = plant.dynamics(q, 0 * q, 0 * q, pull, mass)
+    noise = rng.normal(0, 0.3, wrench.shape)
+    columns = {
+        "actual_q": q, "payload": mass, "payload_cog": np.tile(truth.COG, (40, 1)),
+        "actual_TCP_force": pull, "ft_raw_wrench": wrench + noise + 4.0,
+        "actual_current_as_torque": torque,
+    }  # fmt: skip
+    return plant.model(), columns
+
+
+@pytest.mark.parametrize(
+    "turned", ["actual_TCP_force", "ft_raw_wrench", "actual_current_as_torque"]
+)
+def test_a_sensor_or_a_pull_of_the_wrong_sign_is_suspected(moving, turned):
+    model, columns = moving
+    for seen in ("ft_raw_wrench", "actual_current_as_torque"):
+        if turned not in (seen, "actual_TCP_force"):
+            continue
+        kept = {k: v for k, v in columns.items() if k == seen or "_q" in k or "pa" in k}
+        kept["actual_TCP_force"] = columns["actual_TCP_force"]
+        assert findings(truth.log_of(7, **kept), model, FREE) == []
+        kept[turned] = -kept[turned]
+        (line,) = findings(truth.log_of(7, **kept), model, FREE)
+        assert line.startswith(f"{turned} looks turned round in sign;")

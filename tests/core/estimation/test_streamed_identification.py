@@ -1,0 +1,162 @@
+"""A log in pieces gives what it gives in one piece."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+
+from core.arm import builtin_arm
+from core.errors import ExcitationError, LogError
+from core.estimation.identification import identify_compliance
+from core.estimation.spool import Spool
+from core.estimation.streamed import fold_of, identify_streamed
+from core.log.log import Log, read_log
+from core.log.pieces import LogPieces
+from core.metrology import Metrology
+from core.model import Model
+from core.rotation import rotation_matrix, rotation_vector
+
+COUNT, PIECE = 1500, 400
+
+
+def nominal() -> Model:
+    tool = np.eye(4)
+    tool[:3, 3] = (0.04, -0.03, 0.15)
+    return Model(builtin_arm("ur10e"), tool)
+
+
+def measured_log(rotations: bool, shifted: bool, wild: int = 0) -> Log:
+    rng = np.random.default_rng(3)
+    true = nominal().with_compliance([3e-6, 5e-6, 4e-6, 8e-6, 8e-6, 9e-6], [1e-6] * 6)
+    if shifted:
+        tool = true.tool_in_flange.copy()
+        tool[:3, 3] += (0.001, -0.002, 0.0005)
+        true = replace(true, tool_in_flange=tool)
+    q = rng.uniform(-2.5, 2.5, (COUNT, 6))
+    columns = {
+        "actual_q": q,
+        "payload": rng.choice([0.0, 4.0, 9.0], COUNT),
+        "payload_cog": rng.normal(0, 0.05, (COUNT, 3)),
+        "actual_TCP_force": rng.normal(0, 30, (COUNT, 6)) * [1, 1, 1, 0.1, 0.1, 0.1],
+    }
+    poses = true.predict(q, Log("truth", columns, 6).loads())
+    frame = rotation_matrix(np.array([[0.1, -0.2, 0.7]]))[0] if shifted else np.eye(3)
+    position = poses.position @ frame.T + (0.5 if shifted else 0.0)
+    columns["measured_position"] = position + rng.normal(0, 2e-5, position.shape)
+    columns["measured_position"][:wild] += 0.02
+    columns["measured_position"][40] = np.nan  # a row that nobody measured
+    if rotations:
+        columns["measured_rotation"] = rotation_vector(frame @ poses.rotation)
+        columns["measured_rotation"] += rng.normal(0, 1e-5, position.shape)
+    return Log("session", columns, 6)
+
+
+def pieces_of(log: Log) -> list[Log]:
+    return [log.select(slice(at, at + PIECE)) for at in range(0, len(log), PIECE)]
+
+
+@pytest.mark.parametrize(
+    ("rotations", "shifted", "wild"), [(False, False, 0), (False, True, 20), (True, True, 0)]
+)
+def test_pieces_give_what_the_whole_gives(rotations, shifted, wild):
+    log, metrology = measured_log(rotations, shifted, wild), Metrology(registered=not shifted)
+    whole = identify_compliance(nominal(), log, metrology)
+    found = identify_streamed(nominal(), pieces_of(log), metrology)
+    for name in ("axial", "radial"):
+        np.testing.assert_allclose(
+            getattr(found, name), getattr(whole, name), rtol=1e-9, atol=1e-15
+        )
+    np.testing.assert_allclose(found.std_axial, whole.std_axial, rtol=1e-6)
+    np.testing.assert_allclose(found.tool_offset, whole.tool_offset, atol=1e-11)
+    np.testing.assert_allclose(found.gap_rms, whole.gap_rms, rtol=1e-8)
+    np.testing.assert_allclose(found.remaining_rms, whole.remaining_rms, rtol=1e-8)
+    assert found.remaining_rms_held_out == pytest.approx(whole.remaining_rms_held_out, rel=0.05)
+    assert (found.outliers == whole.outliers).all()
+    assert found.notes == whole.notes
+    assert found.samples == whole.samples == COUNT - 1
+
+
+def test_links_that_bend_go_the_long_way_and_give_the_same():
+    log, metrology = measured_log(False, False), Metrology(registered=True)
+    from core.effects import Site, Term
+
+    model = nominal().with_terms([Term("link_flexibility", Site(2), (1e-6,))])
+    log = log.select(slice(0, 150))
+    whole = identify_compliance(model, log, metrology)
+    found = identify_streamed(model, pieces_of(log), metrology, held_out=False)
+    np.testing.assert_allclose(found.axial, whole.axial, rtol=1e-8, atol=1e-15)
+
+
+def test_a_log_without_loads_is_declined_as_ever():
+    log = measured_log(False, False)
+    light = replace(nominal(), arm=replace(nominal().arm, mass=np.zeros(6)))
+    columns = {name: log.columns[name] for name in ("actual_q", "measured_position")}
+    with pytest.raises(ExcitationError, match="nothing in the log excites"):
+        identify_streamed(light, [replace(log, columns=columns)], Metrology(registered=True))
+
+
+def written(log: Log, path: Path) -> Path:
+    table = {}
+    for name, values in log.columns.items():
+        flat = values.reshape(len(values), -1)
+        for k in range(flat.shape[1]):
+            table[name if values.ndim == 1 else f"{name}_{k}"] = flat[:, k]
+    if path.suffix == ".parquet":
+        parquet.write_table(pa.table(table), path)
+    else:
+        rows = np.column_stack(list(table.values()))
+        np.savetxt(path, rows, delimiter=",", header=",".join(table), comments="", fmt="%.17g")
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".csv"])
+def test_a_file_in_pieces_holds_what_it_holds_in_one(tmp_path, suffix):
+    path = written(measured_log(True, False), tmp_path / f"log{suffix}")
+    whole, parts = read_log(path, 6), list(LogPieces(path, 6, 400))
+    assert [len(part) for part in parts] == [400, 400, 400, 300]
+    assert LogPieces(path, 6).count() == COUNT
+    for name in whole.columns:
+        np.testing.assert_array_equal(
+            np.concatenate([part.columns[name] for part in parts]), whole.columns[name]
+        )
+    assert parts[2].line(5) == whole.line(805)
+    approach = np.concatenate([part.loads().approach for part in parts])
+    np.testing.assert_array_equal(approach, whole.loads().approach)
+
+
+def test_a_joint_that_rests_over_the_seam_keeps_its_last_motion(tmp_path):
+    q = np.zeros((12, 6))
+    q[2:, 0], q[4:, 1], q[9:, 1] = 0.3, -0.2, 0.4
+    path = written(Log("log", {"actual_q": q}, 6), tmp_path / "log.parquet")
+    parts = [part.columns["approach"] for part in LogPieces(path, 6, 3)]
+    np.testing.assert_array_equal(np.concatenate(parts), read_log(path, 6).approach())
+
+
+def test_a_cell_that_is_no_number_is_named_in_a_later_piece(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("payload\n" + "1\n" * 500 + "heavy\n")
+    with pytest.raises(LogError, match="row 502, column payload: found 'heavy'"):
+        list(LogPieces(path, 6, 100))
+
+
+def test_the_median_of_a_spool_is_numpys():
+    rng = np.random.default_rng(0)
+    for count in (1, 2, 999, 1000):
+        rows = rng.normal(0, 10.0 ** rng.integers(-8, 3, (count, 1)), (count, 6))
+        with Spool(6) as spool:
+            spool.append(rows[: count // 2])
+            spool.append(rows[count // 2 :])
+            assert spool.median_size(0, 3) == np.median(np.abs(rows[:, :3]))
+            assert spool.median_size(3, 6) == np.median(np.abs(rows[:, 3:]))
+
+
+def test_folds_are_alike_in_size_and_the_same_at_every_pass():
+    rows = np.arange(100_000)
+    folds = fold_of(rows)
+    assert np.bincount(folds).min() > 0.97 * len(rows) / 5
+    np.testing.assert_array_equal(fold_of(rows[777:1000]), folds[777:1000])

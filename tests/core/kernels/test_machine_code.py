@@ -1,0 +1,126 @@
+"""Machine code of a function goes when another source changes that was compiled into it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from core.kernels import machine_code
+from core.kernels.machine_code import CORE, FOLDERS, MARK
+
+KERNEL = """\
+from numba import njit
+from core.kernels.machine_code import keep_by_all_sources
+keep_by_all_sources()
+@njit(cache=True)
+def statics(x):
+    return {factor} * x
+"""
+CORRECTION = """\
+from numba import njit
+from core.kernels.reference import statics
+@njit(cache=True)
+def correct(x):
+    return statics(x) + 1.0
+print(correct(1.0), sum(correct.stats.cache_hits.values()))
+"""
+
+
+class Package:
+    """A small copy of the real one: two compiled files, one within the other."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.core = folder / "core"
+        (self.core / "kernels").mkdir(parents=True)
+        (self.core / "__init__.py").write_text("")
+        shutil.copy(CORE / "kernels" / "machine_code.py", self.core / "kernels")
+        (self.core / "correction.py").write_text(CORRECTION)
+        self.change(2.0)
+
+    def change(self, factor: float) -> None:
+        (self.core / "kernels" / "reference.py").write_text(KERNEL.format(factor=factor))
+
+    def run(self, **environment: str) -> str:
+        """Return what a process of its own computes, and how often it took what was compiled."""
+        done = subprocess.run(
+            [sys.executable, "-c", "import core.correction"], cwd=self.folder, text=True,
+            env={**os.environ, "PYTHONPATH": str(self.folder), **environment},
+            capture_output=True, timeout=120,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return done.stdout.strip()
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Package:
+    return Package(tmp_path)
+
+
+def test_what_was_compiled_in_changes_and_the_caller_is_compiled_anew(package: Package) -> None:
+    assert package.run() == "3.0 0"
+    assert package.run() == "3.0 1"
+    package.change(5.0)
+    assert package.run() == "6.0 0"
+    assert package.run() == "6.0 1"
+
+
+def test_a_file_without_compiled_functions_costs_nothing(package: Package) -> None:
+    package.run()
+    (package.core / "words.py").write_text("TEXT = 1\n")
+    assert package.run() == "3.0 1"
+
+
+def test_machine_code_from_before_a_module_was_renamed_is_not_read(package: Package) -> None:
+    """Numba's index pickles the classes of arguments by the module that they are defined in."""
+    kernels = package.core / "kernels"
+    arm = "from typing import NamedTuple\nclass Arm(NamedTuple):\n    length: float\n"
+    run = CORRECTION.replace("(x)", "(arm)").replace("statics(arm)", "statics(arm.length)")
+    run = run.replace("correct(1.0)", "correct(Arm(1.0))")
+    reference = (kernels / "reference.py").read_text()
+    (kernels / "reference.py").write_text(arm + reference)
+    (package.core / "correction.py").write_text("from core.kernels.reference import Arm\n" + run)
+    assert package.run() == "3.0 0"
+    (kernels / "reference.py").unlink()
+    (kernels / "renamed.py").write_text(arm + reference)
+    text = (package.core / "correction.py").read_text().replace(".reference", ".renamed")
+    (package.core / "correction.py").write_text(text)
+    assert package.run() == "3.0 0"
+
+
+def test_other_places_for_machine_code_look_at_all_sources_too(
+    package: Package, tmp_path: Path
+) -> None:
+    place = {"NUMBA_CACHE_DIR": str(tmp_path / "elsewhere")}
+    assert package.run(**place) == "3.0 0"
+    assert not list(package.core.rglob("*.nbi"))
+    package.change(5.0)
+    assert package.run(**place) == "6.0 0"
+    assert package.run(**place) == "6.0 1"
+
+
+def test_compiled_functions_stand_only_where_they_are_looked_for() -> None:
+    here = [file for file in CORE.rglob("*.py") if MARK in file.read_bytes()]
+    assert {file.parent for file in here} == set(FOLDERS)
+
+
+def test_each_compiled_function_of_ours_is_kept_so() -> None:
+    from bridge.loop import nominal_stream
+    from core import interpolation, limits
+    from core.kernels import single
+
+    compiled = (single.correct, limits._limit, interpolation._follow, nominal_stream._followed)
+    for function in compiled:
+        stamp = function._cache._impl.locator.get_source_stamp()
+        assert stamp[1] == machine_code.fingerprint(), function
+
+
+def test_functions_of_other_libraries_are_left_alone() -> None:
+    assert machine_code.InTree.from_function(Package.run, np.__file__) is None
+    assert machine_code.InTree.from_function(Package.run, machine_code.__file__) is not None

@@ -1,0 +1,110 @@
+"""LeRobot datasets as their writer lays them out: v3 files, names with ``.pos``, own units."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow
+import pytest
+from pyarrow import parquet
+
+from core.errors import LogError
+from core.log.sources import SourceOptions, source_of
+
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
+NAMES = ("gripper", *JOINTS[::-1])  # another order than the arm's
+FRAMES = 30
+RANGE = {name: (1000 + 100 * i, 3047 + 100 * i) for i, name in enumerate((*JOINTS, "gripper"))}
+
+
+def numbers(episode: int) -> dict[str, np.ndarray]:
+    """Return each joint's numbers (frames,), each its own."""
+    steps = np.arange(FRAMES)
+    return {name: 5.0 * i + steps + 40 * episode for i, name in enumerate(NAMES)}
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Path:
+    folder = tmp_path / "set"
+    (folder / "meta").mkdir(parents=True)
+    (folder / "data" / "chunk-000").mkdir(parents=True)
+    names = [f"{name}.pos" for name in NAMES]
+    features = {key: {"dtype": "float32", "shape": [6], "names": names}
+                for key in ("action", "observation.state")}  # fmt: skip
+    info = {"codebase_version": "v3.0", "fps": 30, "features": features}
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+    rows: dict[str, list] = {"action": [], "observation.state": [], "timestamp": [],
+                             "episode_index": [], "frame_index": []}  # fmt: skip
+    for episode in (0, 1):
+        found = numbers(episode)
+        for k in range(FRAMES):
+            state = [float(found[name][k]) for name in NAMES]
+            rows["observation.state"].append(state)
+            rows["action"].append([value + 0.5 for value in state])
+            rows["timestamp"].append(k / 30)
+            rows["episode_index"].append(episode)
+            rows["frame_index"].append(k)
+    parquet.write_table(pyarrow.table(rows), folder / "data" / "chunk-000" / "file-000.parquet")
+    return folder
+
+
+@pytest.fixture
+def calibration(tmp_path: Path) -> Path:
+    file = tmp_path / "arm.json"
+    file.write_text(json.dumps({
+        name: {"id": i + 1, "drive_mode": 0, "homing_offset": 7, "range_min": low,
+               "range_max": high}
+        for i, (name, (low, high)) in enumerate(RANGE.items())
+    }))  # fmt: skip
+    return file
+
+
+def test_joints_are_found_by_name_and_scaled_by_the_calibration(
+    dataset: Path, calibration: Path
+) -> None:
+    found = source_of(dataset).read(dataset, JOINTS, SourceOptions(calibration=calibration))
+    # from -100 to 100 over 2047 of 4095 steps a turn
+    rad = 2047 / 200 * 2 * np.pi / 4095
+    state = np.column_stack([numbers(0)[name] for name in JOINTS])
+    assert np.allclose(found.columns["actual_q"][:FRAMES], state * rad)
+    assert np.allclose(found.columns["target_q"][:FRAMES], (state + 0.5) * rad)
+    assert any("latency below 33 ms" in note for note in found.notes)
+
+
+def test_episodes_follow_one_another_in_time(dataset: Path) -> None:
+    found = source_of(dataset).read(dataset, JOINTS, SourceOptions(units="degrees"))
+    steps = np.diff(found.columns["timestamp"])
+    assert len(found) == 2 * FRAMES
+    assert np.allclose(np.delete(steps, FRAMES - 1), 1 / 30)
+    assert steps[FRAMES - 1] == pytest.approx(1.0)
+
+
+def test_one_episode_can_be_taken(dataset: Path) -> None:
+    options = SourceOptions(units="rad", episode=1)
+    found = source_of(dataset).read(dataset, JOINTS, options)
+    assert np.allclose(found.columns["actual_q"][:, 0], numbers(1)[JOINTS[0]])
+    with pytest.raises(LogError, match="no episode 7"):
+        source_of(dataset).read(dataset, JOINTS, SourceOptions(units="rad", episode=7))
+
+
+def test_units_that_nobody_says_are_asked_for(dataset: Path) -> None:
+    with pytest.raises(LogError, match=r"--calibration FILE.*--units"):
+        source_of(dataset).read(dataset, JOINTS, SourceOptions())
+
+
+def test_a_calibration_of_another_arm_is_refused(dataset: Path, tmp_path: Path) -> None:
+    file = tmp_path / "other.json"
+    file.write_text(json.dumps({"joint_1": {"range_min": 0, "range_max": 4095}}))
+    with pytest.raises(LogError, match=r"other.json: shoulder_pan: not found"):
+        source_of(dataset).read(dataset, JOINTS, SourceOptions(calibration=file))
+
+
+def test_a_dataset_without_names_is_refused(dataset: Path) -> None:
+    info = dataset / "meta" / "info.json"
+    given = json.loads(info.read_text())
+    given["features"]["action"]["names"] = None
+    info.write_text(json.dumps(given))
+    with pytest.raises(LogError, match=r"features.action.names: found None"):
+        source_of(dataset).read(dataset, JOINTS, SourceOptions(units="rad"))

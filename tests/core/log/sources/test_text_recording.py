@@ -1,0 +1,63 @@
+"""Text recordings of other programs, laid out as those programs write them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from core.errors import LogError
+from core.log.sources import SourceOptions, source_of
+
+
+def franka(path: Path, rows: int = 5) -> np.ndarray:
+    """Write what franka::logToCSV writes; return q (rows, 7)."""
+    vectors = ("state.q", "state.q_d", "state.dq", "state.dq_d", "state.tau_J",
+               "state.tau_ext_hat_filtered", "cmd.q_d")  # fmt: skip
+    header = "time, success_rate, " + ",".join(
+        ", ".join(f"{name}[{i}]" for i in range(7)) for name in vectors
+    )
+    q = 0.1 * np.arange(7) + 0.01 * np.arange(rows)[:, None]
+    lines = [header]
+    for k in range(rows):
+        cells = [k, 1.0, *q[k], *(q[k] + 0.001), *np.zeros(14), *(q[k] * 10), *np.zeros(14)]
+        lines.append(",".join(f"{cell:g}" for cell in cells))
+    path.write_text("\n".join(lines) + "\n")
+    return q
+
+
+def test_a_franka_log_has_seconds_and_both_positions(tmp_path: Path) -> None:
+    q = franka(tmp_path / "log.csv")
+    found = source_of(tmp_path / "log.csv").read(tmp_path / "log.csv", (), SourceOptions())
+    assert np.allclose(found.columns["timestamp"], 0.001 * np.arange(5))
+    assert np.allclose(found.columns["actual_q"], q)
+    assert np.allclose(found.columns["target_q"], q + 0.001)
+    assert np.allclose(found.columns["actual_current_as_torque"], q * 10)
+
+
+def test_an_rtde_recording_has_spaces(tmp_path: Path) -> None:
+    path = tmp_path / "robot.csv"
+    joints = [f"{kind}_q_{i}" for kind in ("target", "actual") for i in range(6)]
+    names = ["timestamp", *joints, "runtime_state", "payload"]
+    values = np.hstack([np.arange(4)[:, None] * 0.002, np.full((4, 12), 0.25),
+                        np.full((4, 1), 2), np.full((4, 1), 1.5)])  # fmt: skip
+    path.write_text("\n".join([" ".join(names)] + [" ".join(map(str, r)) for r in values]) + "\n")
+    found = source_of(path).read(path, (), SourceOptions())
+    assert found.columns["actual_q"].shape == (4, 6)
+    assert np.allclose(found.columns["payload"], 1.5)
+    assert np.allclose(found.columns["timestamp"], 0.002 * np.arange(4))
+
+
+def test_a_log_is_no_other_source(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("timestamp,actual_q_0\n0,1\n")
+    assert source_of(path) is None
+
+
+def test_text_among_the_numbers_is_one_clear_line(tmp_path: Path) -> None:
+    franka(tmp_path / "log.csv")
+    with (tmp_path / "log.csv").open("a") as file:
+        file.write("5,1,what\n")
+    with pytest.raises(LogError, match=r"log.csv: found .*expected rows of numbers"):
+        source_of(tmp_path / "log.csv").read(tmp_path / "log.csv", (), SourceOptions())

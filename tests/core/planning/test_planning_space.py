@@ -1,0 +1,137 @@
+"""Where the arm may be measured: limits, boxes, the arm itself, and what the instrument sees."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from core.arm import builtin_arm
+from core.errors import PlanError
+from core.model import Model
+from core.planning.capsules import Box, segment_distance
+from core.planning.workspace import Place, Space
+
+UP = np.array([[0.0, -np.pi / 2, 0.0, -np.pi / 2, 0.0, 0.0]])  # a UR stretched upwards
+OUT = np.zeros((1, 6))  # a UR stretched out along -x
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    tool = np.eye(4)
+    tool[:3, 3] = [0.02, 0.0, 0.15]
+    return Model(builtin_arm("ur5e"), tool)
+
+
+def test_frames_are_the_rigid_models(model: Model) -> None:
+    space = Space.of(model)
+    q = space.draw(50, np.random.default_rng(0))
+    frames, poses = space.frames(q), model.rigid_pose(q)
+    assert frames.tcp == pytest.approx(poses.position, abs=1e-12)
+    assert frames.rotation == pytest.approx(poses.rotation, abs=1e-12)
+
+
+def test_joints_that_turn_further_than_once_round_need_not_wind_up(model: Model) -> None:
+    space = Space.of(model)
+    assert space.lower == pytest.approx(-np.pi)
+    tight = Space.of(model, lower=[-1] * 6, upper=[0.5, 1, 1, 1, 1, 1])
+    drawn = tight.draw(200, np.random.default_rng(0))
+    assert drawn.min() >= -1
+    assert drawn[:, 0].max() <= 0.5
+    assert not tight.clear(np.full((1, 6), 0.9)).any()
+
+
+def test_a_box_is_hit_by_the_arm_that_reaches_into_it(model: Model) -> None:
+    tip = model.rigid_pose(OUT).position[0]
+    box = Box(tuple(tip - 0.05), tuple(tip + 0.05))
+    assert Space.of(model).clear(OUT).all()
+    assert not Space.of(model, keep_out=[box]).clear(OUT).any()
+    assert Space.of(model, keep_out=[box]).clear(UP).all()
+
+
+def test_a_thin_wall_between_the_joints_is_seen(model: Model) -> None:
+    wall = Box((-0.31, -1.0, 0.0), (-0.30, 1.0, 1.0))  # across the middle of the upper arm
+    assert not Space.of(model, keep_out=[wall]).clear(OUT).any()
+
+
+def test_the_floor_stops_the_forearm_and_not_the_foot(model: Model) -> None:
+    space = Space.of(model, floor=0.0)
+    assert space.clear(UP).all()
+    down = np.array([[0.0, 0.6, 0.0, 0.0, 0.0, 0.0]])
+    assert space.hindrances(down)["come below the floor"].all()
+
+
+def test_a_folded_arm_is_near_itself(model: Model) -> None:
+    folded = np.array([[0.0, -np.pi / 2, np.pi - 0.15, 0.0, 0.5, 0.0]])
+    assert Space.of(model).hindrances(folded)["come near the arm itself"].all()
+
+
+def test_the_load_is_part_of_the_arm(model: Model) -> None:
+    tip = model.rigid_pose(OUT)
+    below = tip.position[0] + tip.rotation[0] @ [0, 0, 0.35]
+    box = Box(tuple(below - 0.03), tuple(below + 0.03))
+    space = Space.of(model, keep_out=[box])
+    assert space.clear(OUT).all()
+    assert not replace(space, hung=((0.0, 0.0, 0.55),)).clear(OUT).any()
+
+
+def test_a_straight_arm_is_nearly_singular(model: Model) -> None:
+    space = Space.of(model)
+    bent = np.array([[0.3, -1.2, 1.3, -1.0, 1.2, 0.4]])
+    assert space.near_singular(space.frames(np.vstack([OUT, bent]))).tolist() == [True, False]
+
+
+def test_the_tracker_sees_what_is_before_the_arm_and_not_what_is_behind_it(model: Model) -> None:
+    tip = model.rigid_pose(OUT).position[0]
+    before = Place((tip[0] - 1.0, tip[1], tip[2]))
+    wrist = Space.of(model).frames(OUT).origin[0, 4]
+    behind = Place(tuple(tip + 3.0 * (wrist - tip)))
+    space = Space.of(model, places=[before, behind])
+    frames = space.frames(OUT)
+    assert not space.sees(frames, 0, 0)["hide the target from place 1"].any()
+    assert space.sees(frames, 1, 0)["hide the target from place 2"].any()
+
+
+def test_a_reflector_is_seen_within_its_cone_and_the_instruments_range(model: Model) -> None:
+    tip = model.rigid_pose(OUT)
+    axis = tip.rotation[0] @ [0, 0, 1.0]
+    place = Place(tuple(tip.position[0] + 2.0 * axis), nearest=0.5, farthest=3.0)
+    space = Space.of(model, places=[place], looks=[(0, 0, 1)], acceptance=np.radians(30))
+    turned = "turn the reflector away from place 1"
+    assert not space.sees(space.frames(OUT), 0, 0)[turned].any()
+    away = replace(space, looks=-space.looks)
+    assert away.sees(away.frames(OUT), 0, 0)[turned].all()
+    near = replace(space, places=(replace(place, nearest=2.5),))
+    assert near.sees(near.frames(OUT), 0, 0)["are out of range from place 1"].all()
+
+
+@pytest.mark.parametrize(
+    ("given_to_space", "expected"),
+    [
+        ({"lower": [0] * 5}, "lower: found 5 values, expected 6"),
+        ({"lower": [1] * 6, "upper": [0.5] * 6}, "joint 1: found limits 1 to 0.5"),
+        ({"keep_out": [Box((0, 0, 1), (1, 1, 0))]}, "keep-out box 1: .*lower below upper"),
+    ],
+)
+def test_rooms_that_cannot_be_are_declined(model: Model, given_to_space, expected) -> None:
+    with pytest.raises(PlanError, match=expected):
+        Space.of(model, **given_to_space)
+
+
+coordinate = st.floats(-2, 2, allow_nan=False)
+point = st.tuples(coordinate, coordinate, coordinate).map(np.array)
+
+
+@given(point, point, point, point)
+@settings(max_examples=50, deadline=None)
+def test_no_two_points_of_two_segments_are_nearer_than_their_distance(p, q, r, s) -> None:
+    share = np.linspace(0, 1, 41)[:, None]
+    one, other = p + share * (q - p), r + share * (s - r)
+    nearest = np.linalg.norm(one[:, None] - other[None], axis=2).min()
+    found = float(segment_distance(p, q, r, s))
+    longest = max(np.linalg.norm(q - p), np.linalg.norm(s - r))
+    assert found <= nearest + 3e-6
+    assert found >= nearest - longest / 40 - 3e-6

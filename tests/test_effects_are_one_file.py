@@ -1,0 +1,94 @@
+"""An effect is one file and one line: nothing else in the house asks for it by name."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+from core.effects import CATALOGUE
+
+ROOT = Path(__file__).parents[1]
+OWN = ROOT / "core" / "effects"
+# identifiers that are also a column of the log, a limit's key or a field of another record: as
+# such they are no effect
+SHARED = {"payload", "payload_cog", "joint_offset", "latency"}
+ASKED = {"effect", "family", "identifier"}  # attributes whose text is an identifier
+TAKING = {"Term", "effect_named", "joints"}  # calls whose first argument is one
+
+
+def _named(text: object) -> str | None:
+    """Return the effect that a text is the name of, or of a parameter of."""
+    if not isinstance(text, str):
+        return None
+    if text in CATALOGUE:
+        return text
+    return next(
+        (e for e in CATALOGUE if e not in SHARED and text.startswith(f"{e}_") and " " not in text),
+        None,
+    )
+
+
+def _texts(node: ast.AST) -> Iterator[str]:
+    for part in ast.walk(node):
+        if isinstance(part, ast.Constant) and isinstance(part.value, str):
+            yield part.value
+
+
+def _asked(tree: ast.AST) -> Iterator[str]:
+    """Yield effects that are compared with, or asked for, by name: shared names count here."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Compare):
+            sides = [node.left, *node.comparators]
+            if any(isinstance(s, ast.Attribute) and s.attr in ASKED for s in sides):
+                yield from (t for s in sides for t in _texts(s) if t in CATALOGUE)
+        if isinstance(node, ast.Call) and node.args:
+            name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+            if name in TAKING:
+                yield from (t for t in _texts(node.args[0]) if t in CATALOGUE)
+        if isinstance(node, ast.Subscript) and getattr(node.value, "id", "") == "CATALOGUE":
+            yield from (t for t in _texts(node.slice) if t in CATALOGUE)
+
+
+def _found(source: str) -> list[str]:
+    """Return the effects that a source names, docstrings left aside."""
+    tree = ast.parse(source)
+    prose = {
+        id(node.body[0].value)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+        and node.body
+        and isinstance(node.body[0], ast.Expr)
+    }
+    found = list(_asked(tree))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and id(node) not in prose:
+            name = _named(node.value)
+            if name and name not in SHARED:
+                found.append(name)
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("core.effects."):
+            found += [(node.module or "").rpartition(".")[2]] * (
+                node.module != "core.effects.effect"
+            )
+    return found
+
+
+def test_no_effect_is_named_outside_its_own_file_and_the_table() -> None:
+    sources = [p for top in ("core", "drivers", "bridge") for p in (ROOT / top).rglob("*.py")]
+    assert len(sources) > 100
+    named = {
+        f"{path.relative_to(ROOT)}: {name}"
+        for path in sources
+        if OWN not in path.parents
+        for name in _found(path.read_text(encoding="utf-8"))
+    }
+    assert named == set()
+
+
+def test_the_search_finds_what_it_looks_for() -> None:
+    assert _found('x = ("backlash", 1)') == ["backlash"]
+    assert _found('x = "ft_bias_fx"') == ["ft_bias"]
+    assert _found('if term.effect == "payload": pass') == ["payload"]
+    assert _found('kept = [t for t in terms if t.effect not in ("payload",)]') == ["payload"]
+    assert _found("from core.effects.backlash import Backlash") == ["backlash"]
+    assert _found('"""What ``backlash`` is."""\nlog.get("payload")') == []
