@@ -25,7 +25,7 @@ from core.diagnosis.result import Cause, Considered, causes_of, considered_of
 from core.diagnosis.rigid_suspicion import softness_findings
 from core.diagnosis.selection.selection import Selection, select, standing
 from core.diagnosis.separation import Measurement, next_measurements
-from core.effects import Term, flexibility_effects
+from core.effects import CATALOGUE, Term, flexibility_effects
 from core.errors import LogError
 from core.log.columns import COLUMNS, misspelt
 from core.log.log import Log
@@ -163,6 +163,8 @@ def _diagnose(
         if simulated is None and len(soft) == 2 and _lacks_much(channel):
             told += softness_findings(model, log, metrology)
     terms = _for_the_model(observed)
+    if not log.one_clock:
+        terms = [_slipped(term, log) for term in terms]
     return Diagnosis(
         _overall(observed), tuple(observed), tuple(hidden),
         next_measurements(model, log, observed), tuple(told), with_found(model, terms),
@@ -218,6 +220,13 @@ def _for_the_model(channels: Sequence[ChannelDiagnosis]) -> list[Term]:
                 if key not in best or deviation < best[key][0]:
                     best[key] = (deviation, term)
     return [term for _, term in best.values()]
+
+
+def _slipped(term: Term, log: Log) -> Term:
+    """Return a term that steps once as it stands today: clocks that overlap hold no moment."""
+    if not CATALOGUE[term.effect].at_moment:
+        return term
+    return replace(term, values=(*term.values[:-1], float(log.times()[0]) - 1.0))
 
 
 def _lacks_much(channel: ChannelDiagnosis) -> bool:

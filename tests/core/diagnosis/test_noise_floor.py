@@ -50,9 +50,13 @@ def test_without_repeats_what_is_left_is_no_measure_of_noise() -> None:
 
 def test_a_pose_under_another_load_is_no_repeat() -> None:
     observation = small.diagnosed("none").channels[0].selection.observation
-    twice = replace(observation, groups=np.arange(len(observation.groups)) // 2)
-    residual = np.ones((len(observation.rows), 3))
-    assert repeat_variance(twice, residual, np.ones(len(residual), dtype=bool))[1] == 0
+    count = len(observation.rows)
+    kept, residual = np.ones(count, dtype=bool), np.ones((count, 3))
+    quantities = {"payload": np.arange(count) * 0.1}
+    twice = replace(observation, groups=np.arange(count) // 2, quantities=quantities)
+    assert repeat_variance(twice, residual, kept)[1] == 0
+    same = replace(twice, quantities={"payload": np.zeros(count)})
+    assert repeat_variance(same, residual, kept) == (0.0, 3 * (count // 2))
 
 
 def recording(noise: float, step: float = 0.0) -> tuple[np.ndarray, Log]:
