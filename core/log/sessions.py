@@ -120,7 +120,8 @@ def _joined(logs: Sequence[Log], names: tuple[str, ...], model: Model, path: str
         columns["timestamp"], one_clock = _clock([log.columns["timestamp"] for log in logs])
     lines = np.concatenate([[log.line(r) for r in range(len(log))] for log in logs])
     return Log(
-        path, columns, logs[0].n, lines=lines, numbers=np.arange(len(lines)) + 1, session_names=names, one_clock=one_clock,
+        path, columns, logs[0].n, lines=lines, numbers=np.arange(len(lines)) + 1,
+        session_names=names, one_clock=one_clock,
         unknown=tuple(dict.fromkeys(u for log in logs for u in log.unknown)),
     )  # fmt: skip
 
