@@ -107,7 +107,8 @@ class _Problem:
 
     def _enough(self, session: int, fitted: NDArray[np.bool_]) -> bool:
         own = int((self._owner == session).sum())
-        return self._k * int((fitted & (self._session == session)).sum()) >= own + 3
+        found = int((fitted & (self._session == session)).sum())
+        return bool(self._k * found >= own + 3)
 
     def _rows(self, samples: NDArray[np.bool_]) -> NDArray[np.bool_]:
         return np.repeat(samples, self._k)

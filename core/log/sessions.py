@@ -39,8 +39,8 @@ def sessions_in(log: Log) -> list[Log]:
         return [log]
     index = session_of(log)
     return [
-        replace(log.select(np.flatnonzero(index == s)), session_names=())
-        for s in range(len(log.session_names))
+        replace(log.select(rows), session_names=())
+        for rows in (np.flatnonzero(index == s) for s in range(len(log.session_names)))
     ]
 
 
