@@ -10,13 +10,16 @@ import numpy as np
 import pytest
 import yaml
 from cli_runs import (
-    cell_in,
+    CELL,
     columns_of,
     gapbridge,
     log_in,
     measured,
     poses_and_loads,
     refused,
+)
+from cli_runs import (
+    cell_in as registered_cell_in,
 )
 
 from bridge.cell import load_cell
@@ -27,6 +30,10 @@ from core.rotation import rotation_matrix
 
 SOFT = Model(builtin_arm("ur10e")).with_terms([Term("axial_compliance", Site(2), (2e-5,))])
 FRAMES = {"a.csv": (np.array([0.2, -0.4, 1.0]), 1.0), "b.csv": (np.array([-1.0, 0.3, 0.2]), -2.0)}
+
+
+def cell_in(folder: Path) -> Path:
+    return registered_cell_in(folder, CELL.replace("registered: true", "registered: false"))
 
 
 def session(folder: Path, name: str, seed: int, start: float = 0.0, rows: int = 40) -> Path:
