@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from core.arm import Arm
-from core.diagnosis.channels.observation import Observation
+from core.diagnosis.observation import Observation
 from core.diagnosis.selection.candidate import Candidate
 from core.diagnosis.selection.state import Work, flat
 from core.effects import CATALOGUE, Effect, Site, Term
