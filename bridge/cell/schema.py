@@ -116,6 +116,9 @@ class Simulation(Section):
     compliance: Compliance | None = Field(
         default=None, description="true flexibilities, rad/Nm; default: drawn from the seed"
     )
+    droop: list[NotNegative] | None = Field(
+        default=None, description="rad/Nm per joint by which servos give way; default: none"
+    )
     tracker_noise: NotNegative | None = Field(default=None, description="m, 1 sigma")
     rtde_port: int | None = Field(default=None, gt=0, lt=65536, strict=True)
     dashboard_port: int | None = Field(default=None, gt=0, lt=65536, strict=True)

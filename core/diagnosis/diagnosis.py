@@ -24,6 +24,7 @@ from core.diagnosis.observation import NotObservable, Observation, thinned
 from core.diagnosis.residual_structure import dependence
 from core.diagnosis.result import Cause, Considered, causes_of, considered_of
 from core.diagnosis.rigid_suspicion import softness_findings
+from core.diagnosis.selection.moments import slip_sentences
 from core.diagnosis.selection.selection import Selection, select, standing
 from core.diagnosis.separation import Measurement, next_measurements
 from core.effects import CATALOGUE, Term, flexibility_effects
@@ -392,6 +393,10 @@ def _channel_findings(channel: ChannelDiagnosis, log: Log) -> list[str]:
         told.append(f"{channel.channel}: {term.effect}{joint} is not accused: {reason}")
         if position_ in channel.judgement.stand_ins:
             told[-1] += "; poses not fitted gain by it: a stand-in"
+    terms = [term for cause in channel.causes for term in cause.terms]
+    whole = channel.verdict == "explained"
+    sentences = slip_sentences(terms, channel.selection.observation, whole)
+    told += [f"{channel.channel}: {sentence}" for sentence in sentences]
     for cause in channel.causes:
         told += [f"{channel.channel}: {note}" for note in cause.notes]
     return told
