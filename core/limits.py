@@ -48,7 +48,7 @@ class Limits:
     offset_rate: float = 0.05
     offset_rotation_rate: float = 0.1
     joint_offset: float = 0.05
-    following: float = 0.35
+    following: float = 0.1
     cycle: float = 0.002
 
     def __post_init__(self) -> None:
@@ -185,7 +185,7 @@ class Limiter:
             joint = int(np.argmax(np.abs(self._q - actual_q)))
             return (
                 f"setpoint: joint {joint + 1} is {abs(self._q[joint] - actual_q[joint]):.4f} rad "
-                f"from its command, expected at most {self.limits.following:g}"
+                f"from its command, expected at most {self.limits.following:g} (limits.following)"
             )
         if not self.started:
             return "setpoint: found no start of the stream, expected start() before limit()"

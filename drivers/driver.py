@@ -140,6 +140,21 @@ class Driver(ABC):
     def _let_go(self) -> None:
         """Do what ``release`` promises; see there."""
 
+    def round_trip(self) -> float | None:
+        """Return how long a question and its answer take now, s; None where nothing can be asked.
+
+        No state is younger than that way lets it be: asked before arming. Raises WriteError where
+        no answer comes.
+        """
+        return None
+
+    def mismatch(self) -> str | None:
+        """Return in words how the controller is set otherwise than the cell says; None: it is not.
+
+        Asked about once a second while the arm is armed; where the link does not show it: None.
+        """
+        return None
+
     def nominal_q(self, state: RobotState) -> Vector:
         """Return the joints (n,) that the robot itself wants, without our correction, rad."""
         return state.target_q

@@ -43,7 +43,7 @@ UNLIKE = 100.0  # chi-square that known effects and any one more must leave of a
 RATIOS = {"wrench": (3.0, 15.0), "tracking": (60.0, 1000.0), "torque": (0.7, 6.0)}
 NONNEGATIVE = (
     "latency", "tracking_lag", "coulomb_friction", "viscous_friction", "rotor_inertia", "payload",
-    "link_inertia", "servo_droop", "dead_band",
+    "link_inertia", "servo_droop", "dead_band", "stribeck_friction", "load_friction",
 )  # fmt: skip
 
 

@@ -82,6 +82,54 @@ def torque_shares(
     return links, carried
 
 
+@dataclass(frozen=True)
+class Shifts:
+    """What centres of gravity that are elsewhere take of the joints: exact, inertia moves along."""
+
+    regressor: Array  # (N, n, n, 10): torque of joint j per dynamic parameter of link l
+    masses: Array  # (n,) kg, of the links
+    centres: Array  # (n, 3) m, in the row's frame
+    places: list[pin.SE3]  # of the row's frame in the joint's
+    payload: tuple[float, Array]
+
+    def of_link(self, link: int, moment: Array) -> Array:
+        """Return the torques (N, n) that a first moment (3,) kg m of a link (from 0) takes more."""
+        mass = max(float(self.masses[link]), 1e-9)
+        return self._moved(link, mass, self.centres[link], moment / mass)
+
+    def of_payload(self, more: float, shift: Array) -> Array:
+        """Return the torques (N, n) of the payload, ``more`` kg heavier, from ``shift`` (3,) m."""
+        return self._moved(len(self.masses) - 1, self.payload[0] + more, self.payload[1], shift)
+
+    def _moved(self, link: int, mass: float, centre: Array, shift: Array) -> Array:
+        import pinocchio as pin
+
+        ends = [
+            pin.Inertia(mass, self.places[link].act(at), np.zeros((3, 3))).toDynamicParameters()
+            for at in (centre + shift, np.asarray(centre, dtype=float))
+        ]
+        return np.asarray(self.regressor[:, :, link] @ (ends[0] - ends[1]))
+
+
+def shifts_of(
+    rows: tuple[Row, ...], gravity: Array, payload: tuple[float, Array],
+    q: Array, qd: Array, qdd: Array,
+) -> Shifts:  # fmt: skip
+    """Return what shifted centres of gravity do along a motion."""
+    import pinocchio as pin
+
+    model, _ = pinocchio_arm(rows, gravity)
+    data = model.createData()
+    n, count = len(rows), len(q)
+    places = [pin.SE3(turn(np.array([[r.alpha, 0, 0]]))[0], np.array([r.a, 0, r.d])) for r in rows]
+    regressor = np.empty((count, n, n, 10))
+    for t in range(count):
+        found = pin.computeJointTorqueRegressor(model, data, q[t], qd[t], qdd[t])
+        regressor[t] = found.reshape(n, n, 10)
+    masses, centres = np.array([r.mass for r in rows]), np.array([r.cog for r in rows])
+    return Shifts(regressor, masses, centres, places, payload)
+
+
 def pinocchio_arm(rows: tuple[Row, ...], gravity: Array) -> tuple[pin.Model, list[pin.Inertia]]:
     """Return the arm as a Pinocchio model, and the inertia of each link in its joint's frame."""
     import pinocchio as pin

@@ -10,7 +10,7 @@ from numpy.random import Generator
 from benchmarks.blind.arms import ARMS, ArmKind
 from benchmarks.blind.bench import Bench, draw_bench
 from benchmarks.blind.mechanics import Array, Session, loads_of, stand
-from benchmarks.blind.moving import Motion, draw_motion, torque_shares
+from benchmarks.blind.moving import Motion, draw_motion, shifts_of, torque_shares
 from benchmarks.blind.parametric import Candidate, Parametric, Place, Values
 from benchmarks.blind.session import Plan
 
@@ -20,9 +20,9 @@ TRACKING_REMAINDERS = ("coupled",)
 TORQUE_REMAINDERS = ("torque_field",)
 TORQUE = (
     "coulomb_friction", "viscous_friction", "rotor_inertia", "link_inertia", "torque_constant",
-    "payload",
+    "payload", "payload_cog", "torque_offset", "stribeck_friction", "load_friction", "link_cog",
 )  # fmt: skip
-TORQUE_OUTSIDE = ("cogging", "stribeck", "warm_friction")
+TORQUE_OUTSIDE = ("cogging", "warm_friction")
 
 
 @dataclass(frozen=True)
@@ -127,12 +127,17 @@ def draw_torque_cell(rng: Generator, seconds: float = 30.0) -> MovingCell:
     links, carried = torque_shares(
         kind.rows, bench.nominal.gravity, (mass, session.payload_cog[0]), q, qd, qdd
     )
+    shifts = shifts_of(kind.rows, bench.nominal.gravity, (mass, session.payload_cog[0]), q, qd, qdd)
     rigid = links.sum(axis=0) + mass * carried
     usual = np.sqrt(np.mean(rigid**2, axis=0)) + 0.02 * np.sqrt(np.mean(rigid**2))
     sigma = usual * rng.uniform(0.01, 0.03)
+    peak = np.abs(qd).max(axis=0)
     speed, swing = np.sqrt(np.mean(qd**2, axis=0)), np.sqrt(np.mean(qdd**2, axis=0))
     candidates: dict[Place, Candidate] = {
-        ("payload", None): Candidate(("payload",), np.array([0.05 * kind.rated]), 8)
+        ("payload", None): Candidate(("payload",), np.array([0.05 * kind.rated]), 8),
+        ("payload_cog", None): Candidate(
+            tuple(f"payload_cog_{k}" for k in "xyz"), np.full(3, 0.1 * kind.tool), 10
+        ),
     }
     for j in range(1, kind.n + 1):
         u = usual[j - 1]
@@ -142,8 +147,17 @@ def draw_torque_cell(rng: Generator, seconds: float = 30.0) -> MovingCell:
             ("rotor_inertia", 0.1 * u / swing[j - 1]),
             ("link_inertia", 0.05),
             ("torque_constant", 0.05),
+            ("torque_offset", 0.1 * u),
+            ("load_friction", 0.1),
         ):
             candidates[(effect, j)] = Candidate((f"{effect}_{j}",), np.array([scale]), 8)
+        candidates[("stribeck_friction", j)] = Candidate(
+            (f"stribeck_friction_{j}",), np.array([0.1 * u]), 8
+        )
+        candidates[("link_cog", j)] = Candidate(
+            tuple(f"link_cog_{j}_{k}" for k in "xyz"), np.full(3, 0.02 * kind.rows[j - 1].mass), 5
+        )
+    slow = peak * rng.uniform(0.04, 0.15, kind.n)  # rad/s, where Stribeck's curve falls
 
     def read(values: Values) -> Array:
         def of(effect: str, j: int) -> float:
@@ -152,13 +166,23 @@ def draw_torque_cell(rng: Generator, seconds: float = 30.0) -> MovingCell:
         joints = range(1, kind.n + 1)
         more = float(values.get(("payload", None), np.zeros(1))[0])
         out = rigid + more * carried
+        shift = values.get(("payload_cog", None), np.zeros(3))
+        if shift.any():
+            out = out + shifts.of_payload(more, shift)
         for j in joints:
             out = out + of("link_inertia", j) * links[j - 1]
+            if ("link_cog", j) in values:
+                out = out + shifts.of_link(j - 1, values[("link_cog", j)])
+        share = np.array([of("load_friction", j) for j in joints])
+        break_away = np.array([of("stribeck_friction", j) for j in joints])
+        offset = np.array([of("torque_offset", j) for j in joints])
+        out = out + (share * np.abs(out) + break_away * np.exp(-((qd / slow) ** 2))) * np.sign(qd)
         coulomb = np.array([of("coulomb_friction", j) for j in joints])
         viscous = np.array([of("viscous_friction", j) for j in joints])
         rotor = np.array([of("rotor_inertia", j) for j in joints])
         scale = 1 + np.array([of("torque_constant", j) for j in joints])
-        return np.asarray((out + coulomb * np.sign(qd) + viscous * qd + rotor * qdd) * scale)
+        out = (out + coulomb * np.sign(qd) + viscous * qd + rotor * qdd) * scale
+        return np.asarray(out + offset)
 
     encoder = 2 * np.pi / 2 ** int(rng.integers(19, 22))
     truth = Parametric(read, sigma, candidates)
@@ -192,15 +216,12 @@ def torque_error(cell: MovingCell, name: str, rng: Generator) -> tuple[Array, tu
     q, qd = cell.motion.at(cell.time), cell.motion.at(cell.time, 1)
     if name == "cogging":
         shape = np.sin(int(rng.integers(6, 40)) * q[:, j] + rng.uniform(-3, 3))
-        columns = (f"actual_q_{j}",)
+        columns: tuple[str, ...] = (f"actual_q_{j}",)
     elif name == "torque_field":
         other = int(rng.choice([i for i in range(cell.kind.n) if i != j]))
         rate, phase = rng.normal(size=(5, 2)) * 1.5, rng.uniform(-np.pi, np.pi, 5)
         shape = np.cos(q[:, [j, other]] @ rate.T + phase) @ rng.normal(size=5)
         columns = (f"actual_q_{j}", f"actual_q_{other}")
-    elif name == "stribeck":
-        shape = np.sign(qd[:, j]) * np.exp(-((qd[:, j] / 0.1) ** 2))
-        columns = (f"actual_qd_{j}",)
     else:
         # the amount decays in time, so both the speed and the time are true answers
         shape = qd[:, j] * (np.exp(-cell.time / 10.0) - 0.35)

@@ -13,7 +13,7 @@ from benchmarks.blind.mechanics import Array, cross, turn
 from benchmarks.blind.parametric import Candidate, Parametric, Place, Values
 from benchmarks.blind.session import Plan
 
-EFFECTS = ("ft_bias", "ft_drift", "ft_gain", "ft_misalignment", "payload")
+EFFECTS = ("ft_bias", "ft_drift", "ft_gain", "ft_misalignment", "payload", "payload_cog")
 OUTSIDE = ("ft_hose", "ft_step", "ft_overload")
 REMAINDERS = ("ft_field",)
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -46,19 +46,25 @@ def draw_wrench_cell(rng: Generator, plan: Plan) -> WrenchCell:
             tuple(f"ft_misalignment_{k}" for k in ("rx", "ry", "rz")), np.full(3, 0.02), 12
         ),
         ("payload", None): Candidate(("payload",), np.array([0.03 * rated]), 15),
+        ("payload_cog", None): Candidate(
+            tuple(f"payload_cog_{k}" for k in "xyz"), np.full(3, 0.1 * bench.kind.tool), 15
+        ),
     }
     return WrenchCell(bench, Parametric(_reader(bench, saturating), sigma, candidates), saturating)
 
 
-def flange_wrench(bench: Bench, more_payload: float) -> Array:
-    """Return what the load does to the flange (N, 6), flange axes, about the flange origin."""
+def flange_wrench(bench: Bench, more_payload: float, shift: Array) -> Array:
+    """Return what the load does to the flange (N, 6), flange axes, about the flange origin.
+
+    Its centre of gravity is ``shift`` (3,) m off, flange axes.
+    """
     session, rotation = bench.session, bench.model.flange_rotation
     mass = (session.payload_mass + more_payload)[:, None]
     weight = np.einsum("nji,j->ni", rotation, bench.nominal.gravity) * mass
     pull = np.einsum("nji,nj->ni", rotation, session.tcp_wrench[:, :3])
     couple = np.einsum("nji,nj->ni", rotation, session.tcp_wrench[:, 3:])
     lever = np.tile(bench.nominal.tool_position, (len(mass), 1))
-    torque = cross(session.payload_cog, weight) + cross(lever, pull) + couple
+    torque = cross(session.payload_cog + shift, weight) + cross(lever, pull) + couple
     return np.column_stack([weight + pull, torque])
 
 
@@ -69,7 +75,8 @@ def _reader(bench: Bench, saturating: bool) -> Callable[[Values], Array]:
     zero = np.zeros(6)
 
     def read(values: Values) -> Array:
-        wrench = flange_wrench(bench, float(values.get(("payload", None), zero)[0]))
+        shift = values.get(("payload_cog", None), zero)[:3]
+        wrench = flange_wrench(bench, float(values.get(("payload", None), zero)[0]), shift)
         tilt = values.get(("ft_misalignment", None), zero)[:3]
         back = turn(tilt[None])[0]  # the sensor's axes in the flange: readings are seen from them
         wrench = np.column_stack([wrench[:, :3] @ back, wrench[:, 3:] @ back])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import configparser
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from bridge.cell.schema import Calibration, Robot
@@ -32,14 +33,22 @@ def build_arm(robot: Robot, folder: Path) -> Arm:
         raise CellError(
             f"robot.calibration: found beside robot.{given[0]}, expected only beside robot.model"
         )
+    if robot.rated_payload is not None and robot.model is not None:
+        raise CellError(
+            "robot.rated_payload: found beside robot.model, expected only beside robot.urdf or "
+            "robot.dh: of a built-in arm it is known"
+        )
     if robot.model is not None:
         return builtin_arm(robot.model, _calibration(robot.calibration, folder))
     if robot.urdf is not None:
         path = folder / robot.urdf
         if not is_file(path):
             raise CellError(f"robot.urdf: file not found: {path}, expected a URDF")
-        return arm_from_urdf(path, robot.tip)
-    return arm_from_dh([row.model_dump() for row in robot.dh or []])
+        arm = arm_from_urdf(path, robot.tip)
+    else:
+        arm = arm_from_dh([row.model_dump() for row in robot.dh or []])
+    rated = robot.rated_payload
+    return arm if rated is None else replace(arm, payload=rated)
 
 
 def _calibration(

@@ -6,10 +6,10 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from bridge.calibration.settings import CalibrationSettings
 from bridge.cell.sections import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
-from bridge.metrics.settings import MetricsSettings
-from bridge.web.settings import WebSettings
+from bridge.cell.settings.calibration import CalibrationSettings
+from bridge.cell.settings.metrics import MetricsSettings
+from bridge.cell.settings.web import WebSettings
 from drivers.ft_sensor.settings import AnyFtSensor
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -51,6 +51,9 @@ class Robot(Section):
     urdf: str | None = Field(default=None, description="a file, seen from the cell's folder")
     dh: list[DhRow] | None = Field(default=None, description="standard DH rows")
     tip: str | None = Field(default=None, description="the URDF link that is the flange")
+    rated_payload: Annotated[Number, Field(gt=0)] | None = Field(
+        default=None, description="kg, of urdf and dh; of model it is known"
+    )
     calibration: Calibration | str | None = Field(
         default=None, description="UR's delta_* values, or its calibration.conf"
     )
@@ -111,6 +114,9 @@ class Simulation(Section):
     )
     compliance: Compliance | None = Field(
         default=None, description="true flexibilities, rad/Nm; default: drawn from the seed"
+    )
+    droop: list[NotNegative] | None = Field(
+        default=None, description="rad/Nm per joint by which servos give way; default: none"
     )
     tracker_noise: NotNegative | None = Field(default=None, description="m, 1 sigma")
     rtde_port: int | None = Field(default=None, gt=0, lt=65536, strict=True)

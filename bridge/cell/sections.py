@@ -19,7 +19,7 @@ from pydantic import (
     model_validator,
 )
 
-from bridge.recording.settings import RecordingSettings as RecordingSettings
+from bridge.cell.settings.recording import RecordingSettings as RecordingSettings
 from core.addresses import is_loopback
 from drivers.can.settings import CanSettings
 from drivers.canopen.settings import CanopenSettings
@@ -83,7 +83,7 @@ class LimitSettings(BaseModel):
         0.0, ge=0.0, description="distance kept from the arm's joint limits, rad"
     )
     following: float = Field(
-        0.35, gt=0.0, le=2.0, description="farthest a command may be from the actual joint, rad"
+        0.1, gt=0.0, le=0.5, description="farthest a command may be from the actual joint, rad"
     )
     ramp_time: float = Field(
         0.5, gt=0.0, le=10.0, description="s in which offsets ramp in and out at least"

@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from bridge.cell import Cell, save_cell
+from bridge.cell.opened_log import open_log
 from bridge.cli.answer import answer
 from bridge.cli.options import (
     cell_option,
     logs_argument,
     open_cell,
-    open_log,
     open_logs,
     remounted_option,
     warn_outside,
 )
 from bridge.cli.progress import status
-from bridge.document.output_file import require_writable, write_text
+from bridge.document.output_file import FOLDER_MODE, require_writable, write_text
 from bridge.document.provenance import fitted, provenance
 from core.diagnosis.diagnosis import Diagnosis
 from core.diagnosis.diagnosis import diagnose as diagnose_log
@@ -155,7 +155,7 @@ def _folder(path: Path) -> None:
     if not path.parent.is_dir():
         raise InputError(f"{path}: found no folder {path.parent}, expected an existing one")
     try:
-        path.mkdir(exist_ok=True)
+        path.mkdir(FOLDER_MODE, exist_ok=True)
     except OSError as error:
         raise InputError(f"{path}: folder cannot be made: {error.strerror}") from None
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bridge.cell import Cell
-from bridge.cli.options import check_log
+from bridge.cell.opened_log import check_log
 from core.errors import LogError
 from core.log.log import Log
 from core.log.mcap_reading import files_of
@@ -54,7 +54,7 @@ def is_large(path: Path) -> bool:
 
 def has_sessions(path: Path) -> bool:
     """Return whether a log's rows belong to several sessions (a column ``session``)."""
-    if path.suffix.lower() == RECORDING or not path.is_file():
+    if source_of(path) is not None or not path.is_file():
         return False
     if path.suffix.lower() in PARQUET:
         from pyarrow import parquet

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import hashlib
-import ipaddress
 import json
 import os
 import socket
@@ -13,23 +12,8 @@ import sys
 from pathlib import Path
 from typing import Any, Self
 
-from bridge.ipc.runtime_folder import runtime_folder
+from bridge.cell.runtime_folder import runtime_folder
 from core.errors import InputError
-from drivers.driver import DriverSettings
-
-
-def address_of(link: DriverSettings) -> str:
-    """Return what tells one controller from another: the same for whatever driver reaches it."""
-    given = link.model_dump(mode="json")
-    if "interface" in given:  # a bus, with a whole arm by each profile
-        names = ("interface", "host", "port", "channel", "profile")
-        return "bus " + " ".join(f"{given.get(k)}" for k in names)
-    if given.get("transport") == "rtu":
-        return f"serial {given['serial']} unit {given.get('device_id')}"
-    host = str(given.get("host", given.get("file", link)))
-    with contextlib.suppress(ValueError, OSError):
-        host = str(ipaddress.ip_address(host))
-    return f"host {host.lower()}"
 
 
 class OwnerLock:

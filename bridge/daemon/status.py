@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections import deque
@@ -12,12 +13,30 @@ from numpy.typing import NDArray
 
 from bridge.daemon.status_document import SCHEMA
 from bridge.ipc.events import Event
+from bridge.loop.checks import NOTHING, UNSOLVED
 from bridge.loop.supervisor import HEALED_BY_RECONNECTING, State
 
 if TYPE_CHECKING:
     from bridge.daemon.daemon import Daemon
 
 RATE_SPAN = 2.0  # s that the rate is taken over
+
+
+def correction(flags: int, residual: float) -> dict[str, Any]:
+    """Return what the status document says of the model at the present pose.
+
+    ``flags`` of a cycle; ``residual``: its correction's distance from the wanted pose, m.
+    """
+    words = ""
+    if flags & UNSOLVED:
+        words = "the model has no correction at the present pose: nothing is corrected"
+    elif flags & NOTHING:
+        words = "the model corrects nothing: found neither compliance nor an effect that acts"
+    return {
+        "solved": not flags & UNSOLVED,
+        "residual": residual if math.isfinite(residual) else None,
+        "detail": words,
+    }
 
 
 class DaemonStatus:
@@ -34,6 +53,9 @@ class DaemonStatus:
         self._batches: deque[tuple[float, int]] = deque()  # s, cycles
         self._heard: float | None = None  # s, monotonic: when the last state was received
         self._received = daemon.page.slices["received"].start
+        self._flags = daemon.page.slices["flags"].start
+        self._residual_at = daemon.page.slices["residual"].start
+        self._correction = (0, 0.0)  # flags and residual, m, of the last cycle
         self.configured: Event = {}  # the last attempt to reload
 
     def take(self, rows: NDArray[np.float64]) -> None:
@@ -41,6 +63,7 @@ class DaemonStatus:
         now = time.monotonic()
         if len(rows):
             self._heard = float(rows[-1, self._received])
+            self._correction = int(rows[-1, self._flags]), float(rows[-1, self._residual_at])
             self._batches.append((now, len(rows)))
         while self._batches and now - self._batches[0][0] > RATE_SPAN:
             self._batches.popleft()
@@ -95,6 +118,7 @@ class DaemonStatus:
             "may_write": daemon.may_write,
             "armed_by": self.armed_by,
             "latched": self.latched,
+            "correction": correction(*self._correction),
             "loop": {
                 "pid": daemon.loop_pid,
                 "restarts": daemon.restarts,

@@ -25,6 +25,8 @@ def lines(status: dict[str, Any]) -> list[str]:
         found.append(f"  armed by {status['armed_by']}")
     if status["latched"]:
         found.append(f"  fault: {status['latched']}; acknowledge with `gapbridge disarm`")
+    if status["correction"]["detail"]:
+        found.append(f"  model: {status['correction']['detail']}")
     counted = {k: v for k, v in status["counts"].items() if v}
     if counted:
         found.append("  counted: " + ", ".join(f"{k} {v}" for k, v in counted.items()))

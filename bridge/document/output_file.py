@@ -1,10 +1,15 @@
-"""Output files: written beside their place, then renamed, so that none is ever half-written."""
+"""Output files: written beside their place, then renamed, so that none is ever half-written.
+
+A new one is the owner's to write and the group's to read (0640), whatever the umask; one that takes
+the place of another keeps that one's permissions.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import os
+import stat
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO
@@ -15,6 +20,8 @@ from numpy.typing import NDArray
 from core.errors import InputError, RunError
 
 PARQUET = (".parquet", ".pq")
+MODE = 0o640  # of a new file
+FOLDER_MODE = 0o750  # of a new folder of recordings, sessions and the like
 
 
 def require_writable(path: Path, *inputs: Path) -> Path:
@@ -53,7 +60,8 @@ def replacing_bytes(path: Path) -> Iterator[IO[bytes]]:
     place = Path(os.path.realpath(path))
     part = place.with_name(f".{place.name}.{os.getpid()}.part")
     try:
-        with open(part, "wb") as file:
+        with open(part, "wb", opener=private) as file:
+            _keep_mode(place, file.fileno())
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -63,6 +71,17 @@ def replacing_bytes(path: Path) -> Iterator[IO[bytes]]:
     finally:
         with contextlib.suppress(OSError):
             part.unlink()
+
+
+def private(path: str | Path, flags: int) -> int:
+    """Open a file for ``open``: a new one is nobody else's (0640)."""
+    return os.open(path, flags | os.O_CLOEXEC, MODE)
+
+
+def _keep_mode(place: Path, fd: int) -> None:
+    """Give a file the permissions of the one whose place it takes."""
+    with contextlib.suppress(OSError):
+        os.fchmod(fd, stat.S_IMODE(place.stat().st_mode))
 
 
 def write_text(path: Path, text: str) -> None:

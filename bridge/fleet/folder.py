@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from bridge.document.output_file import FOLDER_MODE
 from core.errors import InputError
 
 
@@ -13,7 +14,7 @@ def require_folder(path: Path, option: str) -> Path:
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: found a file, expected a folder for {option}")
     try:
-        path.mkdir(parents=True, exist_ok=True)
+        path.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{path}: folder cannot be made: {error.strerror}") from None
     if not os.access(path, os.W_OK):

@@ -11,6 +11,7 @@ from typing import Any, Self
 
 from pydantic_core import from_json, to_json
 
+from bridge.document.output_file import private
 from bridge.fleet.task import Outcome
 from core.errors import InputError, RunError
 
@@ -24,7 +25,7 @@ class Journal:
         self.path = path
         self._synced = 0.0
         try:
-            self._file = path.open("a+b")
+            self._file = open(path, "a+b", opener=private)  # noqa: SIM115
         except OSError as error:
             raise InputError(f"{path}: cannot be written: {error.strerror}") from None
         try:

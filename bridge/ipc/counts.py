@@ -30,6 +30,10 @@ class Count(IntEnum):
     SENSOR_LOST = 20  # force terms dropped
     SILENCE = 21
     LINK_LOST = 22
+    UNSOLVED = 23  # the model's correction did not meet the wanted pose
+    LOAD = 24  # a payload or force that the arm cannot bear
+    NOT_FOLLOWING = 25  # the robot's program does not play, or at another speed
+    MISMATCH = 26  # the controller is set otherwise than the cell says
 
     @property
     def words(self) -> str:

@@ -13,13 +13,22 @@ from bridge.ipc.shared_memory import Page
 from bridge.loop.frozen_watch import FrozenWatch
 from bridge.loop.link_monitor import hold_time
 from bridge.loop.overrun_watch import OverrunWatch
+from bridge.loop.readiness import RateCheck
 from bridge.loop.saturation_watch import SaturationWatch
 from bridge.loop.supervisor import Cause, State, Supervisor
 from core.state import RobotState
+from drivers.driver import Driver
+from drivers.robot_modes import NORMAL, REDUCED, RUNNING
 
-ROBOT_RUNNING, SAFE = 7, (1, 2)  # robot_mode; safety_mode normal, reduced
+SAFE = (NORMAL, REDUCED)  # safety_mode
+STOPS = 0b111_1111_1100  # safety_status_bits: all but normal and reduced mode
+PLAYING = 2  # runtime_state
+SLOWED = 0.95  # speed_scaling: slower, an arm that we move falls behind its setpoints
+FASTEST = 2.0  # speed_scaling: more is a mistake
 LONG_GAP = 10.0  # cycles: after a longer one, what was before means nothing
-DEGRADED, LATE, RESYNC, RAMPING_OUT = 1, 2, 4, 8  # bits of a cycle's flags
+SETTINGS_EVERY = 1.0  # s between two looks at how the controller is set
+# bits of a cycle's flags
+DEGRADED, LATE, RESYNC, RAMPING_OUT, UNSOLVED, NOTHING = 1, 2, 4, 8, 16, 32
 
 
 class LoopChecks:
@@ -32,12 +41,17 @@ class LoopChecks:
         page: Page,
         tell: Callable[[dict[str, Any]], None],
         stale_after: float = 0.0,
+        moves_arm: bool = False,
     ) -> None:
         self._supervisor, self._page, self._tell = supervisor, page, tell
         self._period = 1.0 / rate
         self._longest_gap = max(LONG_GAP / rate, hold_time(rate), stale_after)
         self._frozen, self._overrun = FrozenWatch(), OverrunWatch(rate)
         self._saturation = SaturationWatch()
+        self._moves_arm, self._patience = moves_arm, hold_time(rate)
+        self.rate = RateCheck(rate)
+        self._not_following: float | None = None  # s, controller clock: since when
+        self._settings_at = -1.0  # s, controller clock: of the next look
         self._lasting: set[Count] = set()
         self._last: float | None = None  # s, controller clock
         self.fine = False  # the robot can move
@@ -65,8 +79,22 @@ class LoopChecks:
         else:
             self._judge(Count.OVERRUN, self._overrun.update(state.timestamp, missed), Cause.OVERRUN)
         self._judge(Count.SENSOR_LOST, state.sensor_lost or None, None)
+        self.rate.take(state.timestamp)
         self._check_robot(state)
+        self._check_following(state)
         return resync
+
+    def judge_loads(self, words: str | None) -> None:
+        """Hold where a payload or a force is none that the arm can bear."""
+        self._judge(Count.LOAD, words, Cause.LOAD)
+
+    def judge_settings(self, state: RobotState, driver: Driver) -> None:
+        """Compare the controller's own settings with the cell's, once a second while armed."""
+        armed = self._supervisor.state in (State.ARMED, State.COMPENSATING, State.HOLDING)
+        if not armed or 0.0 <= self._settings_at - state.timestamp <= SETTINGS_EVERY:
+            return
+        self._settings_at = state.timestamp + SETTINGS_EVERY
+        self._judge(Count.MISMATCH, driver.mismatch(), Cause.MISMATCH)
 
     def end(
         self, state: RobotState, commanded: NDArray[float64], clamped: int, duration: float
@@ -82,13 +110,35 @@ class LoopChecks:
 
     def _check_robot(self, state: RobotState) -> None:
         """Take note of a robot that cannot move."""
-        self.fine = state.robot_mode == ROBOT_RUNNING and state.safety_mode in SAFE
+        stops = state.safety_status_bits & STOPS
+        self.fine = state.robot_mode == RUNNING and state.safety_mode in SAFE and not stops
         if self.fine:
             self.robot = ""
             self._lasting.discard(Count.UNSAFE)
             return
         self.robot = f"robot_mode {state.robot_mode}, safety_mode {state.safety_mode}"
+        if stops:
+            self.robot += f", safety_status_bits {state.safety_status_bits:#b}"
         self._judge(Count.UNSAFE, self.robot, Cause.UNSAFE)
+
+    def _check_following(self, state: RobotState) -> None:
+        """Hold where the robot's program does not play, or plays slower than we move the arm."""
+        scaling, words = state.speed_scaling, None
+        if state.runtime_state != PLAYING:
+            words = f"runtime_state: found {state.runtime_state}, expected {PLAYING} (playing)"
+        elif not 0.0 <= scaling <= FASTEST:  # NaN is not
+            words = f"speed_scaling: found {scaling:g}, expected 0 to {FASTEST:g}"
+        elif self._moves_arm and scaling < SLOWED:
+            words = (
+                f"speed_scaling: found {scaling:g}, expected {SLOWED:g} or more: it falls behind"
+            )
+        if words is None or not self._supervisor.state.writes:
+            self._not_following = None
+        elif self._not_following is None:
+            self._not_following = state.timestamp
+        since = self._not_following
+        lasts = since is not None and state.timestamp - since > self._patience
+        self._judge(Count.NOT_FOLLOWING, words if lasts else None, Cause.NOT_FOLLOWING)
 
     def _judge(self, what: Count, words: str | None, cause: Cause | None) -> None:
         """Tell the supervisor of a finding; count and tell it once for as long as it lasts."""

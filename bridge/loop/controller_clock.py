@@ -15,9 +15,9 @@ class ControllerClock:
     The age of a state counts from when its sample could have been here at the earliest, so that
     late packets, late wake-ups and long computing all count. The shortest way over the wire, which
     one clock alone cannot tell, does not. ``hold``: s after which a state is too old to write by.
-    Where all samples after a silence are older than that for as long, the controller's clock has
-    stood still, and the two are tied anew; what a stalled link hands on at once is old for a
-    moment only.
+    What a stalled link hands on at once is old for a moment only. Where all samples are older than
+    that for as long, either the controller's clock has stood still or the way has become longer,
+    which no clock tells: the two are tied anew only while nothing is written.
     """
 
     def __init__(self, rate: float, hold: float = 1.0) -> None:
@@ -26,12 +26,15 @@ class ControllerClock:
         self._last: float | None = None  # s, controller clock
         self._old_since: float | None = None  # s, monotonic: all samples have been old since
 
-    def take(self, state: RobotState) -> int:
-        """Take a new sample; returns the cycles missed since the one before."""
+    def take(self, state: RobotState, writes: bool = False) -> int:
+        """Take a new sample; returns the cycles missed since the one before.
+
+        ``writes``: setpoints are made of the samples, so that old ones stay old.
+        """
         lead, before = state.received - state.timestamp, self._last
         self._last = state.timestamp
         gap = 0.0 if before is None else state.timestamp - before
-        if self._lead is None or self._stood_still(lead, state.received):
+        if self._lead is None or (self._stood_still(lead, state.received) and not writes):
             self._lead, self._old_since = lead, None
         else:
             self._lead = min(lead, self._lead + DRIFT * gap)

@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from core.load_bounds import LoadBounds
 from core.loads import Loads
 from core.state import RobotState
 
@@ -18,10 +19,16 @@ class LiveLoads:
     """Keeps one row of loads up to date: filtered force, payload, temperature, last motion.
 
     The controller's declared payload stands instead of the model's own, because its TCP force has
-    that payload taken off.
+    that payload taken off. Where a load is beyond ``bounds``, none of the state's is taken: the
+    last ones stay, and ``doubt`` says why.
     """
 
-    def __init__(self, n: int, use_force: bool, time_constant: float) -> None:
+    def __init__(
+        self, n: int, use_force: bool, time_constant: float, bounds: LoadBounds | None = None
+    ) -> None:
+        self._bounds = bounds or LoadBounds(math.inf)
+        self._has_payload = False  # a payload has been taken
+        self.doubt: str | None = None  # why a load of the last state cannot be
         self._use_force = use_force
         self._constant = time_constant
         self._wrench = np.zeros((1, 6))
@@ -34,12 +41,12 @@ class LiveLoads:
 
     def update(self, state: RobotState) -> Loads:
         """Return the loads (one row) of this state; the arrays are this object's own."""
-        self._filter_force(state)
+        self.doubt = self._doubt(state)
+        if self.doubt is None:
+            self._filter_force(state)
+            self._take_payload(state)
         self._follow_motion(state.actual_q)
-        has_payload = state.payload is not None and state.payload_cog is not None
-        if has_payload:
-            self._mass[0] = state.payload
-            self._cog[0] = state.payload_cog
+        has_payload = self._has_payload
         if state.joint_temperatures is not None:
             self._temperature[0] = state.joint_temperatures
         return Loads(
@@ -49,6 +56,25 @@ class LiveLoads:
             temperature=None if state.joint_temperatures is None else self._temperature,
             approach=self._approach,
         )
+
+    def _doubt(self, state: RobotState) -> str | None:
+        """Return in words which load of a state cannot be; None: all can.
+
+        Together: the controller takes the declared payload off its force.
+        """
+        found = None
+        if state.payload is not None and state.payload_cog is not None:
+            found = self._bounds.doubt_payload(state.payload, state.payload_cog)
+        if found is None and self._use_force and not state.sensor_lost:
+            found = self._bounds.doubt_wrench(state.actual_TCP_force)
+        return found
+
+    def _take_payload(self, state: RobotState) -> None:
+        """Take the declared payload over, where there is one."""
+        self._has_payload = state.payload is not None and state.payload_cog is not None
+        if self._has_payload:
+            self._mass[0] = state.payload
+            self._cog[0] = state.payload_cog
 
     def forget(self) -> None:
         """Begin anew after a gap: an old force means nothing."""

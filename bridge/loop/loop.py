@@ -19,16 +19,18 @@ from bridge.ipc.command_page import Command, Commands
 from bridge.ipc.counts import Count
 from bridge.ipc.cycle_row import fill_row
 from bridge.ipc.shared_memory import Page, Phase
-from bridge.loop.checks import RAMPING_OUT, LoopChecks
+from bridge.loop.checks import NOTHING, RAMPING_OUT, UNSOLVED, LoopChecks
 from bridge.loop.controller_clock import ControllerClock
 from bridge.loop.link_monitor import StateWatch, hold_time
 from bridge.loop.live_loads import LiveLoads
 from bridge.loop.offset_in_force import OffsetInForce
+from bridge.loop.readiness import ModelCheck
 from bridge.loop.setpoint_stream import SetpointStream, longest_withdrawal
 from bridge.loop.supervisor import Cause, State, Supervisor
 from bridge.loop.writing import Writing
 from bridge.setpoint_source.source import Source, Told
 from core.errors import InvalidStateError, LinkError
+from core.load_bounds import LoadBounds
 from core.loads import Loads
 from core.model import Model
 from core.setpoint import Setpoint
@@ -72,15 +74,20 @@ class Loop:
         self._page, self._tell = page, tell
         self._stream = SetpointStream(model, settings.limits, driver.rate)
         self._loads = LiveLoads(
-            model.arm.n, settings.setpoints.use_force, settings.setpoints.force_filter
-        )
+            model.arm.n, settings.setpoints.use_force, settings.setpoints.force_filter,
+            LoadBounds.of(model),
+        )  # fmt: skip
+        self._acting = Loads()  # of the last cycle
+        self._model_check = ModelCheck(model, settings.setpoints.use_force)
         self._clock = ControllerClock(driver.rate, hold_time(driver.rate))
         self._supervisor = Supervisor(self._changed)
         patience = settings.link.state_timeout
         self._watch = StateWatch(
             driver, model.arm, self._supervisor, page, tell, self._lose, patience
         )
-        self._checks = LoopChecks(driver.rate, self._supervisor, page, tell, patience)
+        self._checks = LoopChecks(
+            driver.rate, self._supervisor, page, tell, patience, driver.moves_arm
+        )
         self._in_force = self._kept_offset()
         self._writing = Writing(
             settings.setpoints, driver, source, self._stream, self._supervisor, page, tell,
@@ -128,7 +135,8 @@ class Loop:
                 self._page.tell_taken(commands.taken)
             if self.stop_requested or commands.stop:
                 self._stop()
-            if wanted and may_write and self._page.seen and self._stop_by is None:
+            seen = self._page.seen and self._checks.rate.known
+            if wanted and may_write and seen and self._stop_by is None:
                 wanted = False
                 self._arm()
             if self._exit is None:
@@ -143,10 +151,31 @@ class Loop:
             words = "a fault is latched: acknowledge it first (gapbridge disarm)"
         elif not self._checks.fine:
             words = f"the robot is not ready: {self._checks.robot}"
+        elif not_ready := self._not_ready():
+            words = not_ready
         else:
             self._supervisor.take(Cause.ARM)
             return
         self._tell({"kind": "refused", "what": "arm", "detail": words})
+
+    def _not_ready(self) -> str:
+        """Return in words why writing could come to nothing here; empty: it can."""
+        stream = self._stream
+        self._model_check.forget()
+        if self._checks.rate.doubt:
+            return self._checks.rate.doubt
+        if self._loads.doubt is not None:
+            return f"the load is implausible: {self._loads.doubt}"
+        if not stream.finite:
+            return "the model's correction is no number at the present pose"
+        if stream.unsolved:
+            return f"the correction cannot be solved at the present pose: {stream.unsolved}"
+        if not self._model_check.corrects(self._acting):
+            return (
+                "the model corrects nothing at any pose: found neither compliance nor an effect in "
+                "the cell that moves the TCP under what acts now"
+            )
+        return ""
 
     def _disarm(self, by_a_person: bool) -> None:
         if self._supervisor.state == State.FAULT:
@@ -202,7 +231,7 @@ class Loop:
         except InvalidStateError as error:
             self._watch.doubt(str(error))
             return
-        missed = self._clock.take(state)
+        missed = self._clock.take(state, self._supervisor.state.writes)
         expiry = self._clock.expiry(state)
         is_fresh = self._watch.believe(expiry)
         self._page.tell_seen()
@@ -212,7 +241,9 @@ class Loop:
         supervisor, writing = self._supervisor, self._writing
         if supervisor.state == State.FAULT:
             writing.ready = False  # its own watchdog, or a person, has the robot
-        loads = self._loads.update(state)
+        loads = self._acting = self._loads.update(state)
+        self._checks.judge_loads(self._loads.doubt)
+        self._checks.judge_settings(state, self._driver)
         seen = time.monotonic()
         if is_fresh and supervisor.state == State.ARMED and writing.start(state, own):
             self._record(state, missed, own, loads, None, at=seen)
@@ -257,8 +288,12 @@ class Loop:
             nominal, corrected, offset = own, correction.q, correction.offset_in_base
             if not stream.finite:
                 self._supervisor.take(Cause.BAD_OUTPUT, "the model's correction is no number")
+            elif not self._model_check.corrects(loads):
+                self._checks.flags |= NOTHING
         else:
             nominal, corrected, offset = setpoint.nominal_q, setpoint.q, setpoint.offset_in_base
+        if stream.unsolved:
+            self._checks.flags |= UNSOLVED
         clamped = stream.clamped if setpoint is not None else 0
         late = 0.0 if at is None else time.monotonic() - at  # arming: no part of the cycle
         row, slices = page.next_row(), page.slices

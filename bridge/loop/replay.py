@@ -18,6 +18,7 @@ from bridge.loop.offset_in_force import InForce, OffsetInForce
 from bridge.loop.setpoint_stream import SetpointStream
 from bridge.loop.supervisor import Cause, State
 from core.errors import GateError, LimitError
+from core.load_bounds import LoadBounds
 from core.loads import Loads
 from core.model import Model
 from core.setpoint import Setpoint
@@ -75,8 +76,9 @@ class ReplayedLoop(Loop):
         settings = self._settings
         self._stream = SetpointStream(self._model, settings.limits, self._recording.rate)
         self._loads = LiveLoads(
-            self._model.arm.n, settings.setpoints.use_force, settings.setpoints.force_filter
-        )
+            self._model.arm.n, settings.setpoints.use_force, settings.setpoints.force_filter,
+            LoadBounds.of(self._model),
+        )  # fmt: skip
         self._clock.skip()
         self._streaming = False
 

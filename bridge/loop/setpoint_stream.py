@@ -24,7 +24,6 @@ from drivers.gate import GateBounds
 Vector = NDArray[np.float64]
 SOLVED = 1e-5  # m: corrections that miss the wanted pose by more are not used
 USUAL_VELOCITY = np.pi  # rad/s: of joints whose limit is not known
-_NOTHING = np.zeros(6)
 
 
 def limits_of(settings: LimitSettings, arm: Arm, rate: float) -> Limits:
@@ -79,9 +78,10 @@ class SetpointStream:
         self._last = 0.0  # s, controller time of the last setpoint
         self._start_gap: Vector | None = None  # rad: where the arm stood minus the first setpoint
         self._since_start = 0.0  # s
-        self.unsolved = 0  # setpoints without a correction that meets the wanted pose
         self.residual = 0.0  # m, of the last correction
         self.finite = True  # the last correction is numbers
+        self._loads = Loads()  # of the last correction
+        self._solved = np.zeros(model.arm.n + 6)  # joint and TCP offset of the last one solved
         self.clamped = 0  # bits of the last setpoint
 
     def correct(self, nominal_q: Vector, loads: Loads) -> Correction:
@@ -91,7 +91,27 @@ class SetpointStream:
         # plain numbers: twelve of them cost four calls on arrays more
         numbers = correction.q.tolist() + correction.offset_in_base.tolist()
         self.finite = math.isfinite(sum(numbers))
+        self._loads = loads
         return correction
+
+    @property
+    def unsolved(self) -> str:
+        """Return in words why the last correction does not meet the wanted pose; empty: it does."""
+        if self.residual < SOLVED:
+            return ""
+        loads = self._loads
+        mass = self._compensator.model.payload_mass
+        if loads.payload_mass is not None:
+            mass = float(loads.payload_mass[0])
+        force = 0.0 if loads.wrench is None else float(np.linalg.norm(loads.wrench[0, :3]))
+        under = f"under a payload of {mass:.3g} kg and a force of {force:.3g} N"
+        if not math.isfinite(self.residual):
+            return f"the model finds no equilibrium {under}: are compliance and effects right?"
+        return (
+            f"the corrected setpoint stays {1e3 * self.residual:.3g} mm from the wanted pose "
+            f"{under}, expected at most {1e3 * SOLVED:g} mm: a singular pose, or a model that "
+            "bends too far"
+        )
 
     def start(
         self, own_q: Vector, timestamp: float, led: bool = False, in_force: InForce | None = None
@@ -109,6 +129,7 @@ class SetpointStream:
             self.limiter.start(own_q, in_force.delta, in_force.offset_in_base)
         self._nominal.start(nominal)
         self._ramp, self._resumes = 0.0, in_force is not None
+        self._solved[:] = 0.0
         self._start_gap, self._since_start = None, np.inf if led else 0.0
         # as if a setpoint had been there one cycle ago
         self._last = timestamp - self.limiter.limits.cycle
@@ -134,10 +155,11 @@ class SetpointStream:
             source_q = self._without_start_gap(source_q, usable)
         nominal = stream.brake(usable) if source_q is None else source_q
         correction = self.correct(nominal, loads)
-        corrected, offset = correction.q, correction.offset_in_base
-        if not self.residual < SOLVED:
-            self.unsolved += 1
-            corrected, offset = nominal, _NOTHING
+        corrected, offset, n = correction.q, correction.offset_in_base, len(nominal)
+        if self.residual < SOLVED:
+            self._solved[:n], self._solved[n:] = corrected - nominal, offset
+        else:  # the last one that was solved is ramped out: the loop ends the motion
+            corrected, offset = nominal + self._solved[:n], self._solved[n:]
         step, before = usable / self._ramp_time, self._share(offset)
         ramp = min(max(goal, before - step), before + step)
         if time.monotonic() > expiry:

@@ -41,6 +41,10 @@ class Cause(StrEnum):
     OVERRUN = "deadlines missed"
     SATURATED = "offset saturated"
     BAD_OUTPUT = "correction no number"
+    UNSOLVED = "correction unsolved"
+    LOAD = "load implausible"
+    NOT_FOLLOWING = "robot not following"
+    MISMATCH = "robot set otherwise"
     FOREIGN = "another commander"
     INEFFECTIVE = "write without effect"
     SILENCE = "silence"
@@ -58,7 +62,8 @@ STOPS_AT_ONCE = (_C.SILENCE, _C.UNSAFE, _C.WRITE_FAILED, _C.BAD_OUTPUT)
 
 RAMPS_OUT = (
     _C.DISARM, _C.STOP, _C.SOURCE_DRY, _C.SETPOINT_REFUSED, _C.STALE, _C.IMPLAUSIBLE, _C.FROZEN,
-    _C.RESYNC, _C.OVERRUN, _C.SATURATED, _C.FOREIGN, _C.INEFFECTIVE,
+    _C.RESYNC, _C.OVERRUN, _C.SATURATED, _C.UNSOLVED, _C.LOAD, _C.NOT_FOLLOWING, _C.MISMATCH,
+    _C.FOREIGN, _C.INEFFECTIVE,
 )  # fmt: skip
 """Causes that end compensating by way of a ramp."""
 
@@ -66,8 +71,6 @@ TRANSITIONS: dict[tuple[State, Cause], State] = {
     (_S.DISCONNECTED, _C.CONNECTED): _S.OBSERVING,
     (_S.OBSERVING, _C.ARM): _S.ARMED,
     (_S.OBSERVING, _C.LATCHED): _S.FAULT,
-    (_S.OBSERVING, _C.SILENCE): _S.FAULT,
-    (_S.OBSERVING, _C.BAD_OUTPUT): _S.FAULT,
     (_S.ARMED, _C.WRITING): _S.COMPENSATING,
     (_S.ARMED, _C.START_REFUSED): _S.OBSERVING,
     **{(_S.ARMED, cause): _S.OBSERVING for cause in RAMPS_OUT},
@@ -85,8 +88,9 @@ TRANSITIONS: dict[tuple[State, Cause], State] = {
 }
 """(state, cause) -> next state. What is not in the table changes nothing.
 
-Only a person's ARM leads to writing; no fault leads back to it. FAULT is left by a person's
-ACKNOWLEDGED, or with the link.
+Only a person's ARM leads to writing; no fault leads back to it. While observing nothing is written,
+so that nothing found then latches: what still lasts when somebody arms is refused there. FAULT is
+left by a person's ACKNOWLEDGED, or with the link.
 """
 
 HEALED_BY_RECONNECTING = (_C.SILENCE, _C.WRITE_FAILED, _C.INEFFECTIVE)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from bridge.cell.sections import SetpointSettings
 from bridge.ipc.counts import Count
 from bridge.ipc.shared_memory import Page, Phase
+from bridge.loop.link_monitor import hold_time
 from bridge.loop.offset_in_force import OffsetInForce
 from bridge.loop.setpoint_stream import SetpointStream
 from bridge.loop.supervisor import Cause, State, Supervisor
@@ -102,11 +103,21 @@ class Writing:
         self._page.enter(Phase.ARMING)
         self.has_armed = True
         try:
+            self._check_way()
             self._driver.arm(state)
             self.ready = True
         finally:
             self._page.enter(Phase.RUNNING)
             self._skip()
+
+    def _check_way(self) -> None:
+        """Refuse a link on which no state can be fresh. Raises WriteError."""
+        taken, most = self._driver.round_trip(), hold_time(self._driver.rate)
+        if taken is not None and taken > most:
+            raise WriteError(
+                f"link: a question and its answer take {1e3 * taken:.0f} ms, expected at most "
+                f"{1e3 * most:.0f} ms: no state behind a setpoint may be older"
+            )
 
     def _refuse_start(self, detail: str) -> None:
         self.release()
@@ -154,12 +165,19 @@ class Writing:
                 self._driver.write_setpoint(setpoint)
                 self._in_force.note(setpoint.q, stream.joint_offset, setpoint.offset_in_base)
                 self._failed = 0
+                self._judge_correction()
                 self._judge_sending(expiry)
                 return setpoint
         except WriteError as error:
             self.unsent = _copied(setpoint)
             self._fail(error)
         return None
+
+    def _judge_correction(self) -> None:
+        """End the motion where the model has no correction; the offset is on its way out."""
+        words = self._stream.unsolved
+        if words and self._supervisor.take(Cause.UNSOLVED, words):
+            self._page.count(Count.UNSOLVED)
 
     def _judge_sending(self, expiry: float) -> None:
         """End the motion where the system stopped this process between judging and sending."""

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.document.output_file import replacing_bytes
+from bridge.recording.finishing import finish_recording
 from core.errors import InputError, LogError
 from core.log.columns import COLUMNS
 from core.log.mcap_reading import Batch, read_batches
@@ -89,9 +90,11 @@ def moment(text: str) -> float | datetime:
 def export(recording: Path, out: Path, span: Span | None = None) -> Exported:
     """Write a recording's cycles as a log: CSV, or Parquet where the suffix of ``out`` says so.
 
-    Columns that no cycle carries are left out. Raises LogError where the recording cannot be used
+    Columns that no cycle carries are left out. A recording that was cut off is finished on the way,
+    where its folder can be written to. Raises LogError where the recording cannot be used
     or holds no cycle of the stretch.
     """
+    finish_recording(recording)
     first, last = _bounds(recording, span or Span())
     columns = _columns_of(recording, first, last)
     exported, every = Exported(), _every(recording)

@@ -8,6 +8,7 @@ import re
 import time
 from pathlib import Path
 
+from bridge.document.output_file import FOLDER_MODE
 from core.errors import InputError
 from core.log.mcap_reading import SUFFIX, last_batch
 
@@ -33,7 +34,7 @@ def _is_taken(folder: Path, session: str) -> bool:
 def require_folder(folder: Path) -> None:
     """Make the folder. Raises InputError where recordings cannot be written into it."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK | os.X_OK):
             raise PermissionError(13, "Permission denied")
     except OSError as error:

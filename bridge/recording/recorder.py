@@ -16,11 +16,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from bridge.cell.settings.recording import RecordingSettings
+from bridge.document.output_file import FOLDER_MODE
 from bridge.ipc.shared_memory import Page
 from bridge.loop.supervisor import State
+from bridge.recording.finishing import finish, unfinished
 from bridge.recording.folder import next_path, number_after, prune, segments
 from bridge.recording.segment import Segment
-from bridge.recording.settings import RecordingSettings
 from bridge.recording.words import LEVELS, level_of, words_of
 from core.errors import LogError
 from core.log.mcap_schema import CONFIGURATION, EVENTS, LOG, STATUS
@@ -63,6 +65,7 @@ class Recorder:
         self.lost = 0  # cycles of this process's time that no file holds
         self._next = self._resume()  # number of the first cycle that no whole flush holds
         self._reader = page.reader(self._next)
+        self._cut_off = unfinished(self._folder)  # files of recorders that were killed
 
     def _resume(self) -> int:
         """Return where a former process of this run has stopped."""
@@ -98,7 +101,16 @@ class Recorder:
                 self._flush(now)
         except OSError as error:
             self._pause(error.strerror or str(error))
+        self._finish_one()
         return len(rows)
+
+    def _finish_one(self) -> None:
+        """Write the summary of one file that a kill has cut off; the ring waits meanwhile."""
+        if self._cut_off and self._segment is not None:
+            path = self._cut_off.pop(0)
+            with contextlib.suppress(OSError, LogError):
+                if finish(path):
+                    self._say(f"finished {path}, which had been cut off", file=str(path))
 
     def close(self) -> None:
         """Write what is there and finish the file."""
@@ -155,7 +167,7 @@ class Recorder:
     def _open(self) -> bool:
         """Begin a new file; returns whether there is one."""
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
+            self._folder.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
             prune(self._folder, self._session, self._settings.keep_total)
             if self._room() < self._settings.keep_free:
                 raise OSError(0, f"less than {self._settings.keep_free:g} MB free")
@@ -192,6 +204,7 @@ class Recorder:
         """Give the file up, keep what whole flushes have written, and try again later."""
         if self._segment is not None:
             self._segment.abandon()
+            self._cut_off.append(self._segment.path)
         self._segment = None
         self._retry_at = time.monotonic() + RETRY_EVERY
         if why != self._why_paused:

@@ -7,6 +7,7 @@ process leaves a file that is good up to its last flush.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import math
 import os
@@ -19,6 +20,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
+from bridge.document.output_file import MODE
 from core.log.mcap_layout import layout_of
 from core.log.mcap_schema import (
     CYCLE_CHANNELS,
@@ -40,7 +42,9 @@ class _File:
     """What the library writes to: kept until ``flush``, then written in one go."""
 
     def __init__(self, path: Path) -> None:
-        self.fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self.fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, MODE)
+        with contextlib.suppress(OSError):  # who finishes files after a kill leaves this one alone
+            fcntl.flock(self.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         _sync_folder(path.parent)  # else a power cut may take the name
         self.good = 0  # bytes of the file that were written by whole flushes
         self._waiting = bytearray()

@@ -66,9 +66,7 @@ def _size(channel: ChannelDiagnosis) -> str:
     }[channel.channel]  # fmt: skip
     per = "joint" if channel.channel in ("tracking", "torque") else "axis"
     floor = channel.noise_floor_rms
-    # where structure is left over, part of it has gone into the estimate of the noise
-    most = "at most " if channel.structured else ""
-    noise = "" if floor is None else f"; measurement noise makes {most}{told(floor, unit)} of it"
+    noise = "" if floor is None else f"; measurement noise makes {told(floor, unit)} of it"
     if floor is not None and floor >= channel.gap_rms:
         noise = f", no more than the measurement noise of {told(floor, unit)}"
     elif channel.verdict == "no_gap":
@@ -99,8 +97,22 @@ def _causes(channel: ChannelDiagnosis) -> str:
     )
     return (
         f"Cause{'s' if many else ''}: {words}; with {'them' if many else 'it'} in the model "
-        f"{change} on measurements that the fit did not see ({sure} sure)."
+        f"{change} on measurements that the fit did not see ({sure} sure).{elsewhere(channel)}"
     )
+
+
+def elsewhere(channel: ChannelDiagnosis) -> str:
+    """Return what to expect where nothing was fitted: never only the flattering figure."""
+    found, unit = channel.elsewhere, channel.unit
+    parts = []
+    if found.new_region is not None:
+        parts.append(f"{told(found.new_region, unit)} in a new region of joint space")
+    if found.new_session is not None:
+        parts.append(f"{told(found.new_session, unit)} in a new session")
+    session = "" if found.new_session is not None else (
+        " One session does not show what a new one brings."
+    )  # fmt: skip
+    return (f" Expect {listed(parts)}." if parts else "") + session
 
 
 def _left(channel: ChannelDiagnosis) -> str:

@@ -69,7 +69,7 @@ def _bars(channel: ChannelDiagnosis, axis: str) -> list[dict[str, Any]]:
     if channel.causes:
         given.append(("after", after(channel), AFTER))
     if channel.noise_floor_rms is not None:
-        given.append(("noise ≤" if channel.structured else "noise", channel.noise_floor_rms, FLOOR))
+        given.append(("noise", channel.noise_floor_rms, FLOOR))
     factor = unit_of(channel.unit)[1]
     return [{
         "type": "bar", "orientation": "h", "xaxis": f"x{axis}", "yaxis": f"y{axis}",

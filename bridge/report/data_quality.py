@@ -8,6 +8,7 @@ from bridge.report.fragment import bullets, heading, paragraph, table
 from bridge.report.material import Material, own_coordinates, per_sample
 from bridge.report.words import CHANNELS, told
 from core.diagnosis.diagnosis import ChannelDiagnosis
+from core.log.log import Log
 
 WILD = 20  # wild readings listed a channel
 
@@ -27,7 +28,7 @@ def section(material: Material) -> str:
     ]  # fmt: skip
     parts.append(heading("Findings"))
     parts.append(bullets(diagnosis.findings) or paragraph("Nothing odd was found in the log."))
-    parts += [_wild(c, material.log.first_row) for c in diagnosis.channels]
+    parts += [_wild(c, material.log) for c in diagnosis.channels]
     if diagnosis.not_observable:
         parts.append(heading("What this log cannot show"))
         parts.append(table(
@@ -38,14 +39,14 @@ def section(material: Material) -> str:
     return "".join(parts)
 
 
-def _wild(channel: ChannelDiagnosis, first_row: int) -> str:
+def _wild(channel: ChannelDiagnosis, log: Log) -> str:
     wild = np.flatnonzero(~channel.selection.kept)
     if not len(wild):
         return ""
     size = per_sample(channel.remaining, own_coordinates(channel))
     worst = wild[np.argsort(-size[wild])][:WILD]
     rows = [
-        [str(int(channel.selection.observation.rows[i]) + first_row), told(float(size[i]),
+        [str(log.line(channel.selection.observation.rows[i])), told(float(size[i]),
          channel.unit)] for i in worst
     ]  # fmt: skip
     more = f" The {WILD} largest of {len(wild)}:" if len(wild) > WILD else ""

@@ -31,6 +31,7 @@ def section(material: Material) -> str:
         if len(material.diagnosis.channels) > 1:
             parts.append(f"<h3>{CHANNELS[channel.channel]}</h3>")
         parts.append(_channel(channel))
+        parts.append(_sessions(channel, material.diagnosis.sessions))
     return "".join(parts)
 
 
@@ -41,12 +42,14 @@ def _shares(channels: tuple[ChannelDiagnosis, ...]) -> str:
         rows.append([
             CHANNELS[c.channel], told(c.gap_rms, c.unit),
             told(c.remaining_rms_held_out, c.unit) if c.causes else "–",
+            told(c.elsewhere.new_region, c.unit), told(c.elsewhere.new_session, c.unit),
             told(c.noise_floor_rms, c.unit),
             bar(part.explained, percent(part.explained), EXPLAINED),
             bar(part.noise, percent(part.noise), FLOOR),
             bar(part.unexplained, percent(part.unexplained), LEFT),
         ])  # fmt: skip
-    heads = ("channel", "before", "after, held out", "noise", "explained", "noise share",
+    heads = ("channel", "before", "after, held out", "in a new region",
+             "in a new session", "noise", "explained", "noise share",
              "unexplained")  # fmt: skip
     return table(heads, rows)
 
@@ -68,6 +71,28 @@ def _channel(channel: ChannelDiagnosis) -> str:
     better = float(np.mean(after < before)) if channel.causes else None
     if better is not None:
         parts.append(paragraph(f"{percent(better)} of the held-out samples came closer."))
+    return "".join(parts)
+
+
+def _sessions(channel: ChannelDiagnosis, sessions: tuple[str, ...]) -> str:
+    """Return how each session does under a fit of the others, and what changed between them."""
+    found = channel.elsewhere.by_session
+    if not found:
+        return ""
+    rows: list[list[Cell]] = [[sessions[s], told(rms, channel.unit)] for s, rms in found]
+    parts = [table(("session", "left under a fit of the others"), rows)]
+    for across in channel.carried:
+        words = effect_words(across.effect)
+        if across.carries:
+            parts.append(paragraph(f"{words}: the same in all sessions that show it."))
+            continue
+        heads = ("changed between sessions", *(sessions[s] for s, _ in across.values))
+        values = [parameters for _, parameters in across.values]
+        lines: list[list[Cell]] = [
+            [same[0].name, *(f"{p.value:.4g} ± {p.std or 0.0:.2g} {p.unit}" for p in same)]
+            for same in zip(*values, strict=True)
+        ]
+        parts.append(table(heads, lines))
     return "".join(parts)
 
 

@@ -11,7 +11,6 @@ from threadpoolctl import threadpool_limits
 
 from core.diagnosis.carrying import Carried, carried
 from core.diagnosis.channels import position, torque, tracking, wrench
-from core.diagnosis.channels.observation import NotObservable, Observation, thinned
 from core.diagnosis.channels.simulation import joined, predicted_by
 from core.diagnosis.every_row import on_every_row, still_accused
 from core.diagnosis.generalisation import NOWHERE, Generalisation, generalisation
@@ -20,19 +19,21 @@ from core.diagnosis.judgement import Judgement, holding, judge
 from core.diagnosis.location import Where, locate
 from core.diagnosis.log_checks.units_and_clocks import check_units, findings
 from core.diagnosis.noise_floor import Floor, noise_floor, own_coordinates, whiteness
+from core.diagnosis.observation import NotObservable, Observation, thinned
 from core.diagnosis.residual_structure import dependence
 from core.diagnosis.result import Cause, Considered, causes_of, considered_of
 from core.diagnosis.rigid_suspicion import softness_findings
+from core.diagnosis.selection.moments import slip_sentences
 from core.diagnosis.selection.selection import Selection, select, standing
 from core.diagnosis.separation import Measurement, next_measurements
-from core.effects import Term, flexibility_effects
+from core.effects import CATALOGUE, Term, flexibility_effects
 from core.errors import LogError
 from core.log.columns import COLUMNS, misspelt
 from core.log.log import Log
-from core.log.ranges import outside_findings
-from core.log.sessions import sessions_in, with_sessions
 from core.metrology import Metrology
 from core.model import Model
+from core.ranges import outside_findings
+from core.sessions import session_of, sessions_in, with_sessions
 
 Array = NDArray[np.float64]
 Observe = Callable[[Model, Log, Metrology], Observation | NotObservable]
@@ -158,11 +159,13 @@ def _diagnose(
         hint = misspelt(log.unknown, lacking, log.n)
         raise LogError(f"{log.path}: found no channel to diagnose, expected one of: {needs}{hint}")
     for channel in observed:
-        told += _channel_findings(channel)
+        told += _channel_findings(channel, log)
         soft = {*flexibility_effects().values()} - {*withhold}
         if simulated is None and len(soft) == 2 and _lacks_much(channel):
             told += softness_findings(model, log, metrology)
     terms = _for_the_model(observed)
+    if not log.one_clock:
+        terms = [_slipped(term, log) for term in terms]
     return Diagnosis(
         _overall(observed), tuple(observed), tuple(hidden),
         next_measurements(model, log, observed), tuple(told), with_found(model, terms),
@@ -176,7 +179,8 @@ def _log_findings(model: Model, log: Log, metrology: Metrology) -> list[str]:
         return findings(log, model, metrology)
     found: dict[str, list[str]] = {}
     for name, part in zip(log.session_names, sessions_in(log), strict=True):
-        for text in findings(part, model, metrology):
+        own = position.session_model(model, part, metrology)
+        for text in findings(part, own, metrology):
             found.setdefault(text, []).append(name)
     told = [f"session {', '.join(names)}: {text}" for text, names in found.items()]
     if not log.one_clock:
@@ -217,6 +221,13 @@ def _for_the_model(channels: Sequence[ChannelDiagnosis]) -> list[Term]:
                 if key not in best or deviation < best[key][0]:
                     best[key] = (deviation, term)
     return [term for _, term in best.values()]
+
+
+def _slipped(term: Term, log: Log) -> Term:
+    """Return a term that steps once as it stands today: clocks that overlap hold no moment."""
+    if not CATALOGUE[term.effect].at_moment:
+        return term
+    return replace(term, values=(*term.values[:-1], float(log.times()[0]) - 1.0))
 
 
 def _lacks_much(channel: ChannelDiagnosis) -> bool:
@@ -348,11 +359,18 @@ def _overall(channels: Sequence[ChannelDiagnosis]) -> str:
     return "unexplained"
 
 
-def _channel_findings(channel: ChannelDiagnosis) -> list[str]:
+def _line_of(log: Log, row: int) -> str:
+    """Return the line of a row in its file; of several sessions with the session's name."""
+    if not log.session_names:
+        return str(log.line(row))
+    return f"{log.line(row)} of {log.session_names[int(session_of(log)[row])]}"
+
+
+def _channel_findings(channel: ChannelDiagnosis, log: Log) -> list[str]:
     told = []
     wild = channel.selection.observation.rows[~channel.selection.kept]
     if len(wild):
-        rows = ", ".join(str(int(r) + 2) for r in wild[:8])
+        rows = ", ".join(_line_of(log, int(r)) for r in wild[:8])
         told.append(
             f"{channel.channel}: {len(wild)} wild reading(s) set aside (row {rows}"
             f"{', ...' if len(wild) > 8 else ''} of the file)"
@@ -361,6 +379,10 @@ def _channel_findings(channel: ChannelDiagnosis) -> list[str]:
         term = channel.selection.terms[position_]
         joint = f" of joint {term.site.joint}" if term.site.joint else ""
         told.append(f"{channel.channel}: {term.effect}{joint} is not accused: {reason}")
+    terms = [term for cause in channel.causes for term in cause.terms]
+    whole = channel.verdict == "explained"
+    sentences = slip_sentences(terms, channel.selection.observation, whole)
+    told += [f"{channel.channel}: {sentence}" for sentence in sentences]
     for cause in channel.causes:
         told += [f"{channel.channel}: {note}" for note in cause.notes]
     return told

@@ -8,6 +8,7 @@ from typing import Any
 from core.diagnosis.carrying import Carried
 from core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
 from core.diagnosis.result import Cause
+from core.effects import CATALOGUE
 
 SCHEMA = "gapbridge.diagnosis/1"
 
@@ -64,7 +65,7 @@ def _channel(c: ChannelDiagnosis, diagnosis: Diagnosis) -> dict[str, Any]:
             "axes": {"frame": frame, "share": list(c.where.axes)},
             "depends_on": _quantities(c.where.depends_on),
         },
-        "causes": [_cause(cause, c.carried, diagnosis.sessions) for cause in c.causes],
+        "causes": [_cause(cause, c, diagnosis) for cause in c.causes],
         "considered": [
             {
                 "effect": k.effect,
@@ -88,16 +89,13 @@ def _quantities(pairs: tuple[tuple[str, float], ...]) -> list[dict[str, Any]]:
     return [{"quantity": name, "held_out_r2": share} for name, share in pairs]
 
 
-def _cause(cause: Cause, carried: tuple[Carried, ...], sessions: tuple[str, ...]) -> dict[str, Any]:
+def _cause(cause: Cause, channel: ChannelDiagnosis, diagnosis: Diagnosis) -> dict[str, Any]:
     shrink = cause.shrink
-    across = next((c for c in carried if c.effect == cause.effect), None)
+    across = next((c for c in channel.carried if c.effect == cause.effect), None)
     return {
         "effect": cause.effect,
         "joints": list(cause.joints),
-        "parameters": [
-            {"name": p.name, "value": p.value, "std": p.std, "unit": p.unit}
-            for p in cause.parameters
-        ],
+        "parameters": _parameters(cause, channel, diagnosis),
         "gap_without": shrink.gap_without if shrink else None,
         "gap_with": shrink.gap_with if shrink else None,
         "shrink": shrink.shrink if shrink else None,
@@ -105,8 +103,38 @@ def _cause(cause: Cause, carried: tuple[Carried, ...], sessions: tuple[str, ...]
         "shrink_alone": cause.shrink_alone,
         "probability": cause.probability,
         "indistinguishable_from": list(cause.indistinguishable_from),
-        **({"across_sessions": _across(across, sessions)} if across else {}),
+        **({"across_sessions": _across(across, diagnosis.sessions)} if across else {}),
     }
+
+
+def _parameters(
+    cause: Cause, channel: ChannelDiagnosis, diagnosis: Diagnosis
+) -> list[dict[str, Any]]:
+    """Return a cause's parameters; a moment on clocks that overlap as the first session after it.
+
+    That time is no time of any of the sessions' clocks.
+    """
+    moment = CATALOGUE[cause.effect].at_moment and not diagnosis.one_clock
+    found: list[dict[str, Any]] = []
+    for p in cause.parameters:
+        entry = {"name": p.name, "value": p.value, "std": p.std, "unit": p.unit}
+        if moment and p.name.endswith("_time"):
+            first = diagnosis.sessions[_first_session(channel, p.value)]
+            found.append({**entry, "value": None, "std": None})
+            name = p.name.removesuffix("_time") + "_session"
+            found.append({"name": name, "value": first, "std": None, "unit": ""})
+        else:
+            found.append(entry)
+    return found
+
+
+def _first_session(channel: ChannelDiagnosis, moment: float) -> int:
+    """Return the first session with rows after a moment of the joined clock."""
+    observation = channel.selection.observation
+    assert observation.times is not None
+    assert observation.session is not None
+    after = observation.times > moment
+    return int(observation.session[after].min() if after.any() else observation.session.max())
 
 
 def _across(carried: Carried, sessions: tuple[str, ...]) -> dict[str, Any]:

@@ -33,6 +33,7 @@ class Log:
     lines: NDArray[np.int64] | None = None  # (N,) line of each row; None: one after the other
     unknown: tuple[str, ...] = ()  # names of the file's columns that no channel reads
     session_names: tuple[str, ...] = ()  # of several sessions; column session holds their index
+    numbers: NDArray[np.int64] | None = None  # (N,) of the rows of several sessions, from 1
     one_clock: bool = True  # False: timestamps of later sessions were shifted behind the first's
 
     def __len__(self) -> int:
@@ -100,6 +101,8 @@ class Log:
         """Return when each row was taken (N,): s of ``timestamp``, else the row's number from 1."""
         if self.has("timestamp"):
             return self.require("timestamp")
+        if self.numbers is not None:
+            return np.asarray(self.numbers, dtype=float)
         lines = np.arange(len(self)) + self.first_row if self.lines is None else self.lines
         return np.asarray(lines - self.first_row + 1, dtype=float)
 
@@ -116,11 +119,12 @@ class Log:
             return None
         return last_motion(q)
 
-    def select(self, rows: Array | slice) -> Log:
+    def select(self, rows: NDArray[Any] | slice) -> Log:
         """Return the log of some of the rows; each keeps the line that it had in the file."""
         lines = np.arange(len(self)) + self.first_row if self.lines is None else self.lines
         columns = {name: values[rows] for name, values in self.columns.items()}
-        return replace(self, columns=columns, lines=lines[rows])
+        numbers = None if self.numbers is None else self.numbers[rows]
+        return replace(self, columns=columns, lines=lines[rows], numbers=numbers)
 
 
 def last_motion(q: Array, dead_band: float = 1e-6) -> Array:

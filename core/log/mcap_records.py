@@ -27,6 +27,7 @@ from core.errors import LogError
 LARGEST_CHUNK = 1 << 28  # bytes, unpacked: one that says more is garbage
 _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
+HEAD_SIZE = _HEAD.size  # bytes before a record's data: opcode and length
 _KNOWN = frozenset(int(code) for code in Opcode)
 _ENDS = (Opcode.DATA_END, Opcode.FOOTER)
 # what the libraries raise where bytes are not what they should be
@@ -60,6 +61,16 @@ def chunk_offsets(file: IO[bytes], path: Path) -> Iterator[tuple[int, int]]:
 
     Raises LogError where the file is no MCAP file. A file of nothing has no chunks.
     """
+    for code, at, length in all_records(file, path):
+        if code == Opcode.CHUNK:
+            yield at, length
+
+
+def all_records(file: IO[bytes], path: Path) -> Iterator[tuple[int, int, int]]:
+    """Yield opcode, where its data begins, and its length, of each record of the data section.
+
+    Ends where a record is not there to its last byte. Raises LogError where it is no MCAP file.
+    """
     size = os.fstat(file.fileno()).st_size
     magic = file.read(len(MCAP0_MAGIC))
     if magic != MCAP0_MAGIC[: len(magic)]:
@@ -71,8 +82,7 @@ def chunk_offsets(file: IO[bytes], path: Path) -> Iterator[tuple[int, int]]:
         at += _HEAD.size
         if code not in _KNOWN or code in _ENDS or at + length > size:
             return
-        if code == Opcode.CHUNK:
-            yield at, length
+        yield code, at, length
         at += length
 
 
@@ -86,6 +96,15 @@ def is_whole(path: Path) -> bool:
 
 def read_chunk(file: IO[bytes], at: int, length: int) -> Contents | None:
     """Return what a chunk holds, None where it is broken."""
+    found = unpacked(file, at, length)
+    try:
+        return None if found is None else _contents(found[1])
+    except BROKEN:
+        return None
+
+
+def unpacked(file: IO[bytes], at: int, length: int) -> tuple[Chunk, bytes] | None:
+    """Return a chunk record and its data unpacked, None where it is broken or holds nothing."""
     file.seek(at)
     raw = file.read(length)
     try:
@@ -93,9 +112,24 @@ def read_chunk(file: IO[bytes], at: int, length: int) -> Contents | None:
         if chunk.uncompressed_size > LARGEST_CHUNK or not chunk.uncompressed_crc:
             return None
         stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-        return _contents(stream.read(size)) if size else None
+        return (chunk, stream.read(size)) if size else None
     except BROKEN:
         return None
+
+
+def inner_records(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yield opcode, where its data begins, and its length, of each record of an unpacked chunk."""
+    at, end = 0, len(data)
+    while at < end:
+        code, length = _HEAD.unpack_from(data, at)
+        yield code, at + HEAD_SIZE, length
+        at += HEAD_SIZE + length
+
+
+def message_head(data: bytes) -> tuple[int, int, int, int]:
+    """Return channel, sequence, log time and publish time (ns) of a message's data."""
+    channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(data)
+    return channel, sequence, log_time, publish_time
 
 
 def _contents(data: bytes) -> Contents:

@@ -73,6 +73,14 @@ class DriverWithSensor(Driver):
         """See Driver.keep_alive."""
         self._arm.keep_alive()
 
+    def round_trip(self) -> float | None:
+        """See Driver.round_trip."""
+        return self._arm.round_trip()
+
+    def mismatch(self) -> str | None:
+        """See Driver.mismatch."""
+        return self._arm.mismatch()
+
     def _send(self, setpoint: Setpoint) -> None:
         """Send one setpoint to the arm."""
         self._arm.write_setpoint(setpoint)

@@ -35,6 +35,11 @@ class ModbusSettings(DriverSettings):
     parity: Literal["N", "E", "O"] = "N"
     stopbits: Literal[1, 2] = 1
     authority: Path | None = Field(None, description="tls: PEM of the CA that is trusted")
+    fingerprint: str | None = Field(
+        None,
+        description="tls: SHA-256 of the controller's own certificate, 64 hexadecimal digits; then "
+        "its name is not compared with host",
+    )
     certificate: Path | None = Field(None, description="tls: PEM of our own certificate")
     key: Path | None = Field(None, description="tls: PEM of our own key")
     rate: float = Field(20.0, gt=0.0, le=500.0, description="cycles per second asked for")
@@ -53,9 +58,23 @@ class ModbusSettings(DriverSettings):
         """Refuse a transport without what it needs."""
         if self.transport == "rtu" and self.serial is None:
             raise ValueError("expected serial, the port to open, with transport rtu")
-        if self.transport == "tls" and self.authority is None:
-            raise ValueError("expected authority, the CA that is trusted, with transport tls")
+        if self.transport == "tls" and self.authority is None and self.fingerprint is None:
+            raise ValueError(
+                "expected authority, the CA that is trusted, or fingerprint, the controller's own "
+                "certificate, with transport tls"
+            )
         return self
+
+    @field_validator("fingerprint")
+    @classmethod
+    def _plain_fingerprint(cls, value: str | None) -> str | None:
+        """Take a SHA-256 as tools print it, with colons or without."""
+        if value is None:
+            return None
+        digits = value.replace(":", "").lower()
+        if len(digits) != 64 or not set(digits) <= set("0123456789abcdef"):
+            raise ValueError("expected 64 hexadecimal digits, the SHA-256 of a certificate")
+        return digits
 
     @field_validator("host")
     @classmethod

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import socket
-import ssl
 from collections.abc import Iterable, Sequence
 from typing import Any, NoReturn
 
@@ -24,6 +23,7 @@ from drivers.modbus.map import Block, RegisterMap
 from drivers.modbus.registers import BIT_TABLES, Table
 from drivers.modbus.settings import ModbusSettings
 from drivers.modbus.tcp_requests import TcpRequests
+from drivers.modbus.tls import CheckedContext, checked_context
 
 READ_FUNCTIONS: dict[Table, int] = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 
@@ -67,7 +67,9 @@ class Transport:
             raise LinkError(f"{self.name}: cannot be reached: {_words(error)}") from None
         if not fine:
             client.close()
-            raise LinkError(f"{self.name}: cannot be reached: no answer or refused")
+            context = client.comm_params.sslctx
+            why = context.refused if isinstance(context, CheckedContext) else ""
+            raise LinkError(f"{self.name}: cannot be reached: {why or 'no answer or refused'}")
         if settings_are_tcp(self._settings) and client.socket is not None:
             client.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._tcp = TcpRequests(client, self._device, self._settings.timeout)
@@ -86,7 +88,8 @@ class Transport:
             )  # fmt: skip
         if settings.transport == "tls":
             return ModbusTlsClient(
-                settings.host, port=self._port, sslctx=_tls(settings), timeout=settings.timeout,
+                settings.host, port=self._port, sslctx=checked_context(settings),
+                timeout=settings.timeout,
                 retries=0,
             )  # fmt: skip
         return ModbusTcpClient(settings.host, port=self._port, timeout=settings.timeout, retries=0)
@@ -252,21 +255,6 @@ def _chunks(address: int, values: Sequence[int], one: bool) -> Iterable[tuple[in
     if one:
         return [(address + i, [int(v)]) for i, v in enumerate(values)]
     return [(address, [int(v) for v in values])]
-
-
-def _tls(settings: ModbusSettings) -> ssl.SSLContext:
-    """Return a context that trusts one authority.
-
-    The library cannot check host names, so the authority must be the plant's own.
-    """
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.minimum_version = ssl.TLSVersion.TLSv1_2
-    context.check_hostname = False
-    context.verify_mode = ssl.CERT_REQUIRED
-    context.load_verify_locations(settings.authority)
-    if settings.certificate is not None:
-        context.load_cert_chain(settings.certificate, settings.key)
-    return context
 
 
 def _words(error: Exception) -> str:

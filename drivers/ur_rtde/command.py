@@ -313,7 +313,7 @@ class OffsetWriter:
         fine &= io.setInputIntRegister(registers.CHECKSUM, total)
         fine &= io.setInputIntRegister(registers.HEARTBEAT, sequence)
         fine &= io.setInputIntRegister(registers.SEQUENCE, sequence)
-        return fine
+        return bool(fine)
 
     def _set(self, fill: Callable[[Any], bool]) -> None:
         try:

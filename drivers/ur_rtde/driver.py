@@ -10,17 +10,19 @@ from numpy.typing import NDArray
 from core.compensation import wanted_pose
 from core.errors import InvalidStateError, LinkError, WriteError
 from core.model import Model
+from core.rotation import one_rotation_matrix
 from core.setpoint import Setpoint
 from core.state import RobotState
 from drivers.driver import Driver
 from drivers.offset_inverse import Nominal
 from drivers.ur_rtde.command import OffsetWriter, ServoWriter, Writer
+from drivers.ur_rtde.round_trip import round_trip
 from drivers.ur_rtde.settings import UrRtdeSettings
 from drivers.ur_rtde.state import StateReader
 
 Vector = NDArray[np.float64]
 OFFSET_SCRIPT = Path(__file__).with_name("gapbridge_offset.script")
-TCP_APART = 0.03  # m: farther apart, the controller's TCP is not the cell's (calibration: a few mm)
+TCP_TURNED = 0.02  # rad: turned further, the controller's TCP is not the cell's
 
 
 class UrRtdeDriver(Driver):
@@ -81,22 +83,36 @@ class UrRtdeDriver(Driver):
 
     def _make_ready(self, state: RobotState) -> None:
         """Make ready for writing: upload the control script, or claim the registers."""
-        if not self.moves_arm:
-            self._check_tcp(state)
+        words = self.mismatch()
+        if words is not None:
+            raise WriteError(f"{self.settings.host}: {words}")
         self._writer.arm(state, self._look)
 
-    def _check_tcp(self, state: RobotState) -> None:
-        """Refuse where the controller's TCP is another than the cell's: offsets act there."""
-        said = self.reader.tcp_pose()
-        if said is None:
-            return
-        wanted = wanted_pose(self._model, state.actual_q).position[0]
-        apart = float(np.linalg.norm(said[:3] - wanted))
-        if not apart <= TCP_APART:  # NaN is not
-            raise WriteError(
-                f"{self.settings.host}: the controller's TCP is {1e3 * apart:.1f} mm from the "
-                "cell's: set the same TCP in both (tool.tcp in the cell file)"
-            )
+    def round_trip(self) -> float | None:
+        """Return how long a question to the RTDE server takes, s; see Driver.round_trip."""
+        return round_trip(self.settings.host)
+
+    def mismatch(self) -> str | None:
+        """Return in words how the controller's TCP differs from the cell's; see Driver.mismatch.
+
+        Offset mode only: offsets act at the controller's TCP, joint setpoints do not.
+        """
+        found = None if self.moves_arm else self.reader.joints_and_tcp()
+        if found is None:
+            return None
+        q, said = found
+        wanted = wanted_pose(self._model, q[None])
+        apart = float(np.linalg.norm(said[:3] - wanted.position[0]))
+        cosine = 0.5 * (np.trace(one_rotation_matrix(said[3:]).T @ wanted.rotation[0]) - 1.0)
+        turned = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        most = self.settings.tcp_tolerance
+        if apart <= most and turned <= TCP_TURNED:  # NaN is not
+            return None
+        return (
+            f"the controller's TCP is {1e3 * apart:.1f} mm and {turned:.3f} rad from the cell's, "
+            f"expected at most {1e3 * most:g} mm (link.tcp_tolerance) and {TCP_TURNED:g} rad: set "
+            "the same TCP in both (tool.tcp in the cell file; robot.calibration beside it)"
+        )
 
     def keep_alive(self) -> None:
         """Feed the watchdog of the control script; see Driver.keep_alive."""

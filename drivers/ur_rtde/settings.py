@@ -37,6 +37,10 @@ class UrRtdeSettings(DriverSettings):
         0.1, gt=0.0, le=1.0,
         description="offset: s after which the robot's program must have echoed an offset",
     )  # fmt: skip
+    tcp_tolerance: float = Field(
+        0.005, gt=0.0, le=0.05,
+        description="offset: m that the controller's TCP may be from the cell's, while armed",
+    )  # fmt: skip
     remote_control: bool = Field(
         True, description="servoj: refuse where the robot is not in remote control"
     )

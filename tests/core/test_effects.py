@@ -17,12 +17,7 @@ from core.model import Model
 from core.motion import motion_of
 
 DH = {"ur10e": builtin_rows("ur10e")["dh"], "seven": SEVEN}
-WITHOUT_UNIT = (
-    "ft_gain",
-    "link_inertia",
-    "load_friction",
-    "torque_constant",
-)  # shares of what is there
+WITHOUT_UNIT = ("ft_gain", "link_inertia", "load_friction", "torque_constant")  # shares
 
 
 @pytest.mark.parametrize("name", CATALOGUE)

@@ -16,6 +16,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from bridge.document.output_file import FOLDER_MODE, MODE
 from core.errors import InputError, RunError
 
 FILE = "journal.jsonl"
@@ -40,10 +41,8 @@ class Journal:
         cannot be written.
         """
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._fd = os.open(
-                self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644
-            )
+            self.path.parent.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
+            self._fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, MODE)
             _sync_folder(self.path.parent)
         except OSError as error:
             raise RunError(f"{self.path}: cannot be written: {error.strerror}") from None

@@ -125,6 +125,7 @@ function showState() {
     parts.push(`armed by ${status.armed_by}`);
   }
   if (status.latched) parts.push(`latched: ${status.latched}`);
+  if (status.correction && status.correction.detail) parts.push(status.correction.detail);
   text($('why'), parts.join(', '));
   document.title = `${state} – ${seen.about.cell}`;
   for (const item of $('path').children) {

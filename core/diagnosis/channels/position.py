@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.channels.observation import NotObservable, Observation, Predict, stacked
+from core.diagnosis.observation import NotObservable, Observation, Predict, stacked
 from core.diagnosis.selection.unnamed import unnamed_rivals
 from core.effects import Term
 from core.errors import LogError
@@ -17,10 +17,10 @@ from core.estimation.identification import pose_groups
 from core.estimation.registration import IDENTITY, Registration, frame_columns, register_robustly
 from core.loads import Loads
 from core.log.log import Log
-from core.log.sessions import session_of, sessions_in
 from core.metrology import Metrology
 from core.model import Model, Poses
 from core.rotation import rotation_matrix, rotation_vector
+from core.sessions import session_of, sessions_in
 
 Array = NDArray[np.float64]
 LEVER = 0.2  # m/rad: first weight of a rotation against a position
@@ -168,6 +168,20 @@ def rounded_groups(q: Array, tolerance: float = 1e-3) -> NDArray[np.int64]:
     return np.asarray(np.unique(rounded, axis=0, return_inverse=True)[1].reshape(-1))
 
 
+def session_model(model: Model, log: Log, metrology: Metrology) -> Model:
+    """Return the model with the tool point of one session, where it was remounted."""
+    if not metrology.remounted or metrology.registered or not log.has("measured_position"):
+        return model
+    q = log.require("actual_q", "target_q")
+    measured = log.columns["measured_position"]
+    rows = np.flatnonzero(np.isfinite(measured).all(axis=1))
+    if 3 * len(rows) < 12:
+        return model
+    data = Data(q[rows], log.loads()[rows], measured[rows], None, registered=False)
+    tool = _placed(model, data, metrology).tool_in_flange
+    return replace(model, tool_in_flange=tool)
+
+
 def _placed(model: Model, data: Data, metrology: Metrology) -> Placement:
     """Return a first estimate of what is free in a session, outliers down-weighted."""
     frame, tool = IDENTITY, model.tool_in_flange
@@ -175,6 +189,7 @@ def _placed(model: Model, data: Data, metrology: Metrology) -> Placement:
         frame = register_robustly(data.position, model.predict(data.q, data.loads).position)
     if metrology.remounted and not metrology.registered:
         fit = fit_nuisances(model, data)
+        assert isinstance(fit.frame, Registration)
         frame, tool = fit.frame, fit.model.tool_in_flange
     return Placement(frame, tool)
 

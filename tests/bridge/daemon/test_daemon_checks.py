@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from daemon_cell import Robot, Run, offsets, wait_for
 
+from bridge.daemon.status_document import lines
 from bridge.loop.supervisor import State
 
 PATIENT = ", state_timeout: 0.2"
@@ -67,3 +69,108 @@ def test_a_loop_that_was_suspended_begins_anew_and_observes(robot: Robot) -> Non
     steps = np.linalg.norm(np.diff(moved, axis=0), axis=1)
     # the robot's own watchdog may have ended its program meanwhile: then nothing more is written
     assert steps[written[1:] & written[:-1]].max() <= 0.05 * 0.002 * 5.001
+
+
+def refusal(run: Run) -> str:
+    """Arm and return why that was refused."""
+    before = len(run.said)
+    run.daemon.arm()
+    wait_for(lambda: len(run.said) > before, 10.0, "a word on arming")
+    time.sleep(0.2)
+    assert not run.daemon.state.writes, run.said
+    return " ".join(run.said[before:])
+
+
+def changed(cell: Path, old: str, new: str) -> None:
+    text = cell.read_text()
+    assert old in text
+    cell.write_text(text.replace(old, new))
+
+
+def nothing_left(run: Run) -> None:
+    assert run.end().exit_code == 1
+    assert not run.cycles()["written"].any()
+
+
+@pytest.mark.parametrize("times", [1000.0, 0.0])
+def test_a_model_that_is_no_use_is_said_so_and_does_not_arm(robot: Robot, times: float) -> None:
+    cell = robot.cell(PATIENT)
+    axial, radial = (
+        [times * value for value in values]
+        for values in (robot.settings.plant.axial, robot.settings.plant.radial)
+    )
+    line = next(line for line in cell.read_text().split("\n") if line.startswith("compliance"))
+    changed(cell, line, f"compliance: {{axial: {axial}, radial: {radial}}}")
+    with Run(cell) as run:
+        run.wait(State.OBSERVING)
+        time.sleep(0.5)
+        said = refusal(run)
+        status = run.daemon.status()
+        nothing_left(run)
+    assert status["correction"]["solved"] == (times == 0.0)
+    if times:
+        assert "the correction cannot be solved at the present pose: " in said
+        assert "no correction at the present pose" in "\n".join(lines(status))
+    else:
+        assert "the model corrects nothing at any pose" in said
+        assert "the model corrects nothing" in "\n".join(lines(status))
+
+
+def script(robot: Robot, line: str) -> None:
+    """Have the controller run a line beside its program, as a person at the pendant would."""
+    text = f"sec person():\n  {line}\nend\n"
+    with socket.create_connection((robot.host, robot.settings.script_port), timeout=5) as upload:
+        upload.sendall(text.encode())
+        time.sleep(0.2)
+
+
+@pytest.mark.parametrize(
+    ("line", "cause"),
+    [
+        ("set_payload(40.0, [0.0, 0.0, 0.06])", "(load implausible): payload: found 40 kg"),
+        ("set_payload(400.0, [0.0, 0.0, 0.06])", "(load implausible): payload: found 400 kg"),
+        ("set_tcp(p[0.0, 0.05, 0.18, 0.0, 0.0, 0.0])", "the controller's TCP is 50.0 mm"),
+        ("set_tcp(p[0.0, 0.0, 0.18, 0.0, 0.1, 0.0])", "0.0 mm and 0.100 rad from the cell's"),
+    ],
+)
+def test_what_a_person_changes_in_the_controller_during_a_run_is_held_and_not_bent_for(
+    robot: Robot, line: str, cause: str
+) -> None:
+    program = robot.start_offset_program()
+    with Run(robot.cell(f"{PATIENT}, mode: offset"), arm=True) as run:
+        run.compensate()
+        time.sleep(0.8)
+        script(robot, line)
+        wait_for(lambda: cause in " ".join(run.said), 3.0, f"{cause} ({run.said})")
+        run.wait(State.OBSERVING, 5.0)
+        assert cause.split(": ")[-1] in refusal(run)
+        run.end()
+        cycles = run.cycles()
+    program.close()
+    before = np.array(cycles["state"]) == "compensating"
+    moved = np.linalg.norm(offsets(cycles)[:, :3], axis=1)
+    # the offset that was there went out; none was made of the change
+    assert moved.max() <= moved[before].max() * 1.01 + 1e-6
+    assert moved.max() < 1e-3
+    assert moved[-1] == 0.0
+
+
+def test_a_rate_above_the_controllers_is_refused_by_name(robot: Robot) -> None:
+    with Run(robot.cell(", rate: 1000"), arm=True) as run:
+        wait_for(lambda: any("link.rate" in line for line in run.said), 30.0, "a refusal")
+        said = " ".join(run.said)
+        nothing_left(run)
+    assert "link.rate: found 1000 Hz, expected at most 500 Hz" in said
+
+
+def test_a_hiccup_while_observing_leaves_no_fault_and_arming_works(robot: Robot) -> None:
+    with Run(robot.cell()) as run:
+        run.wait(State.OBSERVING)
+        time.sleep(0.5)
+        robot.bench("stall 0.5")
+        time.sleep(1.5)
+        assert run.daemon.latched == ""
+        assert run.daemon.state == State.OBSERVING, run.said
+        assert run.daemon.status()["counts"]["silence"] == 1
+        run.compensate()
+        run.end()

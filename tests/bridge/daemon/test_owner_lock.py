@@ -15,10 +15,11 @@ import pytest
 from daemon_cell import Robot, Run, gapbridge, wait_for
 
 from bridge.cell.sections import link_settings
-from bridge.daemon.host import OwnerLock, address_of
+from bridge.daemon.host import OwnerLock
 from bridge.ipc.control_client import ask
 from bridge.loop.supervisor import State
 from core.errors import InputError
+from drivers.controller_address import address_of
 
 
 @pytest.fixture(autouse=True)
@@ -69,6 +70,17 @@ def test_a_second_owner_is_refused_in_one_line_and_the_kernel_frees_the_lock() -
         ({"host": "10.0.0.5"}, {"driver": "modbus", "profile": "ur", "host": "10.0.0.5"}, True),
         ({"host": "10.0.0.5"}, {"host": "10.0.0.6"}, False),
         ({"host": "Robot"}, {"host": "robot"}, True),
+        ({"host": "localhost"}, {"host": "127.0.0.1"}, True),
+        (
+            {"driver": "modbus", "profile": "ur", "host": "10.0.0.5", "port": 5021},
+            {"driver": "modbus", "profile": "ur", "host": "10.0.0.5", "port": 5022},
+            False,
+        ),
+        (
+            {"driver": "modbus", "profile": "ur", "host": "10.0.0.5", "port": 502},
+            {"host": "10.0.0.5"},
+            True,
+        ),
         (
             {"driver": "can", "profile": "piper", "interface": "socketcan", "channel": "can0"},
             {"driver": "can", "profile": "piper", "interface": "socketcan", "channel": "can1"},

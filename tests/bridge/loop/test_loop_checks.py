@@ -261,3 +261,117 @@ def test_a_state_that_is_late_is_counted_and_only_a_stale_one_holds(
 @pytest.mark.parametrize(("rate", "hold"), [(500, 0.04), (125, 0.04), (50, 0.1), (10, 0.2)])
 def test_the_hold_time_is_five_cycles_or_forty_milliseconds(rate: float, hold: float) -> None:
     assert hold_time(rate) == pytest.approx(hold)
+
+
+# -- while observing, and what a robot says beside its modes ---------------------------------------
+
+
+@pytest.mark.parametrize("bits", [1 << bit for bit in range(2, 11)])
+def test_a_stop_in_the_safety_bits_alone_is_a_fault(page: Page, bits: int) -> None:
+    bench = Bench(page, State.COMPENSATING)
+    bench.checks.begin(state(1.0), 0)
+    bench.checks.begin(state(1.0 + T, safety_status_bits=1 | bits), 0)
+    assert bench.supervisor.state == State.FAULT
+    assert not bench.checks.fine
+    assert f"safety_status_bits {1 | bits:#b}" in bench.checks.robot
+
+
+@pytest.mark.parametrize("bits", [1, 2])
+def test_normal_and_reduced_mode_are_no_stop(page: Page, bits: int) -> None:
+    bench = Bench(page, State.COMPENSATING)
+    bench.checks.begin(state(1.0, safety_status_bits=bits), 0)
+    assert bench.supervisor.state == State.COMPENSATING
+
+
+@pytest.mark.parametrize(
+    ("found", "moves_arm", "holds"),
+    [
+        ({"runtime_state": 4}, True, True),
+        ({"runtime_state": 4}, False, True),
+        ({"speed_scaling": 0.5}, True, True),
+        ({"speed_scaling": 0.5}, False, False),  # the robot's own motion, at its own speed
+        ({"speed_scaling": np.nan}, False, True),
+        ({"speed_scaling": 50.0}, False, True),
+        ({"speed_scaling": 1.0}, True, False),
+    ],
+)
+def test_a_robot_that_does_not_follow_for_the_hold_time_is_held(
+    page: Page, found: dict[str, Any], moves_arm: bool, holds: bool
+) -> None:
+    bench = Bench(page, State.COMPENSATING)
+    bench.checks = LoopChecks(500.0, bench.supervisor, page, bench.told.append, moves_arm=moves_arm)
+    for k in range(40):
+        bench.checks.begin(state(1.0 + k * T, **(found if k >= 10 else {})), 0)
+        if k == 10 + round(0.9 * hold_time(500.0) / T):
+            assert bench.supervisor.state == State.COMPENSATING  # a moment is none
+    assert (bench.supervisor.state == State.HOLDING) == holds
+    assert page.counts()["not_following"] == holds
+
+
+def test_a_program_that_does_not_play_is_nobodys_fault_while_nothing_is_written(
+    page: Page,
+) -> None:
+    bench = Bench(page, State.OBSERVING)
+    for k in range(100):
+        bench.checks.begin(state(1.0 + k * T, runtime_state=1), 0)
+    assert page.counts()["not_following"] == 0
+    bench.supervisor.state = State.COMPENSATING  # as it was armed: the program has just begun
+    bench.checks.begin(state(1.0 + 100 * T, runtime_state=1), 0)
+    bench.checks.begin(state(1.0 + 101 * T), 0)
+    assert bench.supervisor.state == State.COMPENSATING
+
+
+def test_a_load_that_cannot_be_holds_and_is_told_with_its_reason(page: Page) -> None:
+    bench = Bench(page, State.COMPENSATING)
+    for _ in range(3):
+        bench.checks.judge_loads("payload: found 400 kg, expected 0 to 7.5 kg")
+    assert bench.supervisor.state == State.HOLDING
+    assert bench.changes[0][3] == "payload: found 400 kg, expected 0 to 7.5 kg"
+    assert page.counts()["load"] == 1
+
+
+class Otherwise(Scripted):
+    """A driver whose controller is set otherwise, from some moment on."""
+
+    asked, words = 0, ""
+
+    def mismatch(self) -> str | None:
+        self.asked += 1
+        return self.words or None
+
+
+def test_the_controllers_settings_are_compared_every_second_while_armed(page: Page) -> None:
+    bench, driver = Bench(page, State.OBSERVING), Otherwise()
+    for k in range(1000):
+        bench.checks.judge_settings(state(1.0 + k * T), driver)
+    assert driver.asked == 0
+    bench.supervisor.state = State.COMPENSATING
+    for k in range(1000):
+        bench.checks.judge_settings(state(3.0 + k * T), driver)
+    assert driver.asked == 2
+    driver.words = "the controller's TCP is 50.0 mm from the cell's"
+    for k in range(501):
+        bench.checks.judge_settings(state(5.0 + k * T), driver)
+    assert bench.supervisor.state == State.HOLDING
+    assert bench.changes[0][3] == driver.words
+
+
+def test_a_hiccup_while_observing_latches_no_fault(
+    page: Page, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = [100.0]
+    monkeypatch.setattr("bridge.loop.link_monitor.time.monotonic", lambda: clock[0])
+    driver, supervisor, watch, told = watched(page)
+    supervisor.state = State.OBSERVING
+    good = driver.next
+    driver.next = StaleStateError("the clock stands still")
+    for _ in range(30):
+        clock[0] += 0.0101
+        assert watch.next() is None
+    assert supervisor.state == State.OBSERVING
+    assert page.counts()["silence"] == 1
+    assert [event["what"] for event in told] == ["stale"]
+    driver.next = good
+    assert watch.next() is not None
+    watch.believe()
+    assert supervisor.state == State.OBSERVING

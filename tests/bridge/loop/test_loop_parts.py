@@ -14,6 +14,7 @@ from bridge.ipc.cycle_row import fill_row
 from bridge.ipc.shared_memory import ROWS, Page, Phase, RunPage
 from bridge.loop.controller_clock import ControllerClock
 from bridge.loop.live_loads import LiveLoads
+from core.load_bounds import LoadBounds
 from core.state import RobotState
 
 Q = np.array([0.0, -1.5, 1.8])
@@ -44,6 +45,35 @@ def test_the_controllers_payload_stands_instead_of_the_models() -> None:
     assert found.payload_mass == pytest.approx([4.0])
     assert found.payload_cog == pytest.approx(np.array([[0, 0, 0.1]]))
     assert loads.update(state(1.2, payload=4.0)).payload_mass is None
+
+
+def test_a_load_beyond_the_arms_bounds_is_not_taken_and_the_last_one_stays() -> None:
+    loads = LiveLoads(3, True, 0.0, LoadBounds(5.0))
+    cog = np.array([0, 0, 0.1])
+    pull = np.array([0.0, 0, -30, 0, 0, 0])
+    for at, mass, force, doubt in (
+        (1.0, 4.0, pull, None),
+        (1.1, 400.0, pull, "payload: found 400 kg"),
+        (1.2, 4.0, 300 * pull, "force: found 9000 N"),
+        (1.3, 40.0, 300 * pull, "payload"),
+        (1.4, 4.0, pull, None),
+    ):
+        found = loads.update(state(at, payload=mass, payload_cog=cog, actual_TCP_force=force))
+        assert found.payload_mass == pytest.approx([4.0])
+        assert found.wrench[0] == pytest.approx(pull)
+        assert (loads.doubt is None) == (doubt is None)
+        assert (doubt or "") in (loads.doubt or "")
+
+
+def test_a_first_payload_that_cannot_be_leaves_the_models_own() -> None:
+    loads = LiveLoads(3, True, 0.0, LoadBounds(5.0))
+    assert loads.update(state(1.0, payload=40.0, payload_cog=Q * 0)).payload_mass is None
+
+
+def test_a_force_that_does_not_count_is_not_doubted() -> None:
+    loads = LiveLoads(3, False, 0.0, LoadBounds(5.0))
+    loads.update(state(1.0, actual_TCP_force=np.full(6, 9e3)))
+    assert loads.doubt is None
 
 
 def test_approach_is_the_last_motion_and_noise_is_none() -> None:
@@ -108,6 +138,20 @@ def test_a_clock_that_stood_still_is_tied_anew_once_nothing_younger_comes() -> N
         clock.take(late)
         if not 19 <= k <= 21:
             assert (clock.expiry(late) < late.received) == (k < 20)
+
+
+def test_while_writing_samples_that_come_later_for_good_stay_old() -> None:
+    clock = ControllerClock(500.0, hold=0.04)
+    now = time.monotonic()
+    clock.take(state(1.0, now - 3.0), writes=True)
+    for k in range(1, 1000):  # from then on 0.21 s later than before
+        late = state(1.0 + 0.002 * k, now - 3.0 + 0.21 + 0.002 * k)
+        clock.take(late, writes=True)
+        assert clock.expiry(late) < late.received
+    clock.take(state(3.0, now - 0.79), writes=False)  # nothing is written any more
+    late = state(3.002, now - 0.788)
+    clock.take(late)
+    assert clock.expiry(late) > late.received
 
 
 def test_what_a_stalled_link_hands_on_at_once_is_old_until_the_newest_has_come() -> None:

@@ -49,6 +49,10 @@ class Failing(Driver):
         self.error: LinkError | None = None
         self.sent: list[np.ndarray] = []
         self.released = 0
+        self.taken: float | None = None  # s, of a question and its answer
+
+    def round_trip(self) -> float | None:
+        return self.taken
 
     def connect(self) -> None: ...
 
@@ -70,11 +74,13 @@ class Stream(SetpointStream):
     """A stream whose model can be made to give no numbers."""
 
     broken = False
+    unsolvable = 0.0  # m: the residual instead
 
     def correct(self, nominal_q: np.ndarray, loads: Loads) -> Correction:
         found = super().correct(nominal_q, loads)
         if self.broken:
             self.residual, self.finite = np.nan, False
+        self.residual = self.unsolvable or self.residual
         return found
 
 
@@ -83,7 +89,8 @@ class Bench:
 
     def __init__(self, page: Page) -> None:
         self.page, self.driver, self.lost = page, Failing(), list[str]()
-        self.supervisor = Supervisor(lambda *_: None)
+        self.changes: list[tuple[str, str]] = []  # cause and detail
+        self.supervisor = Supervisor(lambda *change: self.changes.append(change[2:]))
         self.supervisor.state = State.ARMED
         self.stream = Stream(MODEL, LimitSettings(), 500.0)
         self.loads = LiveLoads(6, True, 0.0)
@@ -138,6 +145,31 @@ def test_a_correction_that_is_no_number_never_leaves_and_is_a_fault(bench: Bench
     assert len(bench.driver.sent) == sent
     assert bench.driver.released == 1
     assert bench.count("bad_output") == 1
+
+
+@pytest.mark.parametrize("residual", [np.inf, 1e-3])
+def test_an_unsolved_correction_ends_the_motion_and_its_offset_is_ramped_out(
+    bench: Bench, residual: float
+) -> None:
+    bench.cycles(400)
+    before = len(bench.driver.sent)
+    assert np.abs(bench.stream.limiter.offset_in_base[:3]).max() > 5e-5
+    bench.stream.unsolvable = residual
+    bench.cycles(1)
+    assert bench.supervisor.state == State.HOLDING
+    assert "correction unsolved" in bench.changes[-1][0]
+    assert ("no equilibrium" if np.isinf(residual) else "1 mm from") in bench.changes[-1][1]
+    assert bench.count("unsolved") == 1
+    offsets = []
+    for _ in range(400):
+        bench.cycles(1)
+        offsets.append(bench.stream.limiter.offset_in_base.copy())
+    assert bench.stream.is_bare
+    assert len(bench.driver.sent) == before + 401  # ramped out, not dropped
+    assert np.abs(bench.driver.sent[-1] - Q).max() < 1e-12
+    lengths = np.linalg.norm(offsets, axis=1)
+    assert lengths[200] > 0.1 * lengths[0]  # over the ramp's time
+    assert np.abs(np.diff(lengths)).max() < 1.1 * lengths[0] / 250
 
 
 def test_nothing_leaves_that_is_made_of_an_old_state_and_the_next_step_is_no_larger(
@@ -250,6 +282,20 @@ def test_holding_brings_the_offset_to_nothing_and_no_step_is_too_large(bench: Be
     bench.cycles(600)
     assert bench.supervisor.state == State.HOLDING
     assert not bench.stream.limiter.offset_in_base.any()
+
+
+@pytest.mark.parametrize(("taken", "armed"), [(None, True), (0.03, True), (0.21, False)])
+def test_a_long_way_to_the_controller_is_refused_at_arming(
+    bench: Bench, taken: float | None, armed: bool
+) -> None:
+    bench.writing.release()
+    bench.supervisor.state = State.ARMED
+    bench.driver.taken = taken
+    bench.writing.start(bench.state(), Q)
+    assert bench.writing.ready == armed
+    assert (bench.supervisor.state == State.ARMED) == armed
+    if not armed:
+        assert bench.changes[-1][1].startswith("link: a question and its answer take 210 ms")
 
 
 def tcp_of(q: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import select
 import ssl
@@ -158,26 +159,34 @@ def openssl(folder: Path, *arguments: str) -> None:
 
 @pytest.fixture(scope="module")
 def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An authority, and keys of a controller and of ours that it has signed."""
+    """An authority, and keys of ours that it has signed."""
     folder = tmp_path_factory.mktemp("keys")
     openssl(
         folder, "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", "ca.key", "-out",
         "ca.pem", "-days", "2", "-subj", "/CN=plant authority",
     )  # fmt: skip
-    for name in ("server", "client"):
-        openssl(
-            folder, "req", "-newkey", "rsa:2048", "-nodes", "-keyout", f"{name}.key", "-out",
-            f"{name}.csr", "-subj", f"/CN={name}",
-        )  # fmt: skip
-        openssl(
-            folder, "x509", "-req", "-in", f"{name}.csr", "-CA", "ca.pem", "-CAkey", "ca.key",
-            "-CAcreateserial", "-out", f"{name}.pem", "-days", "2",
-        )  # fmt: skip
+    certify(folder, "client")
     return folder
+
+
+def certify(folder: Path, name: str, made_out_to: str = "") -> str:
+    """Have the authority sign a certificate, made out to an address; returns its SHA-256."""
+    openssl(
+        folder, "req", "-newkey", "rsa:2048", "-nodes", "-keyout", f"{name}.key", "-out",
+        f"{name}.csr", "-subj", f"/CN={name}",
+    )  # fmt: skip
+    (folder / "san").write_text(f"subjectAltName=IP:{made_out_to}\n" if made_out_to else "")
+    openssl(
+        folder, "x509", "-req", "-in", f"{name}.csr", "-CA", "ca.pem", "-CAkey", "ca.key",
+        "-CAcreateserial", "-out", f"{name}.pem", "-days", "2", "-extfile", "san",
+    )  # fmt: skip
+    der = ssl.PEM_cert_to_DER_cert((folder / f"{name}.pem").read_text())
+    return hashlib.sha256(der).hexdigest()
 
 
 def test_the_contract_holds_over_mutual_tls(keys: Path) -> None:
     case = ModbusCase("ur")
+    certify(keys, "server", case.host)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(keys / "server.pem", keys / "server.key")
     context.load_verify_locations(keys / "ca.pem")
@@ -199,6 +208,35 @@ def test_the_contract_holds_over_mutual_tls(keys: Path) -> None:
         stranger = settings.model_copy(update={"authority": keys / "client.pem"})
         with pytest.raises(LinkError, match="cannot be reached"):
             ModbusDriver(stranger, case.model).connect()
+
+
+def test_over_tls_only_the_named_or_the_pinned_controller_is_let_in(keys: Path) -> None:
+    case = ModbusCase("ur")
+    own = certify(keys, "other", "192.0.2.1")  # of the same authority, made out to another
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(keys / "other.pem", keys / "other.key")
+    server = ModbusServer(case.file, case.host, 15802, tls=context)
+    base = {"profile": "ur", "host": case.host, "port": 15802, "transport": "tls", "rate": 50.0}
+    with PeerThread(case.peer, [server], case.host):
+        named = ModbusSettings(**base, authority=keys / "ca.pem")
+        with pytest.raises(LinkError, match="certificate is refused: IP address mismatch"):
+            ModbusDriver(named, case.model).connect()
+        for more in ({}, {"authority": keys / "ca.pem"}):
+            pinned = ModbusSettings(**base, fingerprint=own, **more)
+            with ModbusDriver(pinned, case.model) as driver:
+                check_reads(driver, case.model)
+            changed = pinned.model_copy(update={"fingerprint": "0" * 64})
+            with pytest.raises(LinkError, match=rf"SHA-256 {own}, expected 0+ \(link"):
+                ModbusDriver(changed, case.model).connect()
+
+
+def test_a_fingerprint_is_taken_as_tools_print_it() -> None:
+    spelled = ":".join(["AB"] * 32)
+    given = {"profile": "ur", "transport": "tls"}
+    assert ModbusSettings(**given, fingerprint=spelled).fingerprint == "ab" * 32
+    for wrong in (None, "ab" * 31, "zz" * 32):
+        with pytest.raises(ValueError, match=r"fingerprint|expected 64"):
+            ModbusSettings(**given, fingerprint=wrong)
 
 
 # -- serial ------------------------------------------------------------------------------------

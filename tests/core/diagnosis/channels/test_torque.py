@@ -8,9 +8,9 @@ import moving_truth as truth
 import numpy as np
 import pytest
 
-from core.diagnosis.channels.observation import NotObservable, Observation
 from core.diagnosis.channels.torque import observe
 from core.diagnosis.diagnosis import diagnose
+from core.diagnosis.observation import NotObservable, Observation, thinned
 from core.effects import Site, Term
 from core.metrology import Metrology
 
@@ -144,7 +144,7 @@ def test_joints_that_move_one_at_a_time_keep_their_rows(plant):
     assert len(seen.rows) > 2000
 
 
-def test_a_long_log_is_thinned_and_held_out_by_stretches_of_time(plant):
+def test_a_long_log_is_looked_at_whole_and_held_out_by_stretches_of_time(plant):
     t = np.arange(15000) / 500
     log = truth.log_of(N, timestamp=t, actual_q=COURSE.at(t),
                        actual_current_as_torque=np.zeros((15000, N)),
@@ -153,13 +153,16 @@ def test_a_long_log_is_thinned_and_held_out_by_stretches_of_time(plant):
     seen = observe(plant.model(2.0), log, METROLOGY)
     assert time.perf_counter() - begin < 3
     assert isinstance(seen, Observation)
-    assert len(seen.measured) == len(seen.rows) == len(seen.groups) == 3000
+    assert len(seen.measured) == len(seen.rows) == len(seen.groups) > 12000
     assert np.all(np.diff(seen.groups) >= 0)
     assert len(np.unique(seen.groups)) >= 20
     assert {"timestamp", "actual_q_0", "actual_qd_5", "joint_temperatures_3"} <= set(
         seen.quantities
     )
-    assert all(len(v) == 3000 for v in seen.quantities.values())
+    assert all(len(v) == len(seen.rows) for v in seen.quantities.values())
+    few = thinned(seen, 300)
+    assert len(few.rows) == len(few.predict(())) == 300
+    assert np.array_equal(few.predict(()), seen.predict(())[np.isin(seen.rows, few.rows)])
 
 
 def test_readings_that_are_missing_are_left_out(plant, recorded):

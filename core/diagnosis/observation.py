@@ -151,6 +151,7 @@ def stacked(parts: Sequence[Observation], quantities: Mapping[str, Array]) -> Ob
         unnamed=unnamed,
         tool_axes=together("tool_axes"),
         axial_moment=together("axial_moment"),
+        times=together("times"),
         rebase=rebase if columns[-1] else None,
         session=np.repeat([int(p.session[0]) if p.session is not None else 0 for p in parts], size),
         nuisance_session=tuple(int(s) for s in np.repeat(

@@ -1,0 +1,95 @@
+"""Whether arming can come to anything: what the model makes of where the arm stands now."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.compensation import Compensator
+from core.loads import Loads
+from core.model import Model
+
+Vector = NDArray[np.float64]
+LEAST = 1e-9  # m, rad: a smaller offset is none
+PULL = 10.0  # N: a model that bends under a pull corrects something
+POSES, SEED = 16, 14  # tried beside the present one
+GAPS = 5  # between states, before the controller's rate counts as known
+KEPT = 50  # gaps between states that are remembered
+SLOWER = 1.5  # times the cell's cycle: the shortest gap between states is not longer
+
+
+class ModelCheck:
+    """Says whether a model corrects anything at all; tries poses once, then remembers."""
+
+    def __init__(self, model: Model, use_force: bool) -> None:
+        self._compensator = Compensator(model)
+        limits, n = model.arm.limits, model.arm.n
+        lower, upper = np.maximum(limits.lower, -np.pi), np.minimum(limits.upper, np.pi)
+        self._poses = np.random.default_rng(SEED).uniform(lower, upper, (POSES, n))
+        self._use_force = use_force
+        self._known: bool | None = None
+
+    def corrects(self, loads: Loads) -> bool:
+        """Return whether some pose gets an offset under these loads (one row), or under a pull."""
+        if self._known is None:
+            self._known = any(self._offset(q, loads) for q in self._poses)
+        return self._known
+
+    def forget(self) -> None:
+        """Try anew the next time: the loads may be others."""
+        self._known = None
+
+    def _offset(self, q: Vector, loads: Loads) -> bool:
+        wrench = np.zeros((1, 6)) if loads.wrench is None else loads.wrench
+        tried = [wrench]
+        if self._use_force:
+            pulls = np.zeros((3, 1, 6))
+            pulls[range(3), 0, range(3)] = PULL
+            tried += [wrench + pull for pull in pulls]
+        for pull in tried:
+            found = self._compensator.correct(
+                q,
+                Loads(
+                    loads.payload_mass, loads.payload_cog, pull, loads.temperature, loads.approach
+                ),
+            )
+            # what cannot be solved is not nothing: it is said where it happens
+            if not found.residual < np.inf or np.abs(found.offset_in_base).max() > LEAST:
+                return True
+        return False
+
+
+class RateCheck:
+    """Compares the cell's rate with the one at which the controller has new states."""
+
+    def __init__(self, rate: float) -> None:
+        self._rate = rate
+        self._last: float | None = None  # s, controller clock
+        self._gaps: deque[float] = deque(maxlen=KEPT)
+
+    def take(self, timestamp: float) -> None:
+        """Take a state's time, s, controller clock."""
+        if self._last is not None and timestamp > self._last:
+            self._gaps.append(timestamp - self._last)
+        self._last = timestamp
+
+    @property
+    def known(self) -> bool:
+        """Return whether enough states have come to judge by."""
+        return len(self._gaps) >= GAPS
+
+    @property
+    def doubt(self) -> str:
+        """Return in words that the cell asks for more than the controller has; empty: it does not.
+
+        The shortest gap is the controller's own: whatever is late on the way only lengthens gaps.
+        """
+        shortest = min(self._gaps, default=0.0)
+        if shortest <= SLOWER / self._rate:
+            return ""
+        return (
+            f"link.rate: found {self._rate:g} Hz, expected at most {1.0 / shortest:.4g} Hz: the "
+            f"controller has a new state every {1e3 * shortest:.3g} ms"
+        )

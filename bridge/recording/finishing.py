@@ -1,0 +1,218 @@
+"""Finishing a recording that was cut off: the summary of what is whole, as its writer would have.
+
+A recorder that was killed leaves whole chunks and no summary; readers that seek cannot open such a
+file. What lies behind the last whole record is cut off. Format: the MCAP specification.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import struct
+import zlib
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import IO
+
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    MessageIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from mcap.writer import MCAP0_MAGIC
+
+from bridge.recording.folder import NAME
+from core.errors import LogError
+from core.log import mcap_records as records
+from core.log.mcap_reading import files_of
+
+_FOOTER = struct.Struct("<BQQQ")
+FOOTER_SIZE = 20
+
+
+@dataclass
+class _Whole:
+    """What is whole in a file."""
+
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    chunks: list[ChunkIndex] = field(default_factory=list)
+    counts: dict[int, int] = field(default_factory=dict)  # messages by channel
+    end: int = 0  # bytes of the file that stay
+    last: dict[int, MessageIndex] = field(default_factory=dict)  # of the last chunk
+
+
+def finish(path: Path) -> bool:
+    """Write the summary of a file that has none; returns whether it lacked one and got it.
+
+    A file that somebody is writing stays as it is. Raises OSError where it cannot be written,
+    LogError where it is no MCAP file.
+    """
+    if records.is_whole(path):
+        return False
+    with path.open("r+b") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            return False
+        if records.is_whole(path):
+            return False
+        whole = _scan(file, path)
+        if not whole.end:
+            return False
+        tail = _tail(whole)
+        file.truncate(whole.end)
+        file.seek(whole.end)
+        file.write(tail)
+        file.flush()
+        os.fsync(file.fileno())
+    return True
+
+
+def finish_recording(recording: Path) -> list[Path]:
+    """Finish the files of a recording that can be; returns them. Raises LogError for no recording.
+
+    A file in a folder that cannot be written to stays as it is: it can be read all the same.
+    """
+    return [path for path in files_of(recording) if _finished(path)]
+
+
+def unfinished(folder: Path) -> list[Path]:
+    """Return the recordings of a folder that have no summary, oldest first; never raises."""
+    found = []
+    with contextlib.suppress(OSError):
+        for path in sorted(folder.iterdir()):
+            with contextlib.suppress(OSError):
+                if NAME.match(path.name) and path.is_file() and not records.is_whole(path):
+                    found.append(path)
+    return found
+
+
+def _finished(path: Path) -> bool:
+    with contextlib.suppress(OSError, LogError):
+        return finish(path)
+    return False
+
+
+def _scan(file: IO[bytes], path: Path) -> _Whole:
+    """Return what is whole, up to the first record that is not."""
+    whole, chunk = _Whole(), None
+    indexed: dict[int, int] = {}  # where the last chunk's indexes stand
+    for code, at, length in records.all_records(file, path):
+        if code == Opcode.HEADER:
+            whole.end = at + length
+        elif code == Opcode.CHUNK:
+            found = _chunk(file, at, length, whole)
+            if found is None:
+                break
+            _close(whole, chunk, indexed)
+            chunk, indexed = found, {}
+            whole.end = at + length
+        elif code == Opcode.MESSAGE_INDEX and chunk is not None:
+            file.seek(at)
+            indexed[int.from_bytes(file.read(2), "little")] = at - records.HEAD_SIZE
+            chunk.message_index_length += records.HEAD_SIZE + length
+            whole.end = at + length
+    if chunk is not None and set(indexed) != set(whole.last):
+        whole.end = chunk.chunk_start_offset + chunk.chunk_length  # torn: written anew behind it
+        whole.chunks.append(chunk)
+        chunk.message_index_length = -1
+    else:
+        _close(whole, chunk, indexed)
+    return whole
+
+
+def _close(whole: _Whole, chunk: ChunkIndex | None, indexed: dict[int, int]) -> None:
+    if chunk is not None:
+        chunk.message_index_offsets = indexed
+        whole.chunks.append(chunk)
+
+
+def _chunk(file: IO[bytes], at: int, length: int, whole: _Whole) -> ChunkIndex | None:
+    """Take a chunk's contents over; returns its index, None where it is broken."""
+    unpacked = records.unpacked(file, at, length)
+    if unpacked is None:
+        return None
+    chunk, data = unpacked
+    whole.last = {}
+    for code, start, size in records.inner_records(data):
+        body = data[start : start + size]
+        if code == Opcode.MESSAGE:
+            channel, _, log_time, _ = records.message_head(body)
+            index = whole.last.setdefault(channel, MessageIndex(channel, []))
+            index.records.append((log_time, start - records.HEAD_SIZE))
+            whole.counts[channel] = whole.counts.get(channel, 0) + 1
+        elif code == Opcode.SCHEMA:
+            schema = Schema.read(ReadDataStream(BytesIO(body)))
+            whole.schemas[schema.id] = schema
+        elif code == Opcode.CHANNEL:
+            told = Channel.read(ReadDataStream(BytesIO(body)))
+            whole.channels[told.id] = told
+    return _index(chunk, at, length)
+
+
+def _index(chunk: Chunk, at: int, length: int) -> ChunkIndex:
+    return ChunkIndex(
+        chunk_length=length + records.HEAD_SIZE, chunk_start_offset=at - records.HEAD_SIZE,
+        compression=chunk.compression, compressed_size=len(chunk.data),
+        message_end_time=chunk.message_end_time, message_index_length=0, message_index_offsets={},
+        message_start_time=chunk.message_start_time, uncompressed_size=chunk.uncompressed_size,
+    )  # fmt: skip
+
+
+def _tail(whole: _Whole) -> bytes:
+    """Return what comes behind what is whole: indexes that were torn, summary, footer, magic."""
+    data = RecordBuilder()
+    last = whole.chunks[-1] if whole.chunks else None
+    if last is not None and last.message_index_length < 0:
+        last.message_index_offsets = {}
+        for channel, index in whole.last.items():
+            last.message_index_offsets[channel] = whole.end + data.count
+            index.write(data)
+        last.message_index_length = data.count
+    DataEnd(0).write(data)
+    begin: bytes = data.end()  # type: ignore[no-untyped-call]
+    start = whole.end + len(begin)
+    summary = RecordBuilder()
+    groups = (
+        (Opcode.SCHEMA, list(whole.schemas.values())),
+        (Opcode.CHANNEL, list(whole.channels.values())),
+        (Opcode.STATISTICS, [_statistics(whole)]),
+        (Opcode.CHUNK_INDEX, whole.chunks),
+    )
+    offsets = []
+    for code, group in groups:
+        first = summary.count
+        for record in group:
+            record.write(summary)
+        offsets.append(SummaryOffset(code, start + first, summary.count - first))
+    offsets_at = start + summary.count
+    for offset in offsets:
+        offset.write(summary)
+    text: bytes = summary.end()  # type: ignore[no-untyped-call]
+    crc = zlib.crc32(_FOOTER.pack(Opcode.FOOTER, FOOTER_SIZE, start, offsets_at), zlib.crc32(text))
+    footer = RecordBuilder()
+    Footer(start, offsets_at, crc).write(footer)
+    end: bytes = footer.end()  # type: ignore[no-untyped-call]
+    return begin + text + end + MCAP0_MAGIC
+
+
+def _statistics(whole: _Whole) -> Statistics:
+    times = [(c.message_start_time, c.message_end_time) for c in whole.chunks]
+    return Statistics(
+        attachment_count=0, channel_count=len(whole.channels), channel_message_counts=whole.counts,
+        chunk_count=len(whole.chunks), message_count=sum(whole.counts.values()),
+        message_end_time=max((end for _, end in times), default=0),
+        message_start_time=min((begin for begin, _ in times), default=0), metadata_count=0,
+        schema_count=len(whole.schemas),
+    )  # fmt: skip

@@ -1,0 +1,77 @@
+"""What we create is the owner's to write and nobody else's to read, whatever the umask says."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from bridge.calibration.session.journal import Journal as SessionJournal
+from bridge.cell import load_cell
+from bridge.cell.saving import save_cell
+from bridge.document.output_file import write_text
+from bridge.fleet.folder import require_folder as require_fleet_folder
+from bridge.fleet.journal import Journal as FleetJournal
+from bridge.ipc.shared_memory import slices_of
+from bridge.loop.supervisor import State
+from bridge.recording.folder import require_folder
+from bridge.recording.segment import Segment
+
+CELL = "robot: {model: ur10e}\npayload: {mass: 5.0}\n"
+
+
+@pytest.fixture(autouse=True)
+def open_umask() -> Iterator[None]:
+    """A umask that takes nothing away: the code itself has to."""
+    before = os.umask(0)
+    yield
+    os.umask(before)
+
+
+def mode(path: Path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def recording(path: Path) -> None:
+    Segment(path, slices_of(6), [state.name for state in State]).close()
+
+
+def session_journal(path: Path) -> None:
+    with SessionJournal(path.parent) as journal:
+        journal.path.rename(path)
+
+
+def fleet_journal(path: Path) -> None:
+    with FleetJournal(path):
+        pass
+
+
+def cell(path: Path) -> None:
+    given = path.with_name("given.yaml")
+    given.write_text(CELL)
+    save_cell(load_cell(given), path)
+
+
+@pytest.mark.parametrize("make", [recording, session_journal, fleet_journal, cell])
+def test_a_new_file_is_0640(tmp_path: Path, make: Callable[[Path], None]) -> None:
+    path = tmp_path / "made"
+    make(path)
+    assert mode(path) == 0o640
+
+
+@pytest.mark.parametrize("make", [require_folder, lambda path: require_fleet_folder(path, "--out")])
+def test_a_new_folder_is_0750(tmp_path: Path, make: Callable[[Path], object]) -> None:
+    make(tmp_path / "folder")
+    assert mode(tmp_path / "folder") == 0o750
+
+
+@pytest.mark.parametrize("kept", [0o600, 0o644])
+def test_a_file_that_is_replaced_keeps_its_permissions(tmp_path: Path, kept: int) -> None:
+    path = tmp_path / "cell.yaml"
+    path.write_text(CELL)
+    path.chmod(kept)
+    write_text(path, CELL)
+    assert mode(path) == kept

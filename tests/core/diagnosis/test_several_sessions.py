@@ -1,0 +1,165 @@
+"""Several sessions: frames and tool points of their own, effects shared, what changed is named.
+
+The truth comes from the blind benchmark's mechanics. What is told of a new session is compared with
+what the model leaves of further sessions, placed by code of this file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import small_arm as small
+
+from benchmarks.blind.mechanics import turn
+from core.diagnosis.diagnosis import diagnose
+from core.diagnosis.document import document
+from core.errors import LogError
+from core.estimation.identification import identify_compliance
+from core.metrology import Metrology
+from core.sessions import join_sessions
+
+MODEL = small.model_of()
+
+
+def session(real, seed: int, poses: int = 40, remounted: bool = False):
+    """Return a session's log in a frame of its own, with a target of its own if remounted."""
+    rng = np.random.default_rng(seed + 7)
+    moved = rng.normal(0, 0.02, 3) if remounted else np.zeros(3)
+    drawn = small.session_of(seed, small.Plan(poses=poses))
+    position = small.readings(replace(real, tool_position=small.TOOL + moved), drawn, seed)
+    rotation = turn(rng.normal(0, 1, (1, 3)))[0]
+    log = small.log_of(drawn, position @ rotation.T + rng.normal(0, 1, 3))
+    return replace(log, path=f"{seed}.csv")
+
+
+def together(real, seeds, **how):
+    return join_sessions([session(real, s, **how) for s in seeds], MODEL)
+
+
+def placed(model, log, tool: bool) -> np.ndarray:
+    """Return the gap (N, 3) with the frame (and tool point) that fit the session best."""
+    q, loads, measured = log.columns["actual_q"], log.loads(), log.columns["measured_position"]
+    shift = np.zeros(3)
+    for _ in range(30):
+        at = model.tool_in_flange.copy()
+        at[:3, 3] += shift
+        poses = replace(model, tool_in_flange=at).predict(q, loads)
+        cm, cp = measured.mean(0), poses.position.mean(0)
+        U, _, V = np.linalg.svd((measured - cm).T @ (poses.position - cp))
+        R = U @ np.diag([1, 1, np.linalg.det(U @ V)]) @ V
+        gap = (measured - cm) @ R - (poses.position - cp)
+        if not tool:
+            return gap
+        A = np.zeros((len(q), 3, 9))
+        A[:, :, :3] = poses.rotation @ model.tool_in_flange[:3, :3].T
+        A[:, :, 3:6] = np.eye(3)
+        for k, e in enumerate(np.eye(3)):
+            A[:, :, 6 + k] = np.cross(e, poses.position)
+        step = np.linalg.lstsq(A.reshape(-1, 9), gap.ravel(), rcond=1e-12)[0]
+        shift = shift + step[:3]
+    return gap
+
+
+def rms(values) -> float:
+    return float(np.sqrt(np.mean(np.asarray(values) ** 2)))
+
+
+@pytest.fixture(scope="module")
+def compliant():
+    log = together(small.REAL["axial_compliance"], (34, 35), remounted=True)
+    return diagnose(MODEL, log, Metrology(sigma=small.SIGMA, remounted=True))
+
+
+def test_a_cause_is_found_across_frames_and_tool_points(compliant) -> None:
+    (channel,) = compliant.channels
+    assert compliant.verdict == "explained"
+    (cause,) = channel.causes
+    assert (cause.effect, cause.joints) == ("axial_compliance", (2,))
+    (parameter,) = cause.parameters
+    assert abs(parameter.value - 4e-6) < 4 * parameter.std
+    (across,) = channel.carried
+    assert across.carries
+    assert [s for s, _ in across.values] == [0, 1]
+
+
+def test_what_is_told_of_a_new_session_holds_for_further_ones(compliant) -> None:
+    real = small.REAL["axial_compliance"]
+    found = compliant.channels[0].elsewhere
+    further = [placed(compliant.model, session(real, s, remounted=True), True) for s in (44, 45)]
+    assert 0.8 < found.new_session / rms(np.concatenate(further)) < 1.25
+    assert [s for s, _ in found.by_session] == [0, 1]
+
+
+def test_figures_of_an_unknown_hold_in_a_new_session_too() -> None:
+    real = small.REAL["cross_coupling"]
+    found = diagnose(MODEL, together(real, (1, 2)), Metrology(sigma=small.SIGMA))
+    (channel,) = found.channels
+    assert not channel.causes
+    further = [placed(found.model, session(real, s), False) for s in (11, 12, 13)]
+    assert 0.8 < channel.elsewhere.new_session / rms(np.concatenate(further)) < 1.25
+
+
+def test_a_target_that_was_remounted_unsaid_is_no_noise() -> None:
+    """The same logs as of the fixture, without the word that the target was taken off."""
+    log = together(small.REAL["axial_compliance"], (34, 35), remounted=True)
+    (channel,) = diagnose(MODEL, log, Metrology(sigma=small.SIGMA)).channels
+    assert channel.elsewhere.new_session > 20 * small.FLOOR or channel.structured
+
+
+def test_a_value_that_changed_is_named_as_changed() -> None:
+    logs = [session(small.soft(2, 4e-6), 1), session(small.soft(2, 8e-6), 2)]
+    found = diagnose(MODEL, join_sessions(logs, MODEL), Metrology(sigma=small.SIGMA))
+    (channel,) = found.channels
+    (across,) = [c for c in channel.carried if c.effect == "axial_compliance"]
+    assert not across.carries
+    values = [p[0].value for _, p in across.values]
+    assert values == pytest.approx([4e-6, 8e-6], rel=0.1)
+    (cause,) = [
+        c for c in document(found)["channels"][0]["causes"] if c["effect"] == "axial_compliance"
+    ]
+    assert cause["across_sessions"]["carries"] is False
+    assert [v["session"] for v in cause["across_sessions"]["values"]] == ["1.csv", "2.csv"]
+
+
+def test_what_holds_in_one_session_only_depends_on_the_session() -> None:
+    """Nothing of the catalogue: two sessions of three bend by the square of another joint."""
+    real = small.REAL["cross_coupling"]
+    bent = replace(real, angle_errors=(lambda s: 3 * real.angle_errors[0](s),))
+    logs = [session(bent, 1), session(small.NOMINAL, 2), session(bent, 3)]
+    found = diagnose(MODEL, join_sessions(logs, MODEL), Metrology(sigma=small.SIGMA))
+    assert "session" in found.channels[0].selection.observation.quantities
+    assert found.channels[0].structured
+
+
+def test_one_session_has_no_figure_for_a_new_one() -> None:
+    found = small.diagnosed("axial_compliance").channels[0].elsewhere
+    assert found.new_session is None
+    assert found.by_session == ()
+    assert found.new_region is not None
+    assert 0.8 * small.FLOOR < found.new_region < 1.3 * small.FLOOR
+
+
+def test_a_session_too_short_for_its_frame_is_refused() -> None:
+    logs = [session(small.NOMINAL, 1), session(small.NOMINAL, 2).select(slice(0, 2))]
+    log = join_sessions(logs, MODEL)
+    for work in (diagnose, identify_compliance):
+        with pytest.raises(LogError, match=r"session 2\.csv: found 2 measured pose\(s\), expected"):
+            work(MODEL, log, Metrology(sigma=small.SIGMA))
+
+
+def test_a_fit_of_sessions_shares_the_flexibilities() -> None:
+    real = replace(small.NOMINAL, axial=np.array(small.KIND.axial))
+    for remounted in (False, True):
+        log = together(real, (1, 2, 3), remounted=remounted)
+        found = identify_compliance(MODEL, log, Metrology(sigma=small.SIGMA, remounted=remounted))
+        off = np.abs(found.axial - small.KIND.axial) / found.std_axial
+        assert off.max() < 4
+        fitted = MODEL.with_compliance(found.axial, found.radial)
+        further = session(real, 11, remounted=remounted)
+        true = rms(placed(fitted, further, remounted))
+        assert 0.8 < found.remaining_rms_new_session / true < 1.25
+        assert 0.8 * small.FLOOR < found.remaining_rms_new_region < 1.4 * small.FLOOR
+    one = identify_compliance(MODEL, session(real, 1), Metrology(sigma=small.SIGMA))
+    assert np.isnan(one.remaining_rms_new_session)
