@@ -38,6 +38,7 @@ AKIN: dict[str, tuple[tuple[str, bool], ...]] = {
     "warm_friction": (("viscous_friction", False), ("coulomb_friction", False)),
     "torque_field": (("torque_offset", False),),
 }  # fmt: skip
+COUPLED = ("link_inertia",)  # effects of one joint that other joints feel
 SIZE = (0.5, 1.5)  # a remainder over the known effects together
 UNLIKE = 100.0  # chi-square that known effects and any one more must leave of a remainder
 RATIOS = {"wrench": (3.0, 15.0), "tracking": (60.0, 1000.0), "torque": (0.7, 6.0)}
@@ -160,7 +161,10 @@ def _told_apart(truth: Parametric, values: Values, error: Array) -> bool:
         if float(left @ left) < CLEAR:
             return False
     own = truth.columns(values, values)
+    touched = {int(j) + 1 for j in np.flatnonzero(np.any(error, axis=0))}
     for place in truth.candidates:
+        if place[0] not in COUPLED and place[1] is not None and place[1] not in touched:
+            continue  # at another joint alone, it makes nothing of this
         columns = own if place in values else np.hstack([own, truth.columns([place], values)])
         left = without(columns, unknown)
         if float(left @ left) < UNLIKE:

@@ -68,7 +68,7 @@ def rms(values) -> float:
 
 @pytest.fixture(scope="module")
 def compliant():
-    log = together(small.REAL["axial_compliance"], (1, 2), remounted=True)
+    log = together(small.REAL["axial_compliance"], (34, 35), remounted=True)
     return diagnose(MODEL, log, Metrology(sigma=small.SIGMA, remounted=True))
 
 
@@ -87,7 +87,7 @@ def test_a_cause_is_found_across_frames_and_tool_points(compliant) -> None:
 def test_what_is_told_of_a_new_session_holds_for_further_ones(compliant) -> None:
     real = small.REAL["axial_compliance"]
     found = compliant.channels[0].elsewhere
-    further = [placed(compliant.model, session(real, s, remounted=True), True) for s in (11, 12)]
+    further = [placed(compliant.model, session(real, s, remounted=True), True) for s in (44, 45)]
     assert 0.8 < found.new_session / rms(np.concatenate(further)) < 1.25
     assert [s for s, _ in found.by_session] == [0, 1]
 
@@ -103,7 +103,7 @@ def test_figures_of_an_unknown_hold_in_a_new_session_too() -> None:
 
 def test_a_target_that_was_remounted_unsaid_is_no_noise() -> None:
     """The same logs as of the fixture, without the word that the target was taken off."""
-    log = together(small.REAL["axial_compliance"], (1, 2), remounted=True)
+    log = together(small.REAL["axial_compliance"], (34, 35), remounted=True)
     (channel,) = diagnose(MODEL, log, Metrology(sigma=small.SIGMA)).channels
     assert channel.elsewhere.new_session > 20 * small.FLOOR or channel.structured
 
