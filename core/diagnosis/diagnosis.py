@@ -277,12 +277,13 @@ def _channel(
         chosen = [selection.term_index[p] for p in verdict.accused]
     gap, remaining = gaps(selection, chosen)
     k = own_coordinates(seen)
+    counted = k if seen.channel == "position" else gap.shape[1]  # a wrench's torques weighed
     kept = selection.kept
     causes = causes_of(selection, verdict, held, model.arm)
-    left = float(np.sqrt(np.mean(remaining[kept][:, :k] ** 2)))
+    left = float(np.sqrt(np.mean((remaining[kept] * seen.weight)[:, :counted] ** 2)))
     verdict, floor = _with_whiteness(verdict, selection, searched)
     held_rms = held.rms(chosen) if held.possible else None
-    gap_rms = float(np.sqrt(np.mean(gap[kept][:, :k] ** 2)))
+    gap_rms = float(np.sqrt(np.mean((gap[kept] * seen.weight)[:, :counted] ** 2)))
     if not causes:  # nothing was fitted but the frame, before as well as after
         held_rms = gap_rms
     structured = verdict.structured

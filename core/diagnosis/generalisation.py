@@ -58,7 +58,8 @@ class _Problem:
     def __init__(self, selection: Selection, chosen: tuple[int, ...]) -> None:
         observation, kept = selection.observation, selection.kept
         self._k = observation.measured.shape[1]
-        self._own = min(self._k, 3) if observation.channel in ("position", "wrench") else self._k
+        self._own = min(self._k, 3) if observation.channel == "position" else self._k
+        self._weight = observation.weight[: self._own]
         self._unwhiten = np.linalg.inv(selection.noise.whitener[kept])
         raw = selection.raw
         self._causes = raw.columns(selection.space, chosen)
@@ -122,6 +123,7 @@ class _Problem:
         """Return whitened residuals as the channel's own coordinates (n, own)."""
         return np.asarray(
             (self._unwhiten[samples] @ left.reshape(-1, self._k, 1))[:, : self._own, 0]
+            * self._weight
         )
 
 

@@ -39,7 +39,9 @@ class HeldOut:
         self._raw, self._target = selection.raw, selection.raw.target
         self._nuisance = selection.raw.nuisance
         k = selection.observation.measured.shape[1]
-        own = {"position": 3, "wrench": 3}.get(selection.observation.channel, k)
+        own = {"position": 3}.get(selection.observation.channel, k)
+        # torques of a wrench count in N, as their noise compares: a cause may show in them alone
+        self._weight = selection.observation.weight[: min(own, k)]
         self._unwhiten = np.linalg.inv(selection.noise.whitener[selection.kept])
         self._k, self._own = k, min(own, k)
         names, group = np.unique(selection.observation.groups[selection.kept], return_inverse=True)
@@ -59,7 +61,7 @@ class HeldOut:
         key = tuple(sorted(chosen))
         if key not in self._known:
             left = self._left(key).reshape(-1, self._k, 1)
-            gap = (self._unwhiten @ left)[:, : self._own, 0]
+            gap = (self._unwhiten @ left)[:, : self._own, 0] * self._weight
             self._known[key] = np.mean(gap**2, axis=1)
         return self._known[key]
 
