@@ -45,9 +45,8 @@ def on_every_row(
     noise = carried_to(placed, selection.noise)
     work = Work(placed, model.arm, candidates, noise, np.ones(len(placed.rows), dtype=bool))
     work.kept = inliers(work, placed.measured - placed.predict(terms))
-    base = terms if placed.channel != "tracking" else ()
-    columns = [exact_columns(placed, c, base) for c in candidates]
-    space, raw = sample_space(work, columns, base, [])
+    columns = [exact_columns(placed, c, terms) for c in candidates]
+    space, raw = sample_space(work, columns, terms, [])
     found = fit(space, tuple(accused))
     fitted, index, spread, residual = refit(work, space, found)
     values, covariance = list(selection.terms), list(selection.covariance)
@@ -55,7 +54,7 @@ def on_every_row(
         values[c], covariance[c] = term, own
     return Selection(
         work.observation, space, found, tuple(values), tuple(range(len(values))),
-        tuple(covariance), work.kept, noise, residual, base, raw,
+        tuple(covariance), work.kept, noise, residual, terms, raw,
     )  # fmt: skip
 
 
