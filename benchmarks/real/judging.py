@@ -8,6 +8,7 @@ predict``, frame fitted) and by the program's own gap for the other channels.
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import subprocess
 import sys
@@ -66,8 +67,8 @@ class Program:
     def __init__(self, command: str = "gapbridge") -> None:
         """Take the program beside the running interpreter, where it is a bare name."""
         first, *others = shlex.split(command)
-        own = Path(sys.executable).with_name(first)
-        self.words = (str(own) if own.is_file() and "/" not in first else first, *others)
+        own = Path(sys.executable).parent / first
+        self.words = (str(own) if own.is_file() and os.sep not in first else first, *others)
 
     def __call__(self, *words: object) -> None:
         """Run one command."""

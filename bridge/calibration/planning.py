@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from bridge.calibration.instruments.settings import Base
 from bridge.calibration.options import Order
-from bridge.calibration.settings import BoxEntry, CalibrationSettings, JointRange, RangeEntry
 from bridge.cell import Cell
+from bridge.cell.settings.calibration import BoxEntry, CalibrationSettings, JointRange, RangeEntry
+from bridge.cell.settings.instruments import Base
 from core.calibration.observables import Observable, make_observable
 from core.calibration.parameters import DEFAULT, Parameters
 from core.calibration.plan import Payload, Plan

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
-from bridge.calibration.settings import CalibrationSettings
 from bridge.cell.document import Document, read_document
 from bridge.cell.effects import compliance_terms, term_of
 from bridge.cell.message import message, messages
 from bridge.cell.robot import build_arm
 from bridge.cell.schema import CellFile, Frame, Simulation
 from bridge.cell.sections import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
-from bridge.metrics.settings import MetricsSettings
-from bridge.web.settings import WebSettings
+from bridge.cell.settings.calibration import CalibrationSettings
+from bridge.cell.settings.metrics import MetricsSettings
+from bridge.cell.settings.web import WebSettings
 from core.arm import Arm
 from core.errors import ArmError, CellError, InputError
 from core.load_bounds import HEAVIEST

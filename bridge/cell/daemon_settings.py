@@ -7,8 +7,8 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from bridge.cell.sections import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
-from bridge.metrics.settings import MetricsSettings
-from bridge.web.settings import WebSettings
+from bridge.cell.settings.metrics import MetricsSettings
+from bridge.cell.settings.web import WebSettings
 from drivers.ft_sensor.settings import AnyFtSensor
 from drivers.ur_rtde.settings import UrRtdeSettings
 

@@ -12,8 +12,8 @@ from pydantic import ValidationError
 
 from bridge.cell import Cell, load_cell
 from bridge.cell.daemon_settings import DaemonSettings
+from bridge.cell.runtime_folder import cell_key, runtime_folder
 from bridge.cell.sections import SetpointSettings
-from bridge.ipc.runtime_folder import cell_key, runtime_folder
 from bridge.served.credentials import check_credentials, read_token
 from core.errors import CellError, InputError
 from core.files import read_bytes, recorded

@@ -6,10 +6,10 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from bridge.calibration.settings import CalibrationSettings
 from bridge.cell.sections import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
-from bridge.metrics.settings import MetricsSettings
-from bridge.web.settings import WebSettings
+from bridge.cell.settings.calibration import CalibrationSettings
+from bridge.cell.settings.metrics import MetricsSettings
+from bridge.cell.settings.web import WebSettings
 from drivers.ft_sensor.settings import AnyFtSensor
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -114,6 +114,9 @@ class Simulation(Section):
     )
     compliance: Compliance | None = Field(
         default=None, description="true flexibilities, rad/Nm; default: drawn from the seed"
+    )
+    droop: list[NotNegative] | None = Field(
+        default=None, description="rad/Nm per joint by which servos give way; default: none"
     )
     tracker_noise: NotNegative | None = Field(default=None, description="m, 1 sigma")
     rtde_port: int | None = Field(default=None, gt=0, lt=65536, strict=True)

@@ -19,7 +19,7 @@ from pydantic import (
     model_validator,
 )
 
-from bridge.recording.settings import RecordingSettings as RecordingSettings
+from bridge.cell.settings.recording import RecordingSettings as RecordingSettings
 from core.addresses import is_loopback
 from drivers.can.settings import CanSettings
 from drivers.canopen.settings import CanopenSettings

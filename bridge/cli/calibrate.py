@@ -101,7 +101,7 @@ def calibrate(
         require_writable(new_cell, cell)
     chosen = instrument_settings(given, instrument)
     from bridge.calibration.options import Order
-    from bridge.calibration.session.run import run_session  # takes the numerical libraries along
+    from bridge.calibration.run import run_session  # takes the numerical libraries along
 
     kind = "verify" if verify else "payload" if payload_only else "tool" if tool_only else "whole"
     order = Order(

@@ -7,7 +7,8 @@ from typing import Any
 
 import click
 
-from bridge.cli.options import joint_names, open_cell
+from bridge.cell.opened_log import joint_names
+from bridge.cli.options import open_cell
 from bridge.document.output_file import PARQUET, require_writable, write_table
 from core.errors import InputError, LogError
 from core.log.sources import SOURCES, SourceOptions, source_of

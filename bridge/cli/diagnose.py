@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from bridge.cell import Cell, save_cell
+from bridge.cell.opened_log import open_log
 from bridge.cli.answer import answer
 from bridge.cli.options import (
     cell_option,
     logs_argument,
     open_cell,
-    open_log,
     open_logs,
     remounted_option,
     warn_outside,

@@ -13,21 +13,15 @@ from rich.table import Table
 
 from bridge.cell import Cell, save_cell
 from bridge.cli.large_log import LargeLog, has_sessions, is_large
-from bridge.cli.options import (
-    cell_option,
-    logs_argument,
-    open_cell,
-    open_logs,
-    remounted_option,
-)
+from bridge.cli.options import cell_option, logs_argument, open_cell, open_logs, remounted_option
 from bridge.cli.progress import progress, status
 from bridge.document.output_file import require_writable
 from bridge.document.provenance import provenance
 from core.errors import ExcitationError
 from core.estimation.identification import Identification, identify_compliance
 from core.estimation.streamed import identify_streamed
-from core.log.ranges import merged, range_of
 from core.metrology import Metrology
+from core.ranges import merged, range_of
 
 
 @click.command()

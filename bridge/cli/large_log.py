@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bridge.cell import Cell
-from bridge.cli.options import check_log
+from bridge.cell.opened_log import check_log
 from core.errors import LogError
 from core.log.log import Log
 from core.log.mcap_reading import files_of

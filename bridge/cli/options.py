@@ -6,16 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import click
-import numpy as np
 
 from bridge.cell import Cell, load_cell
-from core.diagnosis.log_checks.units_and_clocks import check_units
-from core.errors import LogError
-from core.load_bounds import HEAVIEST
-from core.log.log import Log, read_log
-from core.log.ranges import outside
-from core.log.sessions import join_sessions
-from core.log.sources import SourceOptions, source_of
+from bridge.cell.opened_log import open_log
+from core.log.log import Log
+from core.ranges import outside
+from core.sessions import join_sessions
 
 log_argument = click.argument("log", type=click.Path(path_type=Path))
 logs_argument = click.argument(
@@ -43,29 +39,6 @@ def open_cell(path: Path) -> Cell:
     return cell
 
 
-def open_log(path: Path, cell: Cell) -> Log:
-    """Return a log for a cell's arm: a CSV or Parquet file, or another source (core.log.sources).
-
-    Raises LogError where a payload is out of range, angles look like degrees or positions like
-    millimetres.
-    """
-    source = source_of(path)
-    if source is None:
-        log = read_log(path, cell.arm.n)
-    else:
-        converted = source.read(path, joint_names(cell), SourceOptions())
-        for note in converted.notes:
-            click.echo(f"note: {path}: {note}", err=True)
-        log = converted.log(path, cell.arm.n)
-    check_log(log, cell)
-    return log
-
-
-def joint_names(cell: Cell) -> tuple[str, ...]:
-    """Return the names of the cell's joints: those of its URDF, or joint_1, joint_2, ..."""
-    return cell.arm.joint_names or tuple(f"joint_{i + 1}" for i in range(cell.arm.n))
-
-
 def open_logs(paths: Sequence[Path], cell: Cell) -> Log:
     """Return one log, or several as the sessions of one; so is one with a column ``session``.
 
@@ -81,18 +54,3 @@ def warn_outside(log: Log, cell: Cell) -> None:
     """
     for text in outside(log, cell.fitted_range):
         click.echo(f"warning: {log.path}: {text}", err=True)
-
-
-def check_log(log: Log, cell: Cell) -> None:
-    """Raise LogError where a log's numbers cannot be meant for a cell's arm."""
-    for name in ("actual_q", "target_q"):
-        if np.isinf(log.columns.get(name, np.zeros(0))).any():
-            log.require(name)  # names the cell
-    check_units(cell.model, log)
-    mass, rated = log.get("payload"), cell.arm.payload
-    if mass is not None and (mass > HEAVIEST * rated).any():
-        row = int(np.argmax(mass > HEAVIEST * rated))
-        raise LogError(
-            f"{log.path}: row {log.line(row)}, column payload: found {mass[row]:g} kg, out of "
-            f"range: expected 0 to {rated:g} kg, what {cell.arm.name} is rated for"
-        )

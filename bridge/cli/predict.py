@@ -7,14 +7,8 @@ from pathlib import Path
 import click
 import numpy as np
 
-from bridge.cli.options import (
-    cell_option,
-    csv_option,
-    log_argument,
-    open_cell,
-    open_log,
-    warn_outside,
-)
+from bridge.cell.opened_log import open_log
+from bridge.cli.options import cell_option, csv_option, log_argument, open_cell, warn_outside
 from bridge.document.output_file import require_writable, write_table
 from core.errors import InputError, LogError
 

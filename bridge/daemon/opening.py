@@ -5,12 +5,13 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
-from bridge.daemon.host import OwnerLock, address_of
+from bridge.cell.runtime_folder import cell_key, runtime_folder
+from bridge.daemon.host import OwnerLock
 from bridge.document.output_file import private
 from bridge.ipc.control_socket import ControlSocket
-from bridge.ipc.runtime_folder import cell_key, runtime_folder
 from bridge.recording.folder import LOOP_LOG, new_session, require_folder
 from core.errors import InputError
+from drivers.controller_address import address_of
 
 if TYPE_CHECKING:
     from bridge.daemon.daemon import Daemon

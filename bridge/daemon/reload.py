@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 from bridge.cell.cell import complaints
 from bridge.cell.run_settings import Configuration, read_configuration
-from bridge.daemon.host import address_of
 from bridge.ipc.shared_memory import Phase
 from bridge.loop.supervisor import State
 from core.errors import GapbridgeError
+from drivers.controller_address import address_of
 
 if TYPE_CHECKING:
     from bridge.daemon.daemon import Daemon

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from bridge.calibration.report.figures import plain
 from bridge.document.drawing import (
     EDGE,
     GRID,
@@ -23,6 +22,11 @@ from bridge.document.drawing import (
 
 WIDTH, HEIGHT = 340.0, 230.0
 LEFT, RIGHT, TOP, BOTTOM = 44.0, 10.0, 30.0, 38.0
+
+
+def plain(value: float) -> str:
+    """Return a number without trailing zeros."""
+    return f"{value:.4g}".replace("-", "−")
 
 
 @dataclass(frozen=True)

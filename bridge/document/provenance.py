@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 from core.log.log import Log
-from core.log.ranges import range_of
+from core.ranges import range_of
 
 BLOCK = 1 << 20  # bytes read at a time
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.cell import Cell, load_cell
-from bridge.cli.options import open_log
+from bridge.cell.opened_log import open_log
 from core.errors import GapbridgeError
 from core.log.log import Log
 

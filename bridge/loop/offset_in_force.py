@@ -15,8 +15,8 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.daemon.host import address_of
-from bridge.ipc.runtime_folder import runtime_folder
+from bridge.cell.runtime_folder import runtime_folder
+from drivers.controller_address import address_of
 from drivers.driver import DriverSettings
 
 Vector = NDArray[np.float64]

@@ -16,13 +16,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from bridge.cell.settings.recording import RecordingSettings
 from bridge.document.output_file import FOLDER_MODE
 from bridge.ipc.shared_memory import Page
 from bridge.loop.supervisor import State
 from bridge.recording.finishing import finish, unfinished
 from bridge.recording.folder import next_path, number_after, prune, segments
 from bridge.recording.segment import Segment
-from bridge.recording.settings import RecordingSettings
 from bridge.recording.words import LEVELS, level_of, words_of
 from core.errors import LogError
 from core.log.mcap_schema import CONFIGURATION, EVENTS, LOG, STATUS

@@ -15,8 +15,8 @@ from starlette.responses import PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
+from bridge.cell.settings.web import WebSettings
 from bridge.served.guard import WRONG_TOKEN_DELAY, Guard, cookie_name, cookie_of
-from bridge.web.settings import WebSettings
 from bridge.web.stream import Stream, message
 from bridge.web.watched import Watched, encoded
 

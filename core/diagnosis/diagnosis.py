@@ -11,7 +11,6 @@ from threadpoolctl import threadpool_limits
 
 from core.diagnosis.carrying import Carried, carried
 from core.diagnosis.channels import position, torque, tracking, wrench
-from core.diagnosis.channels.observation import NotObservable, Observation, thinned
 from core.diagnosis.channels.simulation import joined, predicted_by
 from core.diagnosis.every_row import on_every_row, still_accused
 from core.diagnosis.generalisation import NOWHERE, Generalisation, generalisation
@@ -20,19 +19,21 @@ from core.diagnosis.judgement import Judgement, holding, judge
 from core.diagnosis.location import Where, locate
 from core.diagnosis.log_checks.units_and_clocks import check_units, findings
 from core.diagnosis.noise_floor import Floor, noise_floor, own_coordinates, whiteness
+from core.diagnosis.observation import NotObservable, Observation, thinned
 from core.diagnosis.residual_structure import dependence
 from core.diagnosis.result import Cause, Considered, causes_of, considered_of
 from core.diagnosis.rigid_suspicion import softness_findings
+from core.diagnosis.selection.moments import slip_sentences
 from core.diagnosis.selection.selection import Selection, select, standing
 from core.diagnosis.separation import Measurement, next_measurements
 from core.effects import CATALOGUE, Term, flexibility_effects
 from core.errors import LogError
 from core.log.columns import COLUMNS, misspelt
 from core.log.log import Log
-from core.log.ranges import outside_findings
-from core.log.sessions import session_of, sessions_in, with_sessions
 from core.metrology import Metrology
 from core.model import Model
+from core.ranges import outside_findings
+from core.sessions import session_of, sessions_in, with_sessions
 
 Array = NDArray[np.float64]
 Observe = Callable[[Model, Log, Metrology], Observation | NotObservable]
@@ -378,6 +379,10 @@ def _channel_findings(channel: ChannelDiagnosis, log: Log) -> list[str]:
         term = channel.selection.terms[position_]
         joint = f" of joint {term.site.joint}" if term.site.joint else ""
         told.append(f"{channel.channel}: {term.effect}{joint} is not accused: {reason}")
+    terms = [term for cause in channel.causes for term in cause.terms]
+    whole = channel.verdict == "explained"
+    sentences = slip_sentences(terms, channel.selection.observation, whole)
+    told += [f"{channel.channel}: {sentence}" for sentence in sentences]
     for cause in channel.causes:
         told += [f"{channel.channel}: {note}" for note in cause.notes]
     return told

@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.channels.observation import Observation
 from core.diagnosis.held_out import HeldOut
 from core.diagnosis.judgement import TIE, Judgement
+from core.diagnosis.observation import Observation
 from core.diagnosis.selection.candidate import Candidate
 from core.diagnosis.selection.following import exact_columns
 from core.diagnosis.selection.local_search import rivals

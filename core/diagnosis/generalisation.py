@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.channels.observation import Observation
 from core.diagnosis.held_out import MANY_ROWS, TINY
+from core.diagnosis.observation import Observation
 from core.diagnosis.selection.refit import WEAK
 from core.diagnosis.selection.selection import Selection
 from core.estimation.regions import joint_regions

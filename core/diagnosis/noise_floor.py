@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.channels.observation import Observation
+from core.diagnosis.observation import Observation
 from core.diagnosis.selection.selection import Selection
 
 Array = NDArray[np.float64]

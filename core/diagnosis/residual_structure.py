@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.channels.observation import HELD
+from core.diagnosis.observation import HELD
 from core.diagnosis.selection.problem import Space
 
 Array = NDArray[np.float64]

@@ -32,10 +32,10 @@ from core.estimation.compliance_fit import (
 from core.estimation.regions import joint_regions
 from core.estimation.registration import Registration
 from core.log.log import Log
-from core.log.sessions import session_of
 from core.metrology import Metrology
 from core.model import Model
 from core.rotation import rotation_matrix
+from core.sessions import session_of
 
 Array = NDArray[np.float64]
 FOLDS = 5

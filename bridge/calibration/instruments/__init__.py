@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
     from bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
-    from bridge.calibration.instruments.settings import InstrumentSettings
+    from bridge.cell.settings.instruments import InstrumentSettings
 
 _HERE = "bridge.calibration.instruments"
 INSTRUMENTS: dict[str, str] = {
-    "typed": f"{_HERE}.typed:Typed",
+    "typed": f"{_HERE}.manual:Typed",
     "file": f"{_HERE}.file:File",
     "folder": f"{_HERE}.folder:WatchedFolder",
     "line_feed": f"{_HERE}.line_feed:LineFeed",
     "dial_gauge": f"{_HERE}.dial_gauge:DialGauge",
     "two_balls": f"{_HERE}.two_balls:TwoBalls",
-    "sphere": f"{_HERE}.sphere:Sphere",
+    "sphere": f"{_HERE}.contact:Sphere",
     "point": f"{_HERE}.point:TipOnPoint",
     "simulated_tracker": f"{_HERE}.simulated_tracker:SimulatedTracker",
 }

@@ -8,7 +8,7 @@ import yaml
 from pydantic import TypeAdapter, ValidationError
 
 from bridge.calibration.instruments import INSTRUMENTS
-from bridge.calibration.instruments.settings import InstrumentSettings
+from bridge.cell.settings.instruments import InstrumentSettings
 from core.errors import InputError
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ import numpy as np
 
 from bridge.calibration.instruments.instrument import Instrument, ReadingError, Samples, Where
 from bridge.calibration.instruments.numbers import FARTHEST, numbers
-from bridge.calibration.instruments.settings import METRES, DialGaugeSettings
+from bridge.cell.settings.instruments import METRES, DialGaugeSettings
 
 
 class DialGauge(Instrument[DialGaugeSettings]):

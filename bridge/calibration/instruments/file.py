@@ -8,8 +8,8 @@ import numpy as np
 
 from bridge.calibration.instruments.instrument import Instrument, ReadingError, Samples, Where
 from bridge.calibration.instruments.numbers import coordinates
-from bridge.calibration.instruments.settings import FileSettings
 from bridge.calibration.instruments.table import Row, Table, read_table
+from bridge.cell.settings.instruments import FileSettings
 from core.errors import InputError
 
 LOOK = 0.1  # s between two looks at the file

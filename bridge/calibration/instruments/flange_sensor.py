@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from bridge.calibration.instruments.instrument import Instrument, Samples, Surroundings, Where
-from bridge.calibration.instruments.settings import Base
+from bridge.cell.settings.instruments import Base
 
 
 class FlangeSensor(Instrument[Base]):

@@ -9,8 +9,8 @@ import numpy as np
 
 from bridge.calibration.instruments.instrument import Instrument, ReadingError, Samples, Where
 from bridge.calibration.instruments.numbers import coordinates
-from bridge.calibration.instruments.settings import FolderSettings
 from bridge.calibration.instruments.table import read_table
+from bridge.cell.settings.instruments import FolderSettings
 from core.errors import InputError
 
 LOOK = 0.1  # s between two looks into the folder

@@ -9,7 +9,7 @@ import numpy as np
 
 from bridge.calibration.instruments.instrument import Instrument, ReadingError, Samples, Where
 from bridge.calibration.instruments.numbers import coordinates, numbers
-from bridge.calibration.instruments.settings import LineFeedSettings
+from bridge.cell.settings.instruments import LineFeedSettings
 from core.errors import LinkError
 
 LONGEST_LINE = 4096  # bytes

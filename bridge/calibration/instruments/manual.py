@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bridge.calibration.instruments.instrument import Instrument, Samples, Where
 from bridge.calibration.instruments.numbers import coordinates, numbers
-from bridge.calibration.instruments.settings import TypedSettings
+from bridge.cell.settings.instruments import TypedSettings
 
 
 class Typed(Instrument[TypedSettings]):

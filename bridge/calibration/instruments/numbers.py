@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.calibration.instruments.instrument import ReadingError
-from bridge.calibration.instruments.settings import METRES, RADIANS, Coordinates
+from bridge.cell.settings.instruments import METRES, RADIANS, Coordinates
 from core.rotation import rotation_vector, rpy_matrix
 
 Array = NDArray[np.float64]

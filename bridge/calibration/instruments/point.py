@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bridge.calibration.instruments.instrument import Instrument, Samples, Where
-from bridge.calibration.instruments.settings import PointSettings
+from bridge.cell.settings.instruments import PointSettings
 
 
 class TipOnPoint(Instrument[PointSettings]):

@@ -7,7 +7,7 @@ import socket
 import numpy as np
 
 from bridge.calibration.instruments.instrument import Instrument, Samples, Where
-from bridge.calibration.instruments.settings import SimulatedTrackerSettings
+from bridge.cell.settings.instruments import SimulatedTrackerSettings
 from core.errors import LinkError
 
 PERIOD_LIMIT = 5.0  # s

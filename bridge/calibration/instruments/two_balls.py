@@ -6,7 +6,7 @@ import numpy as np
 
 from bridge.calibration.instruments.instrument import Instrument, ReadingError, Samples, Where
 from bridge.calibration.instruments.numbers import numbers
-from bridge.calibration.instruments.settings import METRES, TwoBallsSettings
+from bridge.cell.settings.instruments import METRES, TwoBallsSettings
 
 NEAREST = 1e-3  # m between two balls
 

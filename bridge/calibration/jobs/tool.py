@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from bridge.calibration.format import millimetres
 from bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
 from bridge.calibration.instruments.point import TipOnPoint
-from bridge.calibration.instruments.settings import PointSettings
 from bridge.calibration.jobs.job import Job, bare_plan
 from bridge.calibration.options import Order
 from bridge.calibration.planning import loads_of
@@ -19,6 +18,7 @@ from bridge.calibration.session.prompt import Talk
 from bridge.calibration.session.reading_check import Foresight
 from bridge.calibration.session.session import Book
 from bridge.cell import Cell
+from bridge.cell.settings.instruments import PointSettings
 from core.calibration.plan import Plan, PlannedPose
 from core.calibration.tool_session import calibrate_tool
 from core.errors import CellError

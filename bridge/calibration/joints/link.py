@@ -21,10 +21,10 @@ from bridge.calibration.joints.watched_run import WatchedRun
 from bridge.cell import Cell, load_cell
 from bridge.cell.daemon_settings import DaemonSettings
 from bridge.cell.sections import SetpointSettings
+from bridge.cell.settings.recording import RecordingSettings
 from bridge.daemon.daemon import settings_of
 from bridge.ipc.shared_memory import Phase
 from bridge.loop.supervisor import State
-from bridge.recording.settings import RecordingSettings
 from core.calibration.plan import PlannedPose
 from core.errors import LinkError, RunError
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from bridge.document.axes import plain
 from bridge.report.words import unit_of
 from core.calibration.result import Estimate
 
@@ -41,11 +42,6 @@ def fixed(value: float, decimals: int) -> str:
     if not text.strip("-0."):
         text = text.lstrip("-")
     return text.replace("-", "−")
-
-
-def plain(value: float) -> str:
-    """Return a number as people say it: no zeros behind."""
-    return f"{value:.4g}".replace("-", "−")
 
 
 def decimals_of(spread: float) -> int:

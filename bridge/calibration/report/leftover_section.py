@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 
-from bridge.calibration.report.figures import degrees, plain
+from bridge.calibration.report.figures import degrees
 from bridge.calibration.report.material import Material
 from bridge.calibration.report.names import sentence
+from bridge.document.axes import plain
 from bridge.document.blocks import (
     DOUBTFUL,
     GOOD,

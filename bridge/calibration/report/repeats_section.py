@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.report.figures import counted, fixed, mm, mrad, plain
+from bridge.calibration.report.figures import counted, fixed, mm, mrad
 from bridge.calibration.report.material import Material
+from bridge.document.axes import plain
 from bridge.document.blocks import Block, Paragraph, Table
 from bridge.document.section import Section
 from core.calibration.budget.pose_accuracy import PoseAccuracy

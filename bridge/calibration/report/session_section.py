@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from bridge.calibration.report.facts import SessionFacts
-from bridge.calibration.report.figures import load_words, mm, plain
+from bridge.calibration.report.figures import load_words, mm
 from bridge.calibration.report.material import Material
 from bridge.calibration.report.names import sentence
+from bridge.document.axes import plain
 from bridge.document.blocks import Block, Bullets, Columns, Heading, Pairs
 from bridge.document.section import Section
 

@@ -6,10 +6,10 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from bridge.calibration.instruments.settings import InstrumentSettings
 from bridge.calibration.options import Order
 from bridge.calibration.session.journal import FILE, VERSION, Entry, read_entries
 from bridge.cell import Cell
+from bridge.cell.settings.instruments import InstrumentSettings
 from core.errors import InputError
 
 SAME = (

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.channels.observation import NotObservable, Observation, Predict, stacked
+from core.diagnosis.observation import NotObservable, Observation, Predict, stacked
 from core.diagnosis.selection.unnamed import unnamed_rivals
 from core.effects import Term
 from core.errors import LogError
@@ -17,10 +17,10 @@ from core.estimation.identification import pose_groups
 from core.estimation.registration import IDENTITY, Registration, frame_columns, register_robustly
 from core.loads import Loads
 from core.log.log import Log
-from core.log.sessions import session_of, sessions_in
 from core.metrology import Metrology
 from core.model import Model, Poses
 from core.rotation import rotation_matrix, rotation_vector
+from core.sessions import session_of, sessions_in
 
 Array = NDArray[np.float64]
 LEVER = 0.2  # m/rad: first weight of a rotation against a position

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.derivatives import signal_noise
-from core.diagnosis.channels.observation import HELD
+from core.diagnosis.observation import HELD
 from core.estimation.identification import pose_groups
 from core.log.log import Log
 from core.motion import Motion

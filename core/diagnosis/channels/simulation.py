@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.channels.observation import NotObservable, Observation
+from core.diagnosis.observation import NotObservable, Observation
 from core.effects import Term
 from core.errors import LogError
 from core.log.log import Log

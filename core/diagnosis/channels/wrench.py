@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.derivatives import signal_noise
-from core.diagnosis.channels.observation import NotObservable, Observation
 from core.diagnosis.channels.recording import (
     VARIES,
     conditions,
@@ -16,14 +15,15 @@ from core.diagnosis.channels.recording import (
     picked,
     quantities,
 )
+from core.diagnosis.observation import NotObservable, Observation
 from core.diagnosis.selection.unnamed import unnamed_pulls
 from core.dynamics import predict_wrench, with_pieces
 from core.effects import Term
 from core.log.log import Log
-from core.log.sessions import session_of
 from core.metrology import Metrology
 from core.model import Model
 from core.motion import Motion, motion_of
+from core.sessions import session_of
 
 Array = NDArray[np.float64]
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")

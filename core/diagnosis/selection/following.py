@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.channels.observation import Observation
+from core.diagnosis.observation import Observation
 from core.diagnosis.selection.candidate import Candidate, named_columns
 from core.effects import CATALOGUE, Term
 

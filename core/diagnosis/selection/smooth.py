@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arm import Arm
-from core.diagnosis.channels.observation import Observation
+from core.diagnosis.observation import Observation
 from core.diagnosis.selection.candidate import Candidate, carrying, own_target
 from core.effects import Parameter, Site
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.arm import Arm
-from core.diagnosis.channels.observation import Observation
+from core.diagnosis.observation import Observation
 from core.diagnosis.selection.candidate import Candidate
 from core.diagnosis.selection.noise import Noise
 from core.diagnosis.selection.problem import AT_ONCE, Space, prices

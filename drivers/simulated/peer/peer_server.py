@@ -15,9 +15,9 @@ from typing import Protocol, Self
 
 from core.errors import LinkError
 from drivers.simulated.peer.bench import BenchServer, Command
+from drivers.simulated.peer.connection import Connection, listen
 from drivers.simulated.peer.peer import Peer
 from drivers.simulated.peer.real_time import become_punctual
-from drivers.simulated.ur.connection import Connection, listen
 
 LATE = 0.1  # s: behind by more than this, the missed cycles are left out
 COLLECT_EVERY = 2.0  # s

@@ -8,8 +8,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
+from drivers.simulated.peer.connection import Connection
 from drivers.simulated.ur import modes
-from drivers.simulated.ur.connection import Connection
 from drivers.simulated.ur.controller import Controller, Steps
 
 log = logging.getLogger("drivers.simulated")

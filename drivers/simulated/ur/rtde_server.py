@@ -6,8 +6,8 @@ import logging
 import socket
 import struct
 
+from drivers.simulated.peer.connection import Connection
 from drivers.simulated.ur import rtde_protocol as wire
-from drivers.simulated.ur.connection import Connection
 from drivers.simulated.ur.controller import Controller
 from drivers.simulated.ur.rtde_names import INPUTS
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 
+from drivers.simulated.peer.connection import Connection
 from drivers.simulated.ur import offset_program
-from drivers.simulated.ur.connection import Connection
 from drivers.simulated.ur.control_script import control_script, read_control_text
 from drivers.simulated.ur.controller import Controller
 from drivers.simulated.ur.script_programs import script_program

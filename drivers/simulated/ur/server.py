@@ -15,8 +15,8 @@ from functools import partial
 
 from core.errors import LinkError
 from drivers.simulated.peer.bench import BenchServer
+from drivers.simulated.peer.connection import Connection, listen
 from drivers.simulated.peer.real_time import become_punctual
-from drivers.simulated.ur.connection import Connection, listen
 from drivers.simulated.ur.controller import CYCLE, Controller
 from drivers.simulated.ur.dashboard_server import DashboardServer
 from drivers.simulated.ur.own_motion import move_own

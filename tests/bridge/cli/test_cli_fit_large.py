@@ -56,9 +56,9 @@ def test_a_log_is_large_from_its_number_of_rows_on(tmp_path, rows, large):
 
 
 def test_a_recording_that_holds_no_measured_poses_says_so(tmp_path):
+    from bridge.cell.settings.recording import RecordingSettings
     from bridge.ipc.shared_memory import Page
     from bridge.recording.recorder import Recorder
-    from bridge.recording.settings import RecordingSettings
 
     page = Page(6)
     settings = RecordingSettings(folder=tmp_path, keep_free=0.0)

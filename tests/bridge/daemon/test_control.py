@@ -15,11 +15,11 @@ from typing import Any
 import pytest
 from daemon_cell import Robot, Run, gapbridge, wait_for
 
+from bridge.cell.runtime_folder import cell_key, runtime_folder
 from bridge.daemon import control
 from bridge.ipc import control_socket
 from bridge.ipc.control_client import ask, ask_socket, running
 from bridge.ipc.control_socket import ControlSocket, Peer
-from bridge.ipc.runtime_folder import cell_key, runtime_folder
 from bridge.ipc.shared_memory import Phase
 from bridge.loop.supervisor import State
 from core.errors import InputError, RunError

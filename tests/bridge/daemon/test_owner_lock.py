@@ -15,10 +15,11 @@ import pytest
 from daemon_cell import Robot, Run, gapbridge, wait_for
 
 from bridge.cell.sections import link_settings
-from bridge.daemon.host import OwnerLock, address_of
+from bridge.daemon.host import OwnerLock
 from bridge.ipc.control_client import ask
 from bridge.loop.supervisor import State
 from core.errors import InputError
+from drivers.controller_address import address_of
 
 
 @pytest.fixture(autouse=True)

@@ -14,12 +14,12 @@ from daemon_cell import Robot, wait_for
 from numpy.typing import NDArray
 
 from bridge.cell.run_settings import read_configuration
+from bridge.cell.settings.recording import RecordingSettings
 from bridge.daemon.processes import LoopProcess
 from bridge.ipc.command_page import Command, CommandPage
 from bridge.ipc.shared_memory import RunPage
 from bridge.loop.supervisor import State
 from bridge.recording.recorder import Recorder
-from bridge.recording.settings import RecordingSettings
 from core.log.mcap_reading import read_columns
 
 COMPARED = (

@@ -13,13 +13,13 @@ from test_replayed_loop import assert_same_bits
 from bridge.cell import load_cell
 from bridge.cell.daemon_settings import DaemonSettings
 from bridge.cell.sections import SetpointSettings
+from bridge.cell.settings.recording import RecordingSettings
 from bridge.ipc.command_page import Command, CommandPage, Commands
 from bridge.ipc.shared_memory import Page
 from bridge.loop.loop import Exit, Loop
 from bridge.loop.main import _compile
 from bridge.loop.replay import ReplayedLoop
 from bridge.recording.recorder import Recorder
-from bridge.recording.settings import RecordingSettings
 from bridge.setpoint_source.target import TargetSource
 from core.errors import LinkError, PartialWriteError
 from core.log.mcap_reading import read_columns

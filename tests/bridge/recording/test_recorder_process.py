@@ -14,11 +14,11 @@ import pytest
 from recorded import SESSION, N
 
 from bridge.cell.daemon_settings import DaemonSettings
+from bridge.cell.settings.recording import RecordingSettings
 from bridge.ipc import side_process
 from bridge.ipc.shared_memory import Page
 from bridge.ipc.side_process import SideProcess
 from bridge.loop.supervisor import State
-from bridge.recording.settings import RecordingSettings
 from core.log.mcap_reading import read_columns, read_configuration, read_documents
 from core.log.mcap_records import is_whole
 

@@ -17,8 +17,8 @@ from core.diagnosis.diagnosis import diagnose
 from core.diagnosis.document import document
 from core.errors import LogError
 from core.estimation.identification import identify_compliance
-from core.log.sessions import join_sessions
 from core.metrology import Metrology
+from core.sessions import join_sessions
 
 MODEL = small.model_of()
 

@@ -9,7 +9,7 @@ import pytest
 from rtde_client import RtdeClient
 from simulated_cell import cell_settings
 
-from drivers.simulated.ur.connection import listen
+from drivers.simulated.peer.connection import listen
 from drivers.simulated.ur.process import SimulatedController
 from drivers.simulated.ur.rtde_names import INPUTS, OUTPUTS
 from drivers.simulated.ur.rtde_server import RtdeServer

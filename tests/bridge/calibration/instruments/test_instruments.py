@@ -23,7 +23,7 @@ from bridge.calibration.instruments.instrument import (
     Where,
 )
 from bridge.calibration.instruments.numbers import numbers
-from bridge.calibration.instruments.settings import InstrumentSettings
+from bridge.cell.settings.instruments import InstrumentSettings
 from core.errors import InputError, LinkError
 
 SETTINGS: TypeAdapter[InstrumentSettings] = TypeAdapter(InstrumentSettings)

@@ -8,9 +8,9 @@ import moving_truth as truth
 import numpy as np
 import pytest
 
-from core.diagnosis.channels.observation import NotObservable, Observation, thinned
 from core.diagnosis.channels.torque import observe
 from core.diagnosis.diagnosis import diagnose
+from core.diagnosis.observation import NotObservable, Observation, thinned
 from core.effects import Site, Term
 from core.metrology import Metrology
 

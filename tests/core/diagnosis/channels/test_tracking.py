@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from core.arm import builtin_arm
-from core.diagnosis.channels.observation import NotObservable
 from core.diagnosis.channels.tracking import encoder_step, observe
 from core.diagnosis.diagnosis import diagnose
+from core.diagnosis.observation import NotObservable
 from core.effects import Site, Term
 from core.metrology import Metrology
 from core.model import Model

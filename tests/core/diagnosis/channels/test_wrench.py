@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from core.diagnosis.channels.observation import NotObservable
 from core.diagnosis.channels.wrench import observe, torque_weight
+from core.diagnosis.observation import NotObservable
 from core.effects import Site, Term
 from core.metrology import Metrology
 

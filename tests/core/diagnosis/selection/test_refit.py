@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.blind.mechanics import RealArm, turn
-from core.diagnosis.channels.observation import Observation
 from core.diagnosis.channels.position import observe
+from core.diagnosis.observation import Observation
 from core.diagnosis.selection.candidate import named_candidates, named_columns
 from core.diagnosis.selection.noise import estimate_noise
 from core.diagnosis.selection.problem import fit

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.log.log import Log
-from core.log.sessions import sessions_in
+from core.sessions import sessions_in
 
 Array = NDArray[np.float64]
 Range = Mapping[str, tuple[float, float]]

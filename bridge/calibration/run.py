@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from bridge.calibration.format import load_text
 from bridge.calibration.instruments.instrument import AnyInstrument, ReadingError, Surroundings
 from bridge.calibration.jobs.job import Job
+from bridge.calibration.jobs.table import make_job
 from bridge.calibration.joints.joint_source import JointSource, PlannedJoints
 from bridge.calibration.options import Order
 from bridge.calibration.planning import loads_of, metrology_of, space_of, with_loads
 from bridge.calibration.session.folders import begun_entry, check_begun, session_folder
-from bridge.calibration.session.job_table import make_job
 from bridge.calibration.session.joint_sources import make_joints
 from bridge.calibration.session.journal import Journal
 from bridge.calibration.session.measuring import Conversation

@@ -1,0 +1,53 @@
+"""A log as it is opened for a cell: of its arm, in its units, within its ratings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import numpy as np
+
+from bridge.cell.cell import Cell
+from core.diagnosis.log_checks.units_and_clocks import check_units
+from core.errors import LogError
+from core.load_bounds import HEAVIEST
+from core.log.log import Log, read_log
+from core.log.sources import SourceOptions, source_of
+
+
+def open_log(path: Path, cell: Cell) -> Log:
+    """Return a log for a cell's arm: a CSV or Parquet file, or another source (core.log.sources).
+
+    Raises LogError where a payload is out of range, angles look like degrees or positions like
+    millimetres.
+    """
+    source = source_of(path)
+    if source is None:
+        log = read_log(path, cell.arm.n)
+    else:
+        converted = source.read(path, joint_names(cell), SourceOptions())
+        for note in converted.notes:
+            click.echo(f"note: {path}: {note}", err=True)
+        log = converted.log(path, cell.arm.n)
+    check_log(log, cell)
+    return log
+
+
+def joint_names(cell: Cell) -> tuple[str, ...]:
+    """Return the names of the cell's joints: those of its URDF, or joint_1, joint_2, ..."""
+    return cell.arm.joint_names or tuple(f"joint_{i + 1}" for i in range(cell.arm.n))
+
+
+def check_log(log: Log, cell: Cell) -> None:
+    """Raise LogError where a log's numbers cannot be meant for a cell's arm."""
+    for name in ("actual_q", "target_q"):
+        if np.isinf(log.columns.get(name, np.zeros(0))).any():
+            log.require(name)  # names the cell
+    check_units(cell.model, log)
+    mass, rated = log.get("payload"), cell.arm.payload
+    if mass is not None and (mass > HEAVIEST * rated).any():
+        row = int(np.argmax(mass > HEAVIEST * rated))
+        raise LogError(
+            f"{log.path}: row {log.line(row)}, column payload: found {mass[row]:g} kg, out of "
+            f"range: expected 0 to {rated:g} kg, what {cell.arm.name} is rated for"
+        )

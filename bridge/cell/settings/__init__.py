@@ -1,0 +1,1 @@
+"""Sections of a cell file that other folders run by."""

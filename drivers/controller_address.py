@@ -1,0 +1,54 @@
+"""What tells one controller from another."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import ipaddress
+import os
+import socket
+
+from drivers.driver import DriverSettings
+
+OWN_PORTS = (502, 802, 30004)  # Modbus/TCP, Modbus/TCP Security, RTDE
+
+
+def address_of(link: DriverSettings) -> str:
+    """Return what tells one controller from another: the same for whatever driver reaches it.
+
+    A host is what its name resolves to, once for the whole run. A port is left out where it is the
+    protocol's own: RTDE and Modbus of one robot are one controller, ports of a gateway are not.
+    """
+    given = link.model_dump(mode="json")
+    if "interface" in given:  # a bus, with a whole arm by each profile
+        host = given.get("host")
+        bus = {**given, "host": None if host is None else resolved(str(host))}
+        names = ("interface", "host", "port", "channel", "profile")
+        return "bus " + " ".join(f"{bus.get(k)}" for k in names)
+    if given.get("transport") == "rtu":
+        return f"serial {_real(given['serial'])} unit {given.get('device_id')}"
+    if "host" not in given:
+        return f"host {given.get('file', link)}"
+    port = given.get("port")
+    at = f" port {port}" if port is not None and port not in OWN_PORTS else ""
+    return f"host {resolved(str(given['host']))}{at}"
+
+
+@functools.cache
+def resolved(host: str) -> str:
+    """Return the numeric address of a host name, the first in order where it has several.
+
+    A name that nobody knows stays as it is, in small letters: connecting will say so.
+    """
+    with contextlib.suppress(ValueError):
+        return str(ipaddress.ip_address(host))
+    try:
+        found = socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_STREAM)
+    except (OSError, UnicodeError):
+        return host.lower().rstrip(".")
+    return min(str(address[0]) for *_, address in found)
+
+
+def _real(path: str) -> str:
+    """Return a serial port without the links that lead to it."""
+    return os.path.realpath(path)
