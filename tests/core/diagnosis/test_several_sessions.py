@@ -110,7 +110,7 @@ def test_a_target_that_was_remounted_unsaid_is_no_noise() -> None:
 
 
 def test_a_value_that_changed_is_named_as_changed() -> None:
-    logs = [session(small.soft(2, 4e-6), 1), session(small.soft(2, 8e-6), 2)]
+    logs = [session(small.soft(2, 4e-6), 34), session(small.soft(2, 8e-6), 35)]
     found = diagnose(MODEL, join_sessions(logs, MODEL), Metrology(sigma=small.SIGMA))
     (channel,) = found.channels
     (across,) = [c for c in channel.carried if c.effect == "axial_compliance"]
@@ -121,7 +121,7 @@ def test_a_value_that_changed_is_named_as_changed() -> None:
         c for c in document(found)["channels"][0]["causes"] if c["effect"] == "axial_compliance"
     ]
     assert cause["across_sessions"]["carries"] is False
-    assert [v["session"] for v in cause["across_sessions"]["values"]] == ["1.csv", "2.csv"]
+    assert [v["session"] for v in cause["across_sessions"]["values"]] == ["34.csv", "35.csv"]
 
 
 def test_what_holds_in_one_session_only_depends_on_the_session() -> None:
