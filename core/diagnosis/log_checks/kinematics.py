@@ -58,11 +58,6 @@ def other_models(model: Model) -> Iterator[tuple[str, Model]]:
             f"lengths of the DH rows look like {unit}, expected m",
             replace(model, arm=_standard(model.arm, changed)),
         )
-    zeros = rows * [1.0, 1.0, 1.0, np.pi / 180.0]  # alpha in degrees is refused with the cell
-    yield (
-        "offsets of the DH rows look like degrees, expected rad",
-        replace(model, arm=_standard(model.arm, zeros)),
-    )
 
 
 def best_order(model: Model, q: Array, seen: Array) -> tuple[str, Array] | None:
