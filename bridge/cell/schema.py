@@ -93,6 +93,7 @@ class EffectEntry(Section):
     joint: int | None = Field(default=None, strict=True, description="from 1")
     order: Number | None = Field(default=None, description="cycles per turn of the joint")
     parameters: dict[str, Number] = Field(default={}, description="name: value")
+    stand_in: bool = Field(default=False, strict=True, description="useful, but not proved")
 
 
 class MetrologyEntry(Section):

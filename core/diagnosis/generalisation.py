@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.held_out import MANY_ROWS, TINY
 from core.diagnosis.observation import Observation
 from core.diagnosis.selection.refit import WEAK
 from core.diagnosis.selection.selection import Selection
@@ -23,6 +22,8 @@ from core.estimation.regions import joint_regions
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 REGIONS = 5  # of joint space, or stretches of time: each is left out whole
+MANY_ROWS = 6000  # of the sample space: from there sums instead of a decomposition of all rows
+TINY = 1e-12  # share of the largest eigenvalue
 FEWEST = 3  # samples of a region that the figure needs
 GAP = 0.02  # share of a recording on either side of a judged stretch that is not fitted either
 RANK = 1e-9
@@ -62,7 +63,8 @@ class _Problem:
         raw = selection.raw
         self._causes = raw.columns(selection.space, chosen)
         usual = [p.scale for c in chosen for p in selection.space.candidates[c].parameters]
-        self._hold = 1 / (WEAK * np.array(usual)) if usual else np.zeros(0)
+        weak = 1 / (WEAK * np.array(usual)) if usual else np.zeros(0)
+        self._hold = np.maximum(selection.pull(chosen), weak)
         self._nuisance, self._gap = raw.nuisance, raw.target
         self._owner = np.array(observation.nuisance_session or (0,) * raw.nuisance.shape[1])
         whole = observation.session
