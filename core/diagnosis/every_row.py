@@ -47,9 +47,8 @@ def on_every_row(
     noise = carried_to(placed, selection.noise)
     work = Work(placed, model.arm, candidates, noise, np.ones(len(placed.rows), dtype=bool))
     work.kept = inliers(work, placed.measured - placed.predict(terms))
-    base = terms if placed.channel != "tracking" else ()
-    columns = [exact_columns(placed, c, base) for c in candidates]
-    space, raw = sample_space(work, columns, base, [])
+    columns = [exact_columns(placed, c, terms) for c in candidates]
+    space, raw = sample_space(work, columns, terms, [])
     links = {p: selection.prior[c] for p, c in enumerate(selection.term_index)
              if c in selection.prior and p in accused}  # fmt: skip
     near = links_of(space, links).beside(space, links) if links else space
@@ -60,7 +59,7 @@ def on_every_row(
         values[c], covariance[c] = term, own
     return Selection(
         work.observation, space, found, tuple(values), tuple(range(len(values))),
-        tuple(covariance), work.kept, noise, residual, base, raw, links,
+        tuple(covariance), work.kept, noise, residual, terms, raw, links,
     )  # fmt: skip
 
 
