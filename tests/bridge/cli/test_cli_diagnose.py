@@ -103,7 +103,7 @@ def test_stand_ins_go_into_the_cell_only_when_asked_for(
         answer = gapbridge("diagnose", log, "--cell", cell, "--apply", new, *options)
         assert answer.code == 0, answer.err
         texts.append(new.read_text(encoding="utf-8"))
-    assert "stand_in" not in texts[0]
+    assert "stand_in: true" not in texts[0]
     assert texts[1].count("stand_in: true") == 1
     line = refused("diagnose", log, "--cell", cell, "--stand-ins")
     assert "found no --apply" in line
