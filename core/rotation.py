@@ -119,3 +119,16 @@ def rpy_matrix(roll_pitch_yaw: Array) -> Array:
         @ rotation_matrix(np.array([0, pitch, 0]))
         @ rotation_matrix(np.array([roll, 0, 0]))
     )
+
+
+def roll_pitch_yaw(matrix: Array) -> Array:
+    """Return roll, pitch, yaw (3,) in rad of a rotation (3, 3), as URDF has them; see rpy_matrix.
+
+    Where the pitch is a right angle, roll and yaw turn about one axis: yaw is zero then.
+    """
+    level = float(np.hypot(matrix[0, 0], matrix[1, 0]))
+    pitch = np.arctan2(-matrix[2, 0], level)
+    if level < 1e-9:
+        return np.array([np.arctan2(-matrix[1, 2], matrix[1, 1]), pitch, 0.0])
+    roll, yaw = np.arctan2(matrix[2, 1], matrix[2, 2]), np.arctan2(matrix[1, 0], matrix[0, 0])
+    return np.array([roll, pitch, yaw])

@@ -16,9 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from core.errors import WriteError
 from core.model import Model
 from core.setpoint import Setpoint
 from core.state import RobotState
+from drivers.controller_facts import ControllerFacts, Difference, differences
 from drivers.gate import Gate
 
 Vector = NDArray[np.float64]
@@ -67,6 +69,7 @@ class Driver(ABC):
         self.n = model.arm.n  # joints
         self.moves_arm = moves_arm  # setpoints are the arm's motion; False: they ride on its own
         self.gate = Gate(rate, model, moves_arm)
+        self._cell_model = model  # what the controller is compared with
 
     def __init_subclass__(cls, **keys: Any) -> None:
         """Refuse a driver that goes around the gate. Raises TypeError."""
@@ -112,14 +115,36 @@ class Driver(ABC):
     def arm(self, state: RobotState) -> None:
         """Make ready for writing; may take seconds and never moves the arm. Raises WriteError.
 
-        ``state`` is the sample last read; states read before are stale afterwards.
+        ``state`` is the sample last read; states read before are stale afterwards. Refuses where
+        the controller's arm, TCP or gravity are not the cell's.
         """
         self.gate.end()
+        wrong = [d for d in self.differences(state) if d.sure]
+        if wrong:
+            first = wrong[0]
+            raise WriteError(
+                f"{'.'.join(first.keys)}: found {first.found}, expected {first.expected} "
+                "(gapbridge check --live)"
+            )
         self._make_ready(state)
         self.gate.begin(state.target_q, state.actual_q)
 
     def _make_ready(self, state: RobotState) -> None:
         """Do what ``arm`` promises; see there."""
+
+    def facts(self, state: RobotState) -> ControllerFacts:
+        """Return what the controller says of its arm; ``state`` is the sample last read.
+
+        Reads only. Raises LinkError where it has to be asked and does not answer.
+        """
+        return ControllerFacts(
+            n=len(state.actual_q), payload=state.payload, payload_cog=state.payload_cog,
+            q=state.actual_q,
+        )  # fmt: skip
+
+    def differences(self, state: RobotState) -> list[Difference]:
+        """Return where the cell differs from what the controller says. Raises LinkError."""
+        return differences(self.facts(state), self._cell_model, self.rate)
 
     def keep_alive(self) -> None:
         """Feed the robot's own watchdog where that may wait; before each setpoint.

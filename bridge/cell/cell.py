@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from bridge.cell.document import Document, read_document
 from bridge.cell.effects import compliance_terms, term_of
 from bridge.cell.message import message, messages
+from bridge.cell.plausibility import findings
 from bridge.cell.robot import build_arm
 from bridge.cell.schema import CellFile, Frame, Simulation
 from bridge.cell.sections import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
@@ -141,13 +142,23 @@ def load_cell(path: Path | str) -> Cell:
 
 
 def complaints(path: Path) -> list[str]:
-    """Return a line for everything that is wrong with a cell file's keys; none where they fit."""
+    """Return a line for everything that is wrong with a cell file; none where it can be loaded.
+
+    Where keys do not fit, their values are not looked at.
+    """
     document = read_document(path)
     try:
-        CellFile.model_validate({k: v for k, v in document.data.items() if v is not None})
+        file = CellFile.model_validate({k: v for k, v in document.data.items() if v is not None})
     except ValidationError as error:
         return messages(document, CellFile, error)
-    return []
+    try:
+        found = findings(file, document, build_arm(file.robot, path.parent)).errors
+        if not found:
+            cell_of(file, document)
+    except (ArmError, CellError) as error:
+        text = str(error)
+        found = [text if str(path) in text else f"{path}: {text}"]
+    return found
 
 
 def cell_of(file: CellFile, document: Document) -> Cell:
@@ -155,6 +166,9 @@ def cell_of(file: CellFile, document: Document) -> Cell:
     path = document.path
     try:
         arm = build_arm(file.robot, path.parent)
+        found = findings(file, document, arm)
+        if found.errors:
+            raise CellError(found.errors[0])
         warnings = _check_payload(file, arm)
         if file.robot.tip is not None and file.robot.urdf is None:
             warnings.append("robot.tip: means nothing without robot.urdf")
@@ -175,7 +189,14 @@ def cell_of(file: CellFile, document: Document) -> Cell:
     )
     entry = file.metrology
     metrology = Metrology(entry.registered, max(entry.sigma, FINEST), entry.repeatability)
-    return Cell(path, file, document, model, metrology, tuple(f"{path}: {w}" for w in warnings))
+    return Cell(
+        path,
+        file,
+        document,
+        model,
+        metrology,
+        (*found.warnings, *(f"{path}: {w}" for w in warnings)),
+    )
 
 
 def _transform(frame: Frame) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:

@@ -39,7 +39,7 @@ def build_arm(robot: Robot, folder: Path) -> Arm:
             "robot.dh: of a built-in arm it is known"
         )
     if robot.model is not None:
-        return builtin_arm(robot.model, _calibration(robot.calibration, folder))
+        return builtin_arm(robot.model, calibration_of(robot.calibration, folder))
     if robot.urdf is not None:
         path = folder / robot.urdf
         if not is_file(path):
@@ -51,9 +51,13 @@ def build_arm(robot: Robot, folder: Path) -> Arm:
     return arm if rated is None else replace(arm, payload=rated)
 
 
-def _calibration(
+def calibration_of(
     given: Calibration | str | None, folder: Path
 ) -> Mapping[str, Sequence[float]] | None:
+    """Return the deltas that ``robot.calibration`` gives or names; None where it is left out.
+
+    Raises ArmError.
+    """
     if given is None:
         return None
     if isinstance(given, Calibration):

@@ -124,6 +124,7 @@ class Simulation(Section):
     dashboard_port: int | None = Field(default=None, gt=0, lt=65536, strict=True)
     script_port: int | None = Field(default=None, gt=0, lt=65536, strict=True)
     bench_port: int | None = Field(default=None, gt=0, lt=65536, strict=True)
+    primary_port: int | None = Field(default=None, gt=0, lt=65536, strict=True)
 
 
 class SourceFile(Section):

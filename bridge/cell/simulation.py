@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bridge.cell.cell import Cell
+from bridge.cell.robot import calibration_of
 from core.addresses import is_loopback
 from core.errors import CellError
 from core.rotation import rotation_vector
@@ -24,12 +25,13 @@ from drivers.simulated.ur.server import serve
 from drivers.simulated.ur.settings import (
     BENCH_PORT,
     ServerSettings,
+    announced_rows,
     simulated_arm,
     simulated_cell,
 )
 
 HOST = "127.0.0.2"
-PORTS = ("rtde_port", "dashboard_port", "script_port", "bench_port")
+PORTS = ("rtde_port", "dashboard_port", "script_port", "bench_port", "primary_port")
 PERIOD = 0.004  # s, of a Peer's cycle
 
 SIMULATORS: dict[str, str] = {
@@ -72,7 +74,8 @@ def serve_cell(
     settings = server_settings(cell, host, seed)
     say(
         f"{settings.arm.name} at {settings.host}: RTDE {settings.rtde_port}, dashboard "
-        f"{settings.dashboard_port}, scripts {settings.script_port}, bench {settings.bench_port}"
+        f"{settings.dashboard_port}, primary {settings.primary_port}, scripts "
+        f"{settings.script_port}, bench {settings.bench_port}"
     )
     serve(settings, stop, lambda in_flange: served_sensor(cell.ft_sensor, in_flange))
 
@@ -125,6 +128,12 @@ def server_settings(cell: Cell, host: str | None = None, seed: int | None = None
         simulation.start_q,
         **_plant(cell),
     )
+    robot = cell.file.robot
+    if robot.model is not None:
+        deltas = calibration_of(robot.calibration, cell.path.parent)
+        settings = replace(settings, calibrated=announced_rows(robot.model, deltas))
+    else:
+        settings = replace(settings, nominal=(), calibrated=())  # what no controller announces
     return replace(settings, **{name: port for name, port in chosen.items() if port is not None})
 
 

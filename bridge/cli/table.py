@@ -4,6 +4,9 @@ from __future__ import annotations
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("bridge.cli.demo:demo", "Do the whole job on a simulated cell, no hardware."),
+    "init": ("bridge.cli.init:init", "Write a cell from what a controller says of itself."),
+    "check": ("bridge.cli.check:check", "Say whether a cell is fit to be used."),
+    "diff": ("bridge.cli.diff:diff", "Say what changed from one cell to another."),
     "simulate": ("bridge.cli.simulate:simulate", "Serve the simulated controller of a cell."),
     "run": ("bridge.cli.run:run", "Run the on-cell daemon."),
     "status": ("bridge.cli.status:status", "Tell what the daemon of a cell does."),

@@ -171,13 +171,14 @@ def _unnamed(candidate: Candidate, observation: Observation) -> bool:
     """Return whether a candidate stands for an unknown, and not for a named effect's own form.
 
     A function of a joint's own last motion that moves it is play. Of joints that are measured one
-    by one, a function of a joint's own speed or torque is friction, delay or droop.
+    by one, a function of a joint's own speed is friction or delay, and of its own torque droop.
     """
     if candidate.named:
         return False
     stem, _, index = candidate.quantity.rpartition("_")
     own = index.isdigit() and candidate.target.endswith(f"_{int(index) + 1}")
     if observation.channel in ("torque", "tracking"):
-        held = candidate.target == carrying(candidate.quantity)
+        droop = observation.channel == "tracking"
+        held = droop and candidate.target == carrying(candidate.quantity)
         return not (held or (own and stem in ("actual_qd", "target_qd")))
     return not (own and stem == "approach")

@@ -9,6 +9,7 @@ from core.errors import InvalidStateError, LinkError, StaleStateError, WriteErro
 from core.model import Model
 from core.setpoint import Setpoint
 from core.state import RobotState
+from drivers.controller_facts import ControllerFacts, Difference
 from drivers.driver import Driver
 from drivers.ft_sensor import make_sensor
 from drivers.ft_sensor.clock_offset import ClockOffset
@@ -76,6 +77,14 @@ class DriverWithSensor(Driver):
     def round_trip(self) -> float | None:
         """See Driver.round_trip."""
         return self._arm.round_trip()
+
+    def facts(self, state: RobotState) -> ControllerFacts:
+        """See Driver.facts."""
+        return self._arm.facts(state)
+
+    def differences(self, state: RobotState) -> list[Difference]:
+        """See Driver.differences."""
+        return self._arm.differences(state)
 
     def mismatch(self) -> str | None:
         """See Driver.mismatch."""

@@ -32,6 +32,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--rtde-port", type=int, default=defaults.RTDE_PORT)
     parser.add_argument("--dashboard-port", type=int, default=defaults.DASHBOARD_PORT)
     parser.add_argument("--script-port", type=int, default=defaults.SCRIPT_PORT)
+    parser.add_argument("--primary-port", type=int, default=defaults.PRIMARY_PORT)
     parser.add_argument("--bench-port", type=int, default=defaults.BENCH_PORT)
     parser.add_argument(
         "--settings", choices=["-"], help="read all settings as JSON from stdin; end with stdin"
@@ -57,6 +58,7 @@ def _settings(options: argparse.Namespace) -> ServerSettings:
         dashboard_port=options.dashboard_port,
         script_port=options.script_port,
         bench_port=options.bench_port,
+        primary_port=options.primary_port,
     )
 
 

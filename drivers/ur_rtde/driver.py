@@ -13,16 +13,17 @@ from core.model import Model
 from core.rotation import one_rotation_matrix
 from core.setpoint import Setpoint
 from core.state import RobotState
+from drivers.controller_facts import TCP_TURNED, ControllerFacts, Difference, differences
 from drivers.driver import Driver
 from drivers.offset_inverse import Nominal
 from drivers.ur_rtde.command import OffsetWriter, ServoWriter, Writer
+from drivers.ur_rtde.enquiry import enquire
 from drivers.ur_rtde.round_trip import round_trip
 from drivers.ur_rtde.settings import UrRtdeSettings
 from drivers.ur_rtde.state import StateReader
 
 Vector = NDArray[np.float64]
 OFFSET_SCRIPT = Path(__file__).with_name("gapbridge_offset.script")
-TCP_TURNED = 0.02  # rad: turned further, the controller's TCP is not the cell's
 
 
 class UrRtdeDriver(Driver):
@@ -113,6 +114,18 @@ class UrRtdeDriver(Driver):
             f"expected at most {1e3 * most:g} mm (link.tcp_tolerance) and {TCP_TURNED:g} rad: set "
             "the same TCP in both (tool.tcp in the cell file; robot.calibration beside it)"
         )
+
+    def facts(self, state: RobotState) -> ControllerFacts:
+        """Return what RTDE and the primary interface say; see Driver.facts."""
+        return enquire(self.settings.host)
+
+    def differences(self, state: RobotState) -> list[Difference]:
+        """Return where the cell differs; see Driver.differences. Raises WriteError."""
+        try:
+            found = self.facts(state)
+        except LinkError as error:
+            raise WriteError(str(error)) from None
+        return differences(found, self._model, self.rate, self.settings.tcp_tolerance)
 
     def keep_alive(self) -> None:
         """Feed the watchdog of the control script; see Driver.keep_alive."""

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from core.diagnosis.log_checks.kinematics import best_order, inverted, other_models
 from core.errors import InputError
 from core.estimation.registration import register_robustly
 from core.log.log import Log
@@ -22,6 +23,7 @@ Array = NDArray[np.float64]
 MOST = 200  # rows looked at
 FEWEST = 6
 FAR = 0.02  # m and rad: more than any arm errs
+CLEARLY = 0.8  # of the best mistake before, for another to be named instead
 BETTER = 0.1  # share of the distance that may be left for a mistake to be named
 
 
@@ -43,7 +45,7 @@ def frame_findings(model: Model, log: Log, metrology: Metrology) -> list[str]:
     distance = _off(seen, predicted)
     told = []
     if distance > FAR:
-        told.append(_why(model, q, measured, rows, distance))
+        told.append(_why(model, q, measured, rows, distance, log.get("measured_rotation")))
     elif metrology.registered:
         here = float(np.median(np.linalg.norm(seen - predicted, axis=1)))
         if here > FAR and distance < BETTER * here:
@@ -63,14 +65,16 @@ def _off(measured: Array, predicted: Array) -> float:
     return float(np.median(np.linalg.norm(frame.in_base(measured) - predicted, axis=1)))
 
 
-def _why(model: Model, q: Array, measured: Array, rows: Array, distance: float) -> str:
+def _why(
+    model: Model, q: Array, measured: Array, rows: Array, distance: float, turned: Array | None
+) -> str:
     """Return the finding on positions that do not follow the arm."""
     best, name = distance, ""
-    for what, trial_q, trial in _mistakes(model, q, measured, rows):
+    for what, trial_model, trial_q, trial in _mistakes(model, q, measured, rows, turned):
         if len(trial) < FEWEST:
             continue
-        left = _off(trial, model.rigid_pose(trial_q).position)
-        if left < best:
+        left = _off(trial, trial_model.rigid_pose(trial_q).position)
+        if left < CLEARLY * best:
             best, name = left, what
     told = f"the measured positions do not follow the arm: {1e3 * distance:.0f} mm off in any frame"
     if name and best < BETTER * distance:
@@ -79,26 +83,35 @@ def _why(model: Model, q: Array, measured: Array, rows: Array, distance: float) 
 
 
 def _mistakes(
-    model: Model, q: Array, measured: Array, rows: Array
-) -> Iterator[tuple[str, Array, Array]]:
-    """Yield each mistake with joint angles and positions that would put it right."""
+    model: Model, q: Array, measured: Array, rows: Array, turned: Array | None
+) -> Iterator[tuple[str, Model, Array, Array]]:
+    """Yield each mistake with the model, joint angles and positions that would put it right."""
     seen = measured[rows]
     mirrored = seen * [1.0, 1.0, -1.0]
-    yield "they look mirrored (axes of a left-handed frame)", q[rows], mirrored
+    yield "they look mirrored (a left-handed frame, or two axes swapped)", model, q[rows], mirrored
     for joint in range(q.shape[1]):
-        turned = q[rows].copy()
-        turned[:, joint] *= -1
-        yield f"joint {joint + 1} looks turned round in sign", turned, seen
-    yield "the joints look turned round in order", q[rows][:, ::-1], seen
+        flipped = q[rows].copy()
+        flipped[:, joint] *= -1
+        yield f"joint {joint + 1} looks turned round in sign", model, flipped, seen
     for step, word in ((1, "late"), (-1, "early")):
         inside = rows[(rows + step >= 0) & (rows + step < len(q))]
         inside = inside[np.isfinite(measured[inside + step]).all(axis=1)]
-        yield f"they look one row too {word}", q[inside], measured[inside + step]
+        yield f"they look one row too {word}", model, q[inside], measured[inside + step]
     predicted = model.rigid_pose(q[rows]).position
     size = _size(seen) / max(_size(predicted), 1e-9)
     for unit, factor in (("centimetres", 100.0), ("inches", 1 / 0.0254), ("feet", 1 / 0.3048)):
         if abs(np.log(size / factor)) < 0.2:
-            yield f"they look like {unit}, expected m", q[rows], seen / factor
+            yield f"they look like {unit}, expected m", model, q[rows], seen / factor
+    for what, other in other_models(model):
+        yield what, other, q[rows], seen
+    order = best_order(model, q[rows], seen)
+    if order is not None:
+        yield order[0], model, order[1], seen
+    if turned is not None and np.isfinite(turned[rows]).all():
+        yield (
+            "they look inverted: the base seen from the tool", model, q[rows],
+            inverted(seen, turned[rows]),
+        )  # fmt: skip
 
 
 def _size(position: Array) -> float:

@@ -35,18 +35,23 @@ def exact_columns(observation: Observation, candidate: Candidate, base: Sequence
         t.values[0] for t in base
         if t.site.joint == candidate.site.joint and _alike(t, candidate)
     ]  # fmt: skip
-    nothing = observation.predict(())
+    # what else moves the joint stays: play of a joint that lags is not that of one that does not
+    others = [
+        t for t in base
+        if t.site.joint == candidate.site.joint and not _alike(t, candidate)
+    ]  # fmt: skip
+    nothing = observation.predict(others)
     if inside:
         value = float(np.sum(inside))
     else:
-        slope = named_columns(observation, candidate, ())[..., 0]
+        slope = named_columns(observation, candidate, others)[..., 0]
         gap = observation.measured - nothing
         value = float(np.sum(slope * gap) / max(float(np.sum(slope**2)), 1e-300))
     parameter = candidate.parameters[0]
     value = min(max(value, parameter.lower), parameter.upper)
     if abs(value) < SHORTEST * parameter.scale:
-        return named_columns(observation, candidate, ())
-    moved = observation.predict([candidate.term(np.array([value]))]) - nothing
+        return named_columns(observation, candidate, others)
+    moved = observation.predict([*others, candidate.term(np.array([value]))]) - nothing
     return np.asarray(moved / value)[..., None]
 
 

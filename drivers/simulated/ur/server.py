@@ -20,6 +20,7 @@ from drivers.simulated.peer.real_time import become_punctual
 from drivers.simulated.ur.controller import CYCLE, Controller
 from drivers.simulated.ur.dashboard_server import DashboardServer
 from drivers.simulated.ur.own_motion import move_own
+from drivers.simulated.ur.primary_server import PrimaryServer
 from drivers.simulated.ur.rtde_server import RtdeServer, RtdeSession
 from drivers.simulated.ur.script_server import ScriptServer
 from drivers.simulated.ur.settings import ServerSettings, make_controller
@@ -49,6 +50,9 @@ class Server:
         self.rtde = RtdeServer(self.controller, (*settings.version, 0))
         self._dashboard = DashboardServer(self.controller, version, settings.serial)
         self._script = ScriptServer(self.controller)
+        self._primary = PrimaryServer(
+            self.controller, settings.version, settings.nominal, settings.calibrated
+        )
         self._bench = BenchServer(
             self.controller, self.rtde.close_all, partial(move_own, self.controller)
         )
@@ -62,6 +66,9 @@ class Server:
             self._add(listen(host, settings.rtde_port), self.rtde.accept, self._handle_rtde)
             self._add(listen(host, settings.dashboard_port), self._greeted, self._dashboard.handle)
             self._add(listen(host, settings.script_port), Connection, self._script.handle)
+            self._add(
+                listen(host, settings.primary_port), self._primary.accept, self._script.handle
+            )
             self._add(listen(host, settings.bench_port), Connection, self._bench.handle)
         except OSError as error:
             self.close()
@@ -103,6 +110,7 @@ class Server:
             if now - deadline > LATE:
                 deadline = now
             rtde.publish(CYCLE)
+            self._primary.publish()
 
     def _serve_until(self, deadline: float) -> None:
         """Answer clients until the next cycle is due."""

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from core.arm import Arm
+from core.arm import Arm, builtin_names, builtin_rows
 from core.errors import ArmError
 from drivers.simulated.plant.declared import Declared
 from drivers.simulated.plant.kinematics import within_limits
@@ -18,6 +18,10 @@ from drivers.simulated.ur.controller import Controller
 START_Q = (0.0, -1.5, 1.8, -1.87, -1.57, 0.0)  # rad: elbow up, tool pointing down
 UR_JOINTS = 6  # the fields of its protocols hold six
 RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, BENCH_PORT = 30004, 29999, 30003, 30100
+PRIMARY_PORT = 30001
+DELTAS = ("theta", "a", "d", "alpha")
+
+Rows = tuple[tuple[float, float, float, float], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +31,8 @@ class ServerSettings:
     start_q: joints at power-on (6,), rad.
     declare: whether the controller is told the plant's true TCP and payload at the start.
     version: announced to clients: major, minor, bugfix.
+    nominal, calibrated: DH rows (theta, a, d, alpha) that the primary interface announces; empty:
+    none.
     """
 
     arm: PlantArm
@@ -36,10 +42,13 @@ class ServerSettings:
     declare: bool = True
     version: tuple[int, int, int] = (5, 15, 0)
     serial: str = "20215500001"
+    nominal: Rows = ()
+    calibrated: Rows = ()
     rtde_port: int = RTDE_PORT
     dashboard_port: int = DASHBOARD_PORT
     script_port: int = SCRIPT_PORT
     bench_port: int = BENCH_PORT
+    primary_port: int = PRIMARY_PORT
 
 
 def simulated_cell(
@@ -57,7 +66,25 @@ def simulated_cell(
     """
     plant_arm(arm, UR_JOINTS)
     table, drawn, start = simulated_arm(arm, seed, start_q, **plant)
-    return ServerSettings(table, drawn, host, start)
+    rows = announced_rows(table.name)
+    return ServerSettings(table, drawn, host, start, nominal=rows, calibrated=rows)
+
+
+def announced_rows(
+    model: str, calibration: Mapping[str, Sequence[float] | None] | None = None
+) -> Rows:
+    """Return DH rows (theta, a, d, alpha) of a built-in arm with its factory calibration, or ()."""
+    if model not in builtin_names():
+        return ()
+    rows = []
+    for i, row in enumerate(builtin_rows(model)["dh"]):
+        added = [
+            ((calibration or {}).get(f"delta_{key}") or [0.0] * UR_JOINTS)[i] for key in DELTAS
+        ]
+        values = (row.get("offset", 0.0), row["a"], row["d"], row["alpha"])
+        theta, a, d, alpha = (float(v) + float(more) for v, more in zip(values, added, strict=True))
+        rows.append((theta, a, d, alpha))
+    return tuple(rows)
 
 
 def simulated_arm(

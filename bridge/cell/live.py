@@ -1,0 +1,57 @@
+"""A cell beside its controller: what the controller says of its arm, and where the cell differs."""
+
+from __future__ import annotations
+
+import time
+
+from bridge.cell.cell import Cell
+from bridge.cell.message import key_path
+from bridge.cell.plausibility import Findings
+from core.errors import CellError
+from drivers import make_driver
+from drivers.driver import Driver
+
+SAMPLES, LONGEST = 50, 2.0  # states, s
+SLOW = 0.8  # share of the rate asked for that must come
+
+
+def live_findings(cell: Cell) -> Findings:
+    """Return where a cell differs from its controller; observes, and moves nothing.
+
+    Raises CellError for a cell without a link, LinkError where the controller cannot be read.
+    """
+    link = cell.link
+    if link is None:
+        raise CellError(f"{cell.path}: link: found nothing, expected the controller's address")
+    driver = make_driver(link, cell.model)
+    errors: list[str] = []
+    warnings: list[str] = []
+    with driver:
+        state = driver.read_state()
+        for found in driver.differences(state):
+            line = cell.document.line(found.keys)
+            text = (
+                f"{cell.path}, line {line}: {key_path(found.keys)}: found {found.found}, "
+                f"expected {found.expected}"
+            )
+            (errors if found.sure else warnings).append(text)
+        if driver.mismatch() is not None and not errors:
+            errors.append(f"{cell.path}: {driver.mismatch()}")
+        rate = _rate(driver)
+    if rate < SLOW * link.rate:
+        line = cell.document.line(("link", "rate"))
+        warnings.append(
+            f"{cell.path}, line {line}: link.rate: found {link.rate:g} Hz, expected about "
+            f"{rate:.0f} Hz, as states come"
+        )
+    return Findings(errors, warnings)
+
+
+def _rate(driver: Driver) -> float:
+    """Return how often states come, Hz."""
+    begun = time.monotonic()
+    count = 0
+    while count < SAMPLES and time.monotonic() - begun < LONGEST:
+        driver.read_state()
+        count += 1
+    return count / max(time.monotonic() - begun, 1e-6)

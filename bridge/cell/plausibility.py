@@ -1,0 +1,197 @@
+"""Whether the values of a cell can be meant: units by their size, before anything is computed.
+
+A TCP in millimetres puts the tool a hundred metres off and every later number with it. What is
+surely wrong is an error in every command; what is only odd is a warning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from bridge.cell.document import Document
+from bridge.cell.message import key_path
+from bridge.cell.schema import CellFile, Payload
+from core.arm import Arm, builtin_arm
+from core.load_bounds import LEVER, LoadBounds
+from core.model import Model
+from core.plausibility import (
+    TURN,
+    TURNS,
+    Oddity,
+    arm_oddities,
+    flange_in_first,
+    reach,
+    urdf_oddities,
+)
+
+STANDARD = 9.80665  # m/s2
+SENSIBLE_GRAVITY, EARTH = 1.5, 0.1  # m/s2 beside the standard: no place, no place on the ground
+COARSEST, COARSE, FINE = 0.01, 1e-3, 1e-7  # m: 1 sigma of no instrument, of few instruments
+COLD, HOT = (-60.0, -20.0), (150.0, 60.0)  # °C: never, hardly
+SOFTEST, SOFT = 1.0, 0.01  # rad/Nm: no joint, few joints
+CALIBRATED, MUCH = 0.1, 0.02  # m at the flange: no factory calibration, few
+HEAVIEST_LOAD, HEAVY_LOAD = 3000.0, 300.0  # kg, where the arm's rating is not known
+DISPLACED = 2.0  # times the reach, and a metre: no tool is that long
+
+
+class Findings(NamedTuple):
+    """Lines that name file, line, key, what was found and what was expected."""
+
+    errors: list[str]
+    warnings: list[str]
+
+
+def findings(file: CellFile, document: Document, arm: Arm) -> Findings:
+    """Return what cannot be meant in a cell's values (errors), and what is odd (warnings)."""
+    errors: list[str] = []
+    warnings: list[str] = []
+    for oddity in oddities(file, document, arm):
+        place = f"{document.path}, line {document.line(oddity.keys)}: {key_path(oddity.keys)}"
+        inside = f": {oddity.where}" if oddity.where else ""
+        line = f"{place}{inside}: found {oddity.found}, expected {oddity.expected}"
+        (errors if oddity.sure else warnings).append(line)
+    return Findings(errors, warnings)
+
+
+def oddities(file: CellFile, document: Document, arm: Arm) -> Iterator[Oddity]:
+    """Yield every value of a cell that cannot be meant, or hardly; the arm's own come first."""
+    yield from _robot(file, document, arm)
+    far = reach(arm)
+    tcp = file.tool.tcp
+    yield from _length(("tool", "tcp", "xyz"), tcp.xyz, far, "of the TCP")
+    yield from _angles(("tool", "tcp", "rpy"), tcp.rpy)
+    yield from _payload(("payload",), file.payload, arm, far)
+    yield from _surroundings(file)
+    yield from _metrology(file)
+    for key in ("axial", "radial"):
+        for i, value in enumerate(getattr(file.compliance, key) or []):
+            if value > SOFT:
+                yield Oddity(
+                    ("compliance", key, i), f"{value:g}", "rad/Nm (a stiffness, in Nm/rad?)"
+                    if value > SOFTEST else "at most 0.01 rad/Nm", sure=value > SOFTEST,
+                )  # fmt: skip
+    if file.ft_sensor is not None:
+        mounted = file.ft_sensor.sensor_in_flange
+        yield from _length(("ft_sensor", "sensor_in_flange", "xyz"), mounted.xyz, far, "")
+        yield from _angles(("ft_sensor", "sensor_in_flange", "rpy"), mounted.rpy)
+    if file.simulation.payload is not None:
+        yield from _payload(("simulation", "payload"), file.simulation.payload, arm, far)
+    for i, angle in enumerate(file.simulation.start_q or []):
+        if abs(angle) > TURNS:
+            yield Oddity(("simulation", "start_q", i), f"{angle:g}", "rad (it looks like degrees)")
+
+
+def _robot(file: CellFile, document: Document, arm: Arm) -> Iterator[Oddity]:
+    robot = file.robot
+    if robot.dh is not None and robot.model is None and robot.urdf is None:
+        yield from _dh(file, arm)
+        yield from arm_oddities(arm, ("robot", "dh"))
+    if robot.urdf is not None:
+        yield from urdf_oddities(document.path.parent / robot.urdf, arm)
+        yield from arm_oddities(arm, ("robot", "urdf"))
+    if robot.model is not None and robot.calibration is not None:
+        yield from _calibration(robot.model, arm)
+
+
+def _dh(file: CellFile, arm: Arm) -> Iterator[Oddity]:
+    """Yield lengths in mm and angles in degrees of DH rows.
+
+    Lengths count only where the arm comes out too long: of a calibration they may cancel.
+    """
+    rows = file.robot.dh or []
+    longest = max(range(len(rows)), key=lambda i: max(abs(rows[i].a), abs(rows[i].d)))
+    if reach(arm) > 20.0:
+        row = rows[longest]
+        key = "a" if abs(row.a) > abs(row.d) else "d"
+        yield Oddity(
+            ("robot", "dh", longest, key), f"{getattr(row, key):g}", "m (it looks like mm)"
+        )
+    for i, row in enumerate(rows):
+        for key in ("alpha", "offset"):
+            if abs(value := getattr(row, key)) > TURN:
+                yield Oddity(("robot", "dh", i, key), f"{value:g}", "rad (it looks like degrees)")
+
+
+def _calibration(model: str, arm: Arm) -> Iterator[Oddity]:
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (16, arm.n))
+    nominal = builtin_arm(model)
+    apart = (nominal.link_in_link[0] @ flange_in_first(nominal, q))[:, :3, 3]
+    apart = apart - (arm.link_in_link[0] @ flange_in_first(arm, q))[:, :3, 3]
+    shift = float(np.linalg.norm(apart, axis=1).max())
+    if shift > MUCH:
+        yield Oddity(
+            ("robot", "calibration"), f"deltas that move the flange by {1e3 * shift:.3g} mm",
+            f"a factory calibration of a {model}: a few mm", sure=shift > CALIBRATED,
+        )  # fmt: skip
+
+
+def _length(
+    keys: tuple[str | int, ...], xyz: list[float] | tuple[float, ...], far: float, what: str
+) -> Iterator[Oddity]:
+    size = float(np.linalg.norm(xyz))
+    found = f"{size:.4g} m {what} from the flange".replace("  ", " ")
+    if size > DISPLACED * far + 1.0:
+        yield Oddity(keys, found, f"m (it looks like mm: the arm reaches {far:.2f} m)")
+    elif size > far:
+        yield Oddity(keys, found, f"less than the arm's reach, {far:.2f} m", sure=False)
+
+
+def _angles(keys: tuple[str | int, ...], rpy: list[float] | tuple[float, ...]) -> Iterator[Oddity]:
+    worst = max(abs(v) for v in rpy)
+    if worst > TURN:
+        yield Oddity(keys, f"{worst:g}", "rad (it looks like degrees)")
+    elif worst > 3.2:
+        yield Oddity(keys, f"{worst:g}", "rad, at most half a turn", sure=False)
+
+
+def _payload(
+    keys: tuple[str | int, ...], payload: Payload, arm: Arm, far: float
+) -> Iterator[Oddity]:
+    yield from _length((*keys, "cog"), payload.cog, far, "of the centre of gravity")
+    if np.isfinite(arm.payload):
+        bounds = LoadBounds.of(Model(arm=arm))
+        moment = payload.mass * float(np.linalg.norm(payload.cog))
+        if moment > LEVER * bounds.mass:
+            yield Oddity(
+                (*keys, "cog"), f"{payload.mass:g} kg at {np.linalg.norm(payload.cog):.3g} m",
+                f"at most {LEVER * bounds.mass:.3g} kg m ({arm.name})", sure=False,
+            )  # fmt: skip
+        return
+    own = float(arm.mass.sum())
+    for most, sure in ((HEAVIEST_LOAD, True), (own or HEAVY_LOAD, False)):
+        if payload.mass > most:
+            expected = "kg (grams?)" if sure else f"at most {most:.3g} kg"
+            yield Oddity((*keys, "mass"), f"{payload.mass:g} kg", expected, sure=sure)
+            return
+
+
+def _surroundings(file: CellFile) -> Iterator[Oddity]:
+    size = float(np.linalg.norm(file.gravity))
+    if size == 0.0:
+        yield Oddity(("gravity",), "0", "9.80665 m/s2: without it no weight bends", sure=False)
+    elif abs(size - STANDARD) > SENSIBLE_GRAVITY:
+        yield Oddity(("gravity",), f"a length of {size:g}", "9.80665 m/s2, along base axes")
+    elif abs(size - STANDARD) > EARTH:
+        yield Oddity(("gravity",), f"a length of {size:g}", "9.7 to 9.9 m/s2", sure=False)
+    value = file.reference_temperature
+    if not COLD[0] <= value <= HOT[0]:
+        yield Oddity(("reference_temperature",), f"{value:g}", "°C (it looks like kelvin)")
+    elif not COLD[1] <= value <= HOT[1]:
+        yield Oddity(("reference_temperature",), f"{value:g}", "°C (Fahrenheit?)", sure=False)
+
+
+def _metrology(file: CellFile) -> Iterator[Oddity]:
+    entry = file.metrology
+    for key, value in (("sigma", entry.sigma), ("repeatability", entry.repeatability)):
+        if value is None:
+            continue
+        keys = ("metrology", key)
+        if value >= COARSEST:
+            yield Oddity(keys, f"{value:g}", "m, 1 sigma of one coordinate (it looks like mm)")
+        elif value > COARSE:
+            yield Oddity(keys, f"{value:g} m", "less than 0.001 m", sure=False)
+        elif 0.0 < value < FINE:
+            yield Oddity(keys, f"{value:g} m", "more than 1e-7 m", sure=False)

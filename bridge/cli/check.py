@@ -1,0 +1,50 @@
+"""``gapbridge check``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from bridge.cell import load_cell
+from bridge.cell.cell import complaints
+from bridge.cell.live import live_findings
+from bridge.cell.run_settings import read_configuration
+from bridge.cli.options import cell_argument
+from core.errors import InputError
+
+
+@click.command()
+@cell_argument
+@click.option("--live", is_flag=True, help="Compare with the controller too; moves nothing.")
+def check(cell: Path, live: bool) -> None:
+    """Say whether a cell is fit to be used: everything that is wrong or odd in it, with its line.
+
+    Units by their size (m, rad, kg, °C), reach, masses, limits; what cannot be meant is an error,
+    what is only odd a warning. With --live also the controller's TCP, payload, gravity, geometry
+    and rate beside the cell's. Exits 0 where the cell is fit, 2 where it is not.
+
+    Example: gapbridge check config/ur10e_simulated.yaml --live
+    """
+    errors = complaints(cell)
+    warnings: list[str] = []
+    if not errors:
+        given = load_cell(cell)
+        warnings += given.warnings
+        if given.file.link is not None:
+            try:
+                read_configuration(cell)  # what only a run reads: profiles, tokens, credentials
+            except InputError as error:
+                errors.append(str(error))
+        if live and not errors:
+            found = live_findings(given)
+            errors += found.errors
+            warnings += found.warnings
+    for line in warnings:
+        click.echo(f"warning: {line}", err=True)
+    for line in errors:
+        click.echo(f"error: {line}", err=True)
+    if errors:
+        raise click.exceptions.Exit(2)
+    counted = f", {len(warnings)} warning{'s' * (len(warnings) != 1)}" if warnings else ""
+    click.echo(f"{cell}: fit to be used{' with its controller' * live}{counted}")

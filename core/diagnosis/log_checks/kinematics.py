@@ -1,0 +1,172 @@
+"""Kinematics that are another arm's: joint orders, modified DH rows, signs and units of lengths.
+
+Where no frame brings measured and predicted poses together, each mistake that people make with a
+model is tried, and the one that fits is named.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arm import Arm
+from core.estimation.registration import register
+from core.model import Model
+from core.rotation import rotation_matrix
+
+Array = NDArray[np.float64]
+MANY = 6  # joints up to which all orders are tried: 720
+SCREENED = 24  # rows that an order is judged on before all are
+NEAR = 1e-6  # m, rad: frames that are standard DH rows
+
+
+def other_models(model: Model) -> Iterator[tuple[str, Model]]:
+    """Yield what the model may have been taken for, with the model that puts it right."""
+    bare = np.eye(4)
+    if np.linalg.norm(model.tool_in_flange[:3, 3]) > 0:
+        bare[:3, :3] = model.tool_in_flange[:3, :3]
+        yield (
+            "they look like the flange's, not the TCP's (tool.tcp)",
+            replace(model, tool_in_flange=bare),
+        )
+        turned = model.tool_in_flange.copy()
+        turned[:3, 3] *= -1
+        yield "tool.tcp looks turned round in sign", replace(model, tool_in_flange=turned)
+    rows = None if model.arm.joint_names else dh_rows(model.arm)
+    if rows is None:
+        return
+    yield (
+        "robot.dh looks like modified DH rows (Craig), expected standard ones",
+        replace(model, arm=_modified(model.arm, rows)),
+    )
+    for key, column in (("a", 0), ("alpha", 1), ("d", 2), ("offset", 3)):
+        if not np.any(rows[:, column]):
+            continue
+        changed = rows.copy()
+        changed[:, column] *= -1
+        yield (
+            f"{key} of the DH rows looks turned round in sign",
+            replace(model, arm=_standard(model.arm, changed)),
+        )
+    for unit, size in (("inches", 0.0254), ("centimetres", 0.01)):
+        changed = rows * [size, 1.0, size, 1.0]
+        yield (
+            f"lengths of the DH rows look like {unit}, expected m",
+            replace(model, arm=_standard(model.arm, changed)),
+        )
+
+
+def best_order(model: Model, q: Array, seen: Array) -> tuple[str, Array] | None:
+    """Return the order of joints that fits positions (N, 3) best, in words, and q in it.
+
+    All orders of up to six joints; of more, exchanges of two and cyclic shifts. None where the
+    order as it stands is the best.
+    """
+    n = q.shape[1]
+    rows = np.unique(np.linspace(0, len(q) - 1, SCREENED).astype(int))
+    few, target = q[rows], seen[rows]
+    orders = list(_orders(n))
+    stacked = model.rigid_pose(np.concatenate([few[:, order] for order in orders])).position
+    best, chosen = np.inf, orders[0]
+    for order, predicted in zip(orders, np.split(stacked, len(orders)), strict=True):
+        apart = register(target, predicted).in_base(target) - predicted
+        left = float(np.median(np.linalg.norm(apart, axis=1)))
+        if left < best - 1e-12:
+            best, chosen = left, order
+    if chosen == tuple(range(n)):
+        return None
+    return _in_words(chosen), q[:, chosen]
+
+
+def _orders(n: int) -> Iterator[tuple[int, ...]]:
+    own = tuple(range(n))
+    yield own
+    if n <= MANY:
+        if n > 2:
+            yield _exchanged(own, 0, 2)  # ROS sorts a UR's joints by name: elbow first
+        yield from (order for order in itertools.permutations(own) if order != own)
+        return
+    yield from (_exchanged(own, i, j) for i, j in itertools.combinations(own, 2))
+    yield from (own[k:] + own[:k] for k in range(1, n))
+    yield own[::-1]
+
+
+def _exchanged(order: tuple[int, ...], i: int, j: int) -> tuple[int, ...]:
+    swapped = list(order)
+    swapped[i], swapped[j] = swapped[j], swapped[i]
+    return tuple(swapped)
+
+
+def _in_words(order: tuple[int, ...]) -> str:
+    """Return what is wrong with the order: ``order[i]`` is the column that is joint i + 1."""
+    n = len(order)
+    moved = [i for i in range(n) if order[i] != i]
+    if order == tuple(range(n))[::-1]:
+        return "the joints look turned round in order"
+    if len(moved) == 2:
+        i, j = moved
+        hint = (
+            " (a UR's elbow and shoulder pan, as sorted by name)" if (i, j, n) == (0, 2, 6) else ""
+        )
+        return f"joints {i + 1} and {j + 1} look swapped{hint}"
+    columns = ", ".join(f"joint {i + 1} is column _{order[i]}" for i in moved)
+    return f"the joints look out of order: {columns}"
+
+
+def inverted(seen: Array, turned: Array) -> Array:
+    """Return positions (N, 3) of inverted poses: what was measured in the tool's frame."""
+    return np.asarray(-np.einsum("nji,nj->ni", rotation_matrix(turned), seen))
+
+
+def dh_rows(arm: Arm) -> Array | None:
+    """Return standard DH rows (n, 4) a, alpha, d, offset of an arm; None where it has none."""
+    rows = np.zeros((arm.n, 4))
+    before = arm.link_in_link[0]
+    if np.abs(before[:3, 3]).max() > NEAR or abs(before[2, 2] - 1) > NEAR:
+        return None
+    rows[0, 3] = np.arctan2(before[1, 0], before[0, 0])
+    for i in range(arm.n):
+        link = arm.link_in_link[i + 1]
+        # Tz(d) Tx(a) Rx(alpha) and the next row's Rz(offset)
+        alpha = np.arctan2(-link[1, 2], link[2, 2])
+        offset = np.arctan2(-link[0, 1], link[0, 0])
+        rows[i, :3] = link[0, 3], alpha, link[2, 3]
+        if i + 1 < arm.n:
+            rows[i + 1, 3] = offset
+        if np.abs(link - _link(link[0, 3], alpha, link[2, 3], offset)).max() > NEAR:
+            return None
+    return rows
+
+
+def _link(a: float, alpha: float, d: float, offset: float) -> Array:
+    return _turn("z", 0.0, d) @ _turn("x", alpha, a) @ _turn("z", offset, 0.0)
+
+
+def _turn(axis: str, angle: float, along: float) -> Array:
+    """Return a screw (4, 4) about and along an axis."""
+    c, s, frame = np.cos(angle), np.sin(angle), np.eye(4)
+    i, j, k = (1, 2, 0) if axis == "x" else (0, 1, 2)
+    frame[i, i], frame[i, j], frame[j, i], frame[j, j] = c, -s, s, c
+    frame[k, 3] = along
+    return frame
+
+
+def _standard(arm: Arm, rows: Array) -> Arm:
+    links = [_turn("z", rows[0, 3], 0.0)]
+    offsets = [*rows[1:, 3], 0.0]
+    links += [_link(*row[:3], offset) for row, offset in zip(rows, offsets, strict=True)]
+    return replace(arm, link_in_link=np.array(links))
+
+
+def _modified(arm: Arm, rows: Array) -> Arm:
+    """Return the arm whose rows are Craig's: Rx(alpha) Tx(a) Rz(q + offset) Tz(d)."""
+    links, before = [], 0.0
+    for a, alpha, d, offset in rows:
+        links.append(_turn("z", 0.0, before) @ _turn("x", alpha, a) @ _turn("z", offset, 0.0))
+        before = d
+    links.append(_turn("z", 0.0, before))
+    return replace(arm, link_in_link=np.array(links))

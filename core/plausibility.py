@@ -1,0 +1,132 @@
+"""Whether an arm can be one: reach, masses, limits, and what its URDF says before it is an arm.
+
+A length in millimetres or an angle in degrees is a hundred or a thousand times too large, which no
+arm is: such values are mistakes. What only few arms are is odd.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arm import Arm
+from core.files import read_text
+
+Array = NDArray[np.float64]
+POSES = 64
+LONGEST, LONG, SHORT = 20.0, 5.0, 0.05  # m of reach: no arm, few arms, few arms
+TURN = 6.4  # rad: a little more than one turn; a fixed angle beyond is in degrees
+TURNS = 25.0  # rad: no revolute joint is limited further out
+QUICK = 60.0  # rad/s: no joint of an arm turns quicker
+HEAVY, HEAVIEST = 500.0, 5000.0  # kg of one link: few arms, no arm
+
+
+@dataclass(frozen=True)
+class Oddity:
+    """One value that cannot be meant as it stands, or hardly.
+
+    ``keys`` is its path in the cell, where it stands there; ``where`` a place in another file.
+    """
+
+    keys: tuple[str | int, ...]
+    found: str
+    expected: str
+    sure: bool = True
+    where: str = ""
+
+
+def reach(arm: Arm, seed: int = 0) -> float:
+    """Return how far (m) the flange gets from joint 1, by random poses.
+
+    Poses rather than the sum of lengths: lengths of a factory calibration may be hundreds of metres
+    that cancel.
+    """
+    q = np.random.default_rng(seed).uniform(-np.pi, np.pi, (POSES, arm.n))
+    return float(np.linalg.norm(flange_in_first(arm, q)[:, :3, 3], axis=1).max())
+
+
+def flange_in_first(arm: Arm, q: Array) -> Array:
+    """Return the rigid flange (N, 4, 4) in joint 1's frame at zero, for q (N, n) in rad."""
+    frame = np.tile(np.eye(4), (len(q), 1, 1))
+    for i in range(arm.n):
+        c, s = np.cos(q[:, i]), np.sin(q[:, i])
+        turn = np.tile(np.eye(4), (len(q), 1, 1))
+        turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1] = c, -s, s, c
+        frame = frame @ turn @ arm.link_in_link[i + 1]
+    return np.asarray(frame)
+
+
+def arm_oddities(arm: Arm, keys: tuple[str | int, ...]) -> Iterator[Oddity]:
+    """Yield what is odd about an arm as a whole; ``keys`` is where the cell names it."""
+    far = reach(arm)
+    if far > LONGEST:
+        yield Oddity(keys, f"an arm of {far:.4g} m reach", "lengths in m (these look like mm)")
+    elif not SHORT <= far <= LONG:
+        yield Oddity(keys, f"an arm of {far:.3g} m reach", "0.05 to 5 m", sure=False)
+    for i, mass in enumerate(arm.mass):
+        if mass < 0 or mass > HEAVIEST:
+            yield Oddity(keys, f"a link {i + 1} of {mass:.4g} kg", "kg (grams?)")
+        elif mass > HEAVY:
+            yield Oddity(keys, f"a link {i + 1} of {mass:.4g} kg", "at most 500 kg", sure=False)
+        away = float(np.linalg.norm(arm.cog[i])) if mass > 0 else 0.0
+        if far <= LONGEST and away > 2.0 * far + 1.0:
+            yield Oddity(keys, f"a centre of gravity of link {i + 1} {away:.4g} m off", "m (mm?)")
+    weightless = [str(i + 1) for i in range(arm.n) if arm.mass[i] == 0]
+    if len(weightless) == arm.n:
+        yield Oddity(
+            keys, "an arm without masses", "the links' masses: without them only payload and "
+            "pulls bend the model", sure=False,
+        )  # fmt: skip
+    elif weightless:
+        yield Oddity(keys, f"no mass of link {', '.join(weightless)}", "one", sure=False)
+
+
+def urdf_oddities(
+    path: Path, arm: Arm | None = None, keys: tuple[str | int, ...] = ("robot", "urdf")
+) -> Iterator[Oddity]:
+    """Yield what cannot be meant in a URDF; ``arm``: the arm that was made of it."""
+    text = read_text(path)
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError:
+        return
+    used = () if arm is None else arm.joint_names
+    for joint in root.findall("joint"):
+        name = str(joint.get("name"))
+        found = re.search(rf"<joint\b[^>]*\bname\s*=\s*[\"']{re.escape(name)}[\"']", text)
+        line = 1 + text.count("\n", 0, found.start()) if found else 1
+        where = f"{path}, line {line}: joint {name!r}"
+        if name in used and joint.find("mimic") is not None:
+            yield Oddity(
+                keys, "<mimic>", "a motor of its own for every joint between base and flange: "
+                "this one follows another", where=where,
+            )  # fmt: skip
+        origin, limit = joint.find("origin"), joint.find("limit")
+        if (far := _largest(origin, "xyz")) > LONGEST:
+            yield Oddity(keys, f"origin xyz {far:g}", "m (it looks like mm)", where=where)
+        if (angle := _largest(origin, "rpy")) > TURN:
+            yield Oddity(keys, f"origin rpy {angle:g}", "rad (it looks like degrees)", where=where)
+        if joint.get("type") != "revolute":
+            continue
+        for key, most in (("lower", TURNS), ("upper", TURNS), ("velocity", QUICK)):
+            if (value := _largest(limit, key)) > most:
+                yield Oddity(
+                    keys, f"limit {key} {value:g}", "rad (it looks like degrees)", where=where
+                )
+
+
+def _largest(element: ElementTree.Element | None, key: str) -> float:
+    """Return the largest magnitude in an attribute; 0 where it is not there or no number."""
+    try:
+        return max(
+            (abs(float(v)) for v in str((element.get(key) if element is not None else None) or "")
+             .split()), default=0.0,
+        )  # fmt: skip
+    except ValueError:
+        return 0.0

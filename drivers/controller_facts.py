@@ -1,0 +1,138 @@
+"""What a controller says of its arm, and where a cell says otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arm import Arm
+from core.estimation.registration import register_robustly
+from core.model import Model
+from core.plausibility import flange_in_first
+
+Array = NDArray[np.float64]
+TCP_TURNED = 0.02  # rad: turned further, the controller's TCP is not the cell's
+OTHER_ARM, OTHER_CALIBRATION = 0.01, 5e-5  # m at the flange, in the frame that fits best
+MASS, COG = 0.1, 0.005  # kg, m: the controller's payload beside the cell's
+TILTED = 0.2  # m/s2 of gravity
+POSES = 24
+
+
+@dataclass(frozen=True)
+class ControllerFacts:
+    """What a controller says of itself; None where it does not say it."""
+
+    n: int  # joints
+    model: str | None = None  # a built-in arm
+    version: str | None = None
+    arm: Arm | None = None  # nominal geometry with the factory calibration
+    calibration: Mapping[str, Sequence[float]] = field(default_factory=dict)  # delta_*
+    tcp: Array | None = None  # (4, 4) TCP in the flange frame
+    payload: float | None = None  # kg
+    payload_cog: Array | None = None  # (3,) m, flange frame
+    gravity: Array | None = None  # (3,) m/s2 in base; its sign is not known
+    rate: float | None = None  # Hz, most cycles per second
+    lower: Array | None = None  # (n,) rad
+    upper: Array | None = None  # (n,) rad
+    velocity: Array | None = None  # (n,) rad/s
+    q: Array | None = None  # (n,) rad, now
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One value of the cell that is not the controller's; ``sure``: nothing may be written so."""
+
+    keys: tuple[str, ...]  # of the cell
+    found: str
+    expected: str
+    sure: bool = True
+
+
+def differences(
+    facts: ControllerFacts, model: Model, rate: float | None = None, tolerance: float = 0.005
+) -> list[Difference]:
+    """Return where a cell's model (and ``link.rate``, Hz) differs from its controller.
+
+    ``tolerance``: m that the controller's TCP may be from the cell's.
+    """
+    if facts.n != model.arm.n:
+        return [Difference(("robot",), f"{model.arm.n} joints", f"{facts.n}, as the controller")]
+    found = [*_geometry(facts, model), *_tool(facts, model, tolerance), *_load(facts, model)]
+    if rate is not None and facts.rate is not None and rate > 1.02 * facts.rate:
+        found.append(
+            Difference(("link", "rate"), f"{rate:g} Hz", f"at most {facts.rate:g} Hz", sure=False)
+        )
+    return found
+
+
+def _geometry(facts: ControllerFacts, model: Model) -> Iterator[Difference]:
+    if facts.arm is not None:
+        q = np.random.default_rng(0).uniform(-np.pi, np.pi, (POSES, facts.n))
+        theirs = flange_in_first(facts.arm, q)[:, :3, 3]
+        ours = flange_in_first(model.arm, q)[:, :3, 3]
+        off = np.linalg.norm(register_robustly(ours, theirs).in_base(ours) - theirs, axis=1)
+        apart, name = float(off.max()), facts.model or "the controller's arm"
+        if apart > OTHER_ARM:
+            yield Difference(
+                ("robot",), f"an arm whose flange is up to {1e3 * apart:.0f} mm from the "
+                "controller's", f"a {name} with its factory calibration",
+            )  # fmt: skip
+        elif apart > OTHER_CALIBRATION:
+            yield Difference(
+                ("robot", "calibration"), f"geometry up to {1e3 * apart:.2f} mm from the "
+                "controller's", "its factory calibration (gapbridge init writes it)", sure=False,
+            )  # fmt: skip
+    now, limits = facts.q, model.arm.limits
+    if now is None:
+        return
+    beyond = (now < limits.lower - 0.05) | (now > limits.upper + 0.05)
+    if beyond.any():
+        joint = int(np.argmax(beyond))
+        yield Difference(
+            ("robot",), f"joint limits that joint {joint + 1} is beyond, at {now[joint]:.3f} rad",
+            "the arm that stands there", sure=False,
+        )  # fmt: skip
+
+
+def _tool(facts: ControllerFacts, model: Model, tolerance: float) -> Iterator[Difference]:
+    if facts.tcp is None:
+        return
+    ours, theirs = model.tool_in_flange, facts.tcp
+    apart = float(np.linalg.norm(ours[:3, 3] - theirs[:3, 3]))
+    cosine = 0.5 * (float(np.trace(ours[:3, :3].T @ theirs[:3, :3])) - 1.0)
+    turned = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    if apart > 1e-5 or turned > 1e-4:
+        said = ", ".join(f"{v:.5g}" for v in theirs[:3, 3])
+        # the flange of a URDF may have other axes than the controller's
+        sure = (apart > tolerance or turned > TCP_TURNED) and not model.arm.joint_names
+        yield Difference(
+            ("tool", "tcp"), f"a TCP {1e3 * apart:.3g} mm and {turned:.2g} rad from the "
+            "controller's", f"the same TCP in both (controller: xyz [{said}])", sure=sure,
+        )  # fmt: skip
+
+
+def _load(facts: ControllerFacts, model: Model) -> Iterator[Difference]:
+    if facts.payload is not None and abs(facts.payload - model.payload_mass) > MASS:
+        yield Difference(
+            ("payload", "mass"), f"{model.payload_mass:g} kg",
+            f"{facts.payload:g} kg, as the controller has it", sure=False,
+        )  # fmt: skip
+    cog = facts.payload_cog
+    if cog is not None and facts.payload and np.linalg.norm(cog - model.payload_cog) > COG:
+        said = ", ".join(f"{v:.4g}" for v in cog)
+        yield Difference(
+            ("payload", "cog"), f"[{', '.join(f'{v:g}' for v in model.payload_cog)}]",
+            f"[{said}], as the controller has it", sure=False,
+        )  # fmt: skip
+    given = facts.gravity
+    if given is not None and np.linalg.norm(given) > 1.0:
+        apart = min(float(np.linalg.norm(sign * given - model.gravity)) for sign in (1.0, -1.0))
+        if apart > TILTED:
+            said = ", ".join(f"{v:.4g}" for v in given)
+            yield Difference(
+                ("gravity",), f"[{', '.join(f'{v:g}' for v in model.gravity)}]",
+                f"along [{said}], as the controller has it (either sign)",
+            )  # fmt: skip

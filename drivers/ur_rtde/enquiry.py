@@ -1,0 +1,196 @@
+"""What a UR controller says of its arm: RTDE (TCP, payload) and the primary interface.
+
+Reads only: no input is claimed, no program touched. Sources: Universal Robots, RTDE guide (port
+30004), and the client interfaces' description of the primary interface (port 30001): packages of
+int32 size and int8 type, robot states (16) of sub-packages, kinematics info (5) with the factory
+calibration, configuration data (6) with joint limits and nominal DH rows; big-endian.
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.arm import builtin_arm, builtin_names, builtin_rows
+from core.errors import LinkError
+from core.rotation import rotation_matrix, transform
+from drivers.controller_facts import ControllerFacts
+
+Array = NDArray[np.float64]
+RTDE, PRIMARY = 30004, 30001
+N = 6
+SAME = 1e-3  # m, rad: nominal DH rows of one model
+TIMEOUT = 2.0  # s for each of the two
+STATE, KINEMATICS, CONFIGURATION = 16, 5, 6  # types of a package and its sub-packages
+LARGEST = 1 << 20  # bytes of a package
+_FIELDS = {
+    "tcp_offset": 6, "payload": 1, "payload_cog": 3, "target_gravity": 3, "actual_q": 6,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PrimaryFacts:
+    """What the primary interface says: rows are (theta, a, d, alpha) of each joint."""
+
+    calibrated: Array | None = None  # (6, 4) rad, m, m, rad
+    nominal: Array | None = None  # (6, 4)
+    limits: Array | None = None  # (6, 3): lower, upper (rad), velocity (rad/s)
+
+
+def enquire(host: str, rtde_port: int = RTDE, primary_port: int = PRIMARY) -> ControllerFacts:
+    """Return what a UR controller says of itself.
+
+    Where its primary interface cannot be read, model, calibration and limits stay None. Raises
+    LinkError where RTDE cannot.
+    """
+    try:
+        version, said = _rtde(host, rtde_port)
+    except (OSError, EOFError, struct.error) as error:
+        words = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        raise LinkError(f"{host}: found no answer on RTDE's port {rtde_port}: {words}") from None
+    try:
+        primary = read_primary(host, primary_port)
+    except (OSError, EOFError, struct.error):
+        primary = PrimaryFacts()
+    model = None if primary.nominal is None else model_of(primary.nominal)
+    deltas = {}
+    if model is not None and primary.calibrated is not None and primary.nominal is not None:
+        apart = primary.calibrated - nominal_rows(model)
+        deltas = {f"delta_{key}": apart[:, i].tolist()
+                  for i, key in enumerate(("theta", "a", "d", "alpha"))}  # fmt: skip
+    limits, tcp = primary.limits, said.get("tcp_offset")
+    return ControllerFacts(
+        n=N,
+        model=model,
+        version=".".join(str(v) for v in version[:3]),
+        arm=None if model is None else builtin_arm(model, deltas),
+        calibration=deltas,
+        tcp=None if tcp is None else transform(rotation_matrix(tcp[3:]), tcp[:3]),
+        payload=None if "payload" not in said else float(said["payload"][0]),
+        payload_cog=said.get("payload_cog"),
+        gravity=said.get("target_gravity"),
+        rate=500.0 if version[0] >= 5 else 125.0,
+        lower=None if limits is None else limits[:, 0],
+        upper=None if limits is None else limits[:, 1],
+        velocity=None if limits is None else limits[:, 2],
+        q=said.get("actual_q"),
+    )
+
+
+def nominal_rows(model: str) -> Array:
+    """Return (6, 4) theta, a, d, alpha of a built-in arm."""
+    rows = builtin_rows(model)["dh"]
+    return np.array([[r.get("offset", 0.0), r["a"], r["d"], r["alpha"]] for r in rows], dtype=float)
+
+
+def model_of(nominal: Array) -> str | None:
+    """Return the built-in arm that has nominal rows (6, 4), or None."""
+    for name in builtin_names():
+        rows = nominal_rows(name)
+        if rows.shape == nominal.shape and np.abs(rows - nominal).max() < SAME:
+            return name
+    return None
+
+
+# -- RTDE ---------------------------------------------------------------------------------------
+
+
+def _rtde(host: str, port: int) -> tuple[tuple[int, ...], dict[str, Array]]:
+    """Return the controller's version and one sample of the fields that it has."""
+    with socket.create_connection((host, port), TIMEOUT) as link, link.makefile("rb") as answers:
+
+        def ask(kind: str, payload: bytes = b"") -> bytes:
+            link.sendall(struct.pack(">HB", 3 + len(payload), ord(kind)) + payload)
+            return _answer(answers, kind)
+
+        ask("V", struct.pack(">H", 2))
+        version = struct.unpack(">4I", ask("v")[:16])
+        names = list(_FIELDS)
+        for _ in range(2):
+            types = ask("O", struct.pack(">d", 125.0) + ",".join(names).encode())[1:]
+            kinds = types.decode("ascii", "replace").split(",")
+            known = [n for n, k in zip(names, kinds, strict=False) if k != "NOT_FOUND"]
+            if known == names:
+                break
+            names = known
+        ask("S")
+        body = _answer(answers, "U")[1:]
+    values = np.array(struct.unpack(f">{len(body) // 8}d", body[: 8 * (len(body) // 8)]))
+    if len(values) != sum(_FIELDS[n] for n in names) or not np.isfinite(values).all():
+        raise EOFError(f"found {len(values)} numbers in a sample of {', '.join(names)}")
+    said, start = {}, 0
+    for name in names:
+        said[name] = values[start : start + _FIELDS[name]]
+        start += _FIELDS[name]
+    return version, said
+
+
+def _answer(answers: Any, kind: str) -> bytes:
+    while True:
+        size, got = struct.unpack(">HB", _exactly(answers, 3))
+        payload = _exactly(answers, size - 3)
+        if got == ord(kind):
+            return payload
+
+
+def _exactly(stream: Any, count: int) -> bytes:
+    data: bytes = stream.read(count) if count >= 0 else b""
+    if len(data) < max(count, 0) or count < 0:
+        raise EOFError("the connection was closed")
+    return data
+
+
+# -- the primary interface ----------------------------------------------------------------------
+
+
+def read_primary(host: str, port: int = PRIMARY) -> PrimaryFacts:
+    """Return geometry and limits from the primary interface.
+
+    Raises OSError, EOFError where it cannot be read, struct.error where it is another thing.
+    """
+    until, found = time.monotonic() + TIMEOUT, PrimaryFacts()
+    with socket.create_connection((host, port), TIMEOUT) as link, link.makefile("rb") as stream:
+        while time.monotonic() < until:
+            size, kind = struct.unpack(">ib", _exactly(stream, 5))
+            if not 5 <= size <= LARGEST:
+                raise EOFError(f"found a package of {size} bytes")
+            body = _exactly(stream, size - 5)
+            if kind != STATE:
+                continue
+            found = _with_state(found, body)
+            if found.calibrated is not None and found.nominal is not None:
+                return found
+    return found
+
+
+def _with_state(found: PrimaryFacts, body: bytes) -> PrimaryFacts:
+    calibrated, nominal, limits = found.calibrated, found.nominal, found.limits
+    for kind, part in _parts(body):
+        if kind == KINEMATICS:
+            # checksums, then theta, a, d, alpha
+            calibrated = np.array(struct.unpack_from(">24d", part, 24)).reshape(4, 6).T
+        elif kind == CONFIGURATION:
+            bounds = np.array(struct.unpack_from(">12d", part, 0)).reshape(6, 2)
+            fast = np.array(struct.unpack_from(">12d", part, 96)).reshape(6, 2)
+            limits = np.column_stack([bounds, fast[:, 0]])
+            # five lengths and speeds, then a, d, alpha, theta
+            a, d, alpha, theta = np.array(struct.unpack_from(">24d", part, 232)).reshape(4, 6)
+            nominal = np.column_stack([theta, a, d, alpha])
+    return PrimaryFacts(calibrated, nominal, limits)
+
+
+def _parts(body: bytes) -> Iterator[tuple[int, bytes]]:
+    start = 0
+    while start + 5 <= len(body):
+        size, kind = struct.unpack_from(">IB", body, start)
+        if size < 5 or start + size > len(body):
+            raise struct.error(f"found a sub-package of {size} bytes")
+        yield kind, body[start + 5 : start + size]
+        start += size

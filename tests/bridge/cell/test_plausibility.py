@@ -1,0 +1,133 @@
+"""Values that no cell can mean, each with its line; and what is only odd."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from bridge.cell import load_cell
+from bridge.cell.cell import complaints
+from core.arm import builtin_rows
+from core.errors import CellError
+
+ARM = "robot: {model: ur10e}\n"
+URDF = """<robot name="r"><link name="base"/>
+<link name="one"><inertial><mass value="{mass}"/></inertial></link><link name="two">
+<inertial><mass value="3"/></inertial></link>
+<joint name="j1" type="revolute"><parent link="base"/><child link="one"/><axis xyz="0 0 1"/>
+<limit lower="-3" upper="3" velocity="2" effort="9"/></joint>
+<joint name="j2" type="revolute"><parent link="one"/><child link="two"/>
+<origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="0 1 0"/>
+<limit lower="{lower}" upper="2" velocity="2" effort="9"/>{more}</joint>
+<link name="flange"/><joint name="f" type="fixed"><parent link="two"/><child link="flange"/>
+<origin xyz="0 0 0.4"/></joint></robot>"""
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "cell.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def dh(**changed: float) -> str:
+    rows = [dict(row) for row in builtin_rows("ur10e")["dh"]]
+    for key, factor in changed.items():
+        for row in rows:
+            row[key] *= factor
+    return f"robot: {{dh: {rows}}}\n".replace("'", "")
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "key", "found", "expected"),
+    [
+        (ARM + "tool: {tcp: {xyz: [0, 0, 180]}}", 2, "tool.tcp.xyz", "180 m", "mm"),
+        (ARM + "tool: {tcp: {rpy: [0, 0, 90]}}", 2, "tool.tcp.rpy", "90", "degrees"),
+        (ARM + "payload: {mass: 5, cog: [0, 0, 60]}", 2, "payload.cog", "60 m", "mm"),
+        (ARM + "gravity: [0, 0, -1]", 2, "gravity", "1", "9.80665"),
+        (ARM + "gravity: [0, 0, -9810]", 2, "gravity", "9810", "9.80665"),
+        (ARM + "\nreference_temperature: 298", 3, "reference_temperature", "298", "kelvin"),
+        (ARM + "metrology: {sigma: 0.02}", 2, "metrology.sigma", "0.02", "mm"),
+        (ARM + "metrology: {repeatability: 0.05}", 2, "metrology.repeatability", "0.05", "mm"),
+        (ARM + "compliance: {axial: [1e5, 0, 0, 0, 0, 0]}", 2, "compliance.axial", "100000", "Nm"),
+        (ARM + "simulation: {start_q: [0, -90, 0, 0, 0, 0]}", 2, "start_q", "-90", "degrees"),
+        ("robot: {model: ur10e, calibration: {delta_theta: [0, 0, 0, 0, 0, 0],\n"
+         "  delta_a: [0, 0.5, 0, 0, 0, 0]}}", 1, "robot.calibration", "500 mm", "few mm"),
+        (dh(a=1e3, d=1e3), 1, "robot.dh entry 2.a", "-612.7", "mm"),
+        (dh(alpha=57.29578), 1, "robot.dh entry 1.alpha", "90", "degrees"),
+        (dh(mass=1e3), 1, "robot.dh", "7369 kg", "grams"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_meant_is_refused_with_its_line(
+    tmp_path: Path, text: str, line: int, key: str, found: str, expected: str
+) -> None:
+    path = written(tmp_path, text)
+    with pytest.raises(CellError) as caught:
+        load_cell(path)
+    told = str(caught.value)
+    assert told.startswith(f"{path}, line {line}: ")
+    assert "\n" not in told
+    said, wanted = told.split(", expected ")
+    assert key in said
+    assert found in said.split("found ")[1]
+    assert expected in wanted
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (ARM + "gravity: [0, 0, 0]", "gravity"),
+        (ARM + "gravity: [0, 0, -10]", "gravity"),
+        (ARM + "metrology: {sigma: 0.005}", "metrology.sigma"),
+        (ARM + "reference_temperature: 77", "Fahrenheit"),
+        (ARM + "tool: {tcp: {xyz: [0, 0, 1.8]}}", "reach"),
+        (ARM + "compliance: {radial: [0.05, 0, 0, 0, 0, 0]}", "rad/Nm"),
+        (dh(mass=0.0), "without masses"),
+    ],
+)
+def test_what_is_only_odd_is_a_warning(tmp_path: Path, text: str, words: str) -> None:
+    (warning,) = load_cell(written(tmp_path, text)).warnings
+    assert "cell.yaml, line " in warning
+    assert words in warning
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"xyz": "0 0 612.7"}, "line 6: joint 'j2': found origin xyz 612.7"),
+        ({"rpy": "0 90 0"}, "line 6: joint 'j2': found origin rpy 90"),
+        ({"lower": "-170"}, "line 6: joint 'j2': found limit lower 170"),
+        ({"more": "<mimic joint='j1'/>"}, "line 6: joint 'j2': found <mimic>"),
+        ({"mass": "7369"}, "found a link 1 of 7369 kg"),
+    ],
+)
+def test_a_urdf_in_other_units_is_refused_with_its_line_too(
+    tmp_path: Path, changed: dict[str, str], words: str
+) -> None:
+    given = {"xyz": "0 0 0.5", "rpy": "0 0 0", "lower": "-2", "more": "", "mass": "4"}
+    (tmp_path / "arm.urdf").write_text(URDF.format(**(given | changed)), encoding="utf-8")
+    path = written(tmp_path, "robot:\n  urdf: arm.urdf\n")
+    with pytest.raises(CellError, match=r"cell\.yaml, line 2: robot\.urdf: ") as caught:
+        load_cell(path)
+    assert words in str(caught.value)
+
+
+def test_a_sane_urdf_passes_and_one_without_a_mass_warns(tmp_path: Path) -> None:
+    given = {"xyz": "0 0 0.5", "rpy": "0 0 0", "lower": "-2", "more": "", "mass": "4"}
+    (tmp_path / "arm.urdf").write_text(URDF.format(**given), encoding="utf-8")
+    path = written(tmp_path, "robot: {urdf: arm.urdf}\n")
+    assert load_cell(path).warnings == ()
+    (tmp_path / "arm.urdf").write_text(URDF.format(**(given | {"mass": "0"})), encoding="utf-8")
+    assert "no mass of link 1" in load_cell(path).warnings[0]
+
+
+def test_lengths_of_a_calibration_that_cancel_are_right_as_they_stand(tmp_path: Path) -> None:
+    calibration = "{delta_d: [0, 439.14, -439.14, 0, 0, 0]}"
+    path = written(tmp_path, f"robot: {{model: ur10e, calibration: {calibration}}}\n")
+    assert load_cell(path).warnings == ()
+
+
+def test_everything_that_is_wrong_is_listed(tmp_path: Path) -> None:
+    text = ARM + "tool: {tcp: {xyz: [0, 0, 180]}}\ngravity: [0, 0, -1]\n"
+    lines = complaints(written(tmp_path, text))
+    assert [line.split(": ")[1] for line in lines] == ["tool.tcp.xyz", "gravity"]

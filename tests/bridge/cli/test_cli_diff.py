@@ -1,0 +1,64 @@
+"""``gapbridge diff``: what changed, in keys and millimetres."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli_runs import gapbridge, refused
+
+BEFORE = "robot: {model: ur10e}\ntool: {tcp: {xyz: [0, 0, 0.18]}}\n"
+
+
+def cells(folder: Path, after: str) -> tuple[Path, Path]:
+    paths = folder / "before.yaml", folder / "after.yaml"
+    for path, text in zip(paths, (BEFORE, after), strict=True):
+        path.write_text(text, encoding="utf-8")
+    return paths
+
+
+def test_a_longer_tool_moves_the_tcp_by_as_much_everywhere(tmp_path: Path) -> None:
+    paths = cells(tmp_path, BEFORE.replace("0.18", "0.183"))
+    answer = gapbridge("diff", *paths)
+    assert answer.code == 0
+    assert "tool.tcp.xyz: [0, 0, 0.18] -> [0, 0, 0.183]" in answer.out
+    assert "moves by 3.000 mm rms, at most 3.000 mm" in answer.out
+
+
+def test_an_effect_and_a_flexibility_are_named(tmp_path: Path) -> None:
+    more = (
+        "compliance: {axial: [0, 1e-5, 0, 0, 0, 0]}\n"
+        "effects: [{effect: joint_offset, joint: 1, parameters: {value: 0.001}}]\n"
+    )
+    answer = gapbridge("diff", *cells(tmp_path, BEFORE + more), "--json")
+    told = json.loads(answer.out)
+    assert {c["key"] for c in told["changes"]} == {
+        "effect joint_offset of joint 1", "compliance.axial"
+    }  # fmt: skip
+    assert 1e-4 < told["moved"]["rms"] < told["moved"]["largest"] < 0.02
+    assert told["moved"]["poses"] == 200
+
+
+def test_over_a_log_only_its_poses_count(tmp_path: Path) -> None:
+    more = "effects: [{effect: joint_offset, joint: 1, parameters: {value: 0.001}}]\n"
+    paths = cells(tmp_path, BEFORE + more)
+    log = tmp_path / "log.csv"
+    q = np.tile([0.0, -1.2, 1.5, -1.8, -1.5, 0.0], (3, 1)) + np.arange(3)[:, None] * 1e-4
+    names = ",".join(f"actual_q_{i}" for i in range(6))
+    np.savetxt(log, q, delimiter=",", header=names, comments="")
+    told = json.loads(gapbridge("diff", *paths, "--log", log, "--json").out)["moved"]
+    assert told["poses"] == 3
+    assert told["rms"] == pytest.approx(told["largest"], rel=1e-2)  # one place, one radius
+
+
+def test_cells_that_agree_and_cells_of_other_joints(tmp_path: Path) -> None:
+    paths = cells(tmp_path, BEFORE)
+    out = gapbridge("diff", *paths).out
+    assert "no key differs" in out
+    assert "the predicted TCP is the same" in out
+    rows = [{"a": 0.3, "alpha": 0.0, "d": 0.1, "mass": 1.0}] * 3
+    paths[1].write_text(f"robot: {{dh: {rows}}}\n".replace("'", ""), encoding="utf-8")
+    assert "cannot be compared" in gapbridge("diff", *paths).out
+    assert "not found" in refused("diff", paths[0], tmp_path / "none.yaml")
