@@ -106,7 +106,7 @@ class _Remainder:
                 steady.append(0.0)
                 continue
             inverse = np.linalg.pinv(spread[np.ix_(own, own)], hermitian=True)
-            sigmas.append(float(np.sqrt(max(b @ inverse @ b, 0.0) / len(own))))
+            sigmas.append(float(np.sqrt(max(float(b @ inverse @ b), 0.0) / len(own))))
             steady.append(min(share * DRIFT, DRIFT / share))
         return self._with_siblings(accused, np.array(sigmas), np.array(steady))
 
