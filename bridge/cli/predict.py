@@ -7,10 +7,10 @@ from pathlib import Path
 import click
 import numpy as np
 
+from bridge.api.functions import predict as predicted
 from bridge.cell.opened_log import open_log
 from bridge.cli.options import cell_option, csv_option, log_argument, open_cell, warn_outside
 from bridge.document.output_file import require_writable, write_table
-from core.errors import InputError, LogError
 
 
 @click.command()
@@ -31,15 +31,7 @@ def predict(log: Path, cell: Path, out: Path) -> None:
     rows = open_log(log, given)
     warn_outside(rows, given)
     require_writable(out, log, cell)
-    q, loads = rows.require("actual_q", "target_q"), rows.loads()
-    try:
-        if not rows.has("actual_q"):
-            q = given.model.settled(q, loads)
-        poses = given.model.predict(q, loads)
-    except LogError:
-        raise
-    except InputError as error:
-        raise InputError(f"{log}: data {error}") from None
+    found = predicted(given, rows)
     names = [f"predicted_{kind}_{i}" for kind in ("position", "rotation") for i in range(3)]
-    write_table(out, names, np.hstack([poses.position, poses.rotation_vector]))
-    click.echo(f"{out}: {len(q)} predicted poses")
+    write_table(out, names, np.hstack([found.position, found.rotation_vector]))
+    click.echo(f"{out}: {len(rows)} predicted poses")

@@ -1,0 +1,27 @@
+"""Gapbridge from Python: what the commands do, as functions that return small records.
+
+``import gapbridge`` gives the same names.
+"""
+
+from bridge.api.functions import compensate, diagnose, fit, load_cell, predict, read_log
+from bridge.api.records import Corrected, Diagnosed, Fitted, Predicted
+from bridge.cell import Cell
+from core.errors import GapbridgeError, InputError
+from core.log.log import Log
+
+__all__ = [
+    "Cell",
+    "Corrected",
+    "Diagnosed",
+    "Fitted",
+    "GapbridgeError",
+    "InputError",
+    "Log",
+    "Predicted",
+    "compensate",
+    "diagnose",
+    "fit",
+    "load_cell",
+    "predict",
+    "read_log",
+]

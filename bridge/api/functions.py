@@ -1,0 +1,99 @@
+"""The commands as functions: same checks, same results, nothing printed but a source's notes.
+
+All raise InputError, one clear line, for what cannot be used.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from bridge.api.records import Corrected, Diagnosed, Fitted, Predicted
+from bridge.cell import Cell, load_cell
+from bridge.cell.opened_log import open_log
+from bridge.document.provenance import fitted, provenance
+from core.compensation import correct
+from core.errors import InputError, LogError
+from core.log.log import Log
+from core.sessions import join_sessions
+
+__all__ = ["compensate", "diagnose", "fit", "load_cell", "predict", "read_log"]
+
+
+def read_log(path: Path | str | Sequence[Path | str], cell: Cell) -> Log:
+    """Return a log for a cell's arm, checked; several paths are sessions of one arm."""
+    paths = [path] if isinstance(path, (str, Path)) else list(path)
+    return join_sessions([open_log(Path(one), cell) for one in paths], cell.model)
+
+
+def predict(cell: Cell, log: Log) -> Predicted:
+    """Return the TCP pose that the cell's model predicts for every row; ``gapbridge predict``.
+
+    Joints are ``actual_q``; where there is none, ``target_q`` less what the servos are known to
+    give way.
+    """
+    q, loads = log.require("actual_q", "target_q"), log.loads()
+    try:
+        if not log.has("actual_q"):
+            q = cell.model.settled(q, loads)
+        poses = cell.model.predict(q, loads)
+    except LogError:
+        raise
+    except InputError as error:
+        raise InputError(f"{log.path}: data {error}") from None
+    return Predicted(poses.position, poses.rotation_vector)
+
+
+def compensate(cell: Cell, log: Log) -> Corrected:
+    """Return the setpoint of every row whose predicted real pose is the rigid arm's at it."""
+    found = correct(cell.model, log.require("target_q", "actual_q"), log.loads())
+    return Corrected(found.q, found.residual)  # type: ignore[arg-type]  # of N rows: an array
+
+
+def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
+    """Return the joint flexibilities that a log shows; ``gapbridge fit``.
+
+    ``remounted``: the target was taken off between sessions. Raises ExcitationError where nothing
+    in the log excites the compliance.
+    """
+    from core.estimation.identification import identify_compliance  # predict need not wait for it
+
+    metrology = replace(cell.metrology, remounted=remounted)
+    found = identify_compliance(cell.model, log, metrology)
+    held_out = found.remaining_rms_held_out
+    return Fitted(
+        cell=cell, model=cell.model.with_compliance(found.axial, found.radial),
+        axial=found.axial, radial=found.radial, std_axial=found.std_axial,
+        std_radial=found.std_radial, shown=found.identifiable, samples=found.samples,
+        gap_rms=found.gap_rms, remaining_rms=found.remaining_rms,
+        remaining_rms_held_out=held_out if math.isfinite(held_out) else None,
+        notes=(*found.notes, *found.combinations), provenance=fitted(_origin(cell, log), log),
+    )  # fmt: skip
+
+
+def diagnose(
+    cell: Cell, log: Log, *, withhold: Sequence[str] = (), remounted: bool = False,
+    simulated: Log | None = None,
+) -> Diagnosed:  # fmt: skip
+    """Return what explains the gap between a log and the cell's model; ``gapbridge diagnose``.
+
+    ``withhold`` names effects to take out of the catalogue; ``simulated`` is the log of another
+    simulator, row by row, whose values are the prediction.
+    """
+    from core.diagnosis.diagnosis import diagnose as diagnose_log
+    from core.diagnosis.document import document
+    from core.effects import effect_named
+
+    for name in withhold:
+        effect_named(name)
+    metrology = replace(cell.metrology, remounted=remounted)
+    found = diagnose_log(cell.model, log, metrology, withhold=withhold, simulated=simulated)
+    told = document(found) | {"provenance": _origin(cell, log)}
+    return Diagnosed(cell, found.model, str(found.verdict), told)
+
+
+def _origin(cell: Cell, log: Log) -> dict[str, object]:
+    logs = [Path(log.path)] if Path(log.path).is_file() else []
+    return provenance({"log": logs, "cell": [cell.path]})

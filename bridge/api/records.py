@@ -1,0 +1,106 @@
+"""Results as small frozen records; ``to_json`` gives plain lists and numbers, SI units."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge.cell import Cell, save_cell
+from core.model import Model
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """Predicted TCP poses of N rows, in base."""
+
+    position: Array  # (N, 3) m
+    rotation_vector: Array  # (N, 3) rad
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the poses as lists, by the names of the command's columns."""
+        return {
+            "predicted_position": self.position.tolist(),
+            "predicted_rotation": self.rotation_vector.tolist(),
+        }
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """Offset-corrected setpoints of N rows."""
+
+    q: Array  # (N, n) rad
+    residual: Array  # (N,) m: distance of the predicted from the wanted pose
+
+    def to_json(self) -> dict[str, Any]:
+        """Return setpoints and residuals as lists."""
+        return {"corrected_q": self.q.tolist(), "residual": self.residual.tolist()}
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Joint flexibilities found from a log; (n,) each, rad/Nm."""
+
+    cell: Cell  # that was fitted
+    model: Model  # with the flexibilities
+    axial: Array
+    radial: Array
+    std_axial: Array  # 1 sigma
+    std_radial: Array
+    shown: NDArray[np.bool_]  # (2n,), axial then radial: what the data show; the rest is the cell's
+    samples: int
+    gap_rms: float  # m, one coordinate, before
+    remaining_rms: float  # m, after
+    remaining_rms_held_out: float | None  # m, on poses that the fit did not see
+    notes: tuple[str, ...]
+    provenance: dict[str, Any]
+
+    def save(self, path: Path | str) -> None:
+        """Write the cell with the flexibilities found, as ``gapbridge fit`` does."""
+        save_cell(self.cell, path, self.model, {"provenance": self.provenance})
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures as lists and numbers."""
+        return {
+            "axial": self.axial.tolist(), "radial": self.radial.tolist(),
+            "std_axial": _finite(self.std_axial), "std_radial": _finite(self.std_radial),
+            "shown": self.shown.tolist(), "samples": self.samples, "gap_rms": self.gap_rms,
+            "remaining_rms": self.remaining_rms,
+            "remaining_rms_held_out": self.remaining_rms_held_out, "notes": list(self.notes),
+            "provenance": self.provenance,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Diagnosed:
+    """The diagnosis of a log: the document that ``gapbridge diagnose --json`` writes."""
+
+    cell: Cell  # that was diagnosed
+    model: Model  # with the causes added
+    verdict: str
+    document: dict[str, Any]
+
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """Return the effects that are accused, strongest channel first, each once."""
+        found = [c["effect"] for channel in self.document["channels"] for c in channel["causes"]]
+        return tuple(dict.fromkeys(found))
+
+    def save(self, path: Path | str) -> None:
+        """Write the cell with the causes added, as ``--apply`` does."""
+        origin = {"provenance": self.document["provenance"]}
+        save_cell(self.cell, path, self.model, origin)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the document, schema ``gapbridge.diagnosis/1``."""
+        return self.document
+
+
+def _finite(values: Array) -> list[float | None]:
+    return [float(v) if math.isfinite(v) else None for v in values]

@@ -1,0 +1,72 @@
+"""The commands as functions, and the page of examples, run as it stands."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli_runs import (
+    CELL,
+    bent_model,
+    cell_in,
+    columns_of,
+    gapbridge,
+    log_in,
+    measured,
+    poses_and_loads,
+    table_of,
+)
+
+from bridge import api
+
+PAGE = Path(__file__).parents[3] / "docs" / "python.md"
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Path:
+    q, loads = poses_and_loads(60)
+    cell_in(tmp_path, CELL)
+    model = bent_model()
+    log_in(tmp_path, columns_of(q, loads) | measured(model, q, loads, noise=2e-5))
+    return tmp_path
+
+
+def test_predict_and_compensate_are_what_the_commands_write(desk: Path) -> None:
+    paths = desk / "log.csv", "--cell", desk / "cell.yaml", "--out"
+    assert gapbridge("predict", *paths, desk / "p.csv").code == 0
+    assert gapbridge("compensate", *paths, desk / "c.csv").code == 0
+    cell = api.load_cell(desk / "cell.yaml")
+    log = api.read_log(desk / "log.csv", cell)
+    poses, corrected = api.predict(cell, log), api.compensate(cell, log)
+    np.testing.assert_allclose(poses.position, table_of(desk / "p.csv")[1][:, :3], atol=1e-12)
+    np.testing.assert_allclose(corrected.q, table_of(desk / "c.csv")[1], atol=1e-12)
+    json.dumps([poses.to_json(), corrected.to_json()], allow_nan=False)
+
+
+def test_what_cannot_be_used_raises_the_line_of_the_command(desk: Path) -> None:
+    (desk / "bad.yaml").write_text("robot: {model: ur10e}\ngravity: [0, 0, -1]\n")
+    with pytest.raises(api.InputError, match="line 2: gravity"):
+        api.load_cell(desk / "bad.yaml")
+    cell = api.load_cell(desk / "cell.yaml")
+    with pytest.raises(api.InputError, match="'nonsense'"):
+        api.diagnose(cell, api.read_log(desk / "log.csv", cell), withhold=["nonsense"])
+
+
+def test_the_examples_of_the_page_run(desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(desk)
+    names: dict[str, object] = {}
+    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    assert len(blocks) == 5
+    for block in blocks:
+        exec(compile(block, str(PAGE), "exec"), names)
+    found, told = names["found"], names["told"]
+    assert isinstance(found, api.Fitted)
+    assert isinstance(told, api.Diagnosed)
+    assert found.remaining_rms < 0.1 * found.gap_rms
+    json.dumps([found.to_json(), told.to_json()], allow_nan=False)
+    assert (desk / "diagnosed.yaml").exists()
+    driver, wanted = names["driver"], names["wanted"]
+    assert 1e-5 < np.abs(driver.q - wanted).max() < 0.01  # type: ignore[attr-defined]
