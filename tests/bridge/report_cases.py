@@ -50,7 +50,8 @@ def _with_structure(case: Case) -> Case:
 
 
 COMPLIANT = ("axial_compliance", "stiffness_nonlinearity", "link_flexibility", "base_compliance",
-             "payload", "radial_compliance", "gravity_direction")  # fmt: skip
+             "payload", "payload_cog", "radial_compliance", "gravity_direction",
+             "joint_offset", "link_geometry", "tool_frame")  # fmt: skip
 
 
 def _case(

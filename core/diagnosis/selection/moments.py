@@ -104,8 +104,9 @@ def _integrated(work: Work, columns: Sequence[Array], base: Sequence[Term]) -> t
         np.sqrt(np.mean(A[:, : observation.nuisance.shape[2]] ** 2, axis=0)), 1e-300
     )
     A = A * spread
-    root = np.linalg.cholesky(A.T @ A + np.eye(A.shape[1]))
-    C = solve_triangular(root, A.T, lower=True)
+    # the root of A'A + 1 by QR: squared, wide priors would leave nothing of the narrow ones
+    root = np.linalg.qr(np.vstack([A, np.eye(A.shape[1])]), mode="r")
+    C = solve_triangular(root, A.T, trans="T")
     gap = flat((observation.measured - observation.predict(base))[..., None], work)[:, 0]
     return gap, C
 

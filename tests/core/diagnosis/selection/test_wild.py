@@ -50,7 +50,7 @@ def test_a_third_of_the_readings_is_no_bad_luck():
     rng = np.random.default_rng(0)
     found = with_glitches("none", dict(zip(rows, rng.normal(0, 3e-3, (20, 3)), strict=True)))
     (channel,) = found.channels
-    assert channel.selection.kept.mean() > 0.9
+    assert channel.selection.kept.mean() >= 0.9  # a tenth may be outliers
     assert channel.causes == ()
     assert found.verdict != "no_gap"
     assert channel.gap_rms > 1e-3
