@@ -215,7 +215,7 @@ class Compensator:
             self._offset[:] = q - nominal if best < np.inf else 0.0
             self._lead(loads, q)
             _want(rigid, self._rigid_row, self._rigid_shape, q, self._pose)
-            _moved(self._wanted, self._pose, self._offset, moved)
+            _moved(self._wanted, self._pose, q - nominal, moved)
         return Correction(q, moved, best, steps)
 
     def forget(self) -> None:

@@ -18,6 +18,8 @@ from core.loads import Loads
 from core.rotation import rotation_vector
 
 Array = NDArray[np.float64]
+SETTLING = 10  # times that servos are looked at where they have given way
+SETTLED = 1e-10  # rad: less is no change
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
 
 
@@ -161,12 +163,14 @@ class Model:
 
     def settled(self, commands: Array, loads: Loads | None = None) -> Array:
         """Return where the encoders (N, n) come to rest for ``commands`` (N, n), rad."""
-        terms, q = settling(self.terms), np.atleast_2d(commands)
-        if terms:
-            loads = loads or Loads()
-            held = self.held_torque(q, loads)
+        terms, commands, loads = settling(self.terms), np.atleast_2d(commands), loads or Loads()
+        q = commands
+        for _ in range(SETTLING if terms else 0):
+            held, before, q = self.held_torque(q, loads), q, commands
             for term in terms:
                 q = CATALOGUE[term.effect].settle(term, self.arm, q, held, loads.approach)
+            if np.abs(q - before).max(initial=0.0) < SETTLED:
+                break
         return q
 
     def rigid_pose(self, q: Array) -> Poses:

@@ -39,8 +39,8 @@ def sessions_in(log: Log) -> list[Log]:
         return [log]
     index = session_of(log)
     return [
-        replace(log.select(np.flatnonzero(index == s)), session_names=())
-        for s in range(len(log.session_names))
+        replace(log.select(rows), session_names=())
+        for rows in (np.flatnonzero(index == s) for s in range(len(log.session_names)))
     ]
 
 
@@ -120,7 +120,8 @@ def _joined(logs: Sequence[Log], names: tuple[str, ...], model: Model, path: str
         columns["timestamp"], one_clock = _clock([log.columns["timestamp"] for log in logs])
     lines = np.concatenate([[log.line(r) for r in range(len(log))] for log in logs])
     return Log(
-        path, columns, logs[0].n, lines=lines, numbers=np.arange(len(lines)) + 1, session_names=names, one_clock=one_clock,
+        path, columns, logs[0].n, lines=lines, numbers=np.arange(len(lines)) + 1,
+        session_names=names, one_clock=one_clock,
         unknown=tuple(dict.fromkeys(u for log in logs for u in log.unknown)),
     )  # fmt: skip
 

@@ -13,6 +13,8 @@ OWN = ROOT / "core" / "effects"
 # identifiers that are also a column of the log, a limit's key or a field of another record: as
 # such they are no effect
 SHARED = {"payload", "payload_cog", "joint_offset", "latency"}
+# names of joints that a simulator's model is given: they stand in the user's file and in docs
+LABELS = {"bridge/patch/mjcf.py": {"backlash", "axial_compliance"}}
 ASKED = {"effect", "family", "identifier"}  # attributes whose text is an identifier
 TAKING = {"Term", "effect_named", "joints"}  # calls whose first argument is one
 
@@ -67,9 +69,8 @@ def _found(source: str) -> list[str]:
             if name and name not in SHARED:
                 found.append(name)
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("core.effects."):
-            found += [(node.module or "").rpartition(".")[2]] * (
-                node.module != "core.effects.effect"
-            )
+            name = (node.module or "").rpartition(".")[2]
+            found += [name] if name in CATALOGUE else []
     return found
 
 
@@ -81,6 +82,7 @@ def test_no_effect_is_named_outside_its_own_file_and_the_table() -> None:
         for path in sources
         if OWN not in path.parents
         for name in _found(path.read_text(encoding="utf-8"))
+        if name not in LABELS.get(path.relative_to(ROOT).as_posix(), set())
     }
     assert named == set()
 

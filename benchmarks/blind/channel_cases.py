@@ -38,7 +38,9 @@ AKIN: dict[str, tuple[tuple[str, bool], ...]] = {
     "warm_friction": (("viscous_friction", False), ("coulomb_friction", False)),
     "torque_field": (("torque_offset", False),),
 }  # fmt: skip
-SIZE = (0.5, 1.5)  # a remainder over the known effects together
+COUPLED = ("link_inertia",)  # effects of one joint that other joints feel
+SIZE = (0.5, 1.5)  # a remainder over a known effect
+SHOWN = 36.0  # chi-square of a known effect, the remainder counted as noise
 UNLIKE = 100.0  # chi-square that known effects and any one more must leave of a remainder
 RATIOS = {"wrench": (3.0, 15.0), "tracking": (60.0, 1000.0), "torque": (0.7, 6.0)}
 NONNEGATIVE = (
@@ -118,7 +120,7 @@ def draw_channel_case(channel: str, what: str, rng: Generator) -> ChannelCase:
 
 
 def _draw_mixed(channel: str, rng: Generator) -> ChannelCase:
-    """Return one to three known effects beside a remainder of half to one and a half their size."""
+    """Return one to three known effects beside a remainder, half to one and a half as large."""
     for _ in range(DRAWS):
         most = min(3, len(EFFECTS[channel]) - 1)
         count = int(rng.integers(1, most + 1)) if most > 1 else 1
@@ -132,8 +134,12 @@ def _draw_mixed(channel: str, rng: Generator) -> ChannelCase:
         except Redraw:
             continue
         error, columns = _error(cell, name, rng)
-        known = cell.truth.gap(values)
-        size = float(np.sqrt(np.mean(known**2) / np.mean((error / cell.truth.sigma) ** 2)))
+        each = [
+            float(np.mean(cell.truth.gap({p: v for p, v in values.items() if p[0] == e}) ** 2))
+            for e in dict.fromkeys(p[0] for p in values)
+        ]
+        usual = float(np.exp(np.mean(np.log(each))))
+        size = np.sqrt(usual / np.mean((error / cell.truth.sigma) ** 2))
         error = error * size * rng.uniform(*SIZE)
         akin = _akin(name, columns)
         if {p for p in values if p in akin} or not _told_apart(cell.truth, values, error):
@@ -157,10 +163,13 @@ def _told_apart(truth: Parametric, values: Values, error: Array) -> bool:
         rest = {p: v for p, v in values.items() if p != place}
         columns = np.column_stack([truth.columns(rest, values), unknown])
         left = without(columns, full - truth.gap(rest))
-        if float(left @ left) < CLEAR:
+        if float(left @ left) < max(CLEAR, SHOWN * (1 + float(np.mean(unknown**2)))):
             return False
     own = truth.columns(values, values)
+    touched = {int(j) + 1 for j in np.flatnonzero(np.any(error, axis=0))}
     for place in truth.candidates:
+        if place[0] not in COUPLED and place[1] is not None and place[1] not in touched:
+            continue  # at another joint alone, it makes nothing of this
         columns = own if place in values else np.hstack([own, truth.columns([place], values)])
         left = without(columns, unknown)
         if float(left @ left) < UNLIKE:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.blind import twins
+from benchmarks.blind.bench import combined
 from benchmarks.blind.cases import Static, drawn_case
 from benchmarks.blind.channel_cases import ChannelCase
 from benchmarks.blind.measuring import without
@@ -78,7 +79,10 @@ class Hidden:
         assert gap is not None
         hypotheses = [(e, j, c.orders or (1.0, 2.0)) for c in claims for e, j in c.places]
         try:
-            return twins.left_over(self.case.drawn.bench, gap, hypotheses)
+            bench = self.case.drawn.bench
+            shared = [p for p in self.case.drawn.parts
+                      if any((p.effect, p.joint) in c.places for c in claims)]  # fmt: skip
+            return twins.left_over(bench, gap, hypotheses, combined(bench, shared))
         except (ValueError, IndexError):
             return float("inf")
 

@@ -1,8 +1,9 @@
 """Mixed cases of the position channel: one to three known effects and an unknown remainder.
 
-The remainder is of the size of the known effects together, from half to one and a half times it.
-Every known effect stands clear of the others and of the remainder; the remainder stands clear of
-them and of any further effect of the catalogue. The log leaves out whole regions of joint space.
+The remainder is from half to one and a half times as large as a known effect (their geometric
+mean). Every known effect stands clear of the others and of the remainder, and is six sigmas large
+to one who takes the remainder for noise. The remainder stands clear of the known effects and of any
+further one of the catalogue. The log leaves out whole regions of joint space.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ from benchmarks.blind.remainders import REMAINDERS
 from benchmarks.blind.special_cases import Strange, outside_gap, unlike_known
 from benchmarks.blind.static_cases import Drawn, Wish, draw_parts, draw_plan
 
-SIZE = (0.5, 1.5)  # the remainder over the known effects together
+SIZE = (0.5, 1.5)  # the remainder over a known effect
+SHOWN = 36.0  # chi-square of a known effect, the remainder counted as noise
 FLOORS = (3.0, 20.0)  # the remainder over the noise
 BEYOND = 12  # poses kept back
 DRAWS = 150
@@ -57,7 +59,10 @@ def _with_remainder(
         return None
     frame = bench.frame()
     known = bench.whitened_gap(combined(bench, parts))
-    wanted = np.clip(_shown(bench, without(frame, known)) * rng.uniform(*SIZE), *FLOORS)
+    each = [_shown(bench, without(frame, bench.whitened_gap(combined(bench, own))))
+            for own in _by_effect(parts)]  # fmt: skip
+    usual = float(np.exp(np.mean(np.log(np.maximum(each, 1e-9)))))
+    wanted = float(np.clip(usual * rng.uniform(*SIZE), *FLOORS))
     strength = outside.first
     for _ in range(2):
         own = outside_gap(bench, outside, strength)
@@ -72,12 +77,16 @@ def _with_remainder(
         alone = known - bench.whitened_gap(combined(bench, parts[:i] + parts[i + 1 :]))
         others = np.column_stack([frame, unknown, *columns[:i], *columns[i + 1 :]])
         left = without(others, alone)
-        if float(left @ left) < CLEAR:
+        if float(left @ left) < max(CLEAR, SHOWN * (1 + wanted**2)):
             return None
     beside = np.column_stack([frame, *columns])
     if not unlike_known(bench, unknown[:, 0], beside, "timestamp" in outside.depends_on):
         return None
     return Strange(Drawn(bench, tuple(parts), real), outside, float(strength), gap, known)
+
+
+def _by_effect(parts: list[Ingredient]) -> list[list[Ingredient]]:
+    return [[p for p in parts if p.effect == e] for e in dict.fromkeys(p.effect for p in parts)]
 
 
 def _shown(bench: Bench, gap: Array) -> float:

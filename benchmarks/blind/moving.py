@@ -82,44 +82,52 @@ def torque_shares(
     return links, carried
 
 
-def cog_columns(
+@dataclass(frozen=True)
+class Shifts:
+    """What centres of gravity that are elsewhere take of the joints: exact, inertia moves along."""
+
+    regressor: Array  # (N, n, n, 10): torque of joint j per dynamic parameter of link l
+    masses: Array  # (n,) kg, of the links
+    centres: Array  # (n, 3) m, in the row's frame
+    places: list[pin.SE3]  # of the row's frame in the joint's
+    payload: tuple[float, Array]
+
+    def of_link(self, link: int, moment: Array) -> Array:
+        """Return the torques (N, n) that a first moment (3,) kg m of a link (from 0) takes more."""
+        mass = max(float(self.masses[link]), 1e-9)
+        return self._moved(link, mass, self.centres[link], moment / mass)
+
+    def of_payload(self, more: float, shift: Array) -> Array:
+        """Return the torques (N, n) of the payload, ``more`` kg heavier, from ``shift`` (3,) m."""
+        return self._moved(len(self.masses) - 1, self.payload[0] + more, self.payload[1], shift)
+
+    def _moved(self, link: int, mass: float, centre: Array, shift: Array) -> Array:
+        import pinocchio as pin
+
+        ends = [
+            pin.Inertia(mass, self.places[link].act(at), np.zeros((3, 3))).toDynamicParameters()
+            for at in (centre + shift, np.asarray(centre, dtype=float))
+        ]
+        return np.asarray(self.regressor[:, :, link] @ (ends[0] - ends[1]))
+
+
+def shifts_of(
     rows: tuple[Row, ...], gravity: Array, payload: tuple[float, Array],
     q: Array, qd: Array, qdd: Array,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Return torques (n, N, n, 3) per kg m of each link's first moment, and (N, n, 3) of the load.
-
-    First moments in the axes of the row; the load's per metre of shift in the flange. To first
-    order in the shift: inertia about the old centre of gravity moves along with the mass.
-    """
+) -> Shifts:  # fmt: skip
+    """Return what shifted centres of gravity do along a motion."""
     import pinocchio as pin
 
     model, _ = pinocchio_arm(rows, gravity)
     data = model.createData()
     n, count = len(rows), len(q)
-    step = 1e-4
-    last = rows[-1]
-    flange = pin.SE3(turn(np.array([[last.alpha, 0, 0]]))[0], np.array([last.a, 0, last.d]))
     places = [pin.SE3(turn(np.array([[r.alpha, 0, 0]]))[0], np.array([r.a, 0, r.d])) for r in rows]
-
-    def moved(mass: float, place: pin.SE3, at: Array, way: Array) -> Array:
-        ends = [
-            pin.Inertia(mass, place.act(at + s * way), np.zeros((3, 3))).toDynamicParameters()
-            for s in (step, -step)
-        ]
-        return np.asarray((ends[0] - ends[1]) / (2 * step))
-
-    per_link = np.array([
-        [moved(max(r.mass, 1e-9), p, np.array(r.cog), e) / max(r.mass, 1e-9) for e in np.eye(3)]
-        for r, p in zip(rows, places, strict=True)
-    ])  # fmt: skip
-    per_load = np.array([moved(payload[0], flange, payload[1], e) for e in np.eye(3)])
-    links, carried = np.empty((n, count, n, 3)), np.empty((count, n, 3))
+    regressor = np.empty((count, n, n, 10))
     for t in range(count):
-        regressor = pin.computeJointTorqueRegressor(model, data, q[t], qd[t], qdd[t])
-        blocks = regressor.reshape(n, n, 10)
-        links[:, t] = np.einsum("jlk,lek->lje", blocks, per_link)
-        carried[t] = blocks[:, n - 1, :] @ per_load.T
-    return links, carried
+        found = pin.computeJointTorqueRegressor(model, data, q[t], qd[t], qdd[t])
+        regressor[t] = found.reshape(n, n, 10)
+    masses, centres = np.array([r.mass for r in rows]), np.array([r.cog for r in rows])
+    return Shifts(regressor, masses, centres, places, payload)
 
 
 def pinocchio_arm(rows: tuple[Row, ...], gravity: Array) -> tuple[pin.Model, list[pin.Inertia]]:

@@ -10,7 +10,7 @@ from numpy.random import Generator
 from benchmarks.blind.arms import ARMS, ArmKind
 from benchmarks.blind.bench import Bench, draw_bench
 from benchmarks.blind.mechanics import Array, Session, loads_of, stand
-from benchmarks.blind.moving import Motion, cog_columns, draw_motion, torque_shares
+from benchmarks.blind.moving import Motion, draw_motion, shifts_of, torque_shares
 from benchmarks.blind.parametric import Candidate, Parametric, Place, Values
 from benchmarks.blind.session import Plan
 
@@ -76,7 +76,7 @@ def draw_tracking_cell(rng: Generator, seconds: float = 30.0) -> MovingCell:
             for effect in TRACKING
         )
         wanted = stood = motion.lagged(time, delay, lag)
-        for _ in range(3 if droop.any() else 0):  # the weight is felt where the arm stands
+        for _ in range(8 if droop.any() else 0):  # the weight is felt where the arm stands
             stood = wanted - droop * _held(bench, stood)
         return resting(stood, np.abs(band))
 
@@ -127,9 +127,7 @@ def draw_torque_cell(rng: Generator, seconds: float = 30.0) -> MovingCell:
     links, carried = torque_shares(
         kind.rows, bench.nominal.gravity, (mass, session.payload_cog[0]), q, qd, qdd
     )
-    moments, load_moments = cog_columns(
-        kind.rows, bench.nominal.gravity, (mass, session.payload_cog[0]), q, qd, qdd
-    )
+    shifts = shifts_of(kind.rows, bench.nominal.gravity, (mass, session.payload_cog[0]), q, qd, qdd)
     rigid = links.sum(axis=0) + mass * carried
     usual = np.sqrt(np.mean(rigid**2, axis=0)) + 0.02 * np.sqrt(np.mean(rigid**2))
     sigma = usual * rng.uniform(0.01, 0.03)
@@ -157,7 +155,7 @@ def draw_torque_cell(rng: Generator, seconds: float = 30.0) -> MovingCell:
             (f"stribeck_friction_{j}",), np.array([0.1 * u]), 8
         )
         candidates[("link_cog", j)] = Candidate(
-            tuple(f"link_cog_{j}_{k}" for k in "xyz"), np.full(3, 0.02 * kind.rows[j - 1].mass), 15
+            tuple(f"link_cog_{j}_{k}" for k in "xyz"), np.full(3, 0.02 * kind.rows[j - 1].mass), 5
         )
     slow = peak * rng.uniform(0.04, 0.15, kind.n)  # rad/s, where Stribeck's curve falls
 
@@ -169,10 +167,12 @@ def draw_torque_cell(rng: Generator, seconds: float = 30.0) -> MovingCell:
         more = float(values.get(("payload", None), np.zeros(1))[0])
         out = rigid + more * carried
         shift = values.get(("payload_cog", None), np.zeros(3))
-        out = out + load_moments @ shift * (1 + more / mass)
+        if shift.any():
+            out = out + shifts.of_payload(more, shift)
         for j in joints:
             out = out + of("link_inertia", j) * links[j - 1]
-            out = out + moments[j - 1] @ values.get(("link_cog", j), np.zeros(3))
+            if ("link_cog", j) in values:
+                out = out + shifts.of_link(j - 1, values[("link_cog", j)])
         share = np.array([of("load_friction", j) for j in joints])
         break_away = np.array([of("stribeck_friction", j) for j in joints])
         offset = np.array([of("torque_offset", j) for j in joints])

@@ -48,7 +48,7 @@ class Command:
         activate the environment.
         """
         first, *others = shlex.split(text)
-        own = Path(sys.executable).with_name(first)
+        own = Path(sys.executable).parent / first
         return cls((str(own) if own.is_file() and os.sep not in first else first, *others))
 
     def __call__(self, log: Path, cell: Path, withhold: tuple[str, ...]) -> dict[str, Any]:

@@ -95,10 +95,17 @@ def columns_of(bench: Bench, hypotheses: Iterable[Hypothesis], around: RealArm) 
     return np.column_stack(columns) if columns else np.zeros((len(at), 0))
 
 
-def left_over(bench: Bench, real_gap: Array, hypotheses: Iterable[Hypothesis]) -> float:
-    """Return the chi-square that hypotheses leave of a noise-free, whitened gap."""
-    columns = columns_of(bench, hypotheses, bench.nominal)
-    left = without(np.column_stack([bench.frame(), columns]), real_gap)
+def left_over(
+    bench: Bench, real_gap: Array, hypotheses: Iterable[Hypothesis], around: RealArm | None = None
+) -> float:
+    """Return the chi-square that hypotheses leave of a noise-free, whitened gap.
+
+    ``around`` is an arm that has what of the truth the hypotheses share: large effects are not
+    linear together.
+    """
+    arm = around or bench.nominal
+    columns = columns_of(bench, hypotheses, arm)
+    left = without(np.column_stack([bench.frame(), columns]), real_gap - bench.whitened_gap(arm))
     return float(left @ left)
 
 

@@ -25,6 +25,8 @@ SCALE = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "N": (1.0, "N"), "Nm": (1.0, "N
               help="Only this half.")  # fmt: skip
 @click.option("--carried/--no-carried", default=True, help="Also carry answers to later logs.")
 @click.option("--command", default="gapbridge", show_default=True, help="The program to judge.")
+@click.option("--stand-ins", "stand_ins", is_flag=True,
+              help="Judge the model with stand-ins, not accusations alone.")  # fmt: skip
 @click.option("--json", "file", type=click.Path(path_type=Path), default=None,
               help="Write the outcomes.")  # fmt: skip
 def main(
@@ -33,6 +35,7 @@ def main(
     split: str | None,
     carried: bool,
     command: str,
+    stand_ins: bool,
     file: Path | None,
 ) -> None:
     """Judge the diagnosis on rows that its fit did not see, beside plain least squares.
@@ -49,7 +52,7 @@ def main(
             continue
         found |= {p.parent.name: p.parent for p in sorted(folder.glob("*/log.csv"))}
     wanted = set(names.split(",")) if names else None
-    program, outcomes = Program(command), []
+    program, outcomes = Program(command, stand_ins), []
     jobs: list[tuple[str, Path, Path | None]] = [(n, p, None) for n, p in found.items()]
     if carried:
         jobs += [(f"{a} > {b}", found[a], found[b]) for a, b in CARRIED if {a, b} <= set(found)]

@@ -1,4 +1,4 @@
-"""Public data sets of real arms as logs and cells of the contract's columns.
+"""Public data sets of real arms as logs and cells.
 
 ``python -m benchmarks.real.convert CHECKOUTS --out DIR``: CHECKOUTS holds clones of the sources
 under their own names (``git clone https://github.com/OWNER/NAME``); what is not there is skipped.

@@ -8,6 +8,7 @@ predict``, frame fitted) and by the program's own gap for the other channels.
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import subprocess
 import sys
@@ -63,11 +64,12 @@ class Outcome:
 class Program:
     """``gapbridge`` as a command line; raises RuntimeError with what it said."""
 
-    def __init__(self, command: str = "gapbridge") -> None:
+    def __init__(self, command: str = "gapbridge", stand_ins: bool = False) -> None:
         """Take the program beside the running interpreter, where it is a bare name."""
         first, *others = shlex.split(command)
-        own = Path(sys.executable).with_name(first)
-        self.words = (str(own) if own.is_file() and "/" not in first else first, *others)
+        self.words_of_apply = ("--stand-ins",) if stand_ins else ()
+        own = Path(sys.executable).parent / first
+        self.words = (str(own) if own.is_file() and os.sep not in first else first, *others)
 
     def __call__(self, *words: object) -> None:
         """Run one command."""
@@ -114,7 +116,8 @@ def _judge(
         train.write(place / "train.csv")
         test.write(place / "test.csv")
         better = place / "better.yaml"
-        words: list[object] = ["--remounted"] if name in REMOUNTED and _knows(program) else []
+        words: list[object] = [*program.words_of_apply]
+        words += ["--remounted"] if name in REMOUNTED and _knows(program) else []
         start = time.perf_counter()
         told = program.diagnosis(place / "train.csv", nominal, "--apply", better, *words)
         seconds = time.perf_counter() - start

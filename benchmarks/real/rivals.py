@@ -76,7 +76,7 @@ def _wrench_rows(cell: dict[str, Any], table: Table) -> Array:
 def tracking_left(fitted: Table, judged: Table) -> Array:
     """Return what one delay a joint, fitted, leaves of the judged following error (N, n)."""
     delay = np.zeros(fitted.joints().shape[1])
-    for _ in range(4):
+    for _ in range(6):
         error, speed = _following(fitted, delay)
         delay -= np.sum(speed * error, axis=0) / np.maximum(np.sum(speed**2, axis=0), 1e-12)
     return _following(judged, delay)[0]
@@ -91,7 +91,8 @@ def _following(table: Table, delay: Array) -> tuple[Array, Array]:
     for j in range(target.shape[1]):
         wanted[:, j] = np.interp(time - delay[j], time, target[:, j])
         speed[:, j] = np.interp(time - delay[j], time, rate[:, j])
-    return actual - wanted, speed
+    began = time >= time[0] + max(float(delay.max()), 0.0)  # before, the target is not in the log
+    return (actual - wanted)[began], speed[began]
 
 
 def torque_left(cell: dict[str, Any], folder: Path, fitted: Table, judged: Table) -> Array:

@@ -43,7 +43,7 @@ def term_of(entry: EffectEntry, arm: Arm, where: str) -> Term:
                 f"{nearest(name, names)}"
             )
     values = [_value(entry, name, p, where) for name, p in zip(names, parameters, strict=True)]
-    return Term(entry.effect, site, tuple(values))
+    return Term(entry.effect, site, tuple(values), entry.stand_in)
 
 
 def _value(entry: EffectEntry, name: str, parameter: Parameter, where: str) -> float:
@@ -84,17 +84,22 @@ def compliance_entry(terms: Sequence[Term], n: int) -> dict[str, list[float]]:
     entry = {key: np.zeros(n) for key in flexibility_effects()}
     for term in terms:
         key = CATALOGUE[term.effect].flexibility
-        if key and term.site.joint is not None:
+        if _in_section(term) and term.site.joint is not None:
             entry[key][term.site.joint - 1] += term.values[0]
     # what is below zero is no flexibility: it stands among the effects
     return {key: np.maximum(values, 0.0).tolist() for key, values in entry.items()}
+
+
+def _in_section(term: Term) -> bool:
+    """Return whether a term belongs to the section; a stand-in keeps its mark among effects."""
+    return bool(CATALOGUE[term.effect].flexibility) and not term.stand_in
 
 
 def _negative_terms(terms: Sequence[Term]) -> list[Term]:
     """Return what a joint's flexibilities of one kind add up to, where that is below zero."""
     totals: dict[tuple[str, Site], float] = {}
     for term in terms:
-        if CATALOGUE[term.effect].flexibility:
+        if _in_section(term):
             key = (term.effect, term.site)
             totals[key] = totals.get(key, 0.0) + term.values[0]
     return [Term(effect, site, (v,)) for (effect, site), v in totals.items() if v < 0]
@@ -103,7 +108,7 @@ def _negative_terms(terms: Sequence[Term]) -> list[Term]:
 def effect_entries(terms: Sequence[Term], arm: Arm) -> list[dict[str, Any]]:
     """Return the ``effects`` list of a model's terms; flexibilities stand in their own section."""
     entries = []
-    further = [term for term in terms if not CATALOGUE[term.effect].flexibility]
+    further = [term for term in terms if not _in_section(term)]
     for term in (*_negative_terms(terms), *further):
         entry: dict[str, Any] = {"effect": term.effect}
         if term.site.joint is not None:
@@ -113,5 +118,7 @@ def effect_entries(terms: Sequence[Term], arm: Arm) -> list[dict[str, Any]]:
         parameters = effect_named(term.effect).parameters(arm, term.site)
         names = [name_of(parameter) for parameter in parameters]
         entry["parameters"] = dict(zip(names, map(float, term.values), strict=True))
+        if term.stand_in:
+            entry["stand_in"] = True
         entries.append(entry)
     return entries

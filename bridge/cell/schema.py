@@ -93,6 +93,7 @@ class EffectEntry(Section):
     joint: int | None = Field(default=None, strict=True, description="from 1")
     order: Number | None = Field(default=None, description="cycles per turn of the joint")
     parameters: dict[str, Number] = Field(default={}, description="name: value")
+    stand_in: bool = Field(default=False, strict=True, description="useful, but not proved")
 
 
 class MetrologyEntry(Section):
@@ -114,6 +115,9 @@ class Simulation(Section):
     )
     compliance: Compliance | None = Field(
         default=None, description="true flexibilities, rad/Nm; default: drawn from the seed"
+    )
+    droop: list[NotNegative] | None = Field(
+        default=None, description="rad/Nm per joint by which servos give way; default: none"
     )
     tracker_noise: NotNegative | None = Field(default=None, description="m, 1 sigma")
     rtde_port: int | None = Field(default=None, gt=0, lt=65536, strict=True)

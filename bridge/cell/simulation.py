@@ -149,6 +149,13 @@ def _plant(cell: Cell) -> dict[str, Any]:
     }
     if simulation.tracker_noise is not None:
         fields["tracker_noise"] = simulation.tracker_noise
+    if simulation.droop is not None:
+        if len(simulation.droop) != cell.arm.n:
+            raise CellError(
+                f"{cell.path}: simulation.droop: found {len(simulation.droop)} values, "
+                f"expected {cell.arm.n}"
+            )
+        fields["droop"] = tuple(simulation.droop)
     if simulation.compliance is not None:
         for key in ("axial", "radial"):
             values = getattr(simulation.compliance, key)

@@ -64,6 +64,11 @@ def _channel(channel: ChannelDiagnosis, sessions: tuple[str, ...]) -> list[str]:
             f"{size(channel.remaining_rms_held_out, unit)}"
         )
     lines += [f"  {line}" for line in _elsewhere(channel, sessions)]
+    for stand_in in channel.stand_ins:
+        lines.append(
+            f"  stand-in: {_named(stand_in)}: not proved, but the gap shrinks by it in regions "
+            "that the fit did not see; --apply --stand-ins puts it into the model"
+        )
     if channel.structured:
         depends = ", ".join(f"{name} ({share:.0%})" for name, share in channel.depends_on[:4])
         lines.append(
@@ -116,11 +121,7 @@ def _most_changed(values: Sequence[Sequence[Reported]]) -> list[int]:
 
 
 def _cause(cause: Cause, unit: str) -> list[str]:
-    where = ""
-    if cause.joints:
-        plural = "s" if len(cause.joints) > 1 else ""
-        where = f" of joint{plural} {', '.join(str(j) for j in cause.joints)}"
-    lines = [f"cause: {cause.effect}{where} (probability {cause.probability:.3g}){_shrink(cause)}"]
+    lines = [f"cause: {_named(cause)} (probability {cause.probability:.3g}){_shrink(cause)}"]
     if cause.shrink is not None:
         lines.append(
             f"  held-out gap {size(cause.shrink.gap_without, unit)} without it, "
@@ -130,6 +131,13 @@ def _cause(cause: Cause, unit: str) -> list[str]:
     if cause.indistinguishable_from:
         lines.append(f"  these data cannot tell it from {', '.join(cause.indistinguishable_from)}")
     return lines
+
+
+def _named(cause: Cause) -> str:
+    if not cause.joints:
+        return cause.effect
+    plural = "s" if len(cause.joints) > 1 else ""
+    return f"{cause.effect} of joint{plural} {', '.join(str(j) for j in cause.joints)}"
 
 
 def _shrink(cause: Cause) -> str:

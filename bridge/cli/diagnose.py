@@ -60,6 +60,11 @@ if TYPE_CHECKING:
     help="Write the cell with the found effects added.",
 )
 @click.option(
+    "--stand-ins",
+    is_flag=True,
+    help="With --apply: also what is not proved, but shrinks the gap in regions not fitted.",
+)
+@click.option(
     "--withhold",
     multiple=True,
     metavar="EFFECT",
@@ -78,6 +83,7 @@ def diagnose(
     out: Path | None,
     json_file: Path | None,
     new_cell: Path | None,
+    stand_ins: bool,
     withhold: tuple[str, ...],
     sim: Path | None,
 ) -> None:
@@ -90,6 +96,8 @@ def diagnose(
 
     Example: gapbridge diagnose log.csv --cell cell.yaml --out out/diagnosis --apply better.yaml
     """
+    if stand_ins and new_cell is None:
+        raise InputError("--stand-ins: found no --apply, expected the cell to write")
     given = open_cell(cell)
     rows = open_logs(logs, given)
     warn_outside(rows, given)
@@ -111,7 +119,8 @@ def diagnose(
     if json_file is not None:
         write_text(json_file, text)
     if new_cell is not None:
-        save_cell(given, new_cell, found.model, {"provenance": fitted(origin, rows)})
+        applied = found.with_stand_ins if stand_ins else found.model
+        save_cell(given, new_cell, applied, {"provenance": fitted(origin, rows)})
     written = [] if out is None else _write_folder(out, text, found, given, rows)
     for file in (*written, json_file, new_cell):
         if file is not None:

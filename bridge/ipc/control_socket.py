@@ -95,10 +95,10 @@ class ControlSocket:
             self._slots.release()
 
     def _reply(self, connection: socket.socket) -> dict[str, Any]:
+        line = _read_line(connection)  # first: who is refused while it writes loses the answer
         peer = peer_of(connection)
         if peer.uid not in (0, os.geteuid()):
             return refusal(f"found user {peer.uid}, expected the daemon's own ({os.geteuid()})")
-        line = _read_line(connection)
         try:
             request = json.loads(line)
             command = request["command"]

@@ -18,8 +18,9 @@ from bridge.loop.saturation_watch import SaturationWatch
 from bridge.loop.supervisor import Cause, State, Supervisor
 from core.state import RobotState
 from drivers.driver import Driver
+from drivers.robot_modes import NORMAL, REDUCED, RUNNING
 
-ROBOT_RUNNING, SAFE = 7, (1, 2)  # robot_mode; safety_mode normal, reduced
+SAFE = (NORMAL, REDUCED)  # safety_mode
 STOPS = 0b111_1111_1100  # safety_status_bits: all but normal and reduced mode
 PLAYING = 2  # runtime_state
 SLOWED = 0.95  # speed_scaling: slower, an arm that we move falls behind its setpoints
@@ -110,7 +111,7 @@ class LoopChecks:
     def _check_robot(self, state: RobotState) -> None:
         """Take note of a robot that cannot move."""
         stops = state.safety_status_bits & STOPS
-        self.fine = state.robot_mode == ROBOT_RUNNING and state.safety_mode in SAFE and not stops
+        self.fine = state.robot_mode == RUNNING and state.safety_mode in SAFE and not stops
         if self.fine:
             self.robot = ""
             self._lasting.discard(Count.UNSAFE)

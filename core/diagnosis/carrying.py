@@ -21,6 +21,7 @@ from core.effects import CATALOGUE, Reported
 Array = NDArray[np.float64]
 CHANCE = 0.001  # probability below which the values differ by more than chance
 MATTERS = 0.2  # share of a cause's size: sessions that differ by less are alike for a model
+DEAD = 1e-7  # share of a parameter's column that a session has: below, it shows nothing of it
 SHOWN = 3.0  # whitened length of an effect of usual size from which a session shows it
 
 
@@ -68,14 +69,27 @@ def _compared(
     split = np.hstack([columns * (of_row == s)[:, None] for s in shown])
     beside = np.hstack([raw.columns(space, rest), raw.nuisance])
     A = np.hstack([split, beside])
-    size = np.sqrt(np.einsum("ij,ij->j", A, A)) + 1e-300
-    solution, *_ = np.linalg.lstsq(A / size, raw.target, rcond=1e-9)
-    left = raw.target - (A / size) @ solution
+    size = np.sqrt(np.einsum("ij,ij->j", A, A))
+    alive = size > DEAD * np.concatenate(
+        [np.tile(np.sqrt(np.einsum("ij,ij->j", columns, columns)), len(shown)),
+         size[split.shape[1] :]]
+    )  # fmt: skip
+    unit = np.where(alive, 1 / np.where(alive, size, 1.0), 0.0)
+    solution, *_ = np.linalg.lstsq(A * unit, raw.target, rcond=1e-9)
+    left = raw.target - (A * unit) @ solution
     variance = max(float(left @ left) / max(len(left) - A.shape[1], 1), space.floor)
-    inverse = np.linalg.pinv((A / size).T @ (A / size), rcond=1e-10, hermitian=True)
-    covariance = (inverse * variance / np.outer(size, size))[: split.shape[1], : split.shape[1]]
-    values = (solution / size)[: split.shape[1]].reshape(len(shown), width)
-    p_value, matters = _differing(values, covariance, columns, of_row, shown)
+    inverse = np.linalg.pinv((A * unit).T @ (A * unit), rcond=1e-10, hermitian=True)
+    own_part = slice(0, split.shape[1])
+    covariance = (inverse * variance * np.outer(unit, unit))[own_part, own_part]
+    values = (solution * unit)[own_part].reshape(len(shown), width)
+    everywhere = alive[own_part].reshape(len(shown), width).all(axis=0)
+    if not everywhere.any():
+        return None
+    compared = np.flatnonzero(np.tile(everywhere, len(shown)))
+    p_value, matters = _differing(
+        values[:, everywhere], covariance[np.ix_(compared, compared)],
+        columns[:, everywhere], of_row, shown,
+    )  # fmt: skip
     told = []
     for i, s in enumerate(shown):
         block = slice(i * width, (i + 1) * width)

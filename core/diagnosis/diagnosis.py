@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from core.diagnosis.channels.simulation import joined, predicted_by
 from core.diagnosis.every_row import on_every_row, still_accused
 from core.diagnosis.generalisation import NOWHERE, Generalisation, generalisation
 from core.diagnosis.held_out import HeldOut
-from core.diagnosis.judgement import Judgement, holding, judge
+from core.diagnosis.judgement import Judgement, judge, with_stand_ins
 from core.diagnosis.location import Where, locate
 from core.diagnosis.log_checks.units_and_clocks import check_units, findings
 from core.diagnosis.noise_floor import Floor, noise_floor, own_coordinates, whiteness
@@ -23,6 +24,7 @@ from core.diagnosis.observation import NotObservable, Observation, thinned
 from core.diagnosis.residual_structure import dependence
 from core.diagnosis.result import Cause, Considered, causes_of, considered_of
 from core.diagnosis.rigid_suspicion import softness_findings
+from core.diagnosis.selection.moments import slip_sentences
 from core.diagnosis.selection.selection import Selection, select, standing
 from core.diagnosis.separation import Measurement, next_measurements
 from core.effects import CATALOGUE, Term, flexibility_effects
@@ -45,7 +47,6 @@ CHANNELS: Mapping[str, Observe] = {
 }
 
 
-NEEDLESS = 0.05  # share by which more may be left without a cause that seemed needless
 # samples that a diagnosis looks at: more cost time and tell hardly more
 MOST = {"position": 1200, "wrench": 300, "tracking": 300, "torque": 300}
 
@@ -75,6 +76,8 @@ class ChannelDiagnosis:
     gap: Array = field(repr=False)  # (N, k) measured - predicted, frame fitted
     remaining: Array = field(repr=False)  # (N, k) with the causes in the model
     held_out: Array | None = field(repr=False)  # (kept,) rms of each held-out sample
+    stand_ins: tuple[Cause, ...] = ()  # not proved, but useful where nothing was fitted
+    along: tuple[Term, ...] = ()  # causes and stand-ins, fitted together
     elsewhere: Generalisation = NOWHERE  # new region, new session
     noise_floor_source: str = "unknown"  # what measured it
     carried: tuple[Carried, ...] = ()  # of causes, where several sessions show them
@@ -90,6 +93,7 @@ class Diagnosis:
     next_measurements: tuple[Measurement, ...]
     findings: tuple[str, ...]
     model: Model = field(repr=False)  # with the causes in it
+    with_stand_ins: Model = field(repr=False)  # with the stand-ins too, fitted along
     sessions: tuple[str, ...] = ()  # names, where there are several
     one_clock: bool = True  # False: the sessions' timestamps overlap
 
@@ -168,6 +172,7 @@ def _diagnose(
     return Diagnosis(
         _overall(observed), tuple(observed), tuple(hidden),
         next_measurements(model, log, observed), tuple(told), with_found(model, terms),
+        with_found(model, _and_stand_ins(observed, terms)),
         log.session_names, log.one_clock,
     )  # fmt: skip
 
@@ -222,6 +227,14 @@ def _for_the_model(channels: Sequence[ChannelDiagnosis]) -> list[Term]:
     return [term for _, term in best.values()]
 
 
+def _and_stand_ins(channels: Sequence[ChannelDiagnosis], proved: Sequence[Term]) -> list[Term]:
+    """Return the proved terms and the stand-ins, with the values that they have together."""
+    terms = {(t.effect, t.site): t for t in proved}
+    for channel in channels:
+        terms |= {(t.effect, t.site): t for t in channel.along}
+    return list(terms.values())
+
+
 def _slipped(term: Term, log: Log) -> Term:
     """Return a term that steps once as it stands today: clocks that overlap hold no moment."""
     if not CATALOGUE[term.effect].at_moment:
@@ -248,7 +261,9 @@ def _channel(
 ) -> ChannelDiagnosis:  # fmt: skip
     searched = select(seen, model, withhold, progress)
     held = HeldOut(searched)
-    searched, verdict = _judged(searched, held, model)
+    verdict = with_stand_ins(searched, judge(searched, held))
+    stood_in = _stood_in(searched, verdict, held, model)
+    searched = standing(searched, model.arm, verdict.accused, verdict.beside)
     considered = considered_of(searched, verdict, held, model.arm, withhold)
     chosen = [searched.term_index[p] for p in verdict.accused]
     where = locate(searched, gaps(searched, chosen)[0][searched.kept], chosen)
@@ -262,12 +277,13 @@ def _channel(
         chosen = [selection.term_index[p] for p in verdict.accused]
     gap, remaining = gaps(selection, chosen)
     k = own_coordinates(seen)
+    counted = k if seen.channel == "position" else gap.shape[1]  # a wrench's torques weighed
     kept = selection.kept
     causes = causes_of(selection, verdict, held, model.arm)
-    left = float(np.sqrt(np.mean(remaining[kept][:, :k] ** 2)))
+    left = float(np.sqrt(np.mean((remaining[kept] * seen.weight)[:, :counted] ** 2)))
     verdict, floor = _with_whiteness(verdict, selection, searched)
     held_rms = held.rms(chosen) if held.possible else None
-    gap_rms = float(np.sqrt(np.mean(gap[kept][:, :k] ** 2)))
+    gap_rms = float(np.sqrt(np.mean((gap[kept] * seen.weight)[:, :counted] ** 2)))
     if not causes:  # nothing was fitted but the frame, before as well as after
         held_rms = gap_rms
     structured = verdict.structured
@@ -284,7 +300,7 @@ def _channel(
         selection=selection, judgement=verdict, gap=gap, remaining=remaining,
         held_out=np.sqrt(held.squares(chosen)) if held.possible else None,
         elsewhere=generalisation(selection, chosen), carried=carried(selection, chosen, model.arm),
-        noise_floor_source=floor.source,
+        noise_floor_source=floor.source, **stood_in,
     )  # fmt: skip
 
 
@@ -306,22 +322,20 @@ def _with_whiteness(
     return verdict, noise_floor(selection, True)
 
 
-def _judged(selection: Selection, held: HeldOut, model: Model) -> tuple[Selection, Judgement]:
-    """Return the judgement, and the selection with the values of what it leaves accused.
-
-    An accusation that seemed needless stays where the others, fitted exactly, cannot do without.
-    """
-    judged = judge(selection)
-    kept = holding(selection, judged, held)
-    stood = standing(selection, model.arm, kept.accused)
-    if kept.accused != judged.accused and _left(stood) > (1 + NEEDLESS) * _left(selection):
-        return standing(selection, model.arm, judged.accused), judged
-    return stood, kept
-
-
-def _left(selection: Selection) -> float:
-    """Return the rms of what the terms leave of the kept samples."""
-    return float(np.sqrt(np.mean(selection.residual[selection.kept] ** 2)))
+def _stood_in(
+    selection: Selection, verdict: Judgement, held: HeldOut, model: Model
+) -> dict[str, Any]:
+    """Return the stand-ins as causes, and the terms of causes and stand-ins fitted together."""
+    if not verdict.stand_ins:
+        return {}
+    both = (*verdict.accused, *verdict.stand_ins)
+    along = standing(selection, model.arm, both)
+    told = replace(verdict, accused=both, ties={})
+    marked = [replace(along.terms[p], stand_in=p in verdict.stand_ins) for p in both]
+    return {
+        "stand_ins": causes_of(along, told, held, model.arm, verdict.stand_ins),
+        "along": tuple(marked),
+    }
 
 
 def gaps(selection: Selection, chosen: Sequence[int]) -> tuple[Array, Array]:
@@ -378,6 +392,12 @@ def _channel_findings(channel: ChannelDiagnosis, log: Log) -> list[str]:
         term = channel.selection.terms[position_]
         joint = f" of joint {term.site.joint}" if term.site.joint else ""
         told.append(f"{channel.channel}: {term.effect}{joint} is not accused: {reason}")
+        if position_ in channel.judgement.stand_ins:
+            told[-1] += "; poses not fitted gain by it: a stand-in"
+    terms = [term for cause in channel.causes for term in cause.terms]
+    whole = channel.verdict == "explained"
+    sentences = slip_sentences(terms, channel.selection.observation, whole)
+    told += [f"{channel.channel}: {sentence}" for sentence in sentences]
     for cause in channel.causes:
         told += [f"{channel.channel}: {note}" for note in cause.notes]
     return told

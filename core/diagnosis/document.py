@@ -66,6 +66,7 @@ def _channel(c: ChannelDiagnosis, diagnosis: Diagnosis) -> dict[str, Any]:
             "depends_on": _quantities(c.where.depends_on),
         },
         "causes": [_cause(cause, c, diagnosis) for cause in c.causes],
+        "stand_ins": [_cause(stand_in, c, diagnosis) for stand_in in c.stand_ins],
         "considered": [
             {
                 "effect": k.effect,

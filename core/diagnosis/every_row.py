@@ -12,11 +12,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from core.diagnosis.criteria import TIE
 from core.diagnosis.held_out import HeldOut
-from core.diagnosis.judgement import TIE, Judgement
+from core.diagnosis.judgement import Judgement
 from core.diagnosis.observation import Observation
 from core.diagnosis.selection.candidate import Candidate
 from core.diagnosis.selection.following import exact_columns
+from core.diagnosis.selection.geometry import links_of
 from core.diagnosis.selection.local_search import rivals
 from core.diagnosis.selection.noise import carried_to
 from core.diagnosis.selection.outliers import inliers
@@ -45,17 +47,19 @@ def on_every_row(
     noise = carried_to(placed, selection.noise)
     work = Work(placed, model.arm, candidates, noise, np.ones(len(placed.rows), dtype=bool))
     work.kept = inliers(work, placed.measured - placed.predict(terms))
-    base = terms if placed.channel != "tracking" else ()
-    columns = [exact_columns(placed, c, base) for c in candidates]
-    space, raw = sample_space(work, columns, base, [])
-    found = fit(space, tuple(accused))
-    fitted, index, spread, residual = refit(work, space, found)
+    columns = [exact_columns(placed, c, terms) for c in candidates]
+    space, raw = sample_space(work, columns, terms, [])
+    links = {p: selection.prior[c] for p, c in enumerate(selection.term_index)
+             if c in selection.prior and p in accused}  # fmt: skip
+    near = links_of(space, links).beside(space, links) if links else space
+    found = fit(near, tuple(p for p in accused if p not in links))
+    fitted, index, spread, residual = refit(work, space, found, links)
     values, covariance = list(selection.terms), list(selection.covariance)
     for c, term, own in zip(index, fitted, spread, strict=True):
         values[c], covariance[c] = term, own
     return Selection(
         work.observation, space, found, tuple(values), tuple(range(len(values))),
-        tuple(covariance), work.kept, noise, residual, base, raw,
+        tuple(covariance), work.kept, noise, residual, terms, raw, links,
     )  # fmt: skip
 
 
@@ -83,8 +87,11 @@ def still_accused(
         withdrawn += [(p, "over all rows the gap does not shrink by it") for p in gone]
     if tuple(accused) != judgement.accused:
         whole = standing(selection, model.arm, accused)
-        selection = replace(whole, found=fit(selection.space, tuple(accused)))
-    ties = {p: _ties(selection, p) for p in accused}
+        links = {p: own for p, own in selection.prior.items() if p in accused}
+        whole = replace(whole, prior=links)
+        single = tuple(p for p in accused if p not in links)
+        selection = replace(whole, found=fit(whole.working, single))
+    ties = {p: _ties(selection, p) for p in accused if p not in selection.prior}
     return selection, replace(
         judgement, accused=tuple(accused), withdrawn=tuple(withdrawn), ties=ties
     )
@@ -94,16 +101,18 @@ def _ties(selection: Selection, position: int) -> tuple[str, ...]:
     own = selection.terms[position].effect
     names = (
         selection.space.candidates[other].family
-        for _, other in rivals(selection.space, selection.found, position, TIE)
+        for _, other in rivals(selection.working, selection.found, position, TIE)
     )
     return tuple(dict.fromkeys(name for name in names if name != own))
 
 
 def _rivals(selection: Selection, accused: Sequence[int]) -> list[Candidate]:
     """Return the named candidates that explain as well, on the searched rows, as an accused one."""
-    space = selection.space
+    space = selection.working
     near: dict[int, float] = {}
     for p in accused:
+        if selection.term_index[p] in selection.prior:
+            continue
         for score, other in rivals(space, selection.found, selection.term_index[p], TIE):
             if space.candidates[other].named and other not in selection.term_index:
                 near[other] = min(score, near.get(other, np.inf))

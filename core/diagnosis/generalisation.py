@@ -14,14 +14,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.held_out import MANY_ROWS, TINY
 from core.diagnosis.observation import Observation
+from core.diagnosis.selection.refit import WEAK
 from core.diagnosis.selection.selection import Selection
 from core.estimation.regions import joint_regions
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 REGIONS = 5  # of joint space, or stretches of time: each is left out whole
+MANY_ROWS = 6000  # of the sample space: from there sums instead of a decomposition of all rows
+TINY = 1e-12  # share of the largest eigenvalue
 FEWEST = 3  # samples of a region that the figure needs
 GAP = 0.02  # share of a recording on either side of a judged stretch that is not fitted either
 RANK = 1e-9
@@ -56,10 +58,14 @@ class _Problem:
     def __init__(self, selection: Selection, chosen: tuple[int, ...]) -> None:
         observation, kept = selection.observation, selection.kept
         self._k = observation.measured.shape[1]
-        self._own = min(self._k, 3) if observation.channel in ("position", "wrench") else self._k
+        self._own = min(self._k, 3) if observation.channel == "position" else self._k
+        self._weight = observation.weight[: self._own]
         self._unwhiten = np.linalg.inv(selection.noise.whitener[kept])
         raw = selection.raw
         self._causes = raw.columns(selection.space, chosen)
+        usual = [p.scale for c in chosen for p in selection.space.candidates[c].parameters]
+        weak = 1 / (WEAK * np.array(usual)) if usual else np.zeros(0)
+        self._hold = np.maximum(selection.pull(chosen), weak)
         self._nuisance, self._gap = raw.nuisance, raw.target
         self._owner = np.array(observation.nuisance_session or (0,) * raw.nuisance.shape[1])
         whole = observation.session
@@ -80,7 +86,7 @@ class _Problem:
             fitted &= np.isin(self._session, framed)
             if judged.sum() < FEWEST or self._k * fitted.sum() <= A.shape[1]:
                 continue
-            x = _solved(A[self._rows(fitted)], self._gap[self._rows(fitted)])
+            x = _solved(A[self._rows(fitted)], self._gap[self._rows(fitted)], self._hold)
             rows = self._rows(judged)
             left.append(self._in_unit(self._gap[rows] - A[rows] @ x, judged))
         if len(left) < 2:
@@ -98,7 +104,7 @@ class _Problem:
             rows = self._rows(~out)
             if len(self._gap[rows]) <= A.shape[1]:
                 continue
-            x = _solved(A[rows], self._gap[rows])[: self._causes.shape[1]]
+            x = _solved(A[rows], self._gap[rows], self._hold)[: self._causes.shape[1]]
             rows = self._rows(out)
             left, N = self._gap[rows] - self._causes[rows] @ x, self._nuisance[rows][:, own]
             left = left - N @ _solved(N, left)
@@ -107,7 +113,8 @@ class _Problem:
 
     def _enough(self, session: int, fitted: NDArray[np.bool_]) -> bool:
         own = int((self._owner == session).sum())
-        return self._k * int((fitted & (self._session == session)).sum()) >= own + 3
+        found = int((fitted & (self._session == session)).sum())
+        return bool(self._k * found >= own + 3)
 
     def _rows(self, samples: NDArray[np.bool_]) -> NDArray[np.bool_]:
         return np.repeat(samples, self._k)
@@ -116,6 +123,7 @@ class _Problem:
         """Return whitened residuals as the channel's own coordinates (n, own)."""
         return np.asarray(
             (self._unwhiten[samples] @ left.reshape(-1, self._k, 1))[:, : self._own, 0]
+            * self._weight
         )
 
 
@@ -142,16 +150,26 @@ def regions(
     return fold, np.zeros((int(fold.max()) + 1, n), dtype=bool)
 
 
-def _solved(A: Array, b: Array) -> Array:
-    """Return the least squares solution (p,), columns scaled to one length."""
+def _solved(A: Array, b: Array, hold: Array | None = None) -> Array:
+    """Return the least squares solution (p,), columns scaled to one length.
+
+    ``hold`` (<= p,), one over a size, pulls the first columns' values towards zero: what the rows
+    at hand do not show stays there, instead of running to what other rows would never allow.
+    """
     if not A.shape[1]:
         return np.zeros(0)
-    unit = 1 / np.sqrt(np.einsum("ij,ij->j", A, A) + 1e-300)
+    ridge = np.zeros(A.shape[1])
+    if hold is not None:
+        ridge[: len(hold)] = hold**2
+    G = A.T @ A + np.diag(ridge)
+    unit = 1 / np.sqrt(np.diag(G) + 1e-300)
     if len(A) > MANY_ROWS:
-        size, V = np.linalg.eigh((A.T @ A) * np.outer(unit, unit))
+        size, V = np.linalg.eigh(G * np.outer(unit, unit))
         inverse = np.where(size > TINY * size[-1], 1 / np.maximum(size, 1e-300), 0.0)
         return np.asarray(unit * (V @ (inverse * (V.T @ (unit * (A.T @ b))))))
-    return np.asarray(np.linalg.lstsq(A * unit, b, rcond=RANK)[0] * unit)
+    rows = np.vstack([A, np.diag(np.sqrt(ridge))]) * unit
+    right = np.concatenate([b, np.zeros(len(ridge))])
+    return np.asarray(np.linalg.lstsq(rows, right, rcond=RANK)[0] * unit)
 
 
 def _rms(values: Array) -> float:

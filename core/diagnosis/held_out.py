@@ -13,8 +13,7 @@ from core.diagnosis.selection.selection import Selection
 Array = NDArray[np.float64]
 FOLDS = 10
 RESAMPLES = 400
-MANY_ROWS = 6000  # of the sample space: from there sums instead of one decomposition a fold
-TINY = 1e-12  # share of the largest eigenvalue
+TINY = 1e-13  # eigenvalue of unit columns below which a direction is none
 
 
 @dataclass(frozen=True)
@@ -28,23 +27,32 @@ class Shrink:
 
 
 class HeldOut:
-    """Cross-validation of sets of candidates in a selection's sample space, by condition."""
+    """Cross-validation of sets of candidates in a selection's sample space.
 
-    def __init__(self, selection: Selection, seed: int = 0) -> None:
+    Folds are conditions drawn at random, or ``parts`` (n,): numbers from 0 of each kept sample.
+    """
+
+    def __init__(
+        self, selection: Selection, seed: int = 0, parts: NDArray[np.int64] | None = None
+    ) -> None:
         self._space = selection.space
         self._raw, self._target = selection.raw, selection.raw.target
         self._nuisance = selection.raw.nuisance
         k = selection.observation.measured.shape[1]
-        own = {"position": 3, "wrench": 3}.get(selection.observation.channel, k)
+        own = {"position": 3}.get(selection.observation.channel, k)
+        # torques of a wrench count in N, as their noise compares: a cause may show in them alone
+        self._weight = selection.observation.weight[: min(own, k)]
         self._unwhiten = np.linalg.inv(selection.noise.whitener[selection.kept])
         self._k, self._own = k, min(own, k)
         names, group = np.unique(selection.observation.groups[selection.kept], return_inverse=True)
         self._group, self._groups = group, len(names)
-        folds = min(FOLDS, len(names))
-        self.possible = folds >= 2 and len(self._target) > self._nuisance.shape[1] + 3
-        fold_of = np.random.default_rng(seed).permutation(len(names)) % max(folds, 1)
-        self._fold = np.repeat(fold_of[group], k)
-        self._folds = folds
+        if parts is None:
+            order = np.random.default_rng(seed).permutation(len(names))
+            parts = (order % min(FOLDS, len(names)))[group]
+        self._folds = int(parts.max()) + 1
+        self.possible = self._folds >= 2 and len(self._target) > self._nuisance.shape[1] + 3
+        self._fold = np.repeat(parts, k)
+        self._pull = selection.pull
         self._seed = seed
         self._known: dict[tuple[int, ...], Array] = {}
 
@@ -53,7 +61,7 @@ class HeldOut:
         key = tuple(sorted(chosen))
         if key not in self._known:
             left = self._left(key).reshape(-1, self._k, 1)
-            gap = (self._unwhiten @ left)[:, : self._own, 0]
+            gap = (self._unwhiten @ left)[:, : self._own, 0] * self._weight
             self._known[key] = np.mean(gap**2, axis=1)
         return self._known[key]
 
@@ -62,36 +70,19 @@ class HeldOut:
         return float(np.sqrt(np.mean(self.squares(chosen))))
 
     def _left(self, chosen: tuple[int, ...]) -> Array:
-        space = self._space
-        A = np.hstack([self._raw.columns(space, chosen), self._nuisance])
+        A = np.hstack([self._raw.columns(self._space, chosen), self._nuisance])
         if not A.shape[1]:
             return self._target
         unit = 1 / np.sqrt(np.einsum("ij,ij->j", A, A) + 1e-300)
         A = A * unit
-        if len(A) > MANY_ROWS:
-            return self._left_by_sums(A)
+        pull = np.concatenate([self._pull(chosen), np.zeros(self._nuisance.shape[1])])
+        whole, g = A.T @ A + np.diag((pull * unit) ** 2), A.T @ self._target
         left = np.empty_like(self._target)
         for k in range(self._folds):
             out = self._fold == k
-            x = np.linalg.lstsq(A[~out], self._target[~out], rcond=1e-9)[0]
-            left[out] = self._target[out] - A[out] @ x
-        return left
-
-    def _left_by_sums(self, A: Array) -> Array:
-        """Return the residual by normal equations: of many rows they cost one pass for all folds.
-
-        Columns of one length; directions under TINY of the largest count as not shown.
-        """
-        parts = [np.flatnonzero(self._fold == k) for k in range(self._folds)]
-        grams = [A[rows].T @ A[rows] for rows in parts]
-        rights = [A[rows].T @ self._target[rows] for rows in parts]
-        G, g = sum(grams), sum(rights)
-        left = np.empty_like(self._target)
-        for rows, own, right in zip(parts, grams, rights, strict=True):
-            size, V = np.linalg.eigh(G - own)
-            inverse = np.where(size > TINY * size[-1], 1 / np.maximum(size, 1e-300), 0.0)
-            x = V @ (inverse * (V.T @ (g - right)))
-            left[rows] = self._target[rows] - A[rows] @ x
+            own, y = A[out], self._target[out]
+            inverse = np.linalg.pinv(whole - own.T @ own, rcond=TINY, hermitian=True)
+            left[out] = y - own @ (inverse @ (g - own.T @ y))
         return left
 
     def shrink(self, with_set: Sequence[int], without_set: Sequence[int]) -> Shrink:

@@ -1,38 +1,44 @@
 """The judgement: what is accused, what is withdrawn, and what is said to be unexplained.
 
-A set of terms is believed only if nothing structured is left and no unnamed function is needed
-beside it. Otherwise the accusations are weak: they may be what the catalogue can do to imitate a
-cause that it does not hold. Then only what much data makes sure of is kept.
+An accusation stands or falls by itself: it has a value, off its bounds; it withstands the unnamed
+functions that the residual asks for (``remainder``); and it shrinks the gap on samples that its fit
+did not see. That something else is left takes nothing back; it is said.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammaincc
 
+from core.diagnosis.bump import bumps
+from core.diagnosis.criteria import (
+    ENOUGH_REPEATS,
+    GAIN,
+    HINT,
+    INSTRUMENTS,
+    OWN_SIGMAS,
+    REPEATED,
+    STAND_IN_GAIN,
+    STATED,
+    SURE,
+    TIE,
+    USUAL,
+)
 from core.diagnosis.held_out import HeldOut
+from core.diagnosis.regions import parts
+from core.diagnosis.remainder import links_withstand, withstanding
 from core.diagnosis.residual_structure import dependence, structure_p_value
 from core.diagnosis.selection.bent import not_bent
 from core.diagnosis.selection.local_search import rivals
-from core.diagnosis.selection.problem import Found, Space, fit
+from core.diagnosis.selection.problem import Found, Space
 from core.diagnosis.selection.selection import Selection
 
 Array = NDArray[np.float64]
-SURE = 0.002  # probability below which a leftover counts as structured
-MANY = 150  # samples from which causes are kept beside a structured leftover
-ACCOMPLICES = 4  # effects that one short log can hardly hold at once
-TIE = 7.0  # score within which another explanation counts as equally good
-STATED = 1.5  # times the stated noise: beyond, more than noise is left
-REPEATED = 1.6  # times the scatter of repeated poses
-ENOUGH_REPEATS = 30  # degrees of freedom from which repeats are a measure of the noise
-USUAL = 1.2e-4  # m, one coordinate: a worse repeatability than that is none
-INSTRUMENTS = 5.0  # times the instrument's sigma, for coarse instruments
-HINT = 0.05  # probability from which a coordinate is suspect once structure is sure
-TRACE = 0.01  # share of an unnamed function from which a coordinate has it
-TOUCH = 0.1  # share of a cause that acts on a coordinate: more than that touches it
-LEAST = 0.002  # share of the held-out gap that a cause has to take beside a leftover
+BESIDE = "it does not keep its value beside the unknown that is left"
 
 
 @dataclass(frozen=True)
@@ -47,110 +53,160 @@ class Judgement:
     ]  # quantity, held-out share of what is not accounted for
     ties: dict[int, tuple[str, ...]]  # position -> effects that would do as well
     withdrawn: tuple[tuple[int, str], ...]  # position, reason
+    beside: tuple[int, ...] = ()  # unnamed functions that account for what is left
+    stand_ins: tuple[
+        int, ...
+    ] = ()  # positions not accused that shrink the gap in regions not fitted
 
 
-def judge(selection: Selection) -> Judgement:
+def judge(selection: Selection, held: HeldOut) -> Judgement:
     """Return the judgement of a selection."""
-    space, found = selection.space, selection.found
-    smooth = [c for c in found.chosen if not space.candidates[c].named]
-    withdrawn: list[tuple[int, str]] = []
-    believed = [c for c in found.chosen if space.candidates[c].named]
-    straight = not_bent(selection.terms, selection.covariance)
-    for position in straight:
-        withdrawn.append((position, "its curve cannot be told from a straight line"))
-        believed.remove(selection.term_index[position])
-    nuisance = selection.nuisance_basis
-    p_value = structure_p_value(space, nuisance, found.chosen)
-    effects = {space.candidates[c].family for c in believed}
-    sure = SURE * (1 + len(believed))  # the more is accused, the less may be left
-    structured = bool(smooth) or p_value < sure or bool(straight) or _too_much_left(selection)
-    samples = int(selection.kept.sum())
-    if samples < MANY and len(effects) >= ACCOMPLICES:
-        structured = True
-    if structured:
-        weak = _weak(selection, believed, smooth)
-        why = "structure is left beside it"
-        withdrawn += [(selection.term_index.index(c), why) for c in weak]
-        believed = [c for c in believed if c not in weak]
-    accused = tuple(selection.term_index.index(c) for c in believed)
+    withdrawn: dict[int, str] = {}  # candidate -> reason
+    whole = selection
+    if selection.block and not links_withstand(selection):
+        withdrawn |= dict.fromkeys(selection.block, BESIDE)
+        selection = selection.without_links()
+    for position, reason in _no_value(selection).items():
+        withdrawn[selection.term_index[position]] = reason
+    withdrawn |= dict.fromkeys(bumps(selection), "one localised shape does as well")
+    believed = [
+        c for c in selection.term_index if c not in withdrawn and c not in selection.block
+    ]  # fmt: skip
+    stays, beside = withstanding(selection, believed)
+    withdrawn |= {c: BESIDE for c in believed if c not in stays}
+    fallen = bool(withdrawn)
+    stays = [*stays, *selection.block]
+    for c in _gainless(selection, stays, held):
+        withdrawn[c] = "it does not shrink the gap on samples that its fit did not see"
+        stays.remove(c)
+    judgement = _told(whole, selection, stays, withdrawn, fallen)
+    return replace(judgement, beside=tuple(beside))
+
+
+def _told(
+    whole: Selection, selection: Selection, stays: list[int], withdrawn: dict[int, str],
+    fallen: bool,
+) -> Judgement:  # fmt: skip
+    """Return the judgement of what stays of a whole selection, and whether structure is left."""
+    place = {c: p for p, c in enumerate(whole.term_index)}
+    space, nuisance = selection.working, selection.nuisance_basis
+    single = [c for c in stays if c not in selection.block]
+    p_value = structure_p_value(space, nuisance, single)
+    p_value = min(p_value, _too_much_left(whole))
+    unnamed = any(not space.candidates[c].named for c in selection.found.chosen)
+    kinds = {space.candidates[c].family for c in stays}
+    # the more is accused, the less may be left
+    structured = p_value < (HINT if unnamed or fallen else SURE * (1 + len(kinds)))
     depends: tuple[tuple[str, float], ...] = ()
-    if structured or not accused:
-        depends = tuple(dependence(space, nuisance, believed, selection.groups))
+    if structured or not stays:
+        depends = tuple(dependence(space, nuisance, single, selection.groups))
+    ties = _ties(space, selection.found, single)
     return Judgement(
-        accused, structured, p_value, depends, _ties(space, found, selection, accused),
-        tuple(withdrawn),
+        tuple(place[c] for c in stays), structured, p_value, depends,
+        {place[c]: names for c, names in ties.items()},
+        tuple((place[c], why) for c, why in withdrawn.items()),
     )  # fmt: skip
 
 
-def holding(selection: Selection, judgement: Judgement, held: HeldOut) -> Judgement:
-    """Return the judgement without accusations that do not hold on samples the fit did not see.
+def _no_value(selection: Selection) -> dict[int, str]:
+    """Return positions of terms that only a bound holds, or whose value may as well be none."""
+    found = dict.fromkeys(
+        not_bent(selection.terms, selection.covariance),
+        "its curve cannot be told from a straight line",
+    )
+    for position, (c, term) in enumerate(zip(selection.term_index, selection.terms, strict=True)):
+        if c in selection.block:
+            continue
+        candidate, spread = selection.space.candidates[c], selection.covariance[position]
+        if candidate.curve is None and any(
+            min(abs(v - p.lower), abs(v - p.upper)) < 1e-6 * p.scale
+            for p, v in zip(candidate.parameters, term.values, strict=False)
+        ):
+            found[position] = "its value stands on its bound"
+        value = np.array(term.values[: len(spread)])
+        if value @ np.linalg.pinv(spread, hermitian=True) @ value < len(value) * OWN_SIGMAS**2:
+            found[position] = "its value may as well be none"
+    return found
 
-    Only where structure is left beside causes: there a training score is no witness.
-    """
-    if not (judgement.structured and judgement.accused and held.possible):
-        return judgement
-    accused, withdrawn = list(judgement.accused), list(judgement.withdrawn)
-    while accused:
-        index = {p: selection.term_index[p] for p in accused}
-        whole = held.rms(list(index.values()))
-        rest = {p: held.rms([c for o, c in index.items() if o != p]) for p in accused}
-        worst = min(accused, key=lambda p: rest[p])
-        if rest[worst] > whole * (1 + LEAST):
+
+def _gainless(selection: Selection, stays: Sequence[int], held: HeldOut) -> list[int]:
+    """Return the candidates of effects that do not shrink the held-out gap, the weakest first."""
+    if not held.possible:
+        return list(stays)
+    left, fallen = list(stays), []
+    while left:
+        kinds = _by_effect(selection, left)
+        low = {
+            kind: held.shrink(left, [c for c in left if c not in own]).interval[0]
+            for kind, own in kinds.items()
+        }
+        worst = min(low, key=lambda kind: low[kind])
+        if low[worst] > GAIN:
             break
-        accused.remove(worst)
-        withdrawn.append((worst, "it does not hold on samples that its fit did not see"))
-    return replace(judgement, accused=tuple(accused), withdrawn=tuple(withdrawn))
+        fallen += kinds[worst]
+        left = [c for c in left if c not in kinds[worst]]
+    return fallen
 
 
-def _weak(selection: Selection, believed: list[int], smooth: list[int]) -> list[int]:
-    """Return the accusations that structure beside them makes weak.
+def _by_effect(selection: Selection, chosen: Sequence[int]) -> dict[str, list[int]]:
+    kinds: dict[str, list[int]] = {}
+    for c in chosen:
+        kinds.setdefault(selection.space.candidates[c].family, []).append(c)
+    return kinds
 
-    A large log of poses tells many causes apart, so there what holds on unseen poses may stay
-    (``holding``). Where each joint has a coordinate of its own, causes stay that touch none of the
-    coordinates with structure.
+
+def with_stand_ins(selection: Selection, judgement: Judgement) -> Judgement:
+    """Return the judgement with what is not accused, but shrinks the gap in regions not fitted.
+
+    Terms go one by one, the least useful first, until each of those left gains.
     """
-    space, observation = selection.space, selection.observation
-    if observation.channel == "position" and selection.kept.sum() >= MANY:
-        return []
-    k = observation.measured.shape[1]
-    coordinate = np.arange(len(space.y)) % k
-    if observation.channel not in ("tracking", "torque"):
-        return believed
-    nuisance, chosen = selection.nuisance_basis, selection.found.chosen
-    touched = {c: _touches(space, c, coordinate, k) for c in (*believed, *smooth)}
-    bad = np.zeros(k, dtype=bool)
-    for c in smooth:
-        bad |= touched[c] > TRACE
-    for j in range(k):
-        bad[j] |= structure_p_value(space, nuisance, chosen, rows=coordinate == j) < HINT
-    if not bad.any():
-        return believed
-    return [
-        c for c in believed
-        if touched[c][bad].sum() > TOUCH or space.candidates[c].effect.felt_by_all
-    ]  # fmt: skip
+    index, none = selection.term_index, _no_value(selection)
+    useful = [p for p, _ in judgement.withdrawn if p not in none]
+    held = HeldOut(selection, parts=parts(selection.observation, selection.kept))
+    if not (useful and held.possible):
+        return judgement
+    chosen = [*judgement.accused, *useful]
+    units = _units(selection, useful)
+    while units:
+        everything = [index[p] for p in chosen]
+        rest = [[index[p] for p in chosen if p not in unit] for unit in units]
+        worst = min(range(len(units)), key=lambda u: held.rms(rest[u]))
+        if held.shrink(everything, rest[worst]).interval[0] > STAND_IN_GAIN:
+            break
+        gone = units.pop(worst)
+        chosen = [p for p in chosen if p not in gone]
+    stand_ins = tuple(sorted(p for unit in units for p in unit))
+    return replace(judgement, stand_ins=stand_ins)
 
 
-def _touches(space: Space, c: int, coordinate: NDArray[np.int64], k: int) -> Array:
-    """Return how the size of a candidate's columns is shared among the coordinates (k,)."""
-    block = space.columns([c])
-    size = np.bincount(coordinate, np.einsum("ij,ij->i", block, block), k)
-    return np.asarray(size / max(float(size.sum()), 1e-300))
+def _units(selection: Selection, positions: Sequence[int]) -> list[tuple[int, ...]]:
+    """Return the positions each by itself, the links' geometry in one."""
+    links = tuple(p for p in positions if selection.term_index[p] in selection.block)
+    single: list[tuple[int, ...]] = [(p,) for p in positions if p not in links]
+    return [*single, links] if links else single
 
 
-def _too_much_left(selection: Selection) -> bool:
-    """Return whether more is left than noise can be: than repeats, or a repeatability, allow."""
+def _too_much_left(selection: Selection) -> float:
+    """Return the probability that noise leaves as much as is left; 1 unless that is too much.
+
+    Against the noise that is stated, or that repeats show, or that instruments usually have.
+    """
     observation, k = selection.observation, selection.observation.measured.shape[1]
     if observation.sigma <= 0 or observation.channel != "position":
-        return False
+        return 1.0
     left = selection.residual[selection.kept][:, : min(k, 3)]
-    variance = float(np.mean(left**2)) * left.size / max(left.size - selection.used, 1)
+    freedom = max(left.size - selection.used, 1.0)
+    variance = float(np.sum(left**2)) / freedom
+    pure, repeats = pure_error(left, observation.groups[selection.kept])
     if observation.sigma_is_whole:
-        return variance > (STATED * observation.sigma) ** 2
-    pure, freedom = pure_error(left, observation.groups[selection.kept])
-    if freedom >= ENOUGH_REPEATS:
-        return variance > REPEATED**2 * max(pure, observation.sigma**2)
-    return variance > max(USUAL, INSTRUMENTS * observation.sigma) ** 2
+        least, times = observation.sigma**2, STATED
+    elif repeats >= ENOUGH_REPEATS:
+        least, times = max(pure, observation.sigma**2), REPEATED
+    else:
+        least, times = max(USUAL, INSTRUMENTS * observation.sigma) ** 2, 1.0
+    if variance <= times**2 * least:
+        return 1.0
+    return float(gammaincc(freedom / 2, freedom * variance / least / 2))
 
 
 def pure_error(left: Array, groups: NDArray[np.int64]) -> tuple[float, int]:
@@ -167,12 +223,9 @@ def pure_error(left: Array, groups: NDArray[np.int64]) -> tuple[float, int]:
     return total / max(freedom, 1), freedom
 
 
-def _ties(
-    space: Space, found: Found, selection: Selection, accused: tuple[int, ...]
-) -> dict[int, tuple[str, ...]]:
+def _ties(space: Space, found: Found, accused: Sequence[int]) -> dict[int, tuple[str, ...]]:
     told: dict[int, tuple[str, ...]] = {}
-    for position in accused:
-        c = selection.term_index[position]
+    for c in accused:
         own = space.candidates[c].family
         names: list[str] = []
         for _, other in rivals(space, found, c, TIE):
@@ -181,10 +234,5 @@ def _ties(
                 continue
             if space.candidates[other].effect.contains != own:  # a curve holds its line: no rival
                 names.append(family)
-        told[position] = tuple(names)
+        told[c] = tuple(names)
     return told
-
-
-def without(selection: Selection, dropped: set[int]) -> Found:
-    """Return the fit of the chosen set less some candidates."""
-    return fit(selection.space, tuple(c for c in selection.found.chosen if c not in dropped))

@@ -37,11 +37,11 @@ def locate(selection: Selection, gap: Array, accused: Sequence[int]) -> Where:
     total = max(float(space.y @ space.y), 1e-300)
     shares: dict[int, float] = {}
     if accused:
-        fitted = dict(zip(selection.found.chosen, selection.found.values, strict=True))
+        values = selection.fitted(accused)
         for c in accused:
             joint = space.candidates[c].site.joint
             if joint is not None:
-                part = space.X[:, space.start[c] : space.start[c + 1]] @ fitted[c]
+                part = space.X[:, space.start[c] : space.start[c + 1]] @ values[c]
                 # what of the gap points along this part: parts of one gap then add up
                 shares[joint] = shares.get(joint, 0.0) + float(part @ space.y) / total
     else:

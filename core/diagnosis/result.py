@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,11 +49,15 @@ class Considered:
 
 
 def causes_of(
-    selection: Selection, judgement: Judgement, held: HeldOut, arm: Arm
-) -> tuple[Cause, ...]:
-    """Return the accused effects, the one with the largest share of the gap first."""
+    selection: Selection, judgement: Judgement, held: HeldOut, arm: Arm,
+    shown: Sequence[int] | None = None,
+) -> tuple[Cause, ...]:  # fmt: skip
+    """Return the accused effects, the one with the largest share of the gap first.
+
+    ``shown`` are positions: of all accused only these are returned, the others kept in.
+    """
     members: dict[str, list[int]] = {}
-    for position in judgement.accused:
+    for position in judgement.accused if shown is None else shown:
         members.setdefault(selection.terms[position].effect, []).append(position)
     everything = [selection.term_index[p] for p in judgement.accused]
     causes = [
@@ -117,12 +121,14 @@ def _not_shown(effect: str, term: Term, deviation: Array, arm: Arm) -> list[str]
 
 def probability(selection: Selection, own: set[int]) -> float:
     """Return the probability that the effect is needed: against the best set without it."""
-    found = selection.found
-    rest = fit(selection.space, tuple(c for c in found.chosen if c not in own))
+    found, space = selection.found, selection.working
+    if own & set(selection.block):  # they won over the best set without them by more than chance
+        return 1.0
+    rest = fit(space, tuple(c for c in found.chosen if c not in own))
     best = rest.score
-    families = {selection.space.candidates[c].family for c in own}
-    for score, c in children(selection.space, rest.chosen, 12):
-        if selection.space.candidates[c].family not in families:
+    families = {space.candidates[c].family for c in own}
+    for score, c in children(space, rest.chosen, 12):
+        if space.candidates[c].family not in families:
             best = min(best, score)
     odds = np.exp(-0.5 * min(max(best - found.score, 0.0), 700.0))
     return float(1 / (1 + odds))
@@ -133,9 +139,11 @@ def considered_of(
     withhold: Iterable[str] = (),
 ) -> tuple[Considered, ...]:  # fmt: skip
     """Return every other effect of the channel's catalogue, and why it is not accused."""
-    space, channel = selection.space, selection.observation.channel
+    space, channel = selection.working, selection.observation.channel
     accused = {selection.terms[p].effect for p in judgement.accused}
-    kept = tuple(selection.term_index[p] for p in judgement.accused)
+    kept = tuple(
+        c for c in (selection.term_index[p] for p in judgement.accused) if c not in selection.block
+    )
     base = fit(space, kept)
     reasons = {selection.terms[p].effect: why for p, why in judgement.withdrawn}
     told = []
@@ -179,4 +187,4 @@ def _shown(selection: Selection, c: int) -> bool:
 def _score_with(selection: Selection, base: Found, c: int) -> float:
     if c in base.chosen:
         return base.score
-    return fit(selection.space, (*base.chosen, c)).score
+    return fit(selection.working, (*base.chosen, c)).score

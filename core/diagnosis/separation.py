@@ -89,9 +89,11 @@ def _questions(
 ) -> Iterator[_Question]:
     """Yield what is open: effects to be told apart, and effects that the log cannot show."""
     selection = channel.selection
-    space, found = selection.space, selection.found
+    space, found = selection.working, selection.found
     for position in channel.judgement.accused:
         own = selection.term_index[position]
+        if own in selection.block:  # nothing stands for all links but they themselves
+            continue
         family = selection.terms[position].effect
         told = {family}
         rest = tuple(c for c in found.chosen if c != own)

@@ -11,7 +11,7 @@ prediction.
 from __future__ import annotations
 
 from abc import ABC
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -56,6 +56,7 @@ class Term:
     effect: str
     site: Site
     values: tuple[float, ...]
+    stand_in: bool = field(default=False, compare=False)  # True: useful, but not proved
 
     def with_values(self, values: Array) -> Term:
         """Return the same term with other values."""
@@ -101,6 +102,7 @@ class Effect(ABC):
     carried: ClassVar[bool] = False  # True: a load on the joints, which friction may grow with
     adds_mass: ClassVar[bool] = False  # True: kg beyond the declared payload
     scales_reading: ClassVar[bool] = False  # True: the sensor reads zero where nothing acts
+    together: ClassVar[bool] = False  # True: small at all places of a real arm, found as a whole
     felt_by_all: ClassVar[bool] = False  # True: one cause moves coordinates of many joints
 
     # how it is found

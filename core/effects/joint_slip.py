@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from core.effects.effect import JointEffect, Parameter, Site, Term, rows_after
+from core.effects.simulator import Kind, SimulatorChange
 
 if TYPE_CHECKING:
     import numpy as np
@@ -36,6 +37,10 @@ class JointSlip(JointEffect):
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the step, and when it happened."""
         return (Parameter("", "rad", 1e-3, -1.0, 1.0), Parameter("time", "s", 1.0))
+
+    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
+        """Return it in a simulator's terms: the arm as it is since."""
+        return (SimulatorChange(Kind.JOINT_ZERO, term.site.joint, term.values[0]),)
 
     def condition(
         self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]

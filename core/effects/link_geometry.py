@@ -68,6 +68,7 @@ class LinkGeometry(Effect):
     """
 
     identifier = "link_geometry"
+    together = True
     title = "link measures differ"
     label_words = "{part} of link {joint}"
     calibrated = 3

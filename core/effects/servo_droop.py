@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from core.effects.effect import JointEffect, Parameter, Site, Term, typical_moment
+from core.effects.simulator import Kind, SimulatorChange
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,6 +36,10 @@ class ServoDroop(JointEffect):
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the droop per torque."""
         return (Parameter("", "rad/Nm", 5e-3 / typical_moment(arm), 0.0, 1.0),)
+
+    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
+        """Return it in a simulator's terms."""
+        return (SimulatorChange(Kind.SERVO_COMPLIANCE, term.site.joint, term.values[0]),)
 
     def settle(
         self,

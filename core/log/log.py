@@ -122,7 +122,7 @@ class Log:
             return None
         return last_motion(q)
 
-    def select(self, rows: Array | slice) -> Log:
+    def select(self, rows: NDArray[Any] | slice) -> Log:
         """Return the log of some of the rows; each keeps the line that it had in the file."""
         lines = np.arange(len(self)) + self.first_row if self.lines is None else self.lines
         columns = {name: values[rows] for name, values in self.columns.items()}

@@ -13,19 +13,10 @@ from core.state import RobotState
 from drivers.can.assembler import Sample
 from drivers.can.codec import ORDER
 from drivers.can.profile import CanProfile
+from drivers.robot_modes import modes_of
+from drivers.state_check import FASTEST, JITTER, LARGEST, JointCheck
 
 Vector = NDArray[np.float64]
-FASTEST = 20.0  # rad/s: joints that move faster between two samples are a mistake
-JITTER = 0.01  # rad
-LARGEST_ANGLE = 1e4  # rad
-BEYOND = 0.35  # rad past a joint limit: another arm, or another zero
-LARGEST = {"velocity": 60.0, "torque": 1e4, "temperature": 300.0}
-RUNNING, IDLE = 7, 5  # RTDE robot_mode
-SAFETY = {
-    "": (1, 1), "not_ready": (1, 1), "protective_stop": (3, 1 << 2), "emergency_stop": (7, 1 << 7),
-    "fault": (9, 1 << 9),
-}  # fmt: skip
-"""Trouble -> RTDE safety_mode and safety_status_bits."""
 
 
 @njit(**JIT)
@@ -59,13 +50,11 @@ class StateBuilder:
 
     def __init__(self, profile: CanProfile, arm: Arm) -> None:
         self._profile = profile
-        self._lower: list[float] = (arm.limits.lower - BEYOND).tolist()
-        self._upper: list[float] = (arm.limits.upper + BEYOND).tolist()
+        self._joints = JointCheck(arm)
         self._names = [name for name in ORDER if name in profile.quantities]
         others = [np.full(profile.n, LARGEST[name]) for name in self._names[1:]]
-        lower = np.maximum(self._lower, -LARGEST_ANGLE)
-        upper = np.minimum(self._upper, LARGEST_ANGLE)
-        self._bounds = np.array([lower, upper, *others])
+        lower = self._joints.lower
+        self._bounds = np.array([lower, self._joints.upper, *others])
         # compiled here: the first sample must not wait for a compiler
         _looked_at(np.zeros((len(self._names), profile.n)), self._bounds, lower, np.inf)
         self._before: Sample | None = None
@@ -87,7 +76,7 @@ class StateBuilder:
         if qd is None:
             qd = self._differences(sample, before)
         self._before = sample
-        safety, bits = SAFETY[trouble]
+        modes = modes_of((trouble, "" if ready else "not_ready"))
         return RobotState(
             timestamp=sample.received,
             received=sample.received,
@@ -97,9 +86,9 @@ class StateBuilder:
             actual_TCP_force=np.zeros(6),
             joint_temperatures=told.get("temperature"),
             actual_current_as_torque=told.get("torque"),
-            robot_mode=IDLE if trouble == "not_ready" or not ready else RUNNING,
-            safety_mode=safety,
-            safety_status_bits=bits,
+            robot_mode=modes.robot_mode,
+            safety_mode=modes.safety_mode,
+            safety_status_bits=modes.safety_status_bits,
         )
 
     def _told(self, sample: Sample, before: Sample | None) -> dict[str, Vector]:
@@ -110,34 +99,21 @@ class StateBuilder:
             earlier = before.position
         told = _looked_at(table, self._bounds, earlier, step)
         if told < 0:
-            self._check(sample.position, sample.others)
-            if before is not None:
-                self._check_step(sample.position - earlier, sample.received - before.received)
-            raise self._invalid("found a sample that cannot be believed")
+            raise self._invalid(self._reason(sample, before))
         return {name: table[k] for k, name in enumerate(self._names) if told >> k & 1}
 
-    def _check(self, q: Vector, others: dict[str, Vector]) -> None:
-        """Raise what no such arm can say, with words for it."""
-        for i, angle in enumerate(q.tolist()):
-            if not -LARGEST_ANGLE <= angle <= LARGEST_ANGLE:  # NaN is not either
-                raise self._invalid(f"joint {i + 1}: found {angle:g}, expected a finite angle")
-            if not self._lower[i] <= angle <= self._upper[i]:
-                raise self._invalid(
-                    f"joint {i + 1}: found {angle:.4f} rad, far outside the arm's limits: another "
-                    "arm, or another zero"
-                )
-        for name, most in LARGEST.items():
-            for i, value in enumerate(others[name].tolist() if name in others else ()):
-                if abs(value) > most:
-                    raise self._invalid(f"{name} of joint {i + 1}: found {value:g}")
-
-    def _check_step(self, step: Vector, gap: float) -> None:
-        most = FASTEST * gap + JITTER
-        for i, way in enumerate(step.tolist()):
-            if abs(way) > most:
-                raise self._invalid(
-                    f"joint {i + 1}: found a step of {abs(way):.4f} rad in {gap:.4f} s"
-                )
+    def _reason(self, sample: Sample, before: Sample | None) -> str:
+        """Return why a sample cannot be believed."""
+        found = self._joints.outside(sample.position)
+        if found is None:
+            for name, values in sample.others.items():
+                for i, value in enumerate(values.tolist()):
+                    if abs(value) > LARGEST[name]:
+                        return f"{name} of joint {i + 1}: found {value:g}"
+        if found is None and before is not None:
+            gap = sample.received - before.received
+            found = self._joints.jumped(sample.position - before.position, gap)
+        return found or "found a sample that cannot be believed"
 
     def _differences(self, sample: Sample, before: Sample | None) -> Vector:
         """Return velocities (n,) from two positions, rad/s; the bus's clock where it moves."""

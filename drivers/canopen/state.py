@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from core.arm import Arm
 from core.errors import InvalidStateError
 from core.state import RobotState
-from drivers.can.state import BEYOND, FASTEST, IDLE, JITTER, RUNNING, SAFETY
 from drivers.canopen.objects import MODE_ACTIVE, State, state_of
 from drivers.canopen.profile import CanopenProfile
 from drivers.canopen.sync_set import SyncSet
+from drivers.robot_modes import modes_of
+from drivers.state_check import JointCheck
 
 Vector = NDArray[np.float64]
 SPAN, OLDEST = 5, 0.1  # samples, s: what a velocity is reckoned from where drives tell none
@@ -44,7 +45,7 @@ class StateBuilder:
 
     def __init__(self, profile: CanopenProfile, arm: Arm) -> None:
         self._profile = profile
-        self._lower, self._upper = arm.limits.lower - BEYOND, arm.limits.upper + BEYOND
+        self._joints = JointCheck(arm)
         self._rated = profile.rated_torque
         self._last: deque[tuple[float, Vector]] = deque(maxlen=SPAN)  # s of the SYNC, rad
 
@@ -64,18 +65,17 @@ class StateBuilder:
         its SYNC, at which all drives latched their positions.
         """
         q = positions(self._profile, found)
-        self._check(q)
-        if self._last:
+        wrong = self._joints.outside(q)
+        if wrong is None and self._last:
             synced, before = self._last[-1]
-            try:
-                self._check_step(q - before, found.synced - synced)
-            except InvalidStateError:
+            wrong = self._joints.jumped(q - before, found.synced - synced)
+            if wrong is not None:
                 self.forget()
-                raise
+        if wrong is not None:
+            raise self._invalid(wrong)
         qd = self._velocity(found, q)
         self._last.append((found.synced, q))
-        trouble = self._trouble(found, armed)
-        safety, bits = SAFETY[trouble]
+        modes = modes_of([self._trouble(found, armed)])
         return RobotState(
             timestamp=found.synced,
             received=found.received,
@@ -84,9 +84,9 @@ class StateBuilder:
             target_q=q if target is None else target,
             actual_TCP_force=np.zeros(6),
             actual_current_as_torque=self._torque(found),
-            robot_mode=IDLE if trouble == "not_ready" else RUNNING,
-            safety_mode=safety,
-            safety_status_bits=bits,
+            robot_mode=modes.robot_mode,
+            safety_mode=modes.safety_mode,
+            safety_status_bits=modes.safety_status_bits,
         )
 
     def _trouble(self, found: SyncSet, armed: bool) -> str:
@@ -98,23 +98,6 @@ class StateBuilder:
         if "QUICK STOP ACTIVE" in told:
             return "protective_stop"
         return "" if not_following(self._profile, found) is None else "not_ready"
-
-    def _check(self, q: Vector) -> None:
-        outside = ~((q >= self._lower) & (q <= self._upper))
-        if outside.any():
-            joint = int(np.argmax(outside))
-            raise self._invalid(
-                f"joint {joint + 1}: found {q[joint]:.4f} rad, far outside the arm's limits: "
-                "another arm, another zero, or other units"
-            )
-
-    def _check_step(self, step: Vector, gap: float) -> None:
-        way = np.abs(step)
-        if (way > FASTEST * gap + JITTER).any():
-            joint = int(np.argmax(way))
-            raise self._invalid(
-                f"joint {joint + 1}: found a step of {way[joint]:.4f} rad in {gap:.4f} s"
-            )
 
     def _velocity(self, found: SyncSet, q: Vector) -> Vector:
         """Return (n,) rad/s: the drives' own where the profile knows its unit.

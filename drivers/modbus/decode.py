@@ -18,17 +18,18 @@ from drivers.modbus.plan import TURN, BlockPlan
 from drivers.modbus.profile import ECHO_WORDS, addresses, turns_of, vectors
 from drivers.modbus.registers import BIT_TABLES, UNITS, Coding, words_in
 from drivers.modbus.schema import Condition, Mailbox, Place, ProfileFile, Trouble, Vector
+from drivers.state_check import JITTER, LARGEST
 
 Array = NDArray[np.float64]
 Registers = Sequence[bytes]  # of each of RegisterMap.blocks, two bytes each, as on the wire
 Spot = tuple[int, int, Coding]  # a number's block and its first register there
 
 BOUNDS = {
-    "position": 20.0, "velocity": 30.0, "target": 20.0, "joint_torque": 1e5, "temperature": 300.0,
-    "force": 1e5, "moment": 1e5, "echo": math.inf,
+    "position": LARGEST["position"], "target": LARGEST["position"], "velocity": LARGEST["velocity"],
+    "joint_torque": LARGEST["torque"], "temperature": LARGEST["temperature"],
+    "force": LARGEST["force"], "moment": LARGEST["moment"], "echo": math.inf,
 }  # fmt: skip
-"""Largest plausible magnitudes, SI."""
-JITTER = 0.01  # rad beyond what the fastest joint can have come
+"""Largest plausible magnitudes, SI, by the profile's names."""
 
 
 class Sample(NamedTuple):

@@ -22,14 +22,13 @@ from drivers.modbus.settings import ModbusSettings
 from drivers.modbus.transport import Transport
 from drivers.modbus.write import make_writer
 from drivers.offset_inverse import Nominal
+from drivers.robot_modes import NORMAL, REDUCED, RUNNING, modes_of
+from drivers.state_check import JointCheck
 
 Vector = NDArray[np.float64]
 SLOW_EVERY = 0.2  # s between two readings of conditions that lie apart
-BEYOND = 0.1  # rad outside the arm's joint limits: the register map is wrong
 LONGEST_ANSWER, LEAST_ANSWER = 4.0, 0.03  # cycles, s: an older answer is not fresh
 MARGIN = 2.0  # times the arm's own velocity limits: what no joint can pass
-MODES = {"not_ready": (5, 1), "protective_stop": (7, 3), "emergency_stop": (3, 7), "fault": (7, 9)}
-"""Trouble -> RTDE robot_mode and safety_mode."""
 
 
 class ModbusDriver(Driver):
@@ -91,14 +90,9 @@ class ModbusDriver(Driver):
 
     def _check_limits(self, q: Vector) -> None:
         """Refuse joints where the arm cannot be: units, word order or signs are wrong."""
-        limits = self._model.arm.limits
-        outside = (q < limits.lower - BEYOND) | (q > limits.upper + BEYOND)
-        if outside.any():
-            joint = int(np.argmax(outside))
-            raise InvalidStateError(
-                f"joint {joint + 1}: found {q[joint]:.4f} rad, expected the arm's limits, "
-                f"{limits.lower[joint]:.4f} to {limits.upper[joint]:.4f}: is the profile right?"
-            )
+        found = JointCheck(self._model.arm).outside(q)
+        if found is not None:
+            raise InvalidStateError(f"{found}: is the profile right?")
 
     def read_state(self) -> RobotState:
         """Return the next new sample; see Driver.read_state."""
@@ -192,15 +186,13 @@ class ModbusDriver(Driver):
             force[:3] = found["force"]
         if "moment" in found:
             force[3:] = found["moment"]
-        robot_mode, safety_mode = 7, 1
-        for trouble, _ in sample.troubles:
-            mode, safety = MODES[trouble]
-            robot_mode, safety_mode = min(robot_mode, mode), max(safety_mode, safety)
+        modes = modes_of(trouble for trouble, _ in sample.troubles)
         return RobotState(
             timestamp, received, q, velocity, target, force,
             joint_temperatures=found.get("temperature"),
             actual_current_as_torque=found.get("joint_torque"),
-            robot_mode=robot_mode, safety_mode=safety_mode,
+            robot_mode=modes.robot_mode, safety_mode=modes.safety_mode,
+            safety_status_bits=modes.safety_status_bits,
         )  # fmt: skip
 
     def nominal_q(self, state: RobotState) -> Vector:
@@ -219,7 +211,7 @@ class ModbusDriver(Driver):
         """Check robot and resolution, and make ready for writing; moves nothing."""
         name = self.transport.name
         if self.profile.write.mode != "read_only":
-            if state.robot_mode != 7 or state.safety_mode not in (1, 2):
+            if state.robot_mode != RUNNING or state.safety_mode not in (NORMAL, REDUCED):
                 words = "; ".join(text for _, text in self._sample.troubles) if self._sample else ""
                 raise WriteError(f"{name}: the robot is not ready: {words}")
             self._check_resolution(state.actual_q)

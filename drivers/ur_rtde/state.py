@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from core.errors import InvalidStateError, LinkError, StaleStateError
 from core.kernels.reference import JIT
 from core.state import RobotState
+from drivers.state_check import FASTEST, JITTER, LARGEST
 from drivers.ur_rtde.registers import APPLIED, ECHO, PROGRAM
 from drivers.ur_rtde.settings import UrRtdeSettings
 
@@ -27,18 +28,16 @@ Vector = NDArray[np.float64]
 N = 6
 POLL = 200e-6  # s: best of the polls measured (age 0.33 ms, a sixth of a core)
 ATTEMPTS = 4
-FASTEST = 20.0  # rad/s: joints that move faster between two samples are a mistake
-JITTER = 0.01  # rad
 
 # field of RobotState: (getter, size, largest plausible magnitude, whether a controller may lack it)
 _VECTORS: dict[str, tuple[str, int, float, bool]] = {
-    "actual_q": ("getActualQ", N, 20.0, False),
-    "actual_qd": ("getActualQd", N, 30.0, False),
-    "target_q": ("getTargetQ", N, 20.0, False),
-    "actual_TCP_force": ("getActualTCPForce", 6, 1e4, False),
-    "ft_raw_wrench": ("getFtRawWrench", 6, 1e4, True),
-    "joint_temperatures": ("getJointTemperatures", N, 300.0, True),
-    "actual_current": ("getActualCurrent", N, 1e3, True),
+    "actual_q": ("getActualQ", N, LARGEST["position"], False),
+    "actual_qd": ("getActualQd", N, LARGEST["velocity"], False),
+    "target_q": ("getTargetQ", N, LARGEST["position"], False),
+    "actual_TCP_force": ("getActualTCPForce", 6, LARGEST["force"], False),
+    "ft_raw_wrench": ("getFtRawWrench", 6, LARGEST["force"], True),
+    "joint_temperatures": ("getJointTemperatures", N, LARGEST["temperature"], True),
+    "actual_current": ("getActualCurrent", N, LARGEST["current"], True),
     "payload_cog": ("getPayloadCog", 3, 10.0, True),
 }
 POSE = "actual_TCP_pose"  # read when it is asked for, not in every cycle

@@ -189,6 +189,7 @@ def _placed(model: Model, data: Data, metrology: Metrology) -> Placement:
         frame = register_robustly(data.position, model.predict(data.q, data.loads).position)
     if metrology.remounted and not metrology.registered:
         fit = fit_nuisances(model, data)
+        assert isinstance(fit.frame, Registration)
         frame, tool = fit.frame, fit.model.tool_in_flange
     return Placement(frame, tool)
 

@@ -94,7 +94,7 @@ def instrument_noise(signal: Array, motion: Motion) -> Array | None:
         return None
     whole = np.isfinite(signal).all(axis=1)
     step = signal_step(signal[whole])
-    return np.maximum(signal_noise(signal[whole]), step / np.sqrt(12))
+    return np.asarray(np.maximum(signal_noise(signal[whole]), step / np.sqrt(12)))
 
 
 def signal_step(signal: Array) -> Array:

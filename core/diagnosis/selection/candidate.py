@@ -159,9 +159,9 @@ def _at(
         ]
     if effect.shapes:
         had = {t.values[-1] for t in inside}
-        held = (None,) * (len(parameters) - 1)
+        unheld = (None,) * (len(parameters) - 1)
         return [
-            Candidate(effect.identifier, site, parameters[:-1], (*held, shape))
+            Candidate(effect.identifier, site, parameters[:-1], (*unheld, shape))
             for shape in (*effect.shapes, *(had - {*effect.shapes}))
         ]
     if any(p.of_rotation for p in parameters) and not with_rotation:

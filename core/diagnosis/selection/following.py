@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from core.diagnosis.observation import Observation
 from core.diagnosis.selection.candidate import Candidate, named_columns
+from core.diagnosis.selection.problem import Found, Space, fit
 from core.effects import CATALOGUE, Term
 
 Array = NDArray[np.float64]
@@ -34,18 +35,23 @@ def exact_columns(observation: Observation, candidate: Candidate, base: Sequence
         t.values[0] for t in base
         if t.site.joint == candidate.site.joint and _alike(t, candidate)
     ]  # fmt: skip
-    nothing = observation.predict(())
+    # what else moves the joint stays: play of a joint that lags is not that of one that does not
+    others = [
+        t for t in base
+        if t.site.joint == candidate.site.joint and not _alike(t, candidate)
+    ]  # fmt: skip
+    nothing = observation.predict(others)
     if inside:
         value = float(np.sum(inside))
     else:
-        slope = named_columns(observation, candidate, ())[..., 0]
+        slope = named_columns(observation, candidate, others)[..., 0]
         gap = observation.measured - nothing
         value = float(np.sum(slope * gap) / max(float(np.sum(slope**2)), 1e-300))
     parameter = candidate.parameters[0]
     value = min(max(value, parameter.lower), parameter.upper)
     if abs(value) < SHORTEST * parameter.scale:
-        return named_columns(observation, candidate, ())
-    moved = observation.predict([candidate.term(np.array([value]))]) - nothing
+        return named_columns(observation, candidate, others)
+    moved = observation.predict([*others, candidate.term(np.array([value]))]) - nothing
     return np.asarray(moved / value)[..., None]
 
 
@@ -53,3 +59,22 @@ def _alike(term: Term, candidate: Candidate) -> bool:
     """Return whether a term's value is one of the candidate: of delays their sum is."""
     delays = CATALOGUE[term.effect].delays and candidate.effect.delays
     return delays or term.effect == candidate.family
+
+
+def one_delay(space: Space, found: Found) -> Found:
+    """Return the set with all joints that answer late told as one effect of the controller.
+
+    Latency or lag, whichever fits all of these joints better: each joint by itself decides little.
+    """
+    site = {(k.family, k.site.joint): c for c, k in enumerate(space.candidates) if k.effect.delays}
+    late = [c for c in found.chosen if space.candidates[c].effect.delays]
+    if len(late) < 2:
+        return found
+    rest = [c for c in found.chosen if c not in late]
+    joints = sorted({space.candidates[c].site.joint or 0 for c in late})
+    sets = [
+        fit(space, (*rest, *(site[effect, j] for j in joints)))
+        for effect in dict.fromkeys(effect for effect, _ in site)
+        if all((effect, j) in site for j in joints)
+    ]
+    return min(sets, key=lambda f: f.score, default=found)

@@ -15,9 +15,7 @@ BEAM = 6
 DEPTH = 9
 PATIENCE = 2  # depths without a better set before the beam stops
 SMOOTH_TERMS = 2  # more unnamed functions than that tell nothing more
-LINES = 4  # periodic lines a joint may have
-MORE_LINES = 8  # where the log is as large as this
-MANY_ROWS = 1500  # rows of the sample space
+LINES = 4  # periodic lines a joint may have: more are the Fourier series of something else
 DEPENDENT = 1e-5  # share of a block below which a direction counts as given by its others
 
 
@@ -35,7 +33,7 @@ class State:
 def clash(space: Space, chosen: Sequence[int], new: int) -> bool:
     """Return whether a candidate stands instead of, not beside, one that is chosen."""
     b = space.candidates[new]
-    lines, allowed = 0, LINES if len(space.y) < MANY_ROWS else MORE_LINES
+    lines = 0
     if not b.named and sum(not space.candidates[c].named for c in chosen) >= SMOOTH_TERMS:
         return True
     for c in chosen:
@@ -44,7 +42,7 @@ def clash(space: Space, chosen: Sequence[int], new: int) -> bool:
             continue
         if a.family == b.family and a.periodic:
             lines += 1
-            if abs((a.site.order or 0) - (b.site.order or 0)) < 0.75 or lines >= allowed:
+            if abs((a.site.order or 0) - (b.site.order or 0)) < 0.75 or lines >= LINES:
                 return True
         elif a.family in (b.family, b.effect.contains) or b.family == a.effect.contains:
             return True

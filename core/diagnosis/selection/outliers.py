@@ -13,7 +13,7 @@ from core.diagnosis.selection.state import Raw, Work, sample_space
 from core.effects import Term
 
 Array = NDArray[np.float64]
-WILD_SHARE = 0.05  # of the samples: more of them is structure, not bad luck
+WILD_SHARE = 0.1  # of the samples: more of them is structure, not bad luck
 WILD_SIGMA = 5.0
 FORETOLD = 0.5  # share of a wild reading that may be left where something else explains it
 RIDGE = 5.0  # usual sizes of a parameter: prior of the fit that only looks for wild readings

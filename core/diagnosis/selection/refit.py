@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -17,21 +18,26 @@ from core.errors import InputError
 
 Array = NDArray[np.float64]
 REFITS = 8
+NO_PRIOR: Mapping[int, Array] = {}
 WEAK = 100.0  # usual sizes of a parameter: how far the data may take it against nothing
 
 
 def refit(
-    work: Work, space: Space, found: Found
+    work: Work, space: Space, found: Found, links: Mapping[int, Array] = NO_PRIOR
 ) -> tuple[tuple[Term, ...], tuple[int, ...], tuple[Array, ...], Array]:
-    """Refit the named terms exactly, smooth ones kept linear; moves the frame along."""
-    index = tuple(c for c in found.chosen if space.candidates[c].named)
+    """Refit the named terms exactly, smooth ones kept linear; moves the frame along.
+
+    ``links`` are further candidates, with 1 sigma of each number: these are kept near nominal.
+    """
+    index = (*(c for c in found.chosen if space.candidates[c].named), *links)
     freed = {c: _freed(work.arm, space.candidates[c]) for c in index}
     smooth = [c for c in found.chosen if not space.candidates[c].named]
     x = [
         np.array(space.candidates[c].term(v).values)[: len(freed[c].parameters)]
         for c, v in zip(found.chosen, found.values, strict=True)
         if c in index
-    ]
+    ] + [np.zeros(len(space.candidates[c].parameters)) for c in links]
+    usual = [links[c] if c in links else _wide(freed[c]) for c in index]
     extra = space.columns(smooth)
     covariance: list[Array] = []
     for _ in range(REFITS):
@@ -47,7 +53,7 @@ def refit(
         b = flat(gap[..., None], work)[:, 0]
         size = np.sqrt(np.einsum("ij,ij->j", A, A))
         unit = np.where(size > 1e-150, 1 / np.maximum(size, 1e-150), 0.0)  # 0: moves nothing
-        pull, towards = _pull(freed, index, x, A.shape[1])
+        pull, towards = _pull(usual, x, A.shape[1])
         step = _step(np.vstack([A, pull]), np.concatenate([b, towards]), unit, freed, index, x)
         sizes = [len(v) for v in x]
         cuts = np.cumsum([*sizes, extra.shape[1]])
@@ -63,10 +69,11 @@ def refit(
             work.observation = observation.rebase(_along(extra, nuisance, left, work))
         residual_ss = float(np.sum((b - A @ step) ** 2))
         variance = max(residual_ss / max(len(b) - A.shape[1], 1), space.floor)
-        inverse = np.linalg.pinv((A * unit).T @ (A * unit), rcond=1e-13, hermitian=True)
-        whole = inverse * np.outer(unit, unit) * variance
+        whole = np.vstack([A, pull]) * unit
+        inverse = np.linalg.pinv(whole.T @ whole, rcond=1e-13, hermitian=True)
+        spread = inverse * np.outer(unit, unit) * variance
         begin = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
-        covariance = [whole[i:j, i:j] for i, j in itertools.pairwise(begin)]
+        covariance = [spread[i:j, i:j] for i, j in itertools.pairwise(begin)]
         if moved < 1e-6:
             break
     terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
@@ -108,18 +115,21 @@ def _along(extra: Array, nuisance: Array, gap: Array, work: Work) -> Array:
     return np.asarray(solution[extra.shape[1] :])
 
 
-def _pull(
-    freed: dict[int, Candidate], index: tuple[int, ...], x: list[Array], width: int
-) -> tuple[Array, Array]:
-    """Return rows (k, width) and targets that pull what the data leave open towards zero.
+def _pull(usual: list[Array], x: list[Array], width: int) -> tuple[Array, Array]:
+    """Return rows (k, width) and targets that pull parameters ``x`` towards nominal.
 
-    So weak (many usual sizes) that only combinations without any trace in the data feel it: lengths
-    along parallel axes, which otherwise run off against each other.
+    ``usual`` is how far each may be from there. Where that is many usual sizes only combinations
+    without any trace in the data feel it: lengths along parallel axes, which run off else.
     """
-    usual = np.array([WEAK * p.scale for c in index for p in freed[c].parameters])
-    rows = np.zeros((len(usual), width))
-    rows[np.arange(len(usual)), np.arange(len(usual))] = 1 / usual
-    return rows, -np.concatenate([*x, np.zeros(0)]) / usual
+    size = np.concatenate([*usual, np.zeros(0)])
+    rows = np.zeros((len(size), width))
+    rows[np.arange(len(size)), np.arange(len(size))] = 1 / size
+    return rows, -np.concatenate([*x, np.zeros(0)]) / size
+
+
+def _wide(candidate: Candidate) -> Array:
+    """Return how far (d,) the data may take a cause that stands for itself."""
+    return np.array([WEAK * p.scale for p in candidate.parameters])
 
 
 def _share(

@@ -8,7 +8,7 @@ Sets grow in a beam and are then improved by dropping and swapping.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -34,11 +34,17 @@ DEEP = 40  # terms that a large log may show
 UNITED = 10.0  # score by which one cause is preferred that does the work of three
 
 
-def screened_search(space: Space, depth: int = DEPTH, base: Sequence[int] = ()) -> Found:
-    """Return the best set among the candidates worth a search, in the indices of ``space``."""
+def screened_search(
+    space: Space, depth: int = DEPTH, base: Sequence[int] = (),
+    beside: Callable[[Space], Space] = lambda space: space,
+) -> Found:  # fmt: skip
+    """Return the best set among the candidates worth a search, in the indices of ``space``.
+
+    ``beside`` changes the part of the space that is searched (links that are noise in it).
+    """
     keep = screened(space, base)
     place = {int(c): i for i, c in enumerate(keep)}
-    near = part(space, keep)
+    near = beside(part(space, keep))
     found = gathered(near, search(near, depth, [place[c] for c in base]))
     return replace(found, chosen=tuple(int(keep[c]) for c in found.chosen))
 

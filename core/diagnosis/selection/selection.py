@@ -7,12 +7,14 @@ prediction, frames and all), wild readings looked at again; until the set stays 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.arm import Arm
+from core.diagnosis.criteria import HEAVIEST
 from core.diagnosis.observation import Observation
 from core.diagnosis.selection.bent import straightened
 from core.diagnosis.selection.candidate import (
@@ -20,7 +22,8 @@ from core.diagnosis.selection.candidate import (
     joint_quantity,
     named_candidates,
 )
-from core.diagnosis.selection.following import exact_columns
+from core.diagnosis.selection.following import exact_columns, one_delay
+from core.diagnosis.selection.geometry import Links, links_of, with_links
 from core.diagnosis.selection.local_search import pruned
 from core.diagnosis.selection.moments import step_candidates
 from core.diagnosis.selection.noise import Noise, estimate_noise
@@ -45,7 +48,7 @@ class Selection:
 
     observation: Observation  # frame as finally estimated
     space: Space  # columns at the final model; kept samples only
-    found: Found
+    found: Found  # without the links, where their geometry as a whole is a cause
     terms: tuple[Term, ...]  # the named part, refitted exactly
     term_index: tuple[int, ...]  # candidate index of each term
     covariance: tuple[Array, ...]  # per term (d, d) of its fitted parameters
@@ -54,6 +57,8 @@ class Selection:
     residual: Array  # (N, k) measured - predicted by the named terms, frame estimated along
     base: tuple[Term, ...]
     raw: Raw  # the space before the nuisance was projected out
+    prior: dict[int, Array] = field(default_factory=dict)  # 1 sigma (d,) of the numbers of each
+    # link's candidate, where the geometry of all links is a cause
 
     @property
     def nuisance_basis(self) -> Array:
@@ -61,9 +66,58 @@ class Selection:
         return self.raw.basis
 
     @property
+    def block(self) -> tuple[int, ...]:
+        """Return the candidates of all links, where their geometry is a cause as a whole."""
+        return tuple(self.prior)
+
+    @cached_property
+    def links(self) -> Links | None:
+        """Return the links' geometry as a whole, where it is a cause."""
+        return links_of(self.space, self.prior) if self.prior else None
+
+    @cached_property
+    def working(self) -> Space:
+        """Return the space in which ``found`` won: beside the links, where they are a cause."""
+        return self.space if self.links is None else self.links.beside(self.space, self.block)
+
+    def rows_of(self, columns: Array) -> Array:
+        """Return columns (N, k, d) as rows (m, d) of the working space."""
+        kept, B = self.kept, self.nuisance_basis
+        rows = (self.noise.whitener[kept] @ columns[kept]).reshape(len(B), -1)
+        rows = rows - B @ (B.T @ rows)
+        return np.asarray(rows if self.links is None else self.links.whitened(rows))
+
+    def pull(self, chosen: Sequence[int]) -> Array:
+        """Return one over the prior sigma of each number of a set of candidates; 0: none."""
+        size = np.diff(self.space.start)
+        each = [1 / self.prior[c] if c in self.prior else np.zeros(int(size[c])) for c in chosen]
+        return np.concatenate([*each, np.zeros(0)])
+
+    def fitted(self, chosen: Sequence[int]) -> dict[int, Array]:
+        """Return the linear values (d,) of a set of candidates; links are kept near nominal."""
+        space, size = self.space, np.diff(self.space.start)
+        X = space.columns(chosen)
+        whole = X.T @ X + np.diag(self.pull(chosen) ** 2)
+        unit = 1 / np.sqrt(np.diag(whole) + 1e-300)
+        inverse = np.linalg.pinv(whole * np.outer(unit, unit), rcond=1e-12, hermitian=True)
+        x = unit * (inverse @ (unit * (X.T @ space.y)))
+        return dict(zip(chosen, np.split(x, np.cumsum(size[list(chosen)])[:-1]), strict=True))
+
+    def without_links(self) -> Selection:
+        """Return the selection with the links' geometry no cause, the rest as it is."""
+        index = [p for p, c in enumerate(self.term_index) if c not in self.block]
+        return replace(
+            self, prior={}, found=fit(self.space, self.found.chosen),
+            terms=tuple(self.terms[p] for p in index),
+            term_index=tuple(self.term_index[p] for p in index),
+            covariance=tuple(self.covariance[p] for p in index),
+        )  # fmt: skip
+
+    @property
     def used(self) -> float:
-        """Return the number of fitted unknowns, nuisance included."""
-        return float(self.raw.nuisance.shape[1] + sum(len(v) for v in self.found.values))
+        """Return the number of fitted unknowns, nuisance included; of the links what they use."""
+        links = 0.0 if self.links is None else self.links.used
+        return float(self.raw.nuisance.shape[1] + sum(len(v) for v in self.found.values)) + links
 
     @property
     def groups(self) -> NDArray[np.int64]:
@@ -92,17 +146,22 @@ def select(
     work = Work(observation, arm, [], first, kept)
     found: Found | None = None
     space: Space | None = None
+    near: Space | None = None  # the same, beside the links where their geometry is a cause
     columns: list[Array] = []
-    smooth = smooth_candidates(observation, arm)
+    smooth = smooth_candidates(observation)
     for turn in range(ROUNDS):
         if progress:
             progress(f"{observation.channel}: round {turn + 1}")
         work.candidates = [
-            _bounded(c, model)
+            _bounded(c, model, observation)
             for c in named_candidates(arm, observation.channel, withheld, rotation, base, turns)
             if _has_what_it_needs(c, observation)
         ]
-        space, columns = None, []  # the last round's, as large as the new ones: not both at a time
+        space, near, columns = (
+            None,
+            None,
+            [],
+        )  # the last round's, as large as the new ones: not both at a time
         columns = [exact_columns(work.observation, c, base) for c in work.candidates]
         if turn == 0:
             look_for_wild(work, columns)
@@ -111,37 +170,40 @@ def select(
         columns += [own for _, own in stepping]
         space, raw = sample_space(work, columns, base, smooth)
         inside = [locate(work.candidates, t)[0] for t in base]
-        best = screened_search(space, base=inside)
+        best = one_delay(space, screened_search(space, base=inside))
         if turn > 0 and not work.kept.all():
             space, raw, best = with_wild_explained(work, columns, base, smooth, (space, raw, best))
+        near, best, links = with_links(space, best, inside)
         counted, whitened_by = work.kept.copy(), work.noise
         framed = work.observation
         try:
-            terms, index, covariance, residual = refit(work, space, _exactly(space, best, work))
+            exact = _exactly(near, best, work)
+            terms, index, covariance, residual = refit(work, space, exact, links)
         except InputError:  # absurd flexibilities: the arm would buckle
             work.observation = framed  # not the frame that went astray with them
-            best = _stiff(space, best, inside)
+            best, near, links = _stiff(space, best, inside), space, {}
             terms, index, covariance, residual = refit(work, space, best)
         straight = straightened(space, best.chosen, index, terms, covariance)
         if straight is not None:
-            best = pruned(space, fit(space, straight))
-            terms, index, covariance, residual = refit(work, space, best)
+            best = pruned(near, fit(near, straight))
+            terms, index, covariance, residual = refit(work, space, best, links)
         same = terms_alike(terms, base) and turn > 0
         found = best
-        free = 1 - sum(len(v) for v in best.values) / space.freedom
+        used = sum(len(v) for v in best.values) + (links_of(space, links).used if links else 0)
+        free = 1 - used / space.freedom
         changed = look_again(work, _less_smooth(work, space, best, smooth, residual), free)
         if same and not changed:
             break
         base = terms
-    assert space is not None and found is not None
+    assert space is not None and near is not None and found is not None
     if len(space.y) >= LARGE and any(not space.candidates[c].named for c in found.chosen):
         work.kept, work.noise = counted.copy(), whitened_by
         # what goes into a model has to predict without the unnamed function beside it
-        alone = fit(space, [c for c in found.chosen if space.candidates[c].named])
-        terms, index, covariance, residual = refit(work, space, alone)
+        alone = fit(near, [c for c in found.chosen if space.candidates[c].named])
+        terms, index, covariance, residual = refit(work, space, alone, links)
     return Selection(
         work.observation, space, found, terms, index, covariance, counted, whitened_by,
-        residual, base, raw,
+        residual, base, raw, links,
     )  # fmt: skip
 
 
@@ -182,16 +244,26 @@ def _less_smooth(
     return np.asarray(residual - both @ np.linalg.lstsq(rows, target, rcond=1e-9)[0])
 
 
-def standing(selection: Selection, arm: Arm, accused: Sequence[int]) -> Selection:
+def standing(
+    selection: Selection, arm: Arm, accused: Sequence[int], beside: Sequence[int] = ()
+) -> Selection:
     """Return the selection with some of its terms (positions) refitted as all there is.
 
-    Values that were fitted beside a withdrawn term are not those that stand without it.
+    Values that were fitted beside a withdrawn term are not those that stand without it. ``beside``
+    are unnamed functions that account for what is left: in a short log it would bias the values; a
+    long one averages over it, and its model has to predict without them.
     """
-    if not accused or len(accused) == len(selection.terms):
+    short = len(selection.space.y) < LARGE
+    if not accused or (len(accused) == len(selection.terms) and not (short and beside)):
         return selection
     work = Work(selection.observation, arm, [], selection.noise, selection.kept)
     chosen = [selection.term_index[p] for p in accused]
-    fitted, index, spread, residual = refit(work, selection.space, fit(selection.space, chosen))
+    links = selection.prior if set(chosen) & set(selection.prior) else {}
+    space = selection.working if links else selection.space
+    if short:
+        chosen += beside
+    alone = fit(space, [c for c in chosen if c not in links])
+    fitted, index, spread, residual = refit(work, selection.space, alone, links)
     terms, covariance = list(selection.terms), list(selection.covariance)
     for c, term, own in zip(index, fitted, spread, strict=True):
         position = selection.term_index.index(c)
@@ -202,11 +274,15 @@ def standing(selection: Selection, arm: Arm, accused: Sequence[int]) -> Selectio
     )  # fmt: skip
 
 
-def _bounded(candidate: Candidate, model: Model) -> Candidate:
+def _bounded(candidate: Candidate, model: Model, observation: Observation) -> Candidate:
     """Return the candidate with bounds that keep the whole model physical (flexibility >= 0).
 
     Of a curve the bound holds for what its two parts come to together.
     """
+    if candidate.effect.adds_mass:
+        least, most = _loads_that_can_be(model, observation)
+        mass = replace(candidate.parameters[0], lower=least, upper=most)
+        return replace(candidate, parameters=(mass, *candidate.parameters[1:]))
     kind, curved = candidate.effect.flexibility, candidate.curve is not None
     if not (kind or curved):
         return candidate
@@ -216,6 +292,13 @@ def _bounded(candidate: Candidate, model: Model) -> Candidate:
     lower = -float(own[candidate.site.joint - 1])
     bounded = replace(candidate.parameters[0], lower=lower)
     return replace(candidate, parameters=(bounded, *candidate.parameters[1:]))
+
+
+def _loads_that_can_be(model: Model, observation: Observation) -> tuple[float, float]:
+    """Return how far a payload may be off: the true one is no less than nothing, and no giant."""
+    declared = observation.quantities.get("payload", np.array([model.payload_mass]))
+    most = HEAVIEST * max(float(declared.max()), model.arm.payload)
+    return -float(declared.min()), most
 
 
 def _has_what_it_needs(candidate: Candidate, observation: Observation) -> bool:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arm import Arm
 from core.diagnosis.observation import Observation
 from core.diagnosis.selection.candidate import Candidate, carrying, own_target
 from core.effects import Parameter, Site
@@ -23,15 +22,15 @@ SLOW = (0.03, 0.1, 0.3)  # shares of the greatest speed over which friction may 
 STEPS = 23  # moments at which something may have jumped
 
 
-def smooth_candidates(observation: Observation, arm: Arm) -> list[Pair]:
+def smooth_candidates(observation: Observation) -> list[Pair]:
     """Return the smooth candidates of an observation with their columns (N, k, d)."""
     found: list[Pair] = []
-    targets = _targets(observation, arm)
+    moved = targets(observation)
     for name, z in observation.quantities.items():
         shapes = [linear_basis(z)]
         if len(np.unique(z)) > 2:
             shapes.append(spline_basis(z))
-        for target, directions in targets.items():
+        for target, directions in moved.items():
             own = target == own_target(name)
             carries = target == carrying(name)
             for shape in shapes:
@@ -40,7 +39,7 @@ def smooth_candidates(observation: Observation, arm: Arm) -> list[Pair]:
             if own:
                 found += _bumps(name, target, z, directions)
         if name == "timestamp":
-            found += _steps(name, z, targets)
+            found += _steps(name, z, moved)
         found += _frictions(name, z, observation)
     found += _springs(observation)
     for target, columns in observation.unnamed():
@@ -79,25 +78,27 @@ def _frictions(name: str, z: Array, observation: Observation) -> list[Pair]:
     return found
 
 
-def _targets(observation: Observation, arm: Arm) -> dict[str, Array]:
+def targets(observation: Observation) -> dict[str, Array]:
     """Return what may be moved: name -> directions (N, k, directions)."""
     N, k = observation.measured.shape
     J = observation.joint_columns
     if J is None:
         return {axis: np.tile(np.eye(k)[:, i : i + 1], (N, 1, 1))
                 for i, axis in enumerate(observation.axes)}  # fmt: skip
-    targets = {f"joint_{i + 1}": J[:, :, i : i + 1] for i in range(arm.n)}
+    found = {f"joint_{i + 1}": J[:, :, i : i + 1] for i in range(J.shape[2])}
+    if observation.channel != "position":  # each coordinate is a joint
+        return found
     shift = np.zeros((N, k, 3))
     shift[:, :3] = np.eye(3)
-    targets["position"] = shift
+    found["position"] = shift
     scale = np.zeros((N, k, 1))
     scale[:, :3, 0] = observation.measured[:, :3]
-    targets["scale"] = scale
+    found["scale"] = scale
     if observation.tool_axes is not None:
         tool = np.zeros((N, k, 3))
         tool[:, :3] = observation.tool_axes
-        targets["tool"] = tool
-    return targets
+        found["tool"] = tool
+    return found
 
 
 def _spread(quantity: str, target: str, directions: Array, shape: Array) -> Pair:

@@ -13,7 +13,7 @@ from core.diagnosis.observation import Observation
 from core.diagnosis.selection.candidate import Candidate
 from core.diagnosis.selection.noise import Noise
 from core.diagnosis.selection.problem import AT_ONCE, Space, prices
-from core.effects import Term
+from core.effects import CATALOGUE, Term
 
 Array = NDArray[np.float64]
 DEAD = 1e-7  # share of a column that the nuisance leaves: below, nothing is left
@@ -70,7 +70,8 @@ def sample_space(
     X = np.empty((int(work.kept.sum()) * observation.measured.shape[1], int(start[-1])))
     for c, block in enumerate([*columns, *(s for _, s in smooth)]):
         X[:, start[c] : start[c + 1]] = flat(block, work)
-    chords = observation.channel == "tracking"  # from nothing: nothing has to be put back
+    delays = all(CATALOGUE[term.effect].delays for term in base)
+    chords = observation.channel == "tracking" and delays  # from nothing: nothing to put back
     gap = (observation.measured - observation.predict(() if chords else base))[..., None]
     # what the terms already in the model explain is put back, in the linear form at hand
     for term in () if chords else base:

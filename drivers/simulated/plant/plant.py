@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drivers.simulated.plant.kinematics import holding_torque
 from drivers.simulated.plant.plant_arm import Frame, PlantArm, place
 from drivers.simulated.plant.plant_settings import PlantSettings
 from drivers.simulated.plant.rotations import (
@@ -82,6 +83,7 @@ class Plant:
         gain = 1.0 - math.exp(-dt / self.settings.servo_lag)
         most = self.settings.acceleration_limit * dt
         q, qd = [], []
+        target = self._given_way(target)
         for now, speed, goal, limit in zip(self.q, self.qd, target, self.arm.velocity, strict=True):
             gap = goal - now
             if -1e-10 < gap < 1e-10 and -1e-4 < speed < 1e-4:
@@ -95,6 +97,16 @@ class Plant:
             qd.append(wanted)
         self.q, self.qd = tuple(q), tuple(qd)
         self._follow_rest(dt)
+
+    def _given_way(self, target: Sequence[float]) -> Sequence[float]:
+        """Return where the servos rest (n, rad) for `target`, by what they hold where they are."""
+        s, load = self.settings, self.load
+        if not any(s.droop):
+            return target
+        held = holding_torque(
+            self.arm, self.q, s.gravity, load.mass, load.cog, (*load.force, *load.torque), self.tool
+        )
+        return tuple(t - c * m for t, c, m in zip(target, s.droop, held, strict=True))
 
     def _follow_rest(self, dt: float) -> None:
         """Draw a new placement error each time the arm comes to rest after a move."""

@@ -23,6 +23,8 @@ class PlantSettings:
     tcp: TCP in the flange frame, x, y, z (m) and rotation vector (rad).
     wrench: outside pull at the TCP, base axes, N and Nm.
     gravity: in base, m/s^2.
+    droop: how far each servo rests from its target per torque that it holds (n,), rad/Nm; empty:
+        none gives way.
     servo_lag: time constant with which the joints follow the command, s.
     acceleration_limit: of every joint, rad/s^2.
     joint_scatter: placement error of each joint (n,), 1 sigma, rad, unseen by the encoder and
@@ -44,6 +46,7 @@ class PlantSettings:
     tcp: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     wrench: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     gravity: Vector3 = (0.0, 0.0, -9.80665)
+    droop: tuple[float, ...] = ()
     servo_lag: float = 0.008
     acceleration_limit: float = 60.0
     joint_scatter: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from bridge.cell import load_cell, save_cell
 from bridge.cell.document import number_text, parse
 from core.arm import Arm, builtin_arm
-from core.effects import CATALOGUE, Term
+from core.effects import CATALOGUE, Site, Term
 from core.errors import RunError
 
 CONFIG = Path(__file__).parents[3] / "config"
@@ -150,3 +150,21 @@ def test_a_model_with_a_stiffening_joint_keeps_its_linear_part_apart(tmp_path: P
     again = load_cell(tmp_path / "new.yaml")
     assert again.file.compliance.axial == [1e-6] * 7
     assert again.model.terms == model.terms
+
+
+def test_a_stand_in_keeps_its_mark(tmp_path: Path) -> None:
+    cell = load_cell(cell_in(tmp_path))
+    marked = [
+        Term("axial_compliance", Site(2), (3e-6,), stand_in=True),
+        Term("backlash", Site(1), (1e-4,), stand_in=True),
+    ]
+    proved = Term("backlash", Site(3), (2e-4,))
+    new = tmp_path / "new.yaml"
+    save_cell(cell, new, cell.model.with_terms([*marked, proved]))
+    read = {(t.effect, t.site.joint): t.stand_in for t in load_cell(new).model.terms}
+    assert read["axial_compliance", 2]  # beside what the cell's own section holds of that joint
+    assert read["backlash", 1]
+    assert not read["backlash", 3]
+    again = tmp_path / "again.yaml"
+    save_cell(load_cell(new), again)
+    assert again.read_text().count("stand_in: true") == 2

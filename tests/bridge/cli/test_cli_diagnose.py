@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +83,30 @@ def test_the_cell_is_written_also_when_nothing_is_found(tmp_path: Path) -> None:
     assert "verdict: no gap" in answer.out
     assert not any(load_cell(new).model.compliance()[0])
     assert load_cell(new).model.terms == ()
+
+
+def test_stand_ins_go_into_the_cell_only_when_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log, cell = soft_log(tmp_path), cell_in(tmp_path)
+    genuine = command.diagnose_log
+    play = Term("backlash", Site(3), (2e-4,), stand_in=True)
+
+    def with_one(*given: object, **more: object) -> object:
+        found = genuine(*given, **more)  # type: ignore[arg-type]
+        return replace(found, with_stand_ins=found.with_stand_ins.with_terms([play]))
+
+    monkeypatch.setattr(command, "diagnose_log", with_one)
+    texts = []
+    for options in ((), ("--stand-ins",)):
+        new = tmp_path / f"new{len(options)}.yaml"
+        answer = gapbridge("diagnose", log, "--cell", cell, "--apply", new, *options)
+        assert answer.code == 0, answer.err
+        texts.append(new.read_text(encoding="utf-8"))
+    assert "stand_in: true" not in texts[0]
+    assert texts[1].count("stand_in: true") == 1
+    line = refused("diagnose", log, "--cell", cell, "--stand-ins")
+    assert "found no --apply" in line
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from benchmarks.blind.session import Plan
 from core.diagnosis.diagnosis import diagnose
 from core.diagnosis.held_out import HeldOut
-from core.diagnosis.judgement import holding, judge, pure_error
+from core.diagnosis.judgement import judge, pure_error
 from core.diagnosis.result import causes_of, considered_of, probability
 from core.effects import CATALOGUE
 from core.metrology import Metrology
@@ -75,21 +75,44 @@ def test_more_left_than_the_stated_noise_is_structure():
     assert verdicts == ["no_gap", "unexplained"]
 
 
-def test_what_does_not_hold_on_unseen_samples_is_withdrawn():
-    channel = channel_of("backlash")
-    selection = channel.selection
+def test_what_does_not_shrink_the_gap_of_unseen_samples_is_withdrawn():
+    selection = channel_of("backlash").selection
     rng = np.random.default_rng(0)
     drawn = rng.normal(size=len(selection.raw.target))
     noise = replace(selection, raw=replace(selection.raw, target=drawn))
-    believed = replace(judge(selection), structured=True)
-    assert believed.accused
-    left = holding(noise, believed, HeldOut(noise))
+    kept = judge(selection, HeldOut(selection))
+    assert len(kept.accused) == 1
+    left = judge(selection, HeldOut(noise))
     assert left.accused == ()
-    assert {p for p, _ in left.withdrawn} >= set(believed.accused)
-    kept = holding(selection, believed, HeldOut(selection))
-    assert kept.accused == believed.accused
-    sure = replace(believed, structured=False)
-    assert holding(noise, sure, HeldOut(noise)) is sure
+    assert [why for _, why in left.withdrawn] == [
+        "it does not shrink the gap on samples that its fit did not see"
+    ]
+
+
+@pytest.mark.parametrize(("sigmas", "stays"), [(0.5, False), (40.0, True)])
+def test_a_value_that_may_as_well_be_none_is_no_accusation(sigmas, stays):
+    selection = channel_of("backlash").selection
+    (term,) = selection.terms
+    spread = np.array([[(term.values[0] / sigmas) ** 2]])
+    judged = judge(replace(selection, covariance=(spread,)), HeldOut(selection))
+    assert (len(judged.accused) == 1) is stays
+
+
+def test_a_known_effect_is_named_beside_an_unknown_one_that_is_admitted():
+    """Play in one joint, and another that a third carries along."""
+    session = small.session_of(5)
+    errors = [small.REAL[e].angle_errors for e in ("backlash", "cross_coupling")]
+    real = replace(small.NOMINAL, angle_errors=(*errors[0], *errors[1]))
+    log = small.log_of(session, small.readings(real, session, 5))
+    found = diagnose(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
+    (channel,) = found.channels
+    assert found.verdict == "partly_explained"
+    assert [(c.effect, c.joints) for c in channel.causes] == [("backlash", (2,))]
+    assert channel.structured
+    assert channel.p_value < 0.05
+    assert "actual_q_1" in [name for name, _ in channel.depends_on[:3]]
+    (parameter,) = channel.causes[0].parameters
+    assert abs(parameter.value - 9e-4) < 3.5 * parameter.std
 
 
 def test_a_tie_names_the_other_and_leaves_the_strangers_out():

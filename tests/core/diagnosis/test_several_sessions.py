@@ -13,6 +13,7 @@ import pytest
 import small_arm as small
 
 from benchmarks.blind.mechanics import turn
+from core.diagnosis.carrying import carried
 from core.diagnosis.diagnosis import diagnose
 from core.diagnosis.document import document
 from core.errors import LogError
@@ -68,7 +69,7 @@ def rms(values) -> float:
 
 @pytest.fixture(scope="module")
 def compliant():
-    log = together(small.REAL["axial_compliance"], (1, 2), remounted=True)
+    log = together(small.REAL["axial_compliance"], (34, 35), remounted=True)
     return diagnose(MODEL, log, Metrology(sigma=small.SIGMA, remounted=True))
 
 
@@ -87,7 +88,7 @@ def test_a_cause_is_found_across_frames_and_tool_points(compliant) -> None:
 def test_what_is_told_of_a_new_session_holds_for_further_ones(compliant) -> None:
     real = small.REAL["axial_compliance"]
     found = compliant.channels[0].elsewhere
-    further = [placed(compliant.model, session(real, s, remounted=True), True) for s in (11, 12)]
+    further = [placed(compliant.model, session(real, s, remounted=True), True) for s in (44, 45)]
     assert 0.8 < found.new_session / rms(np.concatenate(further)) < 1.25
     assert [s for s, _ in found.by_session] == [0, 1]
 
@@ -103,13 +104,13 @@ def test_figures_of_an_unknown_hold_in_a_new_session_too() -> None:
 
 def test_a_target_that_was_remounted_unsaid_is_no_noise() -> None:
     """The same logs as of the fixture, without the word that the target was taken off."""
-    log = together(small.REAL["axial_compliance"], (1, 2), remounted=True)
+    log = together(small.REAL["axial_compliance"], (34, 35), remounted=True)
     (channel,) = diagnose(MODEL, log, Metrology(sigma=small.SIGMA)).channels
     assert channel.elsewhere.new_session > 20 * small.FLOOR or channel.structured
 
 
 def test_a_value_that_changed_is_named_as_changed() -> None:
-    logs = [session(small.soft(2, 4e-6), 1), session(small.soft(2, 8e-6), 2)]
+    logs = [session(small.soft(2, 4e-6), 34), session(small.soft(2, 8e-6), 35)]
     found = diagnose(MODEL, join_sessions(logs, MODEL), Metrology(sigma=small.SIGMA))
     (channel,) = found.channels
     (across,) = [c for c in channel.carried if c.effect == "axial_compliance"]
@@ -120,7 +121,7 @@ def test_a_value_that_changed_is_named_as_changed() -> None:
         c for c in document(found)["channels"][0]["causes"] if c["effect"] == "axial_compliance"
     ]
     assert cause["across_sessions"]["carries"] is False
-    assert [v["session"] for v in cause["across_sessions"]["values"]] == ["1.csv", "2.csv"]
+    assert [v["session"] for v in cause["across_sessions"]["values"]] == ["34.csv", "35.csv"]
 
 
 def test_what_holds_in_one_session_only_depends_on_the_session() -> None:
@@ -163,3 +164,25 @@ def test_a_fit_of_sessions_shares_the_flexibilities() -> None:
         assert 0.8 * small.FLOOR < found.remaining_rms_new_region < 1.4 * small.FLOOR
     one = identify_compliance(MODEL, session(real, 1), Metrology(sigma=small.SIGMA))
     assert np.isnan(one.remaining_rms_new_session)
+
+
+def test_a_parameter_that_one_session_does_not_show_is_not_compared() -> None:
+    """The second session's rows have a column of zeros for one of the two joints."""
+    logs = [session(small.soft(2, 4e-6), 34), session(small.soft(2, 4e-6), 35)]
+    found = diagnose(MODEL, join_sessions(logs, MODEL), Metrology(sigma=small.SIGMA))
+    selection = found.channels[0].selection
+    (own,) = selection.found.chosen
+    rows = np.repeat(selection.observation.session[selection.kept], 3)
+    X = selection.space.X.copy()
+    other = own - 1 if own else own + 1
+    column = selection.space.start[other]
+    X[:, column] = np.where(rows == 0, X[:, column] + 1e-3, 0.0)
+    taken = selection.raw.taken.copy()
+    taken[:, column] = 0.0
+    changed = replace(
+        selection, space=replace(selection.space, X=X),
+        raw=replace(selection.raw, taken=taken),
+    )  # fmt: skip
+    told = carried(changed, (own, other), MODEL.arm)
+    assert all(np.isfinite(c.p_value) for c in told)
+    assert "axial_compliance" in {c.effect for c in told}

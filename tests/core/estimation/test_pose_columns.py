@@ -92,7 +92,8 @@ def test_columns_are_those_of_differences_on_an_arm_that_bends(effect):
     for c, (t, k) in enumerate(places):
         expected = difference(model, q, loads, t, k, 0.05 * scales[c])
         off = np.abs(found.slopes[:, c] - expected).max()
-        assert off < 2e-7 * np.abs(expected).max(), (model.terms[t], k)
+        # a moment has no slope at all: the step is where it is
+        assert off <= 2e-7 * np.abs(expected).max(), (model.terms[t], k)
 
 
 def test_columns_at_zero_are_those_of_the_rigid_arm():

@@ -42,13 +42,13 @@ def test_only_the_registers_of_the_offset_can_be_written():
     for register in range(48):
         for call, allowed in (
             (inputs.setInputDoubleRegister, registers.OFFSET_DOUBLES),
-            (inputs.setInputIntRegister, (18, 19, 20, 21)),
+            (inputs.setInputIntRegister, (18, 19, 20, 21, 22)),
         ):
             if register in allowed:
                 assert call(register, 1)
             else:
                 with pytest.raises(WriteError, match=str(register)):
                     call(register, 1)
-    assert len(library.calls) == 9
+    assert len(library.calls) == 10
     with pytest.raises(AttributeError):
         inputs.setSpeedSlider(1.0)

@@ -1,0 +1,64 @@
+"""Lines that are one bump: a localised shape in a joint's angle is no period of its gears."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.residual_structure import basis_of
+from core.diagnosis.selection.candidate import joint_quantity
+from core.diagnosis.selection.problem import SMOOTH_PRICE
+from core.diagnosis.selection.selection import Selection
+
+Array = NDArray[np.float64]
+PLACES, WIDTHS = 13, (0.05, 0.1, 0.2)  # where a bump is first looked for, in shares of the range
+
+
+def bumps(selection: Selection) -> set[int]:
+    """Return lines of a joint, with its offset, for which one bump in its angle does as well.
+
+    Place and width of the bump are free; it wins ties.
+    """
+    space, observation = selection.working, selection.observation
+    if observation.channel != "position" or observation.joint_columns is None:
+        return set()
+    chosen = [c for c in selection.found.chosen if space.candidates[c].named]
+    found: set[int] = set()
+    for i in range(observation.joint_columns.shape[2]):
+        here = [c for c in chosen if space.candidates[c].site.joint == i + 1]
+        lines = [c for c in here if space.candidates[c].periodic]
+        if len(lines) < 2:
+            continue
+        group = [c for c in here if space.candidates[c].turns_its_joint]
+        rest = basis_of(space.columns([c for c in chosen if c not in group]))
+        y = space.y - rest @ (rest.T @ space.y)
+        basis = basis_of(space.columns(group) - rest @ (rest.T @ space.columns(group)))
+        told = float(space.misfit(np.array(y @ y - np.sum((basis.T @ y) ** 2))))
+        bump = float(space.misfit(np.array(_best_bump(selection, i, rest, y))))
+        price = 3 * np.log(space.freedom) + 2 * np.log(len(space.candidates)) + SMOOTH_PRICE
+        if bump + price <= told + float(space.price[group].sum()):
+            found |= set(group)
+    return found
+
+
+def _best_bump(selection: Selection, i: int, rest: Array, y: Array) -> float:
+    """Return what the best Gaussian bump in joint i's angle leaves of |y|^2."""
+    from scipy.optimize import minimize
+
+    observation = selection.observation
+    assert observation.joint_columns is not None
+    joint = observation.joint_columns[:, :, i, None]
+    z = observation.quantities[joint_quantity(observation, i)]
+    low, span = float(z.min()), float(np.ptp(z))
+
+    def left(at: Array) -> float:
+        bump = np.exp(-0.5 * ((z - at[0]) / np.exp(at[1])) ** 2)
+        x = selection.rows_of(joint * bump[:, None, None])[:, 0]
+        x = x - rest @ (rest.T @ x)
+        size = float(x @ x)
+        return float(y @ y) - (float(x @ y) ** 2 / size if size > 1e-9 else 0.0)
+
+    tries = [np.array([low + s * span, np.log(w * span)])
+             for s in np.linspace(0, 1, PLACES) for w in WIDTHS]  # fmt: skip
+    best = min(tries, key=left)
+    return float(minimize(left, best, method="Nelder-Mead", options={"maxiter": 120}).fun)

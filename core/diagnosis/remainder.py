@@ -1,0 +1,184 @@
+"""Which accusations keep their value beside an unnamed remainder.
+
+A real arm has known effects and something unknown beside them, and what the catalogue holds can
+imitate a cause that it does not hold. So every unnamed function that the residual asks for is put
+beside the accused effects; an accusation stays that keeps its value beside them, the same in every
+region of the log. The weakest goes first, and what it took is then left for the unnamed to take.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.criteria import DRIFT, SIBLING, SIGMAS, STAND_IN_GAIN, UNKNOWNS
+from core.diagnosis.held_out import HeldOut
+from core.diagnosis.observation import Observation
+from core.diagnosis.regions import parts
+from core.diagnosis.residual_structure import basis_of
+from core.diagnosis.selection.candidate import Candidate, carrying
+from core.diagnosis.selection.problem import gains
+from core.diagnosis.selection.selection import Selection
+from core.diagnosis.selection.smooth import targets
+
+Array = NDArray[np.float64]
+TAKEN = 1e-5  # eigenvalue of unit columns below which a direction is the unnamed functions' own
+SHOWN = 0.3  # share of a number that may lie in such directions
+LARGE = 900  # rows of the sample space from which several accusations go at a time
+HOPELESS = 0.6  # strength below which they do
+
+
+def withstanding(selection: Selection, believed: Sequence[int]) -> tuple[list[int], list[int]]:
+    """Return the candidates, of those believed, that withstand, and the unnamed beside them."""
+    remainder = _Remainder(selection)
+    accused = list(believed)
+    while accused:
+        strength = remainder.strengths(accused)
+        if strength.min() >= 1:
+            break
+        out = {int(np.argmin(strength))}
+        if len(remainder.space.y) > LARGE:
+            worst = np.argsort(strength)[: max(1, len(accused) // 8)]
+            out |= {int(i) for i in worst if strength[i] < HOPELESS}
+        accused = [c for i, c in enumerate(accused) if i not in out]
+    return accused, remainder.beside
+
+
+def links_withstand(selection: Selection) -> bool:
+    """Return whether the geometry of all links predicts regions that its fit did not see.
+
+    None of its numbers is sure by itself, so what they do together is judged: it has to gain.
+    """
+    space = selection.space
+    named = [c for c in selection.found.chosen if space.candidates[c].named]
+    held = HeldOut(selection, parts=parts(selection.observation, selection.kept))
+    if not held.possible:
+        return False
+    links = [*named, *selection.block]
+    return held.shrink(links, named).interval[0] > STAND_IN_GAIN
+
+
+class _Remainder:
+    """The unnamed functions of a selection, asked for anew as accusations go."""
+
+    def __init__(self, selection: Selection) -> None:
+        self.space = selection.working
+        joints = selection.observation.joint_columns is not None
+        unnamed = [
+            c for c, k in enumerate(self.space.candidates) if _unnamed(k, selection.observation)
+        ]
+        self._index = np.array(unnamed, dtype=np.int64)
+        size = np.diff(self.space.start)[self._index]
+        self._price = size * np.log(self.space.freedom) + 2 * np.log(max(len(unnamed), 2))
+        self._asked = [c for c in selection.found.chosen if c in set(unnamed)]
+        self._first = self._asked  # beside which the accused were found
+        self.beside = self._asked  # those of the last question
+        # a constant is part of any function that moves a joint; of a sensor's axis it is a bias
+        moved = targets(selection.observation) if joints else {}
+        self._constant = {name: selection.rows_of(d) for name, d in moved.items()}
+        part_of = parts(selection.observation, selection.kept)
+        self._part = np.repeat(part_of, selection.observation.measured.shape[1])
+
+    def strengths(self, accused: list[int]) -> Array:
+        """Return of each accusation how far it is over what it takes to stay (1: just)."""
+        # of a large log the functions asked for once stay, so that one more is asked for a round
+        large = len(self.space.y) > LARGE and len(self._asked) >= UNKNOWNS
+        asked = self.beside = self.asked_for(accused, 1 if large else UNKNOWNS)
+        if len(self.space.y) > LARGE:
+            self._asked = asked
+        beside = self._beside(asked)
+        value, spread, shown = self._values(accused, beside)
+        found = np.hstack([self._unit(accused), self.space.columns(self._first)])
+        alone = np.linalg.lstsq(found, self.space.y, rcond=1e-9)[0]
+        begin = 0
+        sigmas: list[float] = []
+        steady: list[float] = []
+        for c in accused:
+            size = int(self.space.start[c + 1] - self.space.start[c])
+            own = np.arange(begin, begin + size)[shown[begin : begin + size]]
+            begin += size
+            a, b = alone[own], value[own]
+            share = float(a @ b) / max(float(a @ a), 1e-300)
+            if not len(own) or share <= 0:
+                sigmas.append(0.0)
+                steady.append(0.0)
+                continue
+            inverse = np.linalg.pinv(spread[np.ix_(own, own)], hermitian=True)
+            sigmas.append(float(np.sqrt(max(float(b @ inverse @ b), 0.0) / len(own))))
+            steady.append(min(share * DRIFT, DRIFT / share))
+        return self._with_siblings(accused, np.array(sigmas), np.array(steady))
+
+    def asked_for(self, accused: Sequence[int], most: int = UNKNOWNS) -> list[int]:
+        """Return the unnamed functions that the residual asks for, at the price of chance alone."""
+        space, asked = self.space, list(self._asked)
+        for _ in range(most if len(self._index) else 0):
+            basis = basis_of(np.hstack([space.columns(accused), self._beside(asked)]))
+            left = space.y - basis @ (basis.T @ space.y)
+            freedom = max(space.freedom - basis.shape[1], 1.0)
+            variance = max(float(left @ left) / freedom, space.floor)
+            gain = gains(space, left, basis)[0][self._index] / variance - self._price
+            gain[np.isin(self._index, asked)] = -np.inf
+            if gain.max() <= 0:
+                break
+            asked.append(int(self._index[np.argmax(gain)]))
+        return asked
+
+    def _beside(self, asked: Sequence[int]) -> Array:
+        moved = dict.fromkeys(self.space.candidates[c].target for c in asked)
+        constants = [self._constant[t] for t in moved if t in self._constant]
+        return np.hstack([self.space.columns(asked), *constants])
+
+    def _unit(self, accused: Sequence[int]) -> Array:
+        X = self.space.columns(accused)
+        return np.asarray(X / (np.sqrt(np.einsum("ij,ij->j", X, X)) + 1e-300))
+
+    def _values(self, accused: list[int], beside: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Return values of unit columns, their covariance with scatter, and which are shown.
+
+        The scatter is a jackknife over parts of the log: what only imitates differs among them.
+        """
+        space, X = self.space, self._unit(accused)
+
+        def solved(rows: NDArray[np.bool_]) -> tuple[Array, Array, Array, float]:
+            A, y, U = X[rows], space.y[rows], basis_of(beside[rows])
+            A, y = A - U @ (U.T @ A), y - U @ (U.T @ y)
+            size, V = np.linalg.eigh(A.T @ A)
+            open_ = size > TAKEN
+            inverse = (V * np.where(open_, 1 / np.maximum(size, TAKEN), 0)) @ V.T
+            x = inverse @ (A.T @ y)
+            return x, inverse, (V**2) @ ~open_, float(np.sum((y - A @ x) ** 2))
+
+        value, inverse, taken, rss = solved(np.ones(len(self._part), dtype=bool))
+        freedom = max(space.freedom - X.shape[1] - beside.shape[1], 1.0)
+        without = np.array([solved(self._part != p)[0] for p in np.unique(self._part)])
+        away = without - without.mean(axis=0)
+        scatter = (len(without) - 1) / len(without) * away.T @ away
+        return value, inverse * max(rss / freedom, space.floor) + scatter, taken < SHOWN
+
+    def _with_siblings(self, accused: list[int], sigmas: Array, steady: Array) -> Array:
+        """Return strengths: less is asked at further joints of an effect; of lines as much."""
+        families = [self.space.candidates[c].family for c in accused]
+        first = np.minimum(sigmas / SIGMAS, steady)
+        stays = {f for f, s in zip(families, first, strict=True) if s >= 1}
+        stays -= {k.family for k in self.space.candidates if k.periodic}
+        sibling = np.array([f in stays for f in families])
+        return np.asarray(np.where(sibling, np.minimum(sigmas / SIBLING, steady), first))
+
+
+def _unnamed(candidate: Candidate, observation: Observation) -> bool:
+    """Return whether a candidate stands for an unknown, and not for a named effect's own form.
+
+    A function of a joint's own last motion that moves it is play. Of joints that are measured one
+    by one, a function of a joint's own speed is friction or delay, and of its own torque droop.
+    """
+    if candidate.named:
+        return False
+    stem, _, index = candidate.quantity.rpartition("_")
+    own = index.isdigit() and candidate.target.endswith(f"_{int(index) + 1}")
+    if observation.channel in ("torque", "tracking"):
+        droop = observation.channel == "tracking"
+        held = droop and candidate.target == carrying(candidate.quantity)
+        return not (held or (own and stem in ("actual_qd", "target_qd")))
+    return not (own and stem == "approach")

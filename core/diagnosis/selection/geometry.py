@@ -1,0 +1,113 @@
+"""The geometry of all links as one cause: many small numbers, none of which stands out alone.
+
+Its numbers have a prior (a normal one of an engineer's size), so that what the data do not show
+stays nominal. To a search it is then one more source of correlated noise: the sample space is
+whitened by it, and log det of what it adds is the price that it pays (marginal likelihood).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.diagnosis.criteria import ANGLE, GEOMETRIC, LENGTH, SHARES
+from core.diagnosis.selection.candidate import Candidate
+from core.diagnosis.selection.problem import MARGIN, Found, Space
+from core.diagnosis.selection.search import screened_search
+
+Array = NDArray[np.float64]
+NEVER = 1e9  # a price that no fit is worth
+
+
+def members(space: Space) -> tuple[int, ...]:
+    """Return the candidates of all links' geometry."""
+    return tuple(c for c, k in enumerate(space.candidates) if k.effect.together)
+
+
+def prior(candidate: Candidate, share: float = 1.0) -> Array:
+    """Return 1 sigma (d,) of each number of a link; ``share`` is that of an engineer's size."""
+    return np.array([share * (LENGTH if p.unit == "m" else ANGLE) for p in candidate.parameters])
+
+
+@dataclass(frozen=True)
+class Links:
+    """The geometry of all links as noise of known size, in a sample space."""
+
+    directions: Array  # (m, d) orthonormal
+    spread: Array  # (d,) 1 sigma of the samples along each, by the prior alone
+
+    @property
+    def price(self) -> float:
+        """Return what their numbers cost in -2 log likelihood: log det of what they add."""
+        return float(np.sum(np.log1p(self.spread**2)))
+
+    @property
+    def used(self) -> float:
+        """Return how many numbers the samples determine."""
+        return float(np.sum(self.spread**2 / (1 + self.spread**2)))
+
+    def whitened(self, columns: Array) -> Array:
+        """Return columns (m, ...) in which the links are noise like any other."""
+        less = 1 - 1 / np.sqrt(1 + self.spread**2)
+        along = self.directions.T @ columns
+        return np.asarray(columns - self.directions @ (less * along.T).T)
+
+    def beside(self, space: Space, block: Iterable[int]) -> Space:
+        """Return the space beside them; ``block``, their candidates, can be in no set there."""
+        price = space.price.copy()
+        price[list(block)] = NEVER
+        return replace(space, y=self.whitened(space.y), X=self.whitened(space.X), price=price)
+
+
+def links_of(space: Space, sigma: Mapping[int, Array]) -> Links:
+    """Return the geometry of all links in a space; ``sigma`` is the prior of each candidate."""
+    size = np.concatenate(list(sigma.values()))
+    U, s, _ = np.linalg.svd(space.columns(list(sigma)) * size, full_matrices=False)
+    return Links(U, s)
+
+
+def with_links(
+    space: Space, best: Found, base: Sequence[int]
+) -> tuple[Space, Found, dict[int, Array]]:
+    """Return the better explanation: as it is, or beside the links' geometry as a whole.
+
+    The space returned is the one in which the set was found; the links are in no set, and their
+    prior is returned (empty where they are no cause). A search beside them pays where they do so
+    beside that set, or where it holds several geometric causes.
+    """
+    block = members(space)
+    if len(block) < 2:
+        return space, best, {}
+    tried = []
+    for share in SHARES:
+        sigma = {c: prior(space.candidates[c], share) for c in block}
+        links = links_of(space, sigma)
+        tried.append((_beside_set(space, best, links, block) + links.price, sigma, links))
+    score, sigma, links = min(tried, key=lambda t: t[0])
+    families = {c.family for c in space.candidates if c.named}
+    tries = 2 * float(np.log(len(families) * len(SHARES))) + MARGIN
+    kin = [c for c in best.chosen if _geometric(space.candidates[c])]
+    if len(kin) < GEOMETRIC and score + tries >= best.score:
+        return space, best, {}
+    start = sorted({*base, *best.chosen} - set(block))
+    start = [c for c in start if space.candidates[c].named]
+    other = screened_search(space, base=start, beside=lambda p: links.beside(p, members(p)))
+    if other.score + links.price + tries < best.score:
+        return links.beside(space, block), other, sigma
+    return space, best, {}
+
+
+def _geometric(candidate: Candidate) -> bool:
+    """Return whether this is a link's geometry or the zero of a joint."""
+    return candidate.effect.together or (candidate.turns_its_joint and not candidate.periodic)
+
+
+def _beside_set(space: Space, best: Found, links: Links, block: Sequence[int]) -> float:
+    """Return the score of a set beside the links, the price of these left out."""
+    rest = [c for c in best.chosen if c not in block]
+    A, y = links.whitened(space.columns(rest)), links.whitened(space.y)
+    rss = float(np.sum((y - A @ np.linalg.lstsq(A, y, rcond=1e-9)[0]) ** 2))
+    return float(space.misfit(np.array(rss)) + space.price[rest].sum())

@@ -1,0 +1,48 @@
+"""What a robot is in, in RTDE's numbers, whatever the controller: one table for all drivers.
+
+Source: Universal Robots, RTDE guide (robot_mode, safety_mode, safety_status_bits): bits 0 normal, 2
+protective stop, 6 robot emergency stop, 7 emergency stop, 9 fault, 10 stopped due to safety.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Literal, NamedTuple
+
+POWER_OFF, IDLE, RUNNING = 3, 5, 7  # robot_mode
+NORMAL, REDUCED, PROTECTIVE_STOP, EMERGENCY_STOP, FAULT = 1, 2, 3, 7, 9  # safety_mode
+STOPPED = 1 << 10
+
+Trouble = Literal["", "not_ready", "protective_stop", "emergency_stop", "fault"]
+
+
+class Modes(NamedTuple):
+    """The three numbers of a RobotState that say whether the robot may move."""
+
+    robot_mode: int
+    safety_mode: int
+    safety_status_bits: int
+
+
+MODES: dict[str, Modes] = {
+    "": Modes(RUNNING, NORMAL, 1),
+    "not_ready": Modes(IDLE, NORMAL, 1),
+    "protective_stop": Modes(RUNNING, PROTECTIVE_STOP, 1 << 2 | STOPPED),
+    "emergency_stop": Modes(POWER_OFF, EMERGENCY_STOP, 1 << 6 | 1 << 7 | STOPPED),
+    "fault": Modes(RUNNING, FAULT, 1 << 9 | STOPPED),
+}
+"""Trouble, as profiles name it -> what every driver reports."""
+
+
+def modes_of(troubles: Iterable[str]) -> Modes:
+    """Return the modes of all ``troubles`` at once: the gravest of each, all stops' bits."""
+    found = MODES[""]
+    for trouble in troubles:
+        mode = MODES[trouble]
+        bits = found.safety_status_bits | mode.safety_status_bits
+        found = Modes(
+            min(found.robot_mode, mode.robot_mode),
+            max(found.safety_mode, mode.safety_mode),
+            bits & ~1 if bits & STOPPED else bits,
+        )
+    return found

@@ -1,0 +1,161 @@
+import json
+
+import numpy as np
+import pytest
+import yaml
+
+from benchmarks.real import arms, rivals
+from benchmarks.real.absurd import absurdities
+from benchmarks.real.convert import SOURCES, main, write
+from benchmarks.real.geometry import Fit, fit_geometry, free_numbers, points, registered
+from benchmarks.real.table import Table, halves, read_table
+
+RNG = np.random.default_rng(7)
+
+
+def table(**columns):
+    names, values = [], []
+    for name, column in columns.items():
+        wide = np.asarray(column, dtype=float).reshape(len(column), -1)
+        names += [name] if np.ndim(column) == 1 else [f"{name}_{k}" for k in range(wide.shape[1])]
+        values.append(wide)
+    return Table(tuple(names), np.hstack(values))
+
+
+def poses(count=150):
+    return RNG.uniform(-1.5, 1.5, (count, 6))
+
+
+def test_geometry_and_tool_are_found_in_another_frame():
+    q, session = poses(), np.zeros(150, dtype=np.int64)
+    change = np.zeros((6, 5))
+    for i, kind in free_numbers(arms.UR10):
+        change[i, kind] = RNG.normal() * 1e-3
+    tool = np.array([[0.01, -0.02, 0.11]])
+    true = points(arms.UR10, q, Fit(change, tool), session)
+    turned = true @ arms.flange(arms.UR10, q[:1])[1][0].T + [1, 2, 3]
+    fit = fit_geometry(arms.UR10, q, turned, session, np.array([0, 0, 0.1]))
+    left = turned - registered(points(arms.UR10, q, fit, session), turned)
+    assert np.sqrt(np.mean(left**2)) < 5e-6
+
+
+def test_bias_and_weight_of_a_sensor_are_taken_out():
+    q = poses(40)
+    _, R = arms.flange(arms.UR10, q)
+    down = np.einsum("nji,j->ni", R, [0, 0, -9.80665])
+    wrench = np.hstack([1.2 * down + [1, 2, 3], 1.2 * np.cross([0, 0.01, 0.1], down) + 0.5])
+    log = table(timestamp=np.arange(40) * 10.0, actual_q=q, ft_raw_wrench=wrench)
+    cell = {"robot": {"dh": [link.document() for link in arms.UR10]}}
+    assert np.abs(rivals.wrench_corrected(cell, log, log).get("ft_raw_wrench")).max() < 1e-9
+
+
+def test_one_delay_a_joint_is_found():
+    time = np.arange(2000) * 0.004
+    delay = np.array([0.01, 0.03])
+    wave = [np.sin((1.3 + j) * (time - d)) for j, d in enumerate(delay)]
+    target = np.column_stack([np.sin((1.3 + j) * time) for j in range(2)])
+    log = table(timestamp=time, target_q=target, actual_q=np.column_stack(wave))
+    fitted, judged = (log.rows(keep) for keep in halves(log))
+    assert np.sqrt(np.mean(rivals.tracking_left(fitted, judged)[20:] ** 2)) < 1e-5
+
+
+def test_base_parameters_and_friction_are_found(tmp_path):
+    pin = pytest.importorskip("pinocchio")
+    time = np.arange(1500) * 0.01
+    rate = RNG.uniform(0.5, 2.0, (6, 3))
+    phase = RNG.uniform(-3, 3, (6, 3))
+    angle = time[:, None, None] * rate + phase
+    q, qd, qdd = ((np.sin(angle + k * np.pi / 2) * rate**k * 0.4).sum(axis=2) for k in range(3))
+    model = rivals._pinocchio({"robot": {"dh": [x.document() for x in arms.UR10E]}}, tmp_path, pin)
+    for i, link in enumerate(arms.UR10E):
+        model.inertias[i + 1] = pin.Inertia(link.mass, np.array(link.cog), 0.02 * np.eye(3))
+    data = model.createData()
+    torque = np.array([pin.rnea(model, data, *row) for row in zip(q, qd, qdd, strict=True)])
+    torque += 3 * np.sign(qd) + 2 * qd
+    log = table(timestamp=time, actual_q=q, actual_qd=qd, actual_current_as_torque=torque)
+    cell = {"robot": {"dh": [x.document() for x in arms.UR10E]}}
+    fitted, judged = (log.rows(keep) for keep in halves(log))
+    left = rivals.torque_left(cell, tmp_path, fitted, judged)
+    assert np.sqrt(np.mean(left**2)) < 0.05 * np.sqrt(np.mean(torque**2))
+
+
+def test_a_recording_is_judged_on_its_end_and_poses_at_random():
+    q = poses(50)
+    moving = table(timestamp=np.arange(50) * 0.01, actual_q=q)
+    at_rest = table(timestamp=np.arange(50) * 30.0, actual_q=q)
+    assert halves(moving)[1].nonzero()[0].tolist() == list(range(40, 50))
+    fitted, judged = halves(at_rest)
+    assert judged.sum() == 10 and not (fitted & judged).any()
+    assert np.ptp(judged.nonzero()[0]) > 15
+
+
+@pytest.mark.parametrize(
+    ("effect", "name", "value", "absurd"),
+    [
+        ("payload", "payload", -681.7, True),
+        ("payload", "payload", 0.4, False),
+        ("axial_compliance", "axial_compliance_2", -1e-6, True),
+        ("link_geometry", "link_geometry_3_a", 0.1, True),
+        ("link_geometry", "link_geometry_3_a", 0.001, False),
+        ("viscous_friction", "viscous_friction_3", -2.0, True),
+    ],
+)
+def test_what_no_engineer_believes_is_absurd(effect, name, value, absurd):
+    cause = {"effect": effect, "parameters": [{"name": name, "value": value, "std": 1e-9}]}
+    assert bool(absurdities([cause], 1.0, 5.0)) is absurd
+
+
+def test_a_value_within_its_own_spread_is_absurd():
+    cause = {"effect": "backlash", "parameters": [{"name": "backlash_2", "value": 1e-4,
+                                                   "std": 1e-4}]}  # fmt: skip
+    assert absurdities([cause], 0, 0) == ["backlash (no number of it over 3 sigma)"]
+
+
+def test_a_clone_becomes_a_log_and_a_cell(tmp_path):
+    source = SOURCES["force_sensor_100"]
+    place = tmp_path / source.folder / "datas"
+    place.mkdir(parents=True)
+    turn = RNG.normal(size=(9, 4))
+    pose = np.hstack([np.zeros((9, 3)), turn / np.linalg.norm(turn, axis=1)[:, None]])
+    np.savetxt(place / "recorded_messages_pose_100.txt", pose, delimiter=",")
+    np.savetxt(place / "recorded_messages_wrench_100.txt", np.tile([0, 0, -9.0, 0, 0, 0], (9, 1)),
+               delimiter=",")  # fmt: skip
+    write(tmp_path / "out", source, source.make(tmp_path / source.folder))
+    log = read_table(tmp_path / "out/log.csv")
+    _, R = arms.flange(arms.WRIST, log.joints())
+    force = np.einsum("nij,nj->ni", R, log.get("ft_raw_wrench")[:, :3])
+    assert force == pytest.approx(np.tile([0, 0, -9.0], (9, 1)), abs=1e-6)
+    about = yaml.safe_load((tmp_path / "out/ABOUT.yaml").read_text(encoding="utf-8"))
+    assert source.repository in about["source"]
+
+
+def test_sets_that_are_not_there_are_skipped_by_name(tmp_path):
+    from click.testing import CliRunner
+
+    done = CliRunner().invoke(main, [str(tmp_path), "--out", str(tmp_path / "out")])
+    assert done.exit_code == 0
+    assert "panda: skipped, no clone of github.com/" in done.output
+
+
+def test_a_log_of_weight_alone_is_judged_beside_least_squares(tmp_path):
+    from click.testing import CliRunner
+
+    from benchmarks.real.__main__ import main as judge
+
+    q = poses(40)
+    _, R = arms.flange(arms.UR10, q)
+    down = np.einsum("nji,j->ni", R, [0, 0, -9.80665])
+    wrench = np.hstack([1.2 * down + [4, 2, 3], 1.2 * np.cross([0, 0.01, 0.1], down) + 0.5])
+    log = table(timestamp=np.arange(40) * 10.0, actual_q=q,
+                ft_raw_wrench=wrench + RNG.normal(size=wrench.shape) * 0.02)  # fmt: skip
+    (tmp_path / "one").mkdir()
+    log.write(tmp_path / "one/log.csv")
+    cell = {"robot": {"dh": [link.document() for link in arms.UR10]}}
+    (tmp_path / "one/cell.yaml").write_text(yaml.safe_dump(cell), encoding="utf-8")
+    done = CliRunner().invoke(judge, ["--data", str(tmp_path), "--json", str(tmp_path / "o.json")])
+    assert done.exit_code == 0, done.output
+    (outcome,) = json.loads((tmp_path / "o.json").read_text(encoding="utf-8"))
+    assert outcome["channel"] == "wrench"
+    assert outcome["rival"] < 0.1
+    assert outcome["gap"] > 1.0
+    assert outcome["ratio"] == pytest.approx(outcome["judged"] / outcome["rival"])

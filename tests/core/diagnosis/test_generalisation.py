@@ -1,0 +1,53 @@
+"""What is told of regions and sessions that were not fitted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import small_arm as small
+
+from core.diagnosis.generalisation import _solved, regions
+
+
+def test_regions_are_left_out_whole_and_hold_no_neighbour() -> None:
+    observation = small.diagnosed("none").channels[0].selection.observation
+    kept = np.ones(len(observation.rows), dtype=bool)
+    fold, near = regions(observation, kept)
+    q = np.stack([observation.quantities[f"actual_q_{i}"] for i in range(3)], axis=1)
+    assert sorted(set(fold)) == [0, 1, 2, 3, 4]
+    assert not near.any()
+    centre = np.array([q[fold == f].mean(axis=0) for f in range(5)])
+    nearest = np.argmin(np.linalg.norm(q[:, None] - centre, axis=2), axis=1)
+    assert np.mean(nearest == fold) > 0.9
+
+
+def test_stretches_of_a_recording_have_a_gap_to_what_is_fitted() -> None:
+    observation = small.diagnosed("none").channels[0].selection.observation
+    moving = replace(observation, order_in_time=True)
+    count = len(observation.rows)
+    fold, near = regions(moving, np.ones(count, dtype=bool))
+    assert (np.diff(fold) >= 0).all()
+    for f in range(5):
+        judged = np.flatnonzero(fold == f)
+        fitted = np.flatnonzero((fold != f) & ~near[f])
+        assert min(np.abs(fitted[:, None] - judged).ravel()) >= max(0.02 * count - 1, 1)
+
+
+def test_a_term_that_the_other_regions_do_not_show_changes_nothing() -> None:
+    """Its column is zero in the fitted rows: its value stays at zero, not anywhere."""
+    rng = np.random.default_rng(0)
+    A = np.column_stack([rng.normal(size=50), np.zeros(50), 1e-160 * rng.normal(size=50)])
+    b = 3 * A[:, 0] + 0.01 * rng.normal(size=50)
+    x = _solved(A, b, np.array([1e-6, 1e-6, 1e-6]))
+    assert abs(x[0] - 3) < 0.01
+    assert np.abs(x[1:]).max() < 1e-6
+
+
+def test_many_rows_give_the_same_solution_as_few() -> None:
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(400, 8)) * np.logspace(-6, 2, 8)
+    b = A @ (1 / np.logspace(-6, 2, 8)) + rng.normal(size=400)
+    few = _solved(A, b)
+    many = _solved(np.tile(A, (20, 1)), np.tile(b, 20))
+    assert np.allclose(few, many, rtol=1e-6)

@@ -1,0 +1,152 @@
+"""Slips, droop and dead bands in a diagnosis: found, dated, told apart, and named where unseen."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from core.arm import builtin_arm
+from core.diagnosis.diagnosis import ChannelDiagnosis, diagnose
+from core.effects import Site, Term
+from core.loads import Loads
+from core.log.log import Log
+from core.metrology import Metrology
+from core.model import Model
+
+MODEL = Model(builtin_arm("ur10e"), payload_mass=4.0, payload_cog=np.array([0.0, 0.02, 0.1]))
+SIGMA = 3e-5  # m
+
+
+def sampled(terms: list[Term], count: int = 70, seed: int = 0, clock: bool = True) -> Log:
+    """Return poses at rest, measured in a frame that nobody registered, with ``terms`` in the arm.
+
+    The truth of a slip is put in by hand: rows before and after it are two arms.
+    """
+    rng = np.random.default_rng(seed)
+    q = np.array([0.0, -1.2, 1.5, -1.8, -1.5, 0.0]) + rng.uniform(-0.8, 0.8, (count, 6))
+    loads = Loads(payload_mass=rng.choice([1.0, 4.0, 8.0], count))
+    still = [t for t in terms if not t.effect.endswith("_slip")]
+    position = MODEL.with_terms(still).predict(q, loads).position
+    moment = int(0.6 * count)
+    for term in terms:
+        if term not in still:
+            stands = "joint_offset" if term.effect == "joint_slip" else "tool_frame"
+            values = term.values if term.site.joint else (*term.values, 0.0, 0.0, 0.0)
+            after = MODEL.with_terms([*still, Term(stands, term.site, values)])
+            position[moment:] = after.predict(q, loads).position[moment:]
+    position = position + SIGMA * rng.standard_normal(position.shape) + [0.3, -0.2, 0.1]
+    columns = {"actual_q": q, "payload": loads.payload_mass, "measured_position": position}
+    if clock:
+        columns["timestamp"] = 1.7e9 + 40.0 * np.arange(count)
+    return Log("slip.csv", columns, 6)
+
+
+def position(log: Log) -> tuple[ChannelDiagnosis, tuple[str, ...]]:
+    found = diagnose(MODEL, log, Metrology(registered=False, sigma=2e-5))
+    (channel,) = [c for c in found.channels if c.channel == "position"]
+    return channel, found.findings
+
+
+@pytest.mark.parametrize("clock", [True, False])
+def test_a_joint_that_slips_is_named_sized_and_dated(clock: bool) -> None:
+    channel, findings = position(sampled([Term("joint_slip", Site(3), (2e-3,))], clock=clock))
+    (cause,) = channel.causes
+    assert (cause.effect, cause.joints) == ("joint_slip", (3,))
+    size, moment = cause.parameters
+    assert (size.name, moment.name) == ("joint_slip_3", "joint_slip_3_time")
+    assert size.std is not None
+    assert abs(size.value - 2e-3) < 3 * size.std
+    true = 1.7e9 + 40.0 * 41.5 if clock else 42.5
+    assert abs(moment.value - true) <= (20.0 if clock else 0.5)
+    (sentence,) = [f for f in findings if "joint_slip" in f]
+    assert f"the zero of joint 3 moved by {1e3 * size.value:.3g} mrad (0.115 deg)" in sentence
+    assert "before and after it nothing else changed" in sentence
+    assert ("22:40:40" in sentence) is clock
+    assert ("between rows 42 and 43 of the log" in sentence) is not clock
+
+
+def test_a_target_that_slips_is_no_joint_that_does() -> None:
+    shift = (1e-3, -5e-4, 2e-3)
+    channel, findings = position(sampled([Term("target_slip", Site(), shift)]))
+    (cause,) = channel.causes
+    assert cause.effect == "target_slip"
+    for told, true in zip(cause.parameters, shift, strict=False):
+        assert told.std is not None
+        assert abs(told.value - true) < 4 * told.std
+    (sentence,) = [f for f in findings if "target_slip" in f]
+    (far,) = re.findall(r"the target on the tool moved by (\S+) mm", sentence)
+    assert abs(float(far) - 1e3 * np.linalg.norm(shift)) < 0.05
+
+
+def test_a_slip_beside_an_offset_that_was_there_all_the_time() -> None:
+    terms = [Term("joint_slip", Site(4), (-3e-3,)), Term("joint_offset", Site(2), (1e-3,))]
+    channel, _ = position(sampled(terms, seed=2))
+    found = {(c.effect, c.joints) for c in channel.causes}
+    assert found == {("joint_slip", (4,)), ("joint_offset", (2,))}
+
+
+def test_nothing_slips_in_noise() -> None:
+    for seed in range(3):
+        channel, _ = position(sampled([], seed=10 + seed))
+        assert channel.causes == ()
+        assert channel.verdict == "no_gap"
+
+
+def rests(terms: list[Term], q: np.ndarray, loads: Loads) -> dict[str, np.ndarray]:
+    """Return targets and encoders of servos at rest, by hand: no code of the model's."""
+    actual = q.copy()
+    for _ in range(4):
+        held = MODEL.held_torque(actual, loads)
+        actual = q.copy()
+        for term in terms:
+            j = term.site.joint - 1
+            by = held[:, j] if term.effect == "servo_droop" else loads.approach[:, j]
+            actual[:, j] -= term.values[0] * by
+    noise = 1e-5 * np.random.default_rng(5).standard_normal(q.shape)
+    return {"target_q": q, "actual_q": actual + noise}
+
+
+def followed(terms: list[Term], both: bool = True, move: bool = True) -> ChannelDiagnosis:
+    rng = np.random.default_rng(3)
+    centre = np.array([0.0, -1.2, 1.5, -1.8, -1.5, 0.0])
+    q = centre + rng.uniform(-0.8, 0.8, (50, 6)) * (1.0 if move else np.array([1, 0, 0, 0, 0, 0]))
+    side = rng.choice([-1.0, 1.0], q.shape) if both else np.ones(q.shape)
+    loads = Loads(approach=side)
+    columns = rests(terms, q, loads) | {"approach": side}
+    (channel,) = diagnose(MODEL, Log("r", columns, 6)).channels
+    return channel
+
+
+def test_droop_and_dead_band_are_found_side_by_side() -> None:
+    channel = followed([Term("servo_droop", Site(2), (4e-5,)), Term("dead_band", Site(4), (1e-3,))])
+    values = {p.name: p.value for c in channel.causes for p in c.parameters}
+    assert values.keys() == {"servo_droop_2", "dead_band_4"}
+    assert values["servo_droop_2"] == pytest.approx(4e-5, rel=0.02)
+    assert values["dead_band_4"] == pytest.approx(1e-3, rel=0.02)
+    assert channel.verdict == "explained"
+
+
+def test_what_joints_hold_is_named_where_droop_is_out_of_the_catalogue() -> None:
+    rng = np.random.default_rng(3)
+    q = np.array([0.0, -1.2, 1.5, -1.8, -1.5, 0.0]) + rng.uniform(-0.8, 0.8, (50, 6))
+    loads = Loads(approach=np.ones(q.shape))
+    columns = rests([Term("servo_droop", Site(2), (4e-5,))], q, loads)
+    columns["timestamp"] = 40.0 * np.arange(50)
+    found = diagnose(MODEL, Log("r", columns, 6), withhold=["servo_droop"])
+    (channel,) = found.channels
+    assert channel.verdict == "unexplained"
+    assert channel.depends_on[0][0] == "held_torque_1"
+
+
+def test_a_joint_that_holds_the_same_all_the_time_shows_no_droop_and_the_motion_is_named() -> None:
+    channel = followed([], move=False)
+    assert channel.causes == ()
+    upright = Model(builtin_arm("ur10e"), gravity=np.array([0.0, 0.0, -1e-9]))
+    q = np.random.default_rng(1).uniform(-1, 1, (40, 6))
+    log = Log("r", {"target_q": q, "actual_q": q + 1e-5 * np.cos(7 * q)}, 6)
+    (channel,) = diagnose(upright, log).channels
+    (droop,) = [c for c in channel.considered if c.effect == "servo_droop"]
+    assert not droop.excited
+    assert "change the torque that the joint holds" in droop.reason
