@@ -45,7 +45,7 @@ def main(
     out: Path | None, command: str, inside: str | None, small: bool, listing: bool,
 ) -> None:  # fmt: skip
     """Draw cases whose effect is withheld, have them diagnosed, and score the answers."""
-    console = Console()
+    console = Console(emoji=False)
     if listing:
         for group, own in cases.kinds().items():
             console.print(f"[bold]{group}[/]: {' '.join(own)}")

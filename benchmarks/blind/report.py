@@ -14,7 +14,7 @@ from benchmarks.blind.tally import by_kind, criteria, matrix
 
 def print_report(scores: Sequence[CaseScore], console: Console | None = None) -> None:
     """Print the figures, the kinds, the confusion matrix and what went wrong."""
-    console = console or Console()
+    console = console or Console(emoji=False)  # else :wrench: of a case's name becomes a picture
     if not console.is_terminal:
         console.width = max(console.width, 150)
     console.print(_kinds(scores))

@@ -17,7 +17,7 @@ def lines(status: dict[str, Any]) -> list[str]:
         f"{status['cell']}: {status['state']} since {since}{why}",
         f"  process {status['pid']}, loop {loop['pid'] or 'none'} (restarts {loop['restarts']}), "
         f"session {status['session']}",
-        f"  link: {link['rate_hz']:.1f} Hz, last state {_ms(link['age'])} ago, cycles "
+        f"  link: {link['rate_hz']:.1f} Hz, {_last(link['age'])}, cycles "
         f"{link['cycles']}, missed {link['missed']}, late {link['late']}, setpoints "
         f"{link['written']}",
     ]
@@ -37,5 +37,5 @@ def lines(status: dict[str, Any]) -> list[str]:
     return found
 
 
-def _ms(age: float | None) -> str:
-    return "never" if age is None else f"{1e3 * age:.0f} ms"
+def _last(age: float | None) -> str:
+    return "no state yet" if age is None else f"last state {1e3 * age:.0f} ms ago"

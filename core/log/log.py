@@ -6,6 +6,8 @@ asked for when it is used. CSV goes through numpy, Parquet through pyarrow.
 
 from __future__ import annotations
 
+import gzip
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import LogError
-from core.files import is_file, is_given, read_bytes, read_text
+from core.files import is_file, is_given, read_bytes
 from core.loads import Loads
 from core.log.columns import COLUMNS, INDEXED, is_known, misspelt, nearest, written
 
 Array = NDArray[np.float64]
+GZIP = b"\x1f\x8b"
 
 
 @dataclass(frozen=True)
@@ -148,38 +151,56 @@ def read_log(path: Path | str, n: int) -> Log:
         raise LogError(f"{path}: file not found, expected a CSV or Parquet log")
     if path.suffix.lower() in (".parquet", ".pq"):
         names, table = _read_parquet(path)
+        lines = None
     else:
-        names, table = _read_csv(path)
+        names, table, lines = _read_csv(path)
     if not len(table):
         raise LogError(f"{path}: found no data rows, expected at least one")
     columns = table_columns(path, [name for name in names if is_known(name)], table, n)
     if not columns:
         raise LogError(f"{path}: columns: found none that a log may hold{nearest(names)}")
     unknown = tuple(name for name in names if not is_known(name))
-    return Log(str(path), columns, n, unknown=unknown)
+    counted = None if lines is None else np.arange(len(table)) + 1
+    return Log(str(path), columns, n, unknown=unknown, lines=lines, numbers=counted)
 
 
 def _wanted(names: Sequence[str]) -> list[int]:
     return [i for i, name in enumerate(names) if is_known(name)]
 
 
-def _read_csv(path: Path) -> tuple[list[str], Array]:
-    """Return the names of all columns, and those that are known (rows, known columns)."""
+def _text(path: Path) -> str:
+    """Return a text file, unpacked where it is gzip."""
     try:
-        text = read_text(path, "utf-8-sig")
+        data = read_bytes(path)
+        if data[:2] == GZIP:
+            data = gzip.decompress(data)
+        return data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError:
         raise LogError(f"{path}: found bytes that are no text, expected CSV (UTF-8)") from None
-    lines = text.splitlines()
-    while lines and not lines[-1].strip():
-        lines.pop()
+    except (OSError, EOFError, zlib.error) as error:
+        raise LogError(f"{path}: found no readable file ({error})") from None
+
+
+def _read_csv(path: Path) -> tuple[list[str], Array, NDArray[np.int64] | None]:
+    """Return the names of all columns, those that are known (rows, known columns), and the lines.
+
+    Lines of the rows in the file, or None where they follow each other from 2. Lines that begin
+    with # are comments; with semicolons between the cells a comma may stand for the decimal point.
+    """
+    every = _text(path).split("\n")
+    while every and not every[-1].strip():
+        every.pop()
+    kept = [number for number, line in enumerate(every, start=1) if not is_comment(line)]
+    lines = [every[number - 1] for number in kept]
     if not lines:
         raise LogError(f"{path}: found an empty file, expected a CSV header")
-    delimiter = ";" if lines[0].count(";") > lines[0].count(",") else ","
+    numbers = None if len(kept) == len(every) else np.array(kept[1:], dtype=np.int64)
+    delimiter = delimiter_of(lines[0])
     names = [name.strip().strip('"') for name in lines[0].split(delimiter)]
     if len(lines) == 1:
-        return names, np.empty((0, len(names)))
+        return names, np.empty((0, len(names))), numbers
     width = lines[0].count(delimiter)
-    for number, line in enumerate(lines[1:], start=2):
+    for number, line in zip(kept[1:], lines[1:], strict=True):
         if line.count(delimiter) != width:
             raise LogError(
                 f"{path}: row {number}: found {line.count(delimiter) + 1} cells, "
@@ -187,33 +208,40 @@ def _read_csv(path: Path) -> tuple[list[str], Array]:
             )
     wanted = _wanted(names)
     if not wanted:
-        return names, np.empty((len(lines) - 1, 0))
+        return names, np.empty((len(lines) - 1, 0)), numbers
+    rows = lines[1:]
+    if delimiter == ";":
+        rows = [line.replace(",", ".") for line in rows]
     try:
-        table = np.loadtxt(lines[1:], delimiter=delimiter, usecols=wanted, ndmin=2, comments=None)
+        table = np.loadtxt(rows, delimiter=delimiter, usecols=wanted, ndmin=2, comments=None)
     except ValueError:
-        table = _read_cells(path, lines, delimiter, names, wanted)
-    return names, table
+        table = np.array([
+            [cell_number(path, number, names[i], cell, delimiter) for i, cell in
+             enumerate(line.split(delimiter)) if i in wanted]
+            for number, line in zip(kept[1:], lines[1:], strict=True)
+        ])  # fmt: skip
+    return names, table, numbers
 
 
-def _read_cells(
-    path: Path, lines: list[str], delimiter: str, names: list[str], wanted: list[int]
-) -> Array:
-    """Read cell by cell: empty cells become NaN, others that are no number are named."""
-    table = np.full((len(lines) - 1, len(wanted)), np.nan)
-    for number, line in enumerate(lines[1:]):
-        cells = line.split(delimiter)
-        for column, i in enumerate(wanted):
-            cell = cells[i].strip().strip('"')
-            if not cell:
-                continue
-            try:
-                table[number, column] = float(cell)
-            except ValueError:
-                raise LogError(
-                    f"{path}: row {number + 2}, column {names[i]}: found {cell!r}, "
-                    "expected a number"
-                ) from None
-    return table
+def is_comment(line: str) -> bool:
+    """Return whether a line of a CSV file is a comment."""
+    return line.lstrip().startswith("#")
+
+
+def delimiter_of(header: str) -> str:
+    """Return what stands between the cells of a CSV file."""
+    return ";" if header.count(";") > header.count(",") else ","
+
+
+def cell_number(path: Path, row: int, name: str, cell: str, delimiter: str) -> float:
+    """Return the number in a cell, NaN where it is empty. Raises LogError naming row and column."""
+    text = cell.strip().strip('"')
+    try:
+        return float(text.replace(",", ".") if delimiter == ";" else text) if text else np.nan
+    except ValueError:
+        raise LogError(
+            f"{path}: row {row}, column {name}: found {text!r}, expected a number"
+        ) from None
 
 
 def _read_parquet(path: Path) -> tuple[list[str], Array]:

@@ -16,7 +16,16 @@ from numpy.typing import NDArray
 
 from core.errors import LogError
 from core.log.columns import is_known
-from core.log.log import Log, last_motion, read_log, table_columns
+from core.log.log import (
+    GZIP,
+    Log,
+    cell_number,
+    delimiter_of,
+    is_comment,
+    last_motion,
+    read_log,
+    table_columns,
+)
 
 Array = NDArray[np.float64]
 ROWS = 16_384  # of a piece
@@ -85,6 +94,12 @@ def _tables(path: Path, rows: int) -> Iterator[tuple[list[str], Array]]:
         return _parquet(path, rows)
     if path.suffix.lower() == RECORDING:
         return _recording(path)
+    with path.open("rb") as file:
+        if file.read(2) == GZIP:
+            raise LogError(
+                f"{path}: found gzip of a log that is too long to be read as a whole, expected it "
+                "unpacked (gunzip)"
+            )
     return _csv(path, rows)
 
 
@@ -108,33 +123,24 @@ def _parquet(path: Path, rows: int) -> Iterator[tuple[list[str], Array]]:
 
 def _csv(path: Path, rows: int) -> Iterator[tuple[list[str], Array]]:
     with path.open(encoding="utf-8-sig") as file:
-        header = file.readline()
-        delimiter = ";" if header.count(";") > header.count(",") else ","
+        kept = ((k, line) for k, line in enumerate(file, start=1) if not is_comment(line))
+        header = next(kept, (1, ""))[1]
+        delimiter = delimiter_of(header)
         names = [name.strip().strip('"') for name in header.strip().split(delimiter)]
         wanted = [k for k, name in enumerate(names) if is_known(name)]
-        first = 2
-        while lines := list(islice(file, rows)):
+        while lines := list(islice(kept, rows)):
             table = np.empty((len(lines), len(wanted)))
-            for k, line in enumerate(lines):
+            for k, (number, line) in enumerate(lines):
                 cells = line.strip().split(delimiter)
                 if len(cells) != len(names):
                     raise LogError(
-                        f"{path}: row {first + k}: found {len(cells)} cells, expected "
+                        f"{path}: row {number}: found {len(cells)} cells, expected "
                         f"{len(names)} as in the header"
                     )
-                table[k] = [_number(path, first + k, names[c], cells[c]) for c in wanted]
+                table[k] = [
+                    cell_number(path, number, names[c], cells[c], delimiter) for c in wanted
+                ]
             yield names, table
-            first += len(lines)
-
-
-def _number(path: Path, row: int, name: str, cell: str) -> float:
-    text = cell.strip().strip('"')
-    try:
-        return float(text) if text else np.nan
-    except ValueError:
-        raise LogError(
-            f"{path}: row {row}, column {name}: found {text!r}, expected a number"
-        ) from None
 
 
 def _recording(path: Path) -> Iterator[tuple[list[str], Array]]:

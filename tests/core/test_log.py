@@ -1,5 +1,6 @@
 """Logs: recordings as they come, and one line for every way in which a file can be wrong."""
 
+import gzip
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from core.arm import builtin_arm
 from core.diagnosis.log_checks.units_and_clocks import check_units
 from core.errors import LogError
 from core.log.log import last_motion, read_log
+from core.log.pieces import LogPieces
 from core.model import Model
 
 RECORDING = Path(__file__).parents[2] / ".." / "shared" / "data" / "rad_ur3e_rtde" / "log.csv"
@@ -49,6 +51,26 @@ def test_semicolons_line_ends_marks_and_blank_ends_do_not_matter(tmp_path, delim
     path = tmp_path / "log.csv"
     path.write_bytes(text.encode())
     np.testing.assert_allclose(read_log(path, 6).require("actual_q"), joints())
+
+
+def test_decimal_commas_comments_and_gzip_are_read(tmp_path):
+    rows = [[str(v).replace(".", ",") for v in r] for r in joints()]
+    lines = table(JOINTS, rows, ";").splitlines()
+    text = "\n".join(["# of the cell", *lines[:2], "  # a pause; of two, lines", *lines[2:]]) + "\n"
+    plain, packed = write(tmp_path, text), tmp_path / "log.csv.gz"
+    packed.write_bytes(gzip.compress(text.encode()))
+    for path in (plain, packed):
+        log = read_log(path, 6)
+        np.testing.assert_allclose(log.require("actual_q"), joints())
+        assert [log.line(row) for row in range(3)] == [3, 5, 6]
+        np.testing.assert_array_equal(log.times(), [1, 2, 3])
+    (piece,) = LogPieces(plain, 6)
+    np.testing.assert_allclose(piece.require("actual_q"), joints())
+    with pytest.raises(LogError, match="gunzip"):
+        list(LogPieces(packed, 6))
+    packed.write_bytes(packed.read_bytes()[:40])
+    with pytest.raises(LogError, match="no readable file"):
+        read_log(packed, 6)
 
 
 def test_columns_may_stand_in_any_order_and_unknown_ones_are_ignored(tmp_path):
@@ -114,8 +136,9 @@ UNUSABLE = {
     "a hole between rows": (table(JOINTS, joints(1)) + "\n" + "1,2,3,4,5,6\n",
                             "row 3: found 1 cells, expected 6"),
     "no number": (changed(1, 2, "abc"), "row 3, column actual_q_2: found 'abc', expected a number"),
-    "comma number": (table(JOINTS, [["0,5"] * 6], ";"),
-                     "row 2, column actual_q_0: found '0,5', expected a number"),
+    "two commas": (table(JOINTS, [["1,234,5"] * 6], ";"),
+                   "row 2, column actual_q_0: found '1,234,5', expected a number"),
+    "after a comment": ("# a\n" + changed(1, 2, "abc"), "row 4, column actual_q_2: found 'abc'"),
     "gap": (table([*JOINTS[:3], *JOINTS[4:]], [[1] * 5]),
             "column actual_q_3: not found, expected 6 columns actual_q_0..5"),
     "first missing": (table(JOINTS[1:], [[1] * 5]), "column actual_q_0: not found"),

@@ -158,7 +158,9 @@ def _turn(axis: str, angle: float, along: float) -> Array:
 def _standard(arm: Arm, rows: Array) -> Arm:
     links = [_turn("z", rows[0, 3], 0.0)]
     offsets = [*rows[1:, 3], 0.0]
-    links += [_link(*row[:3], offset) for row, offset in zip(rows, offsets, strict=True)]
+    links += [
+        _link(row[0], row[1], row[2], offset) for row, offset in zip(rows, offsets, strict=True)
+    ]
     return replace(arm, link_in_link=np.array(links))
 
 
