@@ -231,7 +231,7 @@ def test_another_tcp_in_the_controller_is_refused(offset_robot: SimulatedControl
         out["error"] = error_of(other.arm, other.read_state())
         """,
     )
-    assert "tool.tcp: found a TCP 180 mm" in out["error"]
+    assert "the controller's TCP is 180.0 mm" in out["error"]
 
 
 def test_the_checksum_is_what_both_sides_compute() -> None:
