@@ -125,7 +125,9 @@ class UrRtdeDriver(Driver):
             found = self.facts(state)
         except LinkError as error:
             raise WriteError(str(error)) from None
-        return differences(found, self._model, self.rate, self.settings.tcp_tolerance)
+        all_of = differences(found, self._model, self.rate, self.settings.tcp_tolerance)
+        # offset mode: mismatch compares the TCP where it is, before arming and all along
+        return all_of if self.moves_arm else [d for d in all_of if d.keys[0] != "tool"]
 
     def keep_alive(self) -> None:
         """Feed the watchdog of the control script; see Driver.keep_alive."""
