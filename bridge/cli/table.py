@@ -22,7 +22,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "convert": (
         "bridge.cli.convert:convert",
-        "Turn a ROS bag, an MCAP file or a LeRobot dataset into a log.",
+        "Turn a recording of another program into a log.",
     ),
     "fit": ("bridge.cli.fit:fit", "Identify the compliance of a cell from a log."),
     "predict": ("bridge.cli.predict:predict", "Predict the TCP pose of every row of a log."),

@@ -14,7 +14,6 @@ from datetime import UTC, datetime
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from core.arm import Arm
 from core.diagnosis.observation import Observation
@@ -91,6 +90,8 @@ def _integrated(work: Work, columns: Sequence[Array], base: Sequence[Term]) -> t
 
     For any two columns a and b the inner product is then a b - (C a)(C b).
     """
+    from scipy.linalg import solve_triangular  # takes its time, and only steps need it
+
     observation = work.observation
     blocks, prior = [observation.nuisance], [np.full(observation.nuisance.shape[2], FREE)]
     for candidate, block in zip(work.candidates, columns, strict=True):

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 Array = NDArray[np.float64]
 GAP = 5.0  # times the usual distance of two samples: beyond, nothing is interpolated
@@ -46,6 +45,8 @@ class Stream:
         found = {}
         for name, values in self.columns.items():
             if name == "measured_rotation" and len(self.time) > 1:
+                from scipy.spatial.transform import Rotation, Slerp
+
                 turn = Slerp(self.time, Rotation.from_rotvec(values))
                 found[name] = turn(inside).as_rotvec()
             else:

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from core.errors import LogError
 from core.log.sources.joint_order import order_joints
@@ -239,6 +238,8 @@ def _streams(
         streams.append(Stream(one.topic, np.array(one.time), {column: values}).in_order())
         notes.append(f"{one.topic}: taken as {column}, its axes are those of {one.frame!r}")
     if "pose" in samples:
+        from scipy.spatial.transform import Rotation
+
         one = samples["pose"]
         turns = Rotation.from_quat([row["measured_rotation"] for row in one.rows])
         columns = {

@@ -14,7 +14,7 @@ from core.model import Model
 
 
 def test_every_parameter_that_a_session_can_find_has_words_of_its_own():
-    effects = [e for e, effect in CATALOGUE.items() if "position" in effect.channels]
+    effects = [e for e, effect in CATALOGUE.items() if effect.calibratable]
     names = Parameters.every(Model(builtin_arm("ur10e")), effects).names
     words = [parameter_words(name) for name in names]
     assert len(set(words)) == len(names)
