@@ -35,6 +35,9 @@ class DaemonSettings(BaseModel):
     )
     backoff: tuple[float, float] = Field((0.2, 5.0), description="s before a restart: first, most")
     model_source: str = "bridge.cell:load_cell"
+    uncorrected: bool = Field(
+        False, description="arm though the model corrects nothing: a calibration moves a rigid cell"
+    )
 
     @model_validator(mode="after")
     def _source_fits_link(self) -> DaemonSettings:

@@ -74,7 +74,7 @@ class Session:
     def _settings(self, cell: Cell) -> DaemonSettings:
         given = settings_of(cell)
         link = given.link.model_copy(update={"rate": given.link.rate / self._slower})
-        return given.model_copy(update={"link": link})
+        return given.model_copy(update={"link": link, "uncorrected": True})
 
     def _run(self, cell: Cell, load: Load, poses: Array, longest: float) -> Rests:
         daemon = Daemon(self._settings(cell), may_write=True)

@@ -170,7 +170,7 @@ class Loop:
             return "the model's correction is no number at the present pose"
         if stream.unsolved:
             return f"the correction cannot be solved at the present pose: {stream.unsolved}"
-        if not self._model_check.corrects(self._acting):
+        if not self._settings.uncorrected and not self._model_check.corrects(self._acting):
             return (
                 "the model corrects nothing at any pose: found neither compliance nor an effect in "
                 "the cell that moves the TCP under what acts now"

@@ -56,7 +56,7 @@ class LinkedJoints(JointSource):
             update={
                 "recording": RecordingSettings(folder=None), "web": None, "metrics": None,
                 "setpoints": SetpointSettings(source="target"),
-                "model_source": "bridge.calibration.joints.link:uncorrected",
+                "model_source": "bridge.calibration.joints.link:uncorrected", "uncorrected": True,
             }
         )  # fmt: skip
         self._run: WatchedRun | None = None
