@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 from abc import ABC, abstractmethod
 from contextlib import AbstractContextManager
@@ -82,8 +83,9 @@ class DemoLink(ABC):
 
 def free_address(ports: tuple[int, ...]) -> str:
     """Return a loopback address on which none of ``ports`` is taken. Raises RunError."""
-    for last in range(2, LAST_HOST + 1):
-        host = f"127.0.0.{last}"
+    count = LAST_HOST - 1
+    for k in range(count):  # from elsewhere for each process: two may look in the same moment
+        host = f"127.0.0.{2 + (os.getpid() + k) % count}"
         if all(_is_free(host, port) for port in ports):
             return host
     raise RunError(f"found every address from 127.0.0.2 to 127.0.0.{LAST_HOST} taken")

@@ -16,7 +16,13 @@ from bridge.demo.poses import UR10E
 from bridge.demo.result import Resolution
 from bridge.demo.trajectory import visits, write_trajectory
 from drivers.simulated.ur.process import SimulatedController
-from drivers.simulated.ur.settings import BENCH_PORT, DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT
+from drivers.simulated.ur.settings import (
+    BENCH_PORT,
+    DASHBOARD_PORT,
+    PRIMARY_PORT,
+    RTDE_PORT,
+    SCRIPT_PORT,
+)
 
 Array = NDArray[np.float64]
 
@@ -26,7 +32,7 @@ class UrRtdeLink(DemoLink):
 
     name = "ur_rtde"
     template = "cell.yaml"
-    ports = (RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, BENCH_PORT)
+    ports = (RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, PRIMARY_PORT, BENCH_PORT)
     scene = UR10E
 
     def __init__(self, out: Path, seed: int) -> None:
