@@ -22,7 +22,7 @@ from core.errors import InputError
 def patch(model: Path, cell: Path, out: Path, joints: str | None, tcp: str | None) -> None:
     """Write a cell's effects into a simulator's model.
 
-    MODEL is an MJCF (.xml), a URDF or a USD model of the cell's nominal arm. Geometry, offsets,
+    MODEL is an MJCF (.xml) or a URDF model of the cell's nominal arm. Geometry, offsets,
     tool, masses, friction, damping, armature, delay, lag, gain, flexibility and play go where the
     format holds them; what it cannot hold is listed with what people do instead. MODEL itself stays
     as it is.
