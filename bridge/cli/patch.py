@@ -37,9 +37,12 @@ def patch(model: Path, cell: Path, out: Path, joints: str | None, tcp: str | Non
     given = open_cell(cell)
     require_writable(out, model, cell)
     names = tuple(name.strip() for name in joints.split(",")) if joints else ()
+    origin = given.file.provenance
+    on_top = origin is not None and any(file.role == "sim" for file in origin.files)
     patched = kind.patch(
-        model, changes_of(given.model), PatchOptions(names, tcp or ""), [f"cell: {cell.name}"]
-    )
+        model, changes_of(given.model), PatchOptions(names, tcp or "", on_top),
+        [f"cell: {cell.name}"],
+    )  # fmt: skip
     write_text(out, patched.text)
     for line in patched.changed:
         click.echo(line)

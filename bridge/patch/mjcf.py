@@ -49,7 +49,7 @@ class Mjcf(ModelFormat):
                 scene.move(scene.body_of(name), changes.moved(i, world))
                 changed.append(f"joint {name}: its body's frame")
             changed += _joint(scene, name, i + 1, changes)
-            changed += _actuator(scene, name, i + 1, changes)
+            changed += _actuator(scene, name, i + 1, changes, options)
             changed += _springs(scene, name, i, changes, world)
             changed += _scale(scene, name, changes.of_joint(Kind.LINK_SCALE, i + 1))
         missing = _tool(scene, path, changes, options, world, changed)
@@ -193,7 +193,8 @@ def _joint(scene: _Scene, name: str, joint: int, changes: ModelChanges) -> list[
     return lines
 
 
-def _actuator(scene: _Scene, name: str, joint: int, changes: ModelChanges) -> list[str]:
+def _actuator(scene: _Scene, name: str, joint: int, changes: ModelChanges,
+              options: PatchOptions) -> list[str]:  # fmt: skip
     """Set delay, lag and gain of the position actuator of a joint."""
     delay, lag = changes.of_joint(Kind.DELAY, joint), changes.of_joint(Kind.LAG, joint)
     droop = changes.of_joint(Kind.SERVO_COMPLIANCE, joint)
@@ -218,6 +219,10 @@ def _actuator(scene: _Scene, name: str, joint: int, changes: ModelChanges) -> li
         lines.append(f"actuator of {name}: timeconst {lag:.6g} s")
     if droop:
         gain, bias = np.array(drive.gainprm), np.array(drive.biasprm)
+        given = 1 / gain[0] if options.on_top and gain[0] > 0 else 0.0  # rad/Nm, as it came
+        droop += given
+        if gain[0] > 0 > bias[2]:  # a damping ratio, which is positive there, holds by itself
+            bias[2] /= np.sqrt(droop * gain[0])
         gain[0], bias[1] = 1 / droop, -1 / droop
         drive.gainprm, drive.biasprm = gain, bias
         lines.append(f"actuator of {name}: kp {1 / droop:.6g}")

@@ -20,6 +20,7 @@ class PatchOptions:
 
     joints: tuple[str, ...] = ()  # its joints, in the order of the arm's
     tcp: str = ""  # its TCP: a site, link or prim
+    on_top: bool = False  # the cell was diagnosed against this simulator: servos give way further
 
 
 @dataclass(frozen=True)

@@ -100,6 +100,7 @@ def test_no_driver_writes_before_it_is_armed_or_after_it_was_released(
     for hook in ("_send", "_make_ready"):
         monkeypatch.setattr(driver, hook, lambda _: None)
     monkeypatch.setattr(driver, "_let_go", lambda: None)
+    monkeypatch.setattr(driver, "differences", lambda _: [])  # nobody is there to be asked
     state = RobotState(1.0, 0.0, Q, NOTHING, Q, NOTHING)
     with pytest.raises(WriteError, match="expected arm"):
         driver.write_setpoint(setpoint())

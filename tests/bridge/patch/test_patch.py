@@ -153,7 +153,7 @@ def test_moving_effects_become_the_joints_and_actuators_own(tmp_path: Path) -> N
     dof = [compiled.joint(name).dofadr[0] for name in UR_JOINTS]
     assert compiled.dof_frictionloss[dof[0]] == pytest.approx(3.0)
     assert np.ravel(compiled.dof_damping[dof[1]])[0] == pytest.approx(5.0)
-    assert compiled.dof_armature[dof[2]] == pytest.approx(0.4)
+    assert compiled.dof_armature[dof[2]] == pytest.approx(before.dof_armature[dof[2]] + 0.4)
     assert compiled.actuator_dynprm[4, 0] == pytest.approx(0.05)
     play = compiled.joint("wrist_3_joint_backlash")
     assert np.allclose(play.range, [-0.001, 0.001])
@@ -161,6 +161,22 @@ def test_moving_effects_become_the_joints_and_actuators_own(tmp_path: Path) -> N
     assert ratio == pytest.approx(1.1)
     assert compiled.body("payload_difference").mass[0] == pytest.approx(1.5)
     assert not missing
+
+
+@pytest.mark.parametrize("on_top", [False, True])
+def test_a_servo_gives_way_as_much_as_the_cell_says(tmp_path: Path, on_top: bool) -> None:
+    """Found against the simulator, the droop comes beside the simulator's own."""
+    kp, droop = 1e4, 3e-5
+    (tmp_path / "a.xml").write_text(given := mjcf(ARM, UR_JOINTS, kp=kp))
+    model = NOMINAL.with_terms([Term("servo_droop", Site(3), (droop,))])
+    options = PatchOptions(tcp="tcp", on_top=on_top)
+    done = format_of(tmp_path / "a.xml").patch(tmp_path / "a.xml", changes_of(model), options, [])
+    after, before = (mujoco.MjModel.from_xml_string(t) for t in (done.text, given))
+    wanted = 1 / (droop + (1 / kp if on_top else 0))
+    assert after.actuator_gainprm[2, 0] == pytest.approx(wanted, rel=1e-5)
+    assert after.actuator_biasprm[2, 1] == pytest.approx(-wanted, rel=1e-5)
+    ratio = after.actuator_biasprm[2, 2] / before.actuator_biasprm[2, 2]
+    assert ratio == pytest.approx(np.sqrt(wanted / kp), rel=1e-3)  # as well damped as before
 
 
 def test_a_delayed_actuator_moves_later(tmp_path: Path) -> None:
