@@ -61,12 +61,12 @@ faults: .venv/.test
 # one stamp per set of dependencies: a later make finds nothing to do
 .venv/.main: pyproject.toml | .venv/bin/python
 	$(PIP) install --quiet --editable .
-	$(BIN)/python -m bridge.loop.warm_up
+	$(BIN)/python -m gapbridge.bridge.loop.warm_up
 	@touch $@
 
 .venv/.test: pyproject.toml | .venv/bin/python
 	$(PIP) install --quiet --editable '.[test]'
-	$(BIN)/python -m bridge.loop.warm_up
+	$(BIN)/python -m gapbridge.bridge.loop.warm_up
 	@touch $@ .venv/.main
 
 clean:

@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from core.errors import ArmError
+from gapbridge.core.errors import ArmError
 
 Array = NDArray[np.float64]
 
@@ -123,7 +123,7 @@ def _number(row: Mapping[str, Any], key: str, where: str, default: float | None 
 
 def builtin_names() -> tuple[str, ...]:
     """Return the names of the built-in arms."""
-    files = resources.files("core").joinpath("arms").iterdir()
+    files = resources.files("gapbridge.core").joinpath("arms").iterdir()
     return tuple(sorted(f.name.removesuffix(".yaml") for f in files if f.name.endswith(".yaml")))
 
 
@@ -137,7 +137,11 @@ def builtin_rows(name: str) -> dict[str, Any]:
         near = difflib.get_close_matches(str(name), names, n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
         raise ArmError(f"robot.model: found {name!r}, expected one of {', '.join(names)}{hint}")
-    text = resources.files("core").joinpath("arms", f"{name}.yaml").read_text(encoding="utf-8")
+    text = (
+        resources.files("gapbridge.core")
+        .joinpath("arms", f"{name}.yaml")
+        .read_text(encoding="utf-8")
+    )
     table: dict[str, Any] = yaml.safe_load(text)
     return table
 

@@ -15,12 +15,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.effects import CATALOGUE, settling
-from core.kernels import reference as kernel
-from core.kernels import single
-from core.kernels.least_offset import LARGEST_OFFSET as LARGEST_OFFSET
-from core.kernels.least_offset import smallest_offset
-from core.kernels.packed import (
+from gapbridge.core.effects import CATALOGUE, settling
+from gapbridge.core.kernels import reference as kernel
+from gapbridge.core.kernels import single
+from gapbridge.core.kernels.least_offset import LARGEST_OFFSET as LARGEST_OFFSET
+from gapbridge.core.kernels.least_offset import smallest_offset
+from gapbridge.core.kernels.packed import (
     arm_block,
     chain_of,
     row_of,
@@ -30,10 +30,10 @@ from core.kernels.packed import (
     view_row,
     view_shape,
 )
-from core.kernels.reference import JIT, Chain
-from core.kernels.single import LEVER, MAX_STEPS, SCRATCH, TOLERANCE
-from core.loads import Loads
-from core.model import Model, Poses
+from gapbridge.core.kernels.reference import JIT, Chain
+from gapbridge.core.kernels.single import LEVER, MAX_STEPS, SCRATCH, TOLERANCE
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model, Poses
 
 Array = NDArray[np.float64]
 NOTHING = Loads()

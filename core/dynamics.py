@@ -20,10 +20,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.effects import CATALOGUE, Term, acting
-from core.kernels.reference import Chain
-from core.model import Model
-from core.motion import Motion, Pieces
+from gapbridge.core.effects import CATALOGUE, Term, acting
+from gapbridge.core.kernels.reference import Chain
+from gapbridge.core.model import Model
+from gapbridge.core.motion import Motion, Pieces
 
 Array = NDArray[np.float64]
 LIGHTEST = 1e-6  # kg, of a link whose centre of gravity is anywhere

@@ -9,10 +9,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.kernels.reference import JIT
+from gapbridge.core.kernels.reference import JIT
 
 if TYPE_CHECKING:
-    from core.motion import Motion
+    from gapbridge.core.motion import Motion
 
 Array = NDArray[np.float64]
 FINE_STEP = 1e-3  # s: a lag's command is filled in to at least this rate

@@ -13,8 +13,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.errors import LimitError
-from core.kernels.reference import JIT
+from gapbridge.core.errors import LimitError
+from gapbridge.core.kernels.reference import JIT
 
 Array = NDArray[np.float64]
 LONGEST_GAP = 5.0  # cycles: after a longer one, no more than this many cycles' steps are allowed

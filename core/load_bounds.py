@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.model import Model
+from gapbridge.core.model import Model
 
 Vector = NDArray[np.float64]
 HEAVIEST = 1.5  # times the rated payload

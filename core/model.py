@@ -8,14 +8,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arm import Arm
-from core.effects import CATALOGUE, Site, Term, flexibility_effects, settling
-from core.effects.effect import Effect
-from core.errors import InputError
-from core.kernels import many
-from core.kernels.reference import Chain, Rows
-from core.loads import Loads
-from core.rotation import rotation_vector
+from gapbridge.core.arm import Arm
+from gapbridge.core.effects import CATALOGUE, Site, Term, flexibility_effects, settling
+from gapbridge.core.effects.effect import Effect
+from gapbridge.core.errors import InputError
+from gapbridge.core.kernels import many
+from gapbridge.core.kernels.reference import Chain, Rows
+from gapbridge.core.loads import Loads
+from gapbridge.core.rotation import rotation_vector
 
 Array = NDArray[np.float64]
 SETTLING = 10  # times that servos are looked at where they have given way

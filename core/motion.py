@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.derivatives import differentiate
-from core.errors import LogError
-from core.loads import Loads
-from core.log.log import Log
+from gapbridge.core.derivatives import differentiate
+from gapbridge.core.errors import LogError
+from gapbridge.core.loads import Loads
+from gapbridge.core.log.log import Log
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

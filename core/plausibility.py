@@ -15,8 +15,8 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arm import Arm
-from core.files import read_text
+from gapbridge.core.arm import Arm
+from gapbridge.core.files import read_text
 
 Array = NDArray[np.float64]
 POSES = 64

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from core.log.log import Log
-from core.sessions import sessions_in
+from gapbridge.core.log.log import Log
+from gapbridge.core.sessions import sessions_in
 
 Array = NDArray[np.float64]
 Range = Mapping[str, tuple[float, float]]

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import LogError
-from core.log.log import Log
-from core.model import Model
-from core.motion import is_moving
+from gapbridge.core.errors import LogError
+from gapbridge.core.log.log import Log
+from gapbridge.core.model import Model
+from gapbridge.core.motion import is_moving
 
 Array = NDArray[np.float64]
 PAUSE = 60.0  # s between sessions whose clocks overlap

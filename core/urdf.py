@@ -9,10 +9,10 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arm import Arm, JointLimits
-from core.errors import ArmError
-from core.files import read_text
-from core.rotation import rotation_matrix, rpy_matrix, transform
+from gapbridge.core.arm import Arm, JointLimits
+from gapbridge.core.errors import ArmError
+from gapbridge.core.files import read_text
+from gapbridge.core.rotation import rotation_matrix, rpy_matrix, transform
 
 Array = NDArray[np.float64]
 TURNING = ("revolute", "continuous")

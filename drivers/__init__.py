@@ -5,19 +5,19 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, cast
 
-from core.errors import LinkError
+from gapbridge.core.errors import LinkError
 
 if TYPE_CHECKING:
-    from core.model import Model
-    from drivers.driver import Driver, DriverSettings
-    from drivers.gate import GateBounds
+    from gapbridge.core.model import Model
+    from gapbridge.drivers.driver import Driver, DriverSettings
+    from gapbridge.drivers.gate import GateBounds
 
 DRIVERS: dict[str, str] = {
-    "can": "drivers.can.driver:CanDriver",
-    "canopen": "drivers.canopen.driver:CanopenDriver",
-    "modbus": "drivers.modbus.driver:ModbusDriver",
-    "replay": "drivers.replay:ReplayDriver",
-    "ur_rtde": "drivers.ur_rtde.driver:UrRtdeDriver",
+    "can": "gapbridge.drivers.can.driver:CanDriver",
+    "canopen": "gapbridge.drivers.canopen.driver:CanopenDriver",
+    "modbus": "gapbridge.drivers.modbus.driver:ModbusDriver",
+    "replay": "gapbridge.drivers.replay:ReplayDriver",
+    "ur_rtde": "gapbridge.drivers.ur_rtde.driver:UrRtdeDriver",
 }
 """Driver name in a cell file -> ``module:Class``, imported when it is used."""
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arm import Arm
-from core.estimation.registration import register_robustly
-from core.model import Model
-from core.plausibility import flange_in_first
+from gapbridge.core.arm import Arm
+from gapbridge.core.estimation.registration import register_robustly
+from gapbridge.core.model import Model
+from gapbridge.core.plausibility import flange_in_first
 
 Array = NDArray[np.float64]
 TCP_TURNED = 0.02  # rad: turned further, the controller's TCP is not the cell's

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from core.errors import WriteError
-from core.model import Model
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.controller_facts import ControllerFacts, Difference, differences
-from drivers.gate import Gate
+from gapbridge.core.errors import WriteError
+from gapbridge.core.model import Model
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.controller_facts import ControllerFacts, Difference, differences
+from gapbridge.drivers.gate import Gate
 
 Vector = NDArray[np.float64]
 GATED = ("write_setpoint", "arm", "release")  # of the base alone

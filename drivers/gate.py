@@ -15,10 +15,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.errors import GateError
-from core.kernels.reference import JIT
-from core.model import Model
-from core.setpoint import Setpoint
+from gapbridge.core.errors import GateError
+from gapbridge.core.kernels.reference import JIT
+from gapbridge.core.model import Model
+from gapbridge.core.setpoint import Setpoint
 
 Vector = NDArray[np.float64]
 GAP = 5.0  # cycles: no step is larger than this many cycles' allowance

@@ -13,10 +13,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import InvalidStateError
-from core.kernels.packed import arm_block
-from core.kernels.single import NEARER, SCRATCH, take_out
-from core.model import Model
+from gapbridge.core.errors import InvalidStateError
+from gapbridge.core.kernels.packed import arm_block
+from gapbridge.core.kernels.single import NEARER, SCRATCH, take_out
+from gapbridge.core.model import Model
 
 Vector = NDArray[np.float64]
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import yaml
 
-from core.errors import InputError
-from core.files import read_text
+from gapbridge.core.errors import InputError
+from gapbridge.core.files import read_text
 
 
 class ProfileError(InputError):

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from core.errors import LinkError, LogError
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.driver import Driver, DriverSettings
+from gapbridge.core.errors import LinkError, LogError
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.driver import Driver, DriverSettings
 
 if TYPE_CHECKING:
-    from core.model import Model
+    from gapbridge.core.model import Model
 
 Vector = NDArray[np.float64]
 NEEDED = (
@@ -51,7 +51,7 @@ class ReplaySettings(DriverSettings):
 
         Raises InputError where there is none.
         """
-        from core.log.mcap_reading import files_of
+        from gapbridge.core.log.mcap_reading import files_of
 
         path = (folder / self.file).resolve()
         try:
@@ -137,7 +137,7 @@ class ReplayDriver(Driver):
         self._left = iter(())
 
     def _rows(self) -> Iterator[Mapping[str, Vector]]:
-        from core.log.mcap_reading import read_batches  # only who replays loads MCAP
+        from gapbridge.core.log.mcap_reading import read_batches  # only who replays loads MCAP
 
         for batch in read_batches(self.settings.file):
             for k in range(len(batch)):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arm import Arm
+from gapbridge.core.arm import Arm
 
 Vector = NDArray[np.float64]
 FASTEST = 20.0  # rad/s: joints that move faster between two samples are a mistake

@@ -6,7 +6,7 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
-from core.effects import CATALOGUE
+from gapbridge.core.effects import CATALOGUE
 
 ROOT = Path(__file__).parents[1]
 OWN = ROOT / "core" / "effects"
@@ -68,7 +68,9 @@ def _found(source: str) -> list[str]:
             name = _named(node.value)
             if name and name not in SHARED:
                 found.append(name)
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("core.effects."):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
+            "gapbridge.core.effects."
+        ):
             name = (node.module or "").rpartition(".")[2]
             found += [name] if name in CATALOGUE else []
     return found
@@ -92,5 +94,5 @@ def test_the_search_finds_what_it_looks_for() -> None:
     assert _found('x = "ft_bias_fx"') == ["ft_bias"]
     assert _found('if term.effect == "payload": pass') == ["payload"]
     assert _found('kept = [t for t in terms if t.effect not in ("payload",)]') == ["payload"]
-    assert _found("from core.effects.backlash import Backlash") == ["backlash"]
+    assert _found("from gapbridge.core.effects.backlash import Backlash") == ["backlash"]
     assert _found('"""What ``backlash`` is."""\nlog.get("payload")') == []

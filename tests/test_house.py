@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import ast
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
 import pytest
 
-from bridge.cli.table import COMMANDS
+from gapbridge.bridge.cli.table import COMMANDS
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -17,8 +20,8 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 
 def test_every_package_is_listed_for_the_build() -> None:
     listed = set(PROJECT["tool"]["setuptools"]["packages"])
-    found = {
-        ".".join(path.relative_to(ROOT).parts)
+    found = {"gapbridge"} | {
+        ".".join(("gapbridge", *path.relative_to(ROOT).parts))
         for top in ("core", "drivers", "bridge")
         for path in [ROOT / top, *(ROOT / top).rglob("*/")]
         if path.is_dir() and list(path.glob("*.py"))
@@ -29,11 +32,12 @@ def test_every_package_is_listed_for_the_build() -> None:
 
 def test_every_data_file_of_a_package_is_listed_for_the_build() -> None:
     listed = PROJECT["tool"]["setuptools"]["package-data"]
+    package = ROOT / "gapbridge"
+    shipped = {path.resolve() for pattern in listed["gapbridge"] for path in package.glob(pattern)}
     for top in ("core", "drivers", "bridge"):
-        shipped = {path for pattern in listed[top] for path in (ROOT / top).glob(pattern)}
         for path in (ROOT / top).rglob("*"):
             if path.suffix in (".yaml", ".script", ".css", ".js", ".html", ".typed"):
-                assert path in shipped, f"{path} would be missing in an installation"
+                assert path.resolve() in shipped, f"{path} would be missing in an installation"
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -63,3 +67,28 @@ def test_sources_cite_only_files_that_exist() -> None:
     assert cited
     assert not [(str(s), name) for s, name in cited if not (ROOT / name).is_file()]
     assert not [str(s) for s in sources if "CONTRACT" in s.read_text(encoding="utf-8")]
+
+
+def test_every_import_of_ours_goes_through_the_one_package() -> None:
+    """A checkout has core, drivers and bridge on its path too: a module must not be there twice."""
+    ours = {"core", "drivers", "bridge"}
+    for top in (*ours, "gapbridge", "tests", "benchmarks"):
+        for file in (ROOT / top).rglob("*.py"):
+            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+                names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+                if isinstance(node, ast.ImportFrom) and not node.level:
+                    names = [str(node.module)]
+                assert not {name.split(".")[0] for name in names} & ours, (file, names)
+
+
+def test_what_the_package_promises_is_there_and_nothing_else_is_imported_for_it() -> None:
+    code = (
+        "import sys, gapbridge; early = {m.split('.')[0] for m in sys.modules}\n"
+        "for name in dir(gapbridge): getattr(gapbridge, name)\n"
+        "print(early & {'numpy', 'numba'}, {m.split('.')[0] for m in sys.modules} "
+        "& {'core', 'drivers', 'bridge'})"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert done.stdout.split() == ["set()", "set()"], done.stdout + done.stderr

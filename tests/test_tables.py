@@ -6,14 +6,14 @@ import importlib
 
 import pytest
 
-from bridge.calibration.instruments import INSTRUMENTS
-from bridge.calibration.jobs.table import JOBS
-from bridge.cell.simulation import SIMULATORS
-from bridge.cli.table import COMMANDS
-from bridge.daemon.sides import SIDES
-from bridge.setpoint_source import SOURCES
-from drivers import DRIVERS
-from drivers.ft_sensor import FT_SENSORS
+from gapbridge.bridge.calibration.instruments import INSTRUMENTS
+from gapbridge.bridge.calibration.jobs.table import JOBS
+from gapbridge.bridge.cell.simulation import SIMULATORS
+from gapbridge.bridge.cli.table import COMMANDS
+from gapbridge.bridge.daemon.sides import SIDES
+from gapbridge.bridge.setpoint_source import SOURCES
+from gapbridge.drivers import DRIVERS
+from gapbridge.drivers.ft_sensor import FT_SENSORS
 
 NAMED = [
     *INSTRUMENTS.values(),

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.planning.information import inverse
+from gapbridge.core.planning.information import inverse
 
 Array = NDArray[np.float64]
 ROUNDS = 150

@@ -11,9 +11,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import BinaryIO
 
-from bridge.cli import main
+from gapbridge.bridge.cli import main
 
-PYTHON = (sys.executable, "-m", "bridge.cli")
+PYTHON = (sys.executable, "-m", "gapbridge")
 TYPED = b"\n\n"  # the loads hang
 
 

@@ -28,13 +28,13 @@ from benchmarks.calibration.laid_out import (
     lay_out,
     readings_of,
 )
-from core.calibration.fit import estimates_of
-from core.calibration.observables import make_observable
-from core.calibration.parameters import Parameters
-from core.calibration.remainder import predicted
-from core.calibration.rest import come_to_rest
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.core.calibration.fit import estimates_of
+from gapbridge.core.calibration.observables import make_observable
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.remainder import predicted
+from gapbridge.core.calibration.rest import come_to_rest
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 LAYOUTS = {
     "position": Layout(),

@@ -28,15 +28,15 @@ from threadpoolctl import threadpool_limits
 from benchmarks.calibration.best_possible import least_possible
 from benchmarks.calibration.random_cells import RandomCell, random_cell
 from benchmarks.calibration.repeated import Scatter, repeated_sessions
-from core.calibration.observables import Nuisance, Observable, make_observable
-from core.calibration.observables.foreseen import empty_readings
-from core.calibration.parameters import Parameters
-from core.calibration.plan import Plan
-from core.calibration.readings import Readings
-from core.loads import Loads
-from core.planning.candidates import candidates_of
-from core.planning.design import far_end, plan, reference_of
-from core.planning.information import Reference, blocks, gathered, inverse
+from gapbridge.core.calibration.observables import Nuisance, Observable, make_observable
+from gapbridge.core.calibration.observables.foreseen import empty_readings
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.plan import Plan
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.loads import Loads
+from gapbridge.core.planning.candidates import candidates_of
+from gapbridge.core.planning.design import far_end, plan, reference_of
+from gapbridge.core.planning.information import Reference, blocks, gathered, inverse
 
 Array = NDArray[np.float64]
 SIGMA = 3e-5

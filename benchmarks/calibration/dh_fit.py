@@ -9,8 +9,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from benchmarks.blind.mechanics import Array
-from core.estimation.registration import register_robustly
-from core.model import Model
+from gapbridge.core.estimation.registration import register_robustly
+from gapbridge.core.model import Model
 
 LOOKS = 60  # residuals at most: columns that do the same let it wander for minutes
 

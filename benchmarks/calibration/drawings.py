@@ -8,9 +8,9 @@ import numpy as np
 
 from benchmarks.blind.arms import ArmKind
 from benchmarks.blind.mechanics import Array, RealArm, Session
-from core.arm import arm_from_dh
-from core.model import Model
-from core.rotation import transform
+from gapbridge.core.arm import arm_from_dh
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import transform
 
 
 def real_arm(kind: ArmKind, **other: Any) -> RealArm:

@@ -28,11 +28,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.calibration.children import PYTHON, Child, Start, environment, forked, started
-from bridge.calibration.session.journal import FILE, read_entries
-from bridge.calibration.session.plan_document import plan_of
-from core.arm import builtin_arm
-from core.loads import Loads
-from core.model import Model
+from gapbridge.bridge.calibration.session.journal import FILE, read_entries
+from gapbridge.bridge.calibration.session.plan_document import plan_of
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 CELL = """\
 robot: {model: ur10e}
@@ -78,7 +78,7 @@ def run(kills: int, seed: int, say: bool = True, whole: int | None = None) -> Ta
         while tally.kills < kills:
             when = int(rng.integers(0, MOST_KEPT)), float(rng.uniform(0.0, LONGEST_WAIT))
             if whole is not None and tally.kills >= whole and start is started:
-                importlib.import_module("bridge.calibration.jobs.calibrate")
+                importlib.import_module("gapbridge.bridge.calibration.jobs.calibrate")
                 start = forked
             ended = _killed_once(start(_command(folder, session)), session, when, tally)
             if say:

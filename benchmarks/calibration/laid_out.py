@@ -13,8 +13,8 @@ from benchmarks.blind.arms import ArmKind
 from benchmarks.blind.measuring import Instrument, joint_lever, read_arm
 from benchmarks.blind.mechanics import RealArm, Session, stand, turn
 from benchmarks.calibration.drawings import real_arm, session_at
-from core.calibration.readings import Readings
-from core.loads import Loads
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.loads import Loads
 
 Index = NDArray[np.int64]
 SPREAD = {"a": 5e-4, "d": 5e-4, "alpha": 8e-4, "beta": 8e-4}  # m and rad, 1 sigma

@@ -34,15 +34,15 @@ from benchmarks.calibration.laid_out import (
     readings_of,
 )
 from benchmarks.calibration.urdf import urdf_of
-from bridge.cell import load_cell
-from core.calibration.fit import calibrate
-from core.calibration.observables import make_observable
-from core.calibration.parameters import DEFAULT, Parameters
-from core.calibration.readings import Readings
-from core.loads import Loads
-from core.log.log import read_log
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.bridge.cell import load_cell
+from gapbridge.core.calibration.fit import calibrate
+from gapbridge.core.calibration.observables import make_observable
+from gapbridge.core.calibration.parameters import DEFAULT, Parameters
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.loads import Loads
+from gapbridge.core.log.log import read_log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 MEASURED = ("tsinghua_ur5_grid", "ipa_ur10_b", "barrett_wam_grid")
 ALONE = ("cobot10", "seven14")  # under one load as well

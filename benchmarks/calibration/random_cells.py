@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arm import Arm, JointLimits, arm_from_dh, builtin_arm
-from core.calibration.plan import Payload
-from core.model import Model
-from core.planning.capsules import Box
-from core.planning.workspace import Place, Space, reach
-from core.rotation import rotation_matrix
+from gapbridge.core.arm import Arm, JointLimits, arm_from_dh, builtin_arm
+from gapbridge.core.calibration.plan import Payload
+from gapbridge.core.model import Model
+from gapbridge.core.planning.capsules import Box
+from gapbridge.core.planning.workspace import Place, Space, reach
+from gapbridge.core.rotation import rotation_matrix
 
 Array = NDArray[np.float64]
 BUILTIN = ("ur3e", "ur5e", "ur10e", "ur16e", "ur20", "ur30")

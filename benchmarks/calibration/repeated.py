@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.observables import Nuisance, Observable
-from core.calibration.parameters import Parameters
-from core.calibration.readings import Readings
+from gapbridge.core.calibration.observables import Nuisance, Observable
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.readings import Readings
 
 Array = NDArray[np.float64]
 ROUNDS = 6

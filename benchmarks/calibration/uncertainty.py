@@ -30,11 +30,11 @@ from benchmarks.calibration.laid_out import (
     lay_out,
     readings_of,
 )
-from core.calibration.budget.budget import Stated, budget
-from core.calibration.fit import calibrate
-from core.calibration.observables import make_observable
-from core.calibration.parameters import Parameters
-from core.metrology import Metrology
+from gapbridge.core.calibration.budget.budget import Stated, budget
+from gapbridge.core.calibration.fit import calibrate
+from gapbridge.core.calibration.observables import make_observable
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.metrology import Metrology
 
 REPEATED = {"few repeats": 3, "many repeats": 12}
 AWAY = 60  # poses that judge the budget

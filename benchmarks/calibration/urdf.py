@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from core.arm import Arm
+from gapbridge.core.arm import Arm
 
 
 def urdf_of(arm: Arm) -> str:

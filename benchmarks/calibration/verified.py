@@ -31,13 +31,13 @@ from benchmarks.blind.mechanics import Array, RealArm, stand
 from benchmarks.blind.session import Plan
 from benchmarks.calibration.drawings import model_of
 from benchmarks.calibration.laid_out import draw_values, with_values
-from core.calibration.fit import calibrate
-from core.calibration.observables import make_observable
-from core.calibration.parameters import DEFAULT, ORDERS, Parameters
-from core.calibration.readings import Readings
-from core.calibration.result import Calibration
-from core.loads import Loads
-from core.metrology import Metrology
+from gapbridge.core.calibration.fit import calibrate
+from gapbridge.core.calibration.observables import make_observable
+from gapbridge.core.calibration.parameters import DEFAULT, ORDERS, Parameters
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.calibration.result import Calibration
+from gapbridge.core.loads import Loads
+from gapbridge.core.metrology import Metrology
 
 LIMIT = 1.2
 FITTED = 90

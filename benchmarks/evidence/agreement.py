@@ -12,11 +12,11 @@ import argparse
 import numpy as np
 
 from benchmarks.evidence.arms import dh_rows
-from core.arm import arm_from_dh
-from core.compensation import correct
-from core.kernels.single import TOLERANCE
-from core.loads import Loads
-from core.model import Model
+from gapbridge.core.arm import arm_from_dh
+from gapbridge.core.compensation import correct
+from gapbridge.core.kernels.single import TOLERANCE
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 from tests.oracle import equilibrium, rigid
 
 # arm -> largest payload (kg), a usual flexibility (rad/Nm)

@@ -15,11 +15,11 @@ import numpy as np
 
 from benchmarks.evidence import DATA
 from benchmarks.evidence.measured import distances, published, registered, split
-from bridge.cell import load_cell
-from core.diagnosis.diagnosis import Diagnosis, diagnose
-from core.log.log import Log, read_log
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.bridge.cell import load_cell
+from gapbridge.core.diagnosis.diagnosis import Diagnosis, diagnose
+from gapbridge.core.log.log import Log, read_log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 SETS = ("tsinghua_ur5_grid", "barrett_wam_grid", "ipa_ur10_a", "ipa_ur10_b")
 LATER = (("tsinghua_ur5_grid", "tsinghua_ur5_random"), ("barrett_wam_grid", "barrett_wam_random"),

@@ -16,13 +16,13 @@ import numpy as np
 import yaml
 
 from benchmarks.evidence import DATA
-from bridge.cell import load_cell
-from core.errors import InputError
-from core.estimation.identification import identify_compliance, pose_groups
-from core.estimation.registration import Registration, frame_columns, register_robustly
-from core.log.log import Log, read_log
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.bridge.cell import load_cell
+from gapbridge.core.errors import InputError
+from gapbridge.core.estimation.identification import identify_compliance, pose_groups
+from gapbridge.core.estimation.registration import Registration, frame_columns, register_robustly
+from gapbridge.core.log.log import Log, read_log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 HELD_OUT = 5  # every fifth pose
 PAIRS = [("tsinghua_ur5_grid", "tsinghua_ur5_random"), ("barrett_wam_grid", "barrett_wam_random"),

@@ -13,12 +13,12 @@ import numpy as np
 
 from benchmarks.evidence.arms import dh_rows
 from benchmarks.evidence.finite_elements import STIFF, Frame, FrameArm, NodalLoad
-from core.arm import arm_from_dh
-from core.estimation.identification import identify_compliance
-from core.loads import Loads
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.core.arm import arm_from_dh
+from gapbridge.core.estimation.identification import identify_compliance
+from gapbridge.core.loads import Loads
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 FIT, CHECK = 10, 20
 TOOL = np.array([0.02, -0.03, 0.18])

@@ -13,11 +13,11 @@ import numpy as np
 
 from benchmarks.evidence.finite_elements import STIFF, Frame, FrameArm, NodalLoad
 from benchmarks.evidence.paper import TUBE, frame_arm, rigid_model
-from core.estimation.identification import Identification, identify_compliance
-from core.loads import Loads
-from core.log.log import Log
-from core.metrology import Metrology
-from core.rotation import rotation_matrix
+from gapbridge.core.estimation.identification import Identification, identify_compliance
+from gapbridge.core.loads import Loads
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.rotation import rotation_matrix
 
 POSES = 50
 NOISE = 2e-5  # m

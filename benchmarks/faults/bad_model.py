@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from bridge.cell import Cell
-from bridge.cell import load_cell as load
-from core.compensation import Compensator, Correction
-from core.loads import Loads
+from gapbridge.bridge.cell import Cell
+from gapbridge.bridge.cell import load_cell as load
+from gapbridge.core.compensation import Compensator, Correction
+from gapbridge.core.loads import Loads
 
 FLAG = "no_number"
 

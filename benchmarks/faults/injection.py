@@ -6,7 +6,7 @@ import time
 
 from benchmarks.faults.rig import Rig
 from benchmarks.faults.row import Result, Row
-from bridge.loop.supervisor import Cause, State
+from gapbridge.bridge.loop.supervisor import Cause, State
 
 POLL = 0.001  # s
 AFTERWARDS = 0.25  # s for which the end state must stay

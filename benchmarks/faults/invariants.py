@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from benchmarks.faults.wire.seen import Fresh, Numbers, Write
-from drivers.simulated.plant.kinematics import gap, tcp_in_base
-from drivers.simulated.plant.plant_arm import Frame, PlantArm
+from gapbridge.drivers.simulated.plant.kinematics import gap, tcp_in_base
+from gapbridge.drivers.simulated.plant.plant_arm import Frame, PlantArm
 
 OBSERVING, ARMED = 1, 2
 WRITING = (3, 4)  # compensating, holding

@@ -23,10 +23,10 @@ from benchmarks.faults.links import LIMITS, LINKS, own_address
 from benchmarks.faults.peer import Peer
 from benchmarks.faults.process_run import END_LIMIT, ProcessRun
 from benchmarks.faults.report import PAGE, fill
-from bridge.ipc.control_client import ask
-from bridge.loop.supervisor import State
-from core.errors import GapbridgeError
-from core.log.mcap_reading import last_batch
+from gapbridge.bridge.ipc.control_client import ask
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.core.errors import GapbridgeError
+from gapbridge.core.log.mcap_reading import last_batch
 
 LOST = 1.0  # s before a kill that a recording may lack
 CAUGHT_UP = 5.0  # s that a new recorder has for what the killed one had not written

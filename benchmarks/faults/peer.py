@@ -19,7 +19,7 @@ CODE = """
 import contextlib, ctypes, signal
 with contextlib.suppress(Exception):  # it must not outlive whoever started it
     ctypes.CDLL(None).prctl(1, signal.SIGKILL, 0, 0, 0)
-from bridge.cli import main
+from gapbridge.bridge.cli import main
 main()
 """
 

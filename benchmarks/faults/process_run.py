@@ -16,15 +16,15 @@ import psutil
 
 from benchmarks.faults.punctual import go_first
 from benchmarks.faults.running import Event, Told
-from bridge.cell import load_cell
-from bridge.ipc.shared_memory import NAME, Page
-from bridge.loop.supervisor import State
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.ipc.shared_memory import NAME, Page
+from gapbridge.bridge.loop.supervisor import State
 
 CODE = """
 import ctypes, json, signal, sys
 from pathlib import Path
-from bridge.cli import main
-from bridge.daemon.run import run_cell
+from gapbridge.bridge.cli import main
+from gapbridge.bridge.daemon.run import run_cell
 def tell(event):
     print(json.dumps(event, default=str), file=sys.stderr, flush=True)
 sys.exit(run_cell(Path(sys.argv[1]), arm=True, log=tell))

@@ -16,8 +16,8 @@ from benchmarks.faults.proxy import Proxy
 from benchmarks.faults.punctual import be_punctual
 from benchmarks.faults.running import Running
 from benchmarks.faults.tap import Tap
-from bridge.loop.supervisor import State
-from core.errors import LinkError
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.core.errors import LinkError
 
 SOME = 40  # messages decoded at a time
 STARTS = 3

@@ -12,15 +12,15 @@ import numpy as np
 
 from benchmarks.blind.mechanics import Array
 from benchmarks.fleet.simulating import KIND, TYPE, Habits, columns, write_type_cell
-from bridge.cell import load_cell
-from core.errors import ExcitationError
-from core.estimation.compliance_fit import Data, fit_nuisances, residual
-from core.estimation.hierarchical import fit_type
-from core.estimation.hierarchical_evidence import evidence, usual_flexibility
-from core.estimation.identification import identify_compliance
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.bridge.cell import load_cell
+from gapbridge.core.errors import ExcitationError
+from gapbridge.core.estimation.compliance_fit import Data, fit_nuisances, residual
+from gapbridge.core.estimation.hierarchical import fit_type
+from gapbridge.core.estimation.hierarchical_evidence import evidence, usual_flexibility
+from gapbridge.core.estimation.identification import identify_compliance
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 HELD_OUT = 30  # poses of each session that no fit sees
 

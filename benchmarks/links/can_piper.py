@@ -18,12 +18,12 @@ from can.interfaces.socketcand.socketcand import SocketCanDaemonBus
 
 from benchmarks.links.case import Cycles, LinkCase, OurCycle, Pause
 from benchmarks.links.serving import served_cell, written
-from bridge.cell import load_cell
-from bridge.cell.cell import Cell
-from bridge.cell.simulation import simulated_peer
-from drivers.can.driver import CanDriver
-from drivers.can.settings import CanSettings
-from drivers.simulated.peer.peer_server import PeerThread
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cell.cell import Cell
+from gapbridge.bridge.cell.simulation import simulated_peer
+from gapbridge.drivers.can.driver import CanDriver
+from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.simulated.peer.peer_server import PeerThread
 
 HOST, PORT = "127.77.0.4", 29921
 BURST = 0.0015  # s in which all frames of one sample have come

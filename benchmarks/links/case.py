@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.compensation import Compensator
-from core.model import Model
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.driver import Driver
+from gapbridge.core.compensation import Compensator
+from gapbridge.core.model import Model
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.driver import Driver
 
 Vector = NDArray[np.float64]
 Step = Callable[[], None]

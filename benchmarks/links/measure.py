@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.links.case import Cycles, Step
-from core.errors import LinkError
+from gapbridge.core.errors import LinkError
 
 EACH = 25  # cycles in one turn
 WARM = 3  # untimed cycles at the begin of a turn

@@ -14,9 +14,9 @@ from pymodbus.client import ModbusTcpClient
 
 from benchmarks.links.case import Cycles, LinkCase, OurCycle, Pause
 from benchmarks.links.serving import served_cell
-from drivers.modbus.driver import ModbusDriver
-from drivers.modbus.settings import ModbusSettings
-from drivers.modbus.write import MailboxWriter
+from gapbridge.drivers.modbus.driver import ModbusDriver
+from gapbridge.drivers.modbus.settings import ModbusSettings
+from gapbridge.drivers.modbus.write import MailboxWriter
 
 HOST, PORT = "127.77.0.2", 15920
 PACE = 0.005  # s between two cycles: longer than the controller's, so that each finds a new sample

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from bridge.cell import load_cell
-from bridge.cell.cell import Cell
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cell.cell import Cell
 
 ARM = """\
 robot: {model: ur10e}
@@ -34,7 +34,7 @@ def served_cell(link: str) -> Iterator[Cell]:
     """Serve a cell in another process while the block lasts; yields it loaded."""
     with written(link) as path:
         process = subprocess.Popen(
-            [sys.executable, "-m", "bridge.cli", "simulate", str(path)],
+            [sys.executable, "-m", "gapbridge", "simulate", str(path)],
             stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
         try:

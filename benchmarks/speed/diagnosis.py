@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.blind.cases import make_case
-from bridge.cell import load_cell
-from core.diagnosis.diagnosis import diagnose
-from core.log.log import Log, read_log
-from core.model import Model
+from gapbridge.bridge.cell import load_cell
+from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.log.log import Log, read_log
+from gapbridge.core.model import Model
 
 CASES = ("pair", "triple", "torque:pair", "tracking:pair")
 SHARES = {

@@ -7,12 +7,12 @@ import time
 from pathlib import Path
 
 from benchmarks.fleet.simulating import write_fleet
-from bridge.cell import load_cell
-from core.diagnosis.diagnosis import diagnose
-from core.effects import CATALOGUE
-from core.log.log import Log, read_log
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.bridge.cell import load_cell
+from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.log.log import Log, read_log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 THERE = ("axial_compliance", "radial_compliance")  # what the simulated arms of a fleet have
 POSES = (20, 40, 70, 140, 280, 560, 1120)

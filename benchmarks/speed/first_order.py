@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from core.kernels.layout import FAST, U
-from core.kernels.one_row import (
+from gapbridge.core.kernels.layout import FAST, U
+from gapbridge.core.kernels.one_row import (
     AXIS,
     MOMENT,
     ORIGIN,
@@ -21,7 +21,7 @@ from core.kernels.one_row import (
     load,
     place,
 )
-from core.kernels.packed import sizes_of
+from gapbridge.core.kernels.packed import sizes_of
 
 
 @njit(**FAST)

@@ -13,12 +13,12 @@ from benchmarks.speed import task
 from benchmarks.speed.linear_fit import fit_linear
 from benchmarks.speed.peers.pinocchio_task import PinocchioTask
 from benchmarks.speed.sides import Side, compared, interleaved
-from core.calibration.observables import make_observable
-from core.calibration.observables.foreseen import empty_readings
-from core.calibration.parameters import Parameters
-from core.kernels import reference as kernel
-from core.loads import Loads
-from core.model import Model
+from gapbridge.core.calibration.observables import make_observable
+from gapbridge.core.calibration.observables.foreseen import empty_readings
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.kernels import reference as kernel
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 OURS, PEER = "ours", "least_squares, numerical derivatives"
 NOISE = 2e-5  # m

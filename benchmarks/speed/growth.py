@@ -10,9 +10,9 @@ import numpy as np
 
 from benchmarks.speed import diagnosis_growth, task
 from benchmarks.speed.linear_fit import fit_linear
-from core.kernels.many import predict
-from core.kernels.reference import Chain, Rows
-from core.kernels.single import correct
+from gapbridge.core.kernels.many import predict
+from gapbridge.core.kernels.reference import Chain, Rows
+from gapbridge.core.kernels.single import correct
 
 ROWS = (10, 100, 1_000, 10_000, 100_000)
 JOINTS = (2, 3, 4, 5, 6, 7, 8, 10, 12)
@@ -76,7 +76,7 @@ def _joints(n: int) -> dict[str, float]:
 
 def _setpoint(chain: Chain, n: int) -> float:
     """Return the time of one exact correction along a slow path."""
-    from core.compensation import block_of
+    from gapbridge.core.compensation import block_of
 
     block = block_of(chain, chain._replace(compliance=np.zeros((n, 3))))
     mass, cog, wrench = np.array([2.0]), np.zeros((1, 3)), np.zeros((1, 6))

@@ -15,13 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import InputError
-from core.kernels.factor import factor_blocks, normal_blocks
-from core.kernels.layout import LANES
-from core.kernels.reference import Rows
-from core.kernels.threads import in_ranges
-from core.loads import Loads
-from core.model import Model
+from gapbridge.core.errors import InputError
+from gapbridge.core.kernels.factor import factor_blocks, normal_blocks
+from gapbridge.core.kernels.layout import LANES
+from gapbridge.core.kernels.reference import Rows
+from gapbridge.core.kernels.threads import in_ranges
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 CHUNK = 128 * LANES  # rows that are brought into one form at once

@@ -26,9 +26,9 @@ import psutil
 from numpy.typing import NDArray
 
 from benchmarks.machine_stalls import MachineStalls, Missed
-from core.log.mcap_reading import SUFFIX, read_columns
-from drivers.simulated.ur.process import SimulatedController
-from drivers.simulated.ur.settings import simulated_cell
+from gapbridge.core.log.mcap_reading import SUFFIX, read_columns
+from gapbridge.drivers.simulated.ur.process import SimulatedController
+from gapbridge.drivers.simulated.ur.settings import simulated_cell
 
 HOST, RATE = "127.78.0.5", 500.0
 SETTLED = 5.0  # s of compensating before anything is counted
@@ -161,7 +161,7 @@ def _served(folder: Path) -> Iterator[tuple[str, str, Path]]:
         encoding="utf-8",
     )
     with SimulatedController(settings), (folder / LOG).open("wb") as log:
-        command = [sys.executable, "-m", "bridge.cli", "run", str(cell), "--log", "json"]
+        command = [sys.executable, "-m", "gapbridge", "run", str(cell), "--log", "json"]
         timing = Path(__file__).with_name("in_the_loop")
         path = os.pathsep.join([str(timing), *(p for p in sys.path if p)])
         times = folder / TIMES
@@ -232,7 +232,7 @@ def _compensating(web: str, cell: Path) -> None:
 
 
 def _command(name: str, cell: Path) -> int:
-    command = [sys.executable, "-m", "bridge.cli", name, str(cell)]
+    command = [sys.executable, "-m", "gapbridge", name, str(cell)]
     return subprocess.run(command, capture_output=True, check=False).returncode
 
 

@@ -14,8 +14,8 @@ from benchmarks.speed.peers import numpy_task
 from benchmarks.speed.peers.cpp import Cpp, compiler
 from benchmarks.speed.peers.pinocchio_task import PinocchioTask
 from benchmarks.speed.sides import Side, compared, interleaved
-from core.kernels.factor import regressor_blocks
-from core.kernels.threads import in_ranges
+from gapbridge.core.kernels.factor import regressor_blocks
+from gapbridge.core.kernels.threads import in_ranges
 
 OURS, THREADS = "ours", "ours, all threads"
 NUMPY, C, PINOCCHIO = "plain numpy, blocks", "C++ (vectors of eight)", "Pinocchio, loop"
@@ -104,7 +104,7 @@ def fit(count: int, rounds: int) -> dict[str, Any]:
 
 def _single(work: Any) -> None:
     """Do the work on the calling thread alone."""
-    from core.kernels import threads
+    from gapbridge.core.kernels import threads
 
     kept, threads.processors = threads.processors, lambda: 1
     try:

@@ -17,11 +17,11 @@ from benchmarks.speed.peers.casadi_task import casadi_setpoint
 from benchmarks.speed.peers.cpp import Cpp, compiler
 from benchmarks.speed.peers.pinocchio_task import PinocchioTask
 from benchmarks.speed.sides import Call, Side, compared, interleaved
-from bridge.loop.realtime import become_realtime
-from core.compensation import Compensator
-from core.kernels import single
-from core.kernels.packed import pack
-from core.loads import Loads
+from gapbridge.bridge.loop.realtime import become_realtime
+from gapbridge.core.compensation import Compensator
+from gapbridge.core.kernels import single
+from gapbridge.core.kernels.packed import pack
+from gapbridge.core.loads import Loads
 
 OURS, EXACT, EXACT_CALL = (
     "ours, first order",
@@ -144,9 +144,9 @@ def stream(rounds: int) -> dict[str, Any]:
 
 
 def _stream(rounds: int) -> dict[str, Any]:
-    from bridge.cell.sections import LimitSettings
-    from bridge.loop.setpoint_stream import SetpointStream
-    from core.state import RobotState
+    from gapbridge.bridge.cell.sections import LimitSettings
+    from gapbridge.bridge.loop.setpoint_stream import SetpointStream
+    from gapbridge.core.state import RobotState
 
     made = SetpointStream(task.bent(), LimitSettings(), 500.0)
     there, (_, loads) = task.path(500 * rounds), task.rows(1)

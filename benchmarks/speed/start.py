@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-GAPBRIDGE = (sys.executable, "-m", "bridge.cli")
+GAPBRIDGE = (sys.executable, "-m", "gapbridge")
 COMMANDS = {
     "python, nothing": (sys.executable, "-c", "pass"),
     "gapbridge --help": (*GAPBRIDGE, "--help"),
@@ -20,7 +20,8 @@ COMMANDS = {
     "gapbridge predict --help": (*GAPBRIDGE, "predict", "--help"),
     "first prediction, cache warm": (
         sys.executable, "-c",
-        "import numpy as np; from core.arm import builtin_arm; from core.model import Model; "
+        "import numpy as np; from gapbridge.core.arm import builtin_arm; "
+        "from gapbridge.core.model import Model; "
         "Model(builtin_arm('ur10e')).predict(np.zeros((4, 6)))",
     ),
 }  # fmt: skip

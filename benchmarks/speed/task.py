@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arm import builtin_arm
-from core.loads import Loads
-from core.model import Model
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 DAMPING = 1e-3  # m

@@ -3,11 +3,11 @@
 ``import gapbridge`` gives the same names.
 """
 
-from bridge.api.functions import compensate, diagnose, fit, load_cell, predict, read_log
-from bridge.api.records import Corrected, Diagnosed, Fitted, Predicted
-from bridge.cell import Cell
-from core.errors import GapbridgeError, InputError
-from core.log.log import Log
+from gapbridge.bridge.api.functions import compensate, diagnose, fit, load_cell, predict, read_log
+from gapbridge.bridge.api.records import Corrected, Diagnosed, Fitted, Predicted
+from gapbridge.bridge.cell import Cell
+from gapbridge.core.errors import GapbridgeError, InputError
+from gapbridge.core.log.log import Log
 
 __all__ = [
     "Cell",

@@ -10,14 +10,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from bridge.api.records import Corrected, Diagnosed, Fitted, Predicted
-from bridge.cell import Cell, load_cell
-from bridge.cell.opened_log import open_log
-from bridge.document.provenance import fitted, provenance
-from core.compensation import correct
-from core.errors import InputError, LogError
-from core.log.log import Log
-from core.sessions import join_sessions
+from gapbridge.bridge.api.records import Corrected, Diagnosed, Fitted, Predicted
+from gapbridge.bridge.cell import Cell, load_cell
+from gapbridge.bridge.cell.opened_log import open_log
+from gapbridge.bridge.document.provenance import fitted, provenance
+from gapbridge.core.compensation import correct
+from gapbridge.core.errors import InputError, LogError
+from gapbridge.core.log.log import Log
+from gapbridge.core.sessions import join_sessions
 
 __all__ = ["compensate", "diagnose", "fit", "load_cell", "predict", "read_log"]
 
@@ -58,7 +58,9 @@ def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
     ``remounted``: the target was taken off between sessions. Raises ExcitationError where nothing
     in the log excites the compliance.
     """
-    from core.estimation.identification import identify_compliance  # predict need not wait for it
+    from gapbridge.core.estimation.identification import (
+        identify_compliance,  # predict need not wait for it
+    )
 
     metrology = replace(cell.metrology, remounted=remounted)
     found = identify_compliance(cell.model, log, metrology)
@@ -82,9 +84,9 @@ def diagnose(
     ``withhold`` names effects to take out of the catalogue; ``simulated`` is the log of another
     simulator, row by row, whose values are the prediction.
     """
-    from core.diagnosis.diagnosis import diagnose as diagnose_log
-    from core.diagnosis.document import document
-    from core.effects import effect_named
+    from gapbridge.core.diagnosis.diagnosis import diagnose as diagnose_log
+    from gapbridge.core.diagnosis.document import document
+    from gapbridge.core.effects import effect_named
 
     for name in withhold:
         effect_named(name)

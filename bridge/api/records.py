@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell import Cell, save_cell
-from core.model import Model
+from gapbridge.bridge.cell import Cell, save_cell
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 

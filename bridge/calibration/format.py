@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.plan import Payload
+from gapbridge.core.calibration.plan import Payload
 
 Array = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from bridge.cell.settings.instruments import InstrumentSettings
+from gapbridge.bridge.cell.settings.instruments import InstrumentSettings
 
 
 @dataclass(frozen=True)

@@ -7,18 +7,23 @@ from dataclasses import replace
 
 import numpy as np
 
-from bridge.calibration.options import Order
-from bridge.cell import Cell
-from bridge.cell.settings.calibration import BoxEntry, CalibrationSettings, JointRange, RangeEntry
-from bridge.cell.settings.instruments import Base
-from core.calibration.observables import Observable, make_observable
-from core.calibration.parameters import DEFAULT, Parameters
-from core.calibration.plan import Payload, Plan
-from core.errors import CellError
-from core.metrology import Metrology
-from core.planning.capsules import Box
-from core.planning.design import far_end, plan
-from core.planning.workspace import Place, Space
+from gapbridge.bridge.calibration.options import Order
+from gapbridge.bridge.cell import Cell
+from gapbridge.bridge.cell.settings.calibration import (
+    BoxEntry,
+    CalibrationSettings,
+    JointRange,
+    RangeEntry,
+)
+from gapbridge.bridge.cell.settings.instruments import Base
+from gapbridge.core.calibration.observables import Observable, make_observable
+from gapbridge.core.calibration.parameters import DEFAULT, Parameters
+from gapbridge.core.calibration.plan import Payload, Plan
+from gapbridge.core.errors import CellError
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.planning.capsules import Box
+from gapbridge.core.planning.design import far_end, plan
+from gapbridge.core.planning.workspace import Place, Space
 
 REPEATABILITY = 5e-5  # m, 1 sigma of one coordinate, where the cell does not tell it
 NEEDS_PLACE = {"distance": "fixed end", "sphere": "sphere", "point": "point"}

@@ -11,24 +11,28 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.format import load_text
-from bridge.calibration.instruments.instrument import AnyInstrument, ReadingError, Surroundings
-from bridge.calibration.jobs.job import Job
-from bridge.calibration.jobs.table import make_job
-from bridge.calibration.joints.joint_source import JointSource, PlannedJoints
-from bridge.calibration.options import Order
-from bridge.calibration.planning import loads_of, metrology_of, space_of, with_loads
-from bridge.calibration.session.folders import begun_entry, check_begun, session_folder
-from bridge.calibration.session.joint_sources import make_joints
-from bridge.calibration.session.journal import Journal
-from bridge.calibration.session.measuring import Conversation
-from bridge.calibration.session.plan_document import write_poses
-from bridge.calibration.session.positioning import Bringing
-from bridge.calibration.session.prompt import InputEnded, Talk, Word
-from bridge.calibration.session.session import Book
-from bridge.cell import Cell
-from core.calibration.plan import PlannedPose
-from core.errors import CellError, LinkError
+from gapbridge.bridge.calibration.format import load_text
+from gapbridge.bridge.calibration.instruments.instrument import (
+    AnyInstrument,
+    ReadingError,
+    Surroundings,
+)
+from gapbridge.bridge.calibration.jobs.job import Job
+from gapbridge.bridge.calibration.jobs.table import make_job
+from gapbridge.bridge.calibration.joints.joint_source import JointSource, PlannedJoints
+from gapbridge.bridge.calibration.options import Order
+from gapbridge.bridge.calibration.planning import loads_of, metrology_of, space_of, with_loads
+from gapbridge.bridge.calibration.session.folders import begun_entry, check_begun, session_folder
+from gapbridge.bridge.calibration.session.joint_sources import make_joints
+from gapbridge.bridge.calibration.session.journal import Journal
+from gapbridge.bridge.calibration.session.measuring import Conversation
+from gapbridge.bridge.calibration.session.plan_document import write_poses
+from gapbridge.bridge.calibration.session.positioning import Bringing
+from gapbridge.bridge.calibration.session.prompt import InputEnded, Talk, Word
+from gapbridge.bridge.calibration.session.session import Book
+from gapbridge.bridge.cell import Cell
+from gapbridge.core.calibration.plan import PlannedPose
+from gapbridge.core.errors import CellError, LinkError
 
 Array = NDArray[np.float64]
 TITLES = {

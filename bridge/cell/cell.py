@@ -8,23 +8,28 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
-from bridge.cell.document import Document, read_document
-from bridge.cell.effects import compliance_terms, term_of
-from bridge.cell.message import message, messages
-from bridge.cell.plausibility import findings
-from bridge.cell.robot import build_arm
-from bridge.cell.schema import CellFile, Frame, Simulation
-from bridge.cell.sections import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
-from bridge.cell.settings.calibration import CalibrationSettings
-from bridge.cell.settings.metrics import MetricsSettings
-from bridge.cell.settings.web import WebSettings
-from core.arm import Arm
-from core.errors import ArmError, CellError, InputError
-from core.load_bounds import HEAVIEST
-from core.metrology import Metrology
-from core.model import Model
-from core.rotation import rpy_matrix, transform
-from drivers.ft_sensor.settings import FtSensorSettings
+from gapbridge.bridge.cell.document import Document, read_document
+from gapbridge.bridge.cell.effects import compliance_terms, term_of
+from gapbridge.bridge.cell.message import message, messages
+from gapbridge.bridge.cell.plausibility import findings
+from gapbridge.bridge.cell.robot import build_arm
+from gapbridge.bridge.cell.schema import CellFile, Frame, Simulation
+from gapbridge.bridge.cell.sections import (
+    LimitSettings,
+    LinkSettings,
+    RecordingSettings,
+    SetpointSettings,
+)
+from gapbridge.bridge.cell.settings.calibration import CalibrationSettings
+from gapbridge.bridge.cell.settings.metrics import MetricsSettings
+from gapbridge.bridge.cell.settings.web import WebSettings
+from gapbridge.core.arm import Arm
+from gapbridge.core.errors import ArmError, CellError, InputError
+from gapbridge.core.load_bounds import HEAVIEST
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rpy_matrix, transform
+from gapbridge.drivers.ft_sensor.settings import FtSensorSettings
 
 FINEST = 1.0e-9  # m: what a sigma of zero counts as
 

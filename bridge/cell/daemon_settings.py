@@ -6,11 +6,16 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from bridge.cell.sections import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
-from bridge.cell.settings.metrics import MetricsSettings
-from bridge.cell.settings.web import WebSettings
-from drivers.ft_sensor.settings import AnyFtSensor
-from drivers.ur_rtde.settings import UrRtdeSettings
+from gapbridge.bridge.cell.sections import (
+    LimitSettings,
+    LinkSettings,
+    RecordingSettings,
+    SetpointSettings,
+)
+from gapbridge.bridge.cell.settings.metrics import MetricsSettings
+from gapbridge.bridge.cell.settings.web import WebSettings
+from gapbridge.drivers.ft_sensor.settings import AnyFtSensor
+from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
 
 class DaemonSettings(BaseModel):
@@ -34,7 +39,7 @@ class DaemonSettings(BaseModel):
         1.0, gt=0.0, description="s without a heartbeat after which the loop's process is ended"
     )
     backoff: tuple[float, float] = Field((0.2, 5.0), description="s before a restart: first, most")
-    model_source: str = "bridge.cell:load_cell"
+    model_source: str = "gapbridge.bridge.cell:load_cell"
     uncorrected: bool = Field(
         False, description="arm though the model corrects nothing: a calibration moves a rigid cell"
     )

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell.cell import Cell
-from bridge.cell.message import key_path
-from core.loads import Loads
-from core.rotation import rotation_vector
+from gapbridge.bridge.cell.cell import Cell
+from gapbridge.bridge.cell.message import key_path
+from gapbridge.core.loads import Loads
+from gapbridge.core.rotation import rotation_vector
 
 Array = NDArray[np.float64]
 POSES = 200

@@ -10,8 +10,8 @@ from typing import Any
 
 import yaml
 
-from core.errors import CellError
-from core.files import read_text
+from gapbridge.core.errors import CellError
+from gapbridge.core.files import read_text
 
 Keys = Sequence[str | int]
 

@@ -7,11 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from bridge.cell.message import nearest
-from bridge.cell.schema import Compliance, EffectEntry
-from core.arm import Arm
-from core.effects import CATALOGUE, Parameter, Site, Term, effect_named, flexibility_effects
-from core.errors import CellError, InputError
+from gapbridge.bridge.cell.message import nearest
+from gapbridge.bridge.cell.schema import Compliance, EffectEntry
+from gapbridge.core.arm import Arm
+from gapbridge.core.effects import (
+    CATALOGUE,
+    Parameter,
+    Site,
+    Term,
+    effect_named,
+    flexibility_effects,
+)
+from gapbridge.core.errors import CellError, InputError
 
 VALUE = "value"  # the name in the file of a parameter that has none of its own
 

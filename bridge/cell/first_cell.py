@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from bridge.cell.document import number_text
-from bridge.cell.robot import DELTAS
-from core.arm import builtin_arm
-from core.errors import InputError
-from core.rotation import roll_pitch_yaw
-from drivers.controller_facts import ControllerFacts
+from gapbridge.bridge.cell.document import number_text
+from gapbridge.bridge.cell.robot import DELTAS
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.errors import InputError
+from gapbridge.core.rotation import roll_pitch_yaw
+from gapbridge.drivers.controller_facts import ControllerFacts
 
 
 @dataclass(frozen=True)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import time
 
-from bridge.cell.cell import Cell
-from bridge.cell.message import key_path
-from bridge.cell.plausibility import Findings
-from core.errors import CellError
-from drivers import make_driver
-from drivers.driver import Driver
+from gapbridge.bridge.cell.cell import Cell
+from gapbridge.bridge.cell.message import key_path
+from gapbridge.bridge.cell.plausibility import Findings
+from gapbridge.core.errors import CellError
+from gapbridge.drivers import make_driver
+from gapbridge.drivers.driver import Driver
 
 SAMPLES, LONGEST = 50, 2.0  # states, s
 SLOW = 0.8  # share of the rate asked for that must come

@@ -7,12 +7,12 @@ from pathlib import Path
 import click
 import numpy as np
 
-from bridge.cell.cell import Cell
-from core.diagnosis.log_checks.units_and_clocks import check_units
-from core.errors import LogError
-from core.load_bounds import HEAVIEST
-from core.log.log import Log, read_log
-from core.log.sources import SourceOptions, source_of
+from gapbridge.bridge.cell.cell import Cell
+from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units
+from gapbridge.core.errors import LogError
+from gapbridge.core.load_bounds import HEAVIEST
+from gapbridge.core.log.log import Log, read_log
+from gapbridge.core.log.sources import SourceOptions, source_of
 
 
 def open_log(path: Path, cell: Cell) -> Log:

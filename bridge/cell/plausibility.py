@@ -11,13 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bridge.cell.document import Document
-from bridge.cell.message import key_path
-from bridge.cell.schema import CellFile, Payload
-from core.arm import Arm, builtin_arm
-from core.load_bounds import LEVER, LoadBounds
-from core.model import Model
-from core.plausibility import (
+from gapbridge.bridge.cell.document import Document
+from gapbridge.bridge.cell.message import key_path
+from gapbridge.bridge.cell.schema import CellFile, Payload
+from gapbridge.core.arm import Arm, builtin_arm
+from gapbridge.core.load_bounds import LEVER, LoadBounds
+from gapbridge.core.model import Model
+from gapbridge.core.plausibility import (
     TURN,
     TURNS,
     Oddity,

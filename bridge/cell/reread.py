@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 from typing import Any
 
-from bridge.cell.daemon_settings import DaemonSettings
-from bridge.cell.run_settings import read_configuration
-from core.errors import GapbridgeError
+from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.cell.run_settings import read_configuration
+from gapbridge.core.errors import GapbridgeError
 
 KEPT = ("web", "metrics", "recording", "model_source")  # belongs to this run's processes
 

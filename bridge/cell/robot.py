@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from bridge.cell.schema import Calibration, Robot
-from core.arm import Arm, arm_from_dh, builtin_arm
-from core.errors import ArmError, CellError
-from core.files import is_file, read_text
-from core.urdf import arm_from_urdf
+from gapbridge.bridge.cell.schema import Calibration, Robot
+from gapbridge.core.arm import Arm, arm_from_dh, builtin_arm
+from gapbridge.core.errors import ArmError, CellError
+from gapbridge.core.files import is_file, read_text
+from gapbridge.core.urdf import arm_from_urdf
 
 DELTAS = ("delta_theta", "delta_a", "delta_d", "delta_alpha")
 

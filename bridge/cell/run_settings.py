@@ -10,13 +10,13 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from bridge.cell import Cell, load_cell
-from bridge.cell.daemon_settings import DaemonSettings
-from bridge.cell.runtime_folder import cell_key, runtime_folder
-from bridge.cell.sections import SetpointSettings
-from bridge.served.credentials import check_credentials, read_token
-from core.errors import CellError, InputError
-from core.files import read_bytes, recorded
+from gapbridge.bridge.cell import Cell, load_cell
+from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
+from gapbridge.bridge.cell.sections import SetpointSettings
+from gapbridge.bridge.served.credentials import check_credentials, read_token
+from gapbridge.core.errors import CellError, InputError
+from gapbridge.core.files import read_bytes, recorded
 
 
 @dataclass(frozen=True)

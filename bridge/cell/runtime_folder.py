@@ -8,7 +8,7 @@ import stat
 import tempfile
 from pathlib import Path
 
-from core.errors import InputError
+from gapbridge.core.errors import InputError
 
 
 def candidates() -> list[Path]:

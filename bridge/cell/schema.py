@@ -6,11 +6,16 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from bridge.cell.sections import LimitSettings, LinkSettings, RecordingSettings, SetpointSettings
-from bridge.cell.settings.calibration import CalibrationSettings
-from bridge.cell.settings.metrics import MetricsSettings
-from bridge.cell.settings.web import WebSettings
-from drivers.ft_sensor.settings import AnyFtSensor
+from gapbridge.bridge.cell.sections import (
+    LimitSettings,
+    LinkSettings,
+    RecordingSettings,
+    SetpointSettings,
+)
+from gapbridge.bridge.cell.settings.calibration import CalibrationSettings
+from gapbridge.bridge.cell.settings.metrics import MetricsSettings
+from gapbridge.bridge.cell.settings.web import WebSettings
+from gapbridge.drivers.ft_sensor.settings import AnyFtSensor
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0)]

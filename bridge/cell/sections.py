@@ -19,13 +19,13 @@ from pydantic import (
     model_validator,
 )
 
-from bridge.cell.settings.recording import RecordingSettings as RecordingSettings
-from core.addresses import is_loopback
-from drivers.can.settings import CanSettings
-from drivers.canopen.settings import CanopenSettings
-from drivers.modbus.settings import ModbusSettings
-from drivers.replay import ReplaySettings
-from drivers.ur_rtde.settings import UrRtdeSettings
+from gapbridge.bridge.cell.settings.recording import RecordingSettings as RecordingSettings
+from gapbridge.core.addresses import is_loopback
+from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.canopen.settings import CanopenSettings
+from gapbridge.drivers.modbus.settings import ModbusSettings
+from gapbridge.drivers.replay import ReplaySettings
+from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
 DEFAULT_DRIVER = "ur_rtde"
 

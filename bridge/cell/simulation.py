@@ -12,17 +12,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bridge.cell.cell import Cell
-from bridge.cell.robot import calibration_of
-from core.addresses import is_loopback
-from core.errors import CellError
-from core.rotation import rotation_vector
-from drivers.driver import DriverSettings
-from drivers.simulated.ft_sensor.serving import served_sensor
-from drivers.simulated.peer.peer import Peer, make_peer
-from drivers.simulated.peer.peer_server import PeerServer, serve_peer
-from drivers.simulated.ur.server import serve
-from drivers.simulated.ur.settings import (
+from gapbridge.bridge.cell.cell import Cell
+from gapbridge.bridge.cell.robot import calibration_of
+from gapbridge.core.addresses import is_loopback
+from gapbridge.core.errors import CellError
+from gapbridge.core.rotation import rotation_vector
+from gapbridge.drivers.driver import DriverSettings
+from gapbridge.drivers.simulated.ft_sensor.serving import served_sensor
+from gapbridge.drivers.simulated.peer.peer import Peer, make_peer
+from gapbridge.drivers.simulated.peer.peer_server import PeerServer, serve_peer
+from gapbridge.drivers.simulated.ur.server import serve
+from gapbridge.drivers.simulated.ur.settings import (
     BENCH_PORT,
     ServerSettings,
     announced_rows,
@@ -35,9 +35,9 @@ PORTS = ("rtde_port", "dashboard_port", "script_port", "bench_port", "primary_po
 PERIOD = 0.004  # s, of a Peer's cycle
 
 SIMULATORS: dict[str, str] = {
-    "can": "drivers.simulated.can.server:make_servers",
-    "canopen": "drivers.simulated.canopen.server:make_servers",
-    "modbus": "drivers.simulated.modbus.server:make_servers",
+    "can": "gapbridge.drivers.simulated.can.server:make_servers",
+    "canopen": "gapbridge.drivers.simulated.canopen.server:make_servers",
+    "modbus": "gapbridge.drivers.simulated.modbus.server:make_servers",
 }
 """link.driver -> ``module:function(link, host, peer) -> list[PeerServer]``, imported on use."""
 

@@ -1,5 +1,5 @@
 """The command line: ``gapbridge COMMAND``."""
 
-from bridge.cli.main import main
+from gapbridge.bridge.cli.main import main
 
 __all__ = ["main"]

@@ -1,5 +1,5 @@
-"""``python -m bridge.cli`` is ``gapbridge``."""
+"""``python -m gapbridge.bridge.cli`` is ``gapbridge`` too."""
 
-from bridge.cli.main import main
+from gapbridge.bridge.cli.main import main
 
 main()

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
-from core.diagnosis.result import Cause
-from core.diagnosis.separation import Measurement
-from core.effects import Reported
+from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
+from gapbridge.core.diagnosis.result import Cause
+from gapbridge.core.diagnosis.separation import Measurement
+from gapbridge.core.effects import Reported
 
 VERDICTS = {
     "no_gap": "no gap: nothing stands above the noise",

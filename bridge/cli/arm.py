@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from bridge.cli.options import cell_argument
-from bridge.ipc.control_client import ask
+from gapbridge.bridge.cli.options import cell_argument
+from gapbridge.bridge.ipc.control_client import ask
 
 
 @click.command()

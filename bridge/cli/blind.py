@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from core.errors import RunError
+from gapbridge.core.errors import RunError
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 BENCHMARK = "benchmarks.blind.__main__"

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import click
 
-from bridge.calibration.instruments.choice import instrument_settings
-from bridge.cli.options import cell_argument, open_cell
-from bridge.document.output_file import require_writable
+from gapbridge.bridge.calibration.instruments.choice import instrument_settings
+from gapbridge.bridge.cli.options import cell_argument, open_cell
+from gapbridge.bridge.document.output_file import require_writable
 
 EPILOG = """\b
 At every question:
@@ -100,8 +100,8 @@ def calibrate(
     if new_cell is not None:
         require_writable(new_cell, cell)
     chosen = instrument_settings(given, instrument)
-    from bridge.calibration.options import Order
-    from bridge.calibration.run import run_session  # takes the numerical libraries along
+    from gapbridge.bridge.calibration.options import Order
+    from gapbridge.bridge.calibration.run import run_session  # takes the numerical libraries along
 
     kind = "verify" if verify else "payload" if payload_only else "tool" if tool_only else "whole"
     order = Order(

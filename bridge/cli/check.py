@@ -6,12 +6,12 @@ from pathlib import Path
 
 import click
 
-from bridge.cell import load_cell
-from bridge.cell.cell import complaints
-from bridge.cell.live import live_findings
-from bridge.cell.run_settings import read_configuration
-from bridge.cli.options import cell_argument
-from core.errors import InputError
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cell.cell import complaints
+from gapbridge.bridge.cell.live import live_findings
+from gapbridge.bridge.cell.run_settings import read_configuration
+from gapbridge.bridge.cli.options import cell_argument
+from gapbridge.core.errors import InputError
 
 
 @click.command()

@@ -7,13 +7,19 @@ from pathlib import Path
 import click
 import numpy as np
 
-from bridge.cell.opened_log import open_log
-from bridge.cli.options import cell_option, csv_option, log_argument, open_cell, warn_outside
-from bridge.cli.progress import progress
-from bridge.document.output_file import require_writable, write_table
-from core.compensation import correct
-from core.errors import InputError
-from core.model import Array
+from gapbridge.bridge.cell.opened_log import open_log
+from gapbridge.bridge.cli.options import (
+    cell_option,
+    csv_option,
+    log_argument,
+    open_cell,
+    warn_outside,
+)
+from gapbridge.bridge.cli.progress import progress
+from gapbridge.bridge.document.output_file import require_writable, write_table
+from gapbridge.core.compensation import correct
+from gapbridge.core.errors import InputError
+from gapbridge.core.model import Array
 
 CHUNK = 500  # rows between two looks of the progress bar
 MISSED = 1e-6  # m: a corrected setpoint that leaves more than this is told

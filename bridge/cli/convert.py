@@ -7,12 +7,12 @@ from typing import Any
 
 import click
 
-from bridge.cell.opened_log import joint_names
-from bridge.cli.options import open_cell
-from bridge.document.output_file import PARQUET, require_writable, write_table
-from core.errors import InputError, LogError
-from core.log.sources import SOURCES, SourceOptions, source_of
-from core.log.sources.ros_bag import TYPES, WRENCHES
+from gapbridge.bridge.cell.opened_log import joint_names
+from gapbridge.bridge.cli.options import open_cell
+from gapbridge.bridge.document.output_file import PARQUET, require_writable, write_table
+from gapbridge.core.errors import InputError, LogError
+from gapbridge.core.log.sources import SOURCES, SourceOptions, source_of
+from gapbridge.core.log.sources.ros_bag import TYPES, WRENCHES
 
 ROLES = tuple(TYPES)
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from bridge.cli.optional import member
-from core.errors import InputError
+from gapbridge.bridge.cli.optional import member
+from gapbridge.core.errors import InputError
 
 
 @click.command()
@@ -43,4 +43,4 @@ def demo(seed: int, out: Path, link: str) -> None:  # fmt: skip
     """
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: found a file, expected a folder for --out")
-    member("bridge.demo", "run_demo", "demo")(seed=seed, out=out, link=link)
+    member("gapbridge.bridge.demo", "run_demo", "demo")(seed=seed, out=out, link=link)

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from bridge.cell import Cell, save_cell
-from bridge.cell.opened_log import open_log
-from bridge.cli.answer import answer
-from bridge.cli.options import (
+from gapbridge.bridge.cell import Cell, save_cell
+from gapbridge.bridge.cell.opened_log import open_log
+from gapbridge.bridge.cli.answer import answer
+from gapbridge.bridge.cli.options import (
     cell_option,
     logs_argument,
     open_cell,
@@ -20,16 +20,16 @@ from bridge.cli.options import (
     remounted_option,
     warn_outside,
 )
-from bridge.cli.progress import status
-from bridge.document.output_file import FOLDER_MODE, require_writable, write_text
-from bridge.document.provenance import fitted, provenance
-from core.diagnosis.diagnosis import Diagnosis
-from core.diagnosis.diagnosis import diagnose as diagnose_log
-from core.diagnosis.document import document
-from core.effects import effect_named
-from core.errors import InputError, LogError
-from core.log.log import Log
-from core.metrology import Metrology
+from gapbridge.bridge.cli.progress import status
+from gapbridge.bridge.document.output_file import FOLDER_MODE, require_writable, write_text
+from gapbridge.bridge.document.provenance import fitted, provenance
+from gapbridge.core.diagnosis.diagnosis import Diagnosis
+from gapbridge.core.diagnosis.diagnosis import diagnose as diagnose_log
+from gapbridge.core.diagnosis.document import document
+from gapbridge.core.effects import effect_named
+from gapbridge.core.errors import InputError, LogError
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -171,7 +171,9 @@ def _folder(path: Path) -> None:
 
 def _write_folder(folder: Path, text: str, found: Diagnosis, cell: Cell, log: Log) -> list[Path]:
     """Write diagnosis.json and report.html; returns their paths."""
-    from bridge.report import write_report  # plotly takes its time, and only --out needs it
+    from gapbridge.bridge.report import (
+        write_report,  # plotly takes its time, and only --out needs it
+    )
 
     written = [folder / "diagnosis.json"]
     write_text(written[0], text)

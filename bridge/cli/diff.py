@@ -9,10 +9,10 @@ from typing import Any
 import click
 import numpy as np
 
-from bridge.cell import Cell
-from bridge.cell.difference import Change, Moved, changes, moved
-from bridge.cell.opened_log import open_log
-from bridge.cli.options import open_cell
+from gapbridge.bridge.cell import Cell
+from gapbridge.bridge.cell.difference import Change, Moved, changes, moved
+from gapbridge.bridge.cell.opened_log import open_log
+from gapbridge.bridge.cli.options import open_cell
 
 
 @click.command()

@@ -6,8 +6,8 @@ import inspect
 
 import click
 
-from core.arm import builtin_arm
-from core.effects import CATALOGUE, CHANNELS, Effect, effect_named
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.effects import CATALOGUE, CHANNELS, Effect, effect_named
 
 
 @click.command()

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import click
 
-from bridge.document.output_file import require_writable, write_text
-from bridge.recording.export import Exported, Span, export, moment
-from core.errors import InputError
-from core.log.mcap_reading import SUFFIX, files_of, read_configuration
+from gapbridge.bridge.document.output_file import require_writable, write_text
+from gapbridge.bridge.recording.export import Exported, Span, export, moment
+from gapbridge.core.errors import InputError
+from gapbridge.core.log.mcap_reading import SUFFIX, files_of, read_configuration
 
 
 @click.command("export")

@@ -11,17 +11,23 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from bridge.cell import Cell, save_cell
-from bridge.cli.large_log import LargeLog, has_sessions, is_large
-from bridge.cli.options import cell_option, logs_argument, open_cell, open_logs, remounted_option
-from bridge.cli.progress import progress, status
-from bridge.document.output_file import require_writable
-from bridge.document.provenance import provenance
-from core.errors import ExcitationError
-from core.estimation.identification import Identification, identify_compliance
-from core.estimation.streamed import identify_streamed
-from core.metrology import Metrology
-from core.ranges import merged, range_of
+from gapbridge.bridge.cell import Cell, save_cell
+from gapbridge.bridge.cli.large_log import LargeLog, has_sessions, is_large
+from gapbridge.bridge.cli.options import (
+    cell_option,
+    logs_argument,
+    open_cell,
+    open_logs,
+    remounted_option,
+)
+from gapbridge.bridge.cli.progress import progress, status
+from gapbridge.bridge.document.output_file import require_writable
+from gapbridge.bridge.document.provenance import provenance
+from gapbridge.core.errors import ExcitationError
+from gapbridge.core.estimation.identification import Identification, identify_compliance
+from gapbridge.core.estimation.streamed import identify_streamed
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.ranges import merged, range_of
 
 
 @click.command()

@@ -9,20 +9,20 @@ from typing import Any
 
 import click
 
-from bridge.cli.progress import progress
-from bridge.fleet import diagnosing, fitting
-from bridge.fleet.cell_source import cell_source
-from bridge.fleet.dask_workers import DaskWorkers
-from bridge.fleet.folder import require_folder
-from bridge.fleet.journal import Journal
-from bridge.fleet.local_workers import LocalWorkers
-from bridge.fleet.outcome_words import ending
-from bridge.fleet.runner import Done, run, tasks_of
-from bridge.fleet.session import Found, find_sessions
-from bridge.fleet.task import BAD, DONE, Outcome, Work
-from bridge.fleet.workers import Workers
-from core.effects import effect_named
-from core.errors import InputError, RunError
+from gapbridge.bridge.cli.progress import progress
+from gapbridge.bridge.fleet import diagnosing, fitting
+from gapbridge.bridge.fleet.cell_source import cell_source
+from gapbridge.bridge.fleet.dask_workers import DaskWorkers
+from gapbridge.bridge.fleet.folder import require_folder
+from gapbridge.bridge.fleet.journal import Journal
+from gapbridge.bridge.fleet.local_workers import LocalWorkers
+from gapbridge.bridge.fleet.outcome_words import ending
+from gapbridge.bridge.fleet.runner import Done, run, tasks_of
+from gapbridge.bridge.fleet.session import Found, find_sessions
+from gapbridge.bridge.fleet.task import BAD, DONE, Outcome, Work
+from gapbridge.bridge.fleet.workers import Workers
+from gapbridge.core.effects import effect_named
+from gapbridge.core.errors import InputError, RunError
 
 OUT = Path("out/fleet")
 
@@ -82,7 +82,7 @@ def diagnose(withhold: tuple[str, ...], **given: Any) -> None:
     for name in withhold:
         effect_named(name)
     done, found = _run("diagnose", diagnosing.work, {"withhold": list(withhold)}, **given)
-    from bridge.fleet.output import write_diagnosed
+    from gapbridge.bridge.fleet.output import write_diagnosed
 
     _told(done, found, *write_diagnosed(done, found, given["out"]))
 
@@ -104,7 +104,7 @@ def fit(cells: Path | None, **given: Any) -> None:
     if cells is not None:
         require_folder(cells, "--apply")
     done, found = _run("fit", fitting.work, {}, **given)
-    from bridge.fleet.output import write_fitted
+    from gapbridge.bridge.fleet.output import write_fitted
 
     _told(done, found, *write_fitted(done, found, given["out"], cells))
 

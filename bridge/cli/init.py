@@ -10,17 +10,17 @@ import click
 import numpy as np
 from pydantic import ValidationError
 
-from bridge.cell import load_cell
-from bridge.cell.first_cell import Asked, first_cell
-from bridge.cell.sections import link_settings
-from bridge.document.output_file import require_writable, write_text
-from core.arm import builtin_arm
-from core.errors import GapbridgeError, InputError
-from core.model import Model
-from core.urdf import arm_from_urdf
-from drivers import make_driver
-from drivers.controller_facts import ControllerFacts
-from drivers.ur_rtde.enquiry import enquire
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cell.first_cell import Asked, first_cell
+from gapbridge.bridge.cell.sections import link_settings
+from gapbridge.bridge.document.output_file import require_writable, write_text
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.errors import GapbridgeError, InputError
+from gapbridge.core.model import Model
+from gapbridge.core.urdf import arm_from_urdf
+from gapbridge.drivers import make_driver
+from gapbridge.drivers.controller_facts import ControllerFacts
+from gapbridge.drivers.ur_rtde.enquiry import enquire
 
 
 @click.command()

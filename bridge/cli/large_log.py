@@ -6,14 +6,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from bridge.cell import Cell
-from bridge.cell.opened_log import check_log
-from core.errors import LogError
-from core.log.log import Log
-from core.log.mcap_reading import files_of
-from core.log.pieces import PARQUET, LogPieces
-from core.log.sources import source_of
-from core.log.sources.recording import Recording
+from gapbridge.bridge.cell import Cell
+from gapbridge.bridge.cell.opened_log import check_log
+from gapbridge.core.errors import LogError
+from gapbridge.core.log.log import Log
+from gapbridge.core.log.mcap_reading import files_of
+from gapbridge.core.log.pieces import PARQUET, LogPieces
+from gapbridge.core.log.sources import source_of
+from gapbridge.core.log.sources.recording import Recording
 
 LARGE = 20_000  # rows from which a log is read in pieces
 BYTES = 8_000_000  # of a text file that holds about as many

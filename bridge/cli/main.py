@@ -12,8 +12,8 @@ from typing import NoReturn
 
 import click
 
-from bridge.cli.table import COMMANDS
-from core.errors import GapbridgeError
+from gapbridge.bridge.cli.table import COMMANDS
+from gapbridge.core.errors import GapbridgeError
 
 SUCCESS, FAILURE, UNUSABLE = 0, 1, 2
 

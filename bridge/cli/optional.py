@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from core.errors import RunError
+from gapbridge.core.errors import RunError
 
 
 def member(module: str, name: str, command: str) -> Any:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import click
 
-from bridge.cell import Cell, load_cell
-from bridge.cell.opened_log import open_log
-from core.log.log import Log
-from core.ranges import outside
-from core.sessions import join_sessions
+from gapbridge.bridge.cell import Cell, load_cell
+from gapbridge.bridge.cell.opened_log import open_log
+from gapbridge.core.log.log import Log
+from gapbridge.core.ranges import outside
+from gapbridge.core.sessions import join_sessions
 
 log_argument = click.argument("log", type=click.Path(path_type=Path))
 logs_argument = click.argument(

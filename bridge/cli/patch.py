@@ -6,9 +6,9 @@ from pathlib import Path
 
 import click
 
-from bridge.cli.options import cell_option, open_cell
-from bridge.document.output_file import require_writable, write_text
-from core.errors import InputError
+from gapbridge.bridge.cli.options import cell_option, open_cell
+from gapbridge.bridge.document.output_file import require_writable, write_text
+from gapbridge.core.errors import InputError
 
 
 @click.command()
@@ -29,7 +29,7 @@ def patch(model: Path, cell: Path, out: Path, joints: str | None, tcp: str | Non
 
     Example: gapbridge patch ur10e.xml --cell better.yaml --out ur10e_real.xml --tcp attachment_site
     """
-    from bridge.patch import PatchOptions, changes_of, format_of
+    from gapbridge.bridge.patch import PatchOptions, changes_of, format_of
 
     kind = format_of(model)
     if not model.is_file():

@@ -7,10 +7,16 @@ from pathlib import Path
 import click
 import numpy as np
 
-from bridge.api.functions import predict as predicted
-from bridge.cell.opened_log import open_log
-from bridge.cli.options import cell_option, csv_option, log_argument, open_cell, warn_outside
-from bridge.document.output_file import require_writable, write_table
+from gapbridge.bridge.api.functions import predict as predicted
+from gapbridge.bridge.cell.opened_log import open_log
+from gapbridge.bridge.cli.options import (
+    cell_option,
+    csv_option,
+    log_argument,
+    open_cell,
+    warn_outside,
+)
+from gapbridge.bridge.document.output_file import require_writable, write_table
 
 
 @click.command()

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import click
 
-from bridge.cli.optional import member
-from bridge.cli.options import cell_argument, open_cell
-from bridge.ipc.log_lines import JsonLines
-from core.errors import InputError
+from gapbridge.bridge.cli.optional import member
+from gapbridge.bridge.cli.options import cell_argument, open_cell
+from gapbridge.bridge.ipc.log_lines import JsonLines
+from gapbridge.core.errors import InputError
 
 
 @click.command()
@@ -41,7 +41,7 @@ def run(cell: Path, observe: bool, arm: bool, duration: float | None, log: str) 
     if observe and arm:
         raise InputError("--observe: found beside --arm, expected one of them")
     given = open_cell(cell)
-    result = member("bridge.daemon.run", "run_cell", "run")(
+    result = member("gapbridge.bridge.daemon.run", "run_cell", "run")(
         given,
         observe=observe,
         arm=arm,

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import click
 
-from bridge.cell.simulation import serve_cell
-from bridge.cli.options import cell_argument, open_cell
+from gapbridge.bridge.cell.simulation import serve_cell
+from gapbridge.bridge.cli.options import cell_argument, open_cell
 
 
 @click.command()

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import click
 
-from bridge.daemon.status_document import lines
-from bridge.ipc.control_client import ask, running
+from gapbridge.bridge.daemon.status_document import lines
+from gapbridge.bridge.ipc.control_client import ask, running
 
 
 @click.command()

@@ -6,10 +6,10 @@ import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from bridge.ipc.control_socket import Peer, refusal
-from bridge.ipc.events import Event
-from bridge.ipc.shared_memory import Phase
-from bridge.loop.supervisor import Cause, State
+from gapbridge.bridge.ipc.control_socket import Peer, refusal
+from gapbridge.bridge.ipc.events import Event
+from gapbridge.bridge.ipc.shared_memory import Phase
+from gapbridge.bridge.loop.supervisor import Cause, State
 
 LONGEST_ARMING = 25.0  # s: uploads a program to the robot
 LONGEST_RAMP = 20.0  # s

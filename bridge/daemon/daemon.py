@@ -17,24 +17,24 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any
 
-from bridge.cell.daemon_settings import DaemonSettings
-from bridge.cell.run_settings import Configuration, configuration_for, settings_of
-from bridge.daemon.control import Control
-from bridge.daemon.opening import open_all
-from bridge.daemon.processes import LoopProcess
-from bridge.daemon.reload import Reload
-from bridge.daemon.service_manager import ServiceManager
-from bridge.daemon.sides import Sides
-from bridge.daemon.status import DaemonStatus
-from bridge.daemon.summary import RunSummary, Tally
-from bridge.ipc.command_page import Command, CommandPage
-from bridge.ipc.control_socket import ControlSocket
-from bridge.ipc.events import Event, EventBook
-from bridge.ipc.shared_memory import Phase, RunPage
-from bridge.loop.loop import LONGEST_STOP, Exit
-from bridge.loop.setpoint_stream import longest_withdrawal
-from bridge.loop.supervisor import State
-from core.errors import InputError, LinkError
+from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.cell.run_settings import Configuration, configuration_for, settings_of
+from gapbridge.bridge.daemon.control import Control
+from gapbridge.bridge.daemon.opening import open_all
+from gapbridge.bridge.daemon.processes import LoopProcess
+from gapbridge.bridge.daemon.reload import Reload
+from gapbridge.bridge.daemon.service_manager import ServiceManager
+from gapbridge.bridge.daemon.sides import Sides
+from gapbridge.bridge.daemon.status import DaemonStatus
+from gapbridge.bridge.daemon.summary import RunSummary, Tally
+from gapbridge.bridge.ipc.command_page import Command, CommandPage
+from gapbridge.bridge.ipc.control_socket import ControlSocket
+from gapbridge.bridge.ipc.events import Event, EventBook
+from gapbridge.bridge.ipc.shared_memory import Phase, RunPage
+from gapbridge.bridge.loop.loop import LONGEST_STOP, Exit
+from gapbridge.bridge.loop.setpoint_stream import longest_withdrawal
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.core.errors import InputError, LinkError
 
 __all__ = ["Daemon", "Say", "settings_of"]
 

@@ -12,8 +12,8 @@ import sys
 from pathlib import Path
 from typing import Any, Self
 
-from bridge.cell.runtime_folder import runtime_folder
-from core.errors import InputError
+from gapbridge.bridge.cell.runtime_folder import runtime_folder
+from gapbridge.core.errors import InputError
 
 
 class OwnerLock:

@@ -5,16 +5,16 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
-from bridge.cell.runtime_folder import cell_key, runtime_folder
-from bridge.daemon.host import OwnerLock
-from bridge.document.output_file import private
-from bridge.ipc.control_socket import ControlSocket
-from bridge.recording.folder import LOOP_LOG, new_session, require_folder
-from core.errors import InputError
-from drivers.controller_address import address_of
+from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
+from gapbridge.bridge.daemon.host import OwnerLock
+from gapbridge.bridge.document.output_file import private
+from gapbridge.bridge.ipc.control_socket import ControlSocket
+from gapbridge.bridge.recording.folder import LOOP_LOG, new_session, require_folder
+from gapbridge.core.errors import InputError
+from gapbridge.drivers.controller_address import address_of
 
 if TYPE_CHECKING:
-    from bridge.daemon.daemon import Daemon
+    from gapbridge.bridge.daemon.daemon import Daemon
 
 
 def open_all(daemon: Daemon, stack: ExitStack, arm: bool, by: str) -> bool:

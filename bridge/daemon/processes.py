@@ -13,12 +13,12 @@ import sys
 import time
 from typing import IO, Any
 
-from bridge.cell.run_settings import Configuration
-from bridge.ipc.command_page import Command, CommandPage
-from bridge.ipc.sealed_memory import sealed_bytes
-from bridge.ipc.shared_memory import Phase, RunPage
-from bridge.ipc.side_process import environment
-from bridge.loop.loop import Exit
+from gapbridge.bridge.cell.run_settings import Configuration
+from gapbridge.bridge.ipc.command_page import Command, CommandPage
+from gapbridge.bridge.ipc.sealed_memory import sealed_bytes
+from gapbridge.bridge.ipc.shared_memory import Phase, RunPage
+from gapbridge.bridge.ipc.side_process import environment
+from gapbridge.bridge.loop.loop import Exit
 
 STARTING_LIMIT = 180.0  # s: imports and, the first time, compilation
 ENDING_LIMIT = 2.0  # s
@@ -57,7 +57,7 @@ class LoopProcess:
             # spawned, never forked: nothing of this process's threads and locks may be inherited;
             # in a session of its own, so that a Ctrl-C reaches it through the daemon only
             self._process = subprocess.Popen(
-                [sys.executable, "-X", "faulthandler", "-m", "bridge.loop.main"],
+                [sys.executable, "-X", "faulthandler", "-m", "gapbridge.bridge.loop.main"],
                 stdin=stdin.fileno(), stdout=log, stderr=log, env=environment(),
                 pass_fds=(page.fd, commands.fd, files, theirs.fileno()), start_new_session=True,
             )  # fmt: skip

@@ -11,15 +11,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bridge.cell.cell import complaints
-from bridge.cell.run_settings import Configuration, read_configuration
-from bridge.ipc.shared_memory import Phase
-from bridge.loop.supervisor import State
-from core.errors import GapbridgeError
-from drivers.controller_address import address_of
+from gapbridge.bridge.cell.cell import complaints
+from gapbridge.bridge.cell.run_settings import Configuration, read_configuration
+from gapbridge.bridge.ipc.shared_memory import Phase
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.core.errors import GapbridgeError
+from gapbridge.drivers.controller_address import address_of
 
 if TYPE_CHECKING:
-    from bridge.daemon.daemon import Daemon
+    from gapbridge.bridge.daemon.daemon import Daemon
 
 KEPT_UNTIL_RESTART = ("recording", "web", "metrics")
 """Sections whose processes go on as they are; a changed one takes effect at the next start."""

@@ -12,11 +12,11 @@ from typing import Any
 
 import click
 
-from bridge.cell import Cell
-from bridge.cell.run_settings import Configuration, read_configuration
-from bridge.daemon.daemon import Daemon, Say
-from bridge.daemon.summary import RunSummary
-from bridge.ipc.events import Event
+from gapbridge.bridge.cell import Cell
+from gapbridge.bridge.cell.run_settings import Configuration, read_configuration
+from gapbridge.bridge.daemon.daemon import Daemon, Say
+from gapbridge.bridge.daemon.summary import RunSummary
+from gapbridge.bridge.ipc.events import Event
 
 
 def run_cell(

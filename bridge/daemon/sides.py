@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import IO, Any
 
-from bridge.cell.daemon_settings import DaemonSettings
-from bridge.ipc.shared_memory import Page
-from bridge.ipc.side_process import SideProcess
+from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.side_process import SideProcess
 
 SIDES: dict[str, tuple[str, Callable[[DaemonSettings], bool]]] = {
-    "recorder": ("bridge.recording.main", lambda s: s.recording.folder is not None),
-    "web": ("bridge.web.main", lambda s: s.web is not None),
-    "metrics": ("bridge.metrics.main", lambda s: s.metrics is not None),
+    "recorder": ("gapbridge.bridge.recording.main", lambda s: s.recording.folder is not None),
+    "web": ("gapbridge.bridge.web.main", lambda s: s.web is not None),
+    "metrics": ("gapbridge.bridge.metrics.main", lambda s: s.metrics is not None),
 }
 """Name -> (module to run, whether a run's settings want it)."""
 

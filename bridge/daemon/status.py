@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.daemon.status_document import SCHEMA
-from bridge.ipc.events import Event
-from bridge.loop.checks import NOTHING, UNSOLVED
-from bridge.loop.supervisor import HEALED_BY_RECONNECTING, State
+from gapbridge.bridge.daemon.status_document import SCHEMA
+from gapbridge.bridge.ipc.events import Event
+from gapbridge.bridge.loop.checks import NOTHING, UNSOLVED
+from gapbridge.bridge.loop.supervisor import HEALED_BY_RECONNECTING, State
 
 if TYPE_CHECKING:
-    from bridge.daemon.daemon import Daemon
+    from gapbridge.bridge.daemon.daemon import Daemon
 
 RATE_SPAN = 2.0  # s that the rate is taken over
 

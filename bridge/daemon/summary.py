@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.ipc.shared_memory import slices_of
-from core.limits import CLAMPS
+from gapbridge.bridge.ipc.shared_memory import slices_of
+from gapbridge.core.limits import CLAMPS
 
 Array = NDArray[np.float64]
 UNIT = 1e-6  # s: bin of a histogram

@@ -11,9 +11,9 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.demo.poses import Load
-from core.errors import LinkError
-from drivers.simulated.ur.settings import ServerSettings
+from gapbridge.bridge.demo.poses import Load
+from gapbridge.core.errors import LinkError
+from gapbridge.drivers.simulated.ur.settings import ServerSettings
 
 Array = NDArray[np.float64]
 READINGS_PERIOD = 0.01  # s between two readings of the tracker

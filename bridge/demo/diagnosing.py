@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from core.errors import RunError
+from gapbridge.core.errors import RunError
 
 LONGEST = 120.0  # s
 POLITE = 10  # niceness: the loop comes first
@@ -20,7 +20,7 @@ class Diagnosing:
 
     def __init__(self, log: Path, cell: Path, out: Path) -> None:
         self._command = [
-            sys.executable, "-m", "bridge.cli", "diagnose", str(log), "--cell", str(cell),
+            sys.executable, "-m", "gapbridge", "diagnose", str(log), "--cell", str(cell),
             "--out", str(out),
         ]  # fmt: skip
         self._process: subprocess.Popen[str] | None = None

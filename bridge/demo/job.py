@@ -11,23 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from bridge.cell import Cell, load_cell, save_cell
-from bridge.demo.diagnosing import Diagnosing
-from bridge.demo.links import DemoLink, demo_link
-from bridge.demo.links.link import free_address as _free_address
-from bridge.demo.links.ur_rtde import UrRtdeLink
-from bridge.demo.page import page
-from bridge.demo.picture import picture
-from bridge.demo.poses import Load, Plan, plan
-from bridge.demo.rests import Rests, joined, write_log
-from bridge.demo.result import Result
-from bridge.demo.session import Session
-from bridge.demo.terminal import show
-from bridge.document.output_file import write_text
-from bridge.loop.warm_up import warm_up
-from core.errors import RunError
-from core.estimation.identification import identify_compliance
-from core.log.log import read_log
+from gapbridge.bridge.cell import Cell, load_cell, save_cell
+from gapbridge.bridge.demo.diagnosing import Diagnosing
+from gapbridge.bridge.demo.links import DemoLink, demo_link
+from gapbridge.bridge.demo.links.link import free_address as _free_address
+from gapbridge.bridge.demo.links.ur_rtde import UrRtdeLink
+from gapbridge.bridge.demo.page import page
+from gapbridge.bridge.demo.picture import picture
+from gapbridge.bridge.demo.poses import Load, Plan, plan
+from gapbridge.bridge.demo.rests import Rests, joined, write_log
+from gapbridge.bridge.demo.result import Result
+from gapbridge.bridge.demo.session import Session
+from gapbridge.bridge.demo.terminal import show
+from gapbridge.bridge.document.output_file import write_text
+from gapbridge.bridge.loop.warm_up import warm_up
+from gapbridge.core.errors import RunError
+from gapbridge.core.estimation.identification import identify_compliance
+from gapbridge.core.log.log import read_log
 
 Array = NDArray[np.float64]
 PORTS = UrRtdeLink.ports

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from bridge.demo.picture import GREEN, RED, picture
-from bridge.demo.result import Result
+from gapbridge.bridge.demo.picture import GREEN, RED, picture
+from gapbridge.bridge.demo.result import Result
 
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #1f2933; max-width: 980px; margin: 2rem auto;

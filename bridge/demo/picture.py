@@ -7,11 +7,11 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.demo.poses import Load
-from bridge.demo.result import Result, visits_of_poses
-from core.kernels import reference as kernel
-from core.loads import Loads
-from core.model import Model
+from gapbridge.bridge.demo.poses import Load
+from gapbridge.bridge.demo.result import Result, visits_of_poses
+from gapbridge.core.kernels import reference as kernel
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 WIDTH, HEIGHT = 960, 420

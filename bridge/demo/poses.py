@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.kernels.single import LEVER
-from core.loads import Loads
-from core.model import Model
+from gapbridge.core.kernels.single import LEVER
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 

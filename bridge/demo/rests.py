@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.demo.poses import Load
-from bridge.document.output_file import write_table
-from core.errors import RunError
-from core.rotation import rotation_matrix, rotation_vector
+from gapbridge.bridge.demo.poses import Load
+from gapbridge.bridge.document.output_file import write_table
+from gapbridge.core.errors import RunError
+from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 Array = NDArray[np.float64]
 STILL = 0.003  # rad/s: slower than this, the arm stands

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.demo.poses import TEST_LOADS, Load
-from bridge.demo.rests import Rests
-from core.estimation.identification import Identification
-from core.model import Model
+from gapbridge.bridge.demo.poses import TEST_LOADS, Load
+from gapbridge.bridge.demo.rests import Rests
+from gapbridge.core.estimation.identification import Identification
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 

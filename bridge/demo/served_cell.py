@@ -14,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from core.errors import LinkError
+from gapbridge.core.errors import LinkError
 
 PR_SET_PDEATHSIG = 1  # prctl's
 START_LIMIT = 40.0  # s
@@ -26,7 +26,7 @@ class ServedCell:
 
     def __init__(self, cell: Path, seed: int) -> None:
         self._command = [
-            sys.executable, "-m", "bridge.cli", "simulate", str(cell), "--seed", str(seed),
+            sys.executable, "-m", "gapbridge", "simulate", str(cell), "--seed", str(seed),
         ]  # fmt: skip
         self._process: subprocess.Popen[str] | None = None
         self._told: list[str] = []

@@ -10,18 +10,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell import Cell
-from bridge.cell.daemon_settings import DaemonSettings
-from bridge.daemon.daemon import Daemon, settings_of
-from bridge.daemon.summary import RunSummary
-from bridge.demo.bench import Tracker
-from bridge.demo.links.link import DemoLink
-from bridge.demo.poses import Load
-from bridge.demo.rests import Rests, rests
-from bridge.demo.result import LoopFigures
-from bridge.loop.supervisor import Cause, State
-from core.errors import LinkError, RunError
-from core.log.mcap_reading import read_columns
+from gapbridge.bridge.cell import Cell
+from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.daemon.daemon import Daemon, settings_of
+from gapbridge.bridge.daemon.summary import RunSummary
+from gapbridge.bridge.demo.bench import Tracker
+from gapbridge.bridge.demo.links.link import DemoLink
+from gapbridge.bridge.demo.poses import Load
+from gapbridge.bridge.demo.rests import Rests, rests
+from gapbridge.bridge.demo.result import LoopFigures
+from gapbridge.bridge.loop.supervisor import Cause, State
+from gapbridge.core.errors import LinkError, RunError
+from gapbridge.core.log.mcap_reading import read_columns
 
 Array = NDArray[np.float64]
 ATTEMPTS = 8  # a machine that others keep busy may end several runs in a row

@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bridge.demo.result import Result, visits_of_poses
+from gapbridge.bridge.demo.result import Result, visits_of_poses
 
 WIDTH = 32  # characters of the longest bar
 EIGHTHS = " ▏▎▍▌▋▊▉█"

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.document.output_file import write_table
+from gapbridge.bridge.document.output_file import write_table
 
 Array = NDArray[np.float64]
 PERIOD = 0.002  # s

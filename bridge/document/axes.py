@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from bridge.document.drawing import (
+from gapbridge.bridge.document.drawing import (
     EDGE,
     GRID,
     INK,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from bridge.document.drawing import Drawing
+from gapbridge.bridge.document.drawing import Drawing
 
 GOOD, DOUBTFUL, BAD, QUIET = "good", "doubtful", "bad", "quiet"
 

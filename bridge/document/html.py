@@ -6,7 +6,7 @@ import math
 from html import escape
 from importlib.resources import files
 
-from bridge.document.blocks import (
+from gapbridge.bridge.document.blocks import (
     Badge,
     Bar,
     Block,
@@ -24,7 +24,7 @@ from bridge.document.blocks import (
     Tiles,
     Verdict,
 )
-from bridge.document.svg import svg
+from gapbridge.bridge.document.svg import svg
 
 
 def html(document: Document) -> str:
@@ -38,7 +38,7 @@ def html(document: Document) -> str:
         f"<title>{title}</title>"
         # an empty icon keeps browsers from asking for one
         '<link rel="icon" href="data:,">'
-        f"<style>{_own('bridge.report')}{_own('bridge.document')}</style></head><body>"
+        f"<style>{_own('gapbridge.bridge.report')}{_own('gapbridge.bridge.document')}</style></head><body>"
         f"<header><h1>{title}</h1><p>{escape(document.subtitle)}</p><nav>{links}</nav></header>"
         f"<main>{body}</main><footer><p>{escape(document.footer)}</p></footer></body></html>\n"
     )

@@ -17,7 +17,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import InputError, RunError
+from gapbridge.core.errors import InputError, RunError
 
 PARQUET = (".parquet", ".pq")
 MODE = 0o640  # of a new file

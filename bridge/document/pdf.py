@@ -20,7 +20,7 @@ from reportlab.platypus import (
 )
 from reportlab.platypus import Paragraph as Text
 
-from bridge.document.blocks import (
+from gapbridge.bridge.document.blocks import (
     Block,
     Bullets,
     Columns,
@@ -33,10 +33,10 @@ from bridge.document.blocks import (
     Tiles,
     Verdict,
 )
-from bridge.document.pdf_drawing import DrawnRow
-from bridge.document.pdf_style import STYLES, badge_markup
-from bridge.document.pdf_table import columns_table, table, tiles_table
-from bridge.document.pdf_text import PLAIN, load_fonts, markup
+from gapbridge.bridge.document.pdf_drawing import DrawnRow
+from gapbridge.bridge.document.pdf_style import STYLES, badge_markup
+from gapbridge.bridge.document.pdf_table import columns_table, table, tiles_table
+from gapbridge.bridge.document.pdf_text import PLAIN, load_fonts, markup
 
 SIDE, TOP, BOTTOM = 18 * mm, 16 * mm, 18 * mm
 WIDTH = A4[0] - 2 * SIDE

@@ -6,8 +6,8 @@ from reportlab.lib.colors import HexColor
 from reportlab.pdfgen.canvas import Canvas
 from reportlab.platypus import Flowable
 
-from bridge.document.drawing import Circle, Drawing, Line, Rectangle, Shape, Stroke, Text
-from bridge.document.pdf_text import BOLD, PLAIN
+from gapbridge.bridge.document.drawing import Circle, Drawing, Line, Rectangle, Shape, Stroke, Text
+from gapbridge.bridge.document.pdf_text import BOLD, PLAIN
 
 
 class DrawnRow(Flowable):

@@ -7,8 +7,8 @@ from typing import Any
 from reportlab.lib.colors import HexColor
 from reportlab.lib.styles import ParagraphStyle
 
-from bridge.document.blocks import Badge
-from bridge.document.pdf_text import BOLD, PLAIN, markup
+from gapbridge.bridge.document.blocks import Badge
+from gapbridge.bridge.document.pdf_text import BOLD, PLAIN, markup
 
 INK, SOFT = HexColor("#1c2730"), HexColor("#5b6770")
 GROUNDS = {"good": ("#e2f4e9", "#1d6b42"), "doubtful": ("#fdf0d9", "#8a5a0b"),

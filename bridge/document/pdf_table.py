@@ -9,9 +9,9 @@ from reportlab.lib.colors import HexColor
 from reportlab.platypus import Flowable, Paragraph, TableStyle
 from reportlab.platypus import Table as Grid
 
-from bridge.document.blocks import Badge, Bar, Cell, Columns, Pairs, Strong, Table, Tiles
-from bridge.document.pdf_style import STYLES, badge_markup
-from bridge.document.pdf_text import markup
+from gapbridge.bridge.document.blocks import Badge, Bar, Cell, Columns, Pairs, Strong, Table, Tiles
+from gapbridge.bridge.document.pdf_style import STYLES, badge_markup
+from gapbridge.bridge.document.pdf_text import markup
 
 LINE, RULE = HexColor("#e3e8ec"), HexColor("#9aa5b1")
 Command = tuple[str, tuple[int, int], tuple[int, int], *tuple[Any, ...]]

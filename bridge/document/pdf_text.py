@@ -20,7 +20,7 @@ _RUNS = re.compile(f"[{_HANGUL}]+|[{_HAN}]+|[^{_HANGUL}{_HAN}]+")
 @cache
 def load_fonts() -> None:
     """Make the PDF's fonts known to the library."""
-    folder = files("bridge.document").joinpath("fonts")
+    folder = files("gapbridge.bridge.document").joinpath("fonts")
     for name, file in ((PLAIN, "DejaVuSansCondensed.ttf"), (BOLD, "DejaVuSansCondensed-Bold.ttf")):
         with as_file(folder.joinpath(file)) as path:
             pdfmetrics.registerFont(TTFont(name, str(path)))

@@ -11,8 +11,8 @@ from typing import Any
 
 import click
 
-from core.log.log import Log
-from core.ranges import range_of
+from gapbridge.core.log.log import Log
+from gapbridge.core.ranges import range_of
 
 BLOCK = 1 << 20  # bytes read at a time
 

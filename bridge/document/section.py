@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import ClassVar, Generic, TypeVar
 
-from bridge.document.blocks import Block, Part
+from gapbridge.bridge.document.blocks import Block, Part
 
 M = TypeVar("M")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from html import escape
 
-from bridge.document.drawing import Circle, Drawing, Line, Rectangle, Shape, Stroke, Text
+from gapbridge.bridge.document.drawing import Circle, Drawing, Line, Rectangle, Shape, Stroke, Text
 
 
 def svg(drawing: Drawing) -> str:

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from bridge.cell import load_cell, save_cell
-from bridge.document.output_file import write_text
-from bridge.fleet.fit_summary import Fitted, FittedArm, FittedType
-from core.estimation.compliance_fit import flexibilities
+from gapbridge.bridge.cell import load_cell, save_cell
+from gapbridge.bridge.document.output_file import write_text
+from gapbridge.bridge.fleet.fit_summary import Fitted, FittedArm, FittedType
+from gapbridge.core.estimation.compliance_fit import flexibilities
 
 TABLE = "cells.csv"
 

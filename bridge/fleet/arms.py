@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from bridge.fleet.session import natural
-from bridge.fleet.task import DONE, Outcome
+from gapbridge.bridge.fleet.session import natural
+from gapbridge.bridge.fleet.task import DONE, Outcome
 
 
 def usable(outcomes: Sequence[Outcome]) -> list[Outcome]:

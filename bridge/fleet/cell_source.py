@@ -7,9 +7,9 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 
-from bridge.cell import load_cell
-from bridge.fleet.session import Session
-from core.errors import CellError, InputError
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.fleet.session import Session
+from gapbridge.core.errors import CellError, InputError
 
 BESIDE = "beside"
 NAMES = ("cell.yaml", "cell.yml")

@@ -13,9 +13,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from bridge.fleet.task import CRASHED, DEATHS, Outcome, Task, died, outcome, perform
-from bridge.fleet.workers import Workers
-from core.errors import RunError
+from gapbridge.bridge.fleet.task import CRASHED, DEATHS, Outcome, Task, died, outcome, perform
+from gapbridge.bridge.fleet.workers import Workers
+from gapbridge.core.errors import RunError
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from bridge.cell import Cell
-from core.diagnosis.diagnosis import diagnose
-from core.diagnosis.document import document
-from core.log.log import Log
+from gapbridge.bridge.cell import Cell
+from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.document import document
+from gapbridge.core.log.log import Log
 
 EPOCH = 1.0e9  # s: timestamps beyond count from 1970, those below from some start
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from bridge.fleet.arms import by_arm, usable
-from bridge.fleet.drift import Drift, Series, drifts, places
-from bridge.fleet.outlying import Outlier, far_from_median
-from bridge.fleet.task import Outcome
+from gapbridge.bridge.fleet.arms import by_arm, usable
+from gapbridge.bridge.fleet.drift import Drift, Series, drifts, places
+from gapbridge.bridge.fleet.outlying import Outlier, far_from_median
+from gapbridge.bridge.fleet.task import Outcome
 
 GAP = "gap_rms"
 

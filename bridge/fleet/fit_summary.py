@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from bridge.fleet.arms import by_arm
-from bridge.fleet.drift import Drift, believed
-from bridge.fleet.outlying import Outlier
-from bridge.fleet.task import Outcome
-from core.estimation.hierarchical import ArmFit, Scatter, SessionFit, TypeFit, fit_type
-from core.estimation.hierarchical_evidence import Evidence
+from gapbridge.bridge.fleet.arms import by_arm
+from gapbridge.bridge.fleet.drift import Drift, believed
+from gapbridge.bridge.fleet.outlying import Outlier
+from gapbridge.bridge.fleet.task import Outcome
+from gapbridge.core.estimation.hierarchical import ArmFit, Scatter, SessionFit, TypeFit, fit_type
+from gapbridge.core.estimation.hierarchical_evidence import Evidence
 
 Array = NDArray[np.float64]
 UNIT = "rad/Nm"

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bridge.cell import Cell
-from bridge.fleet.diagnosing import facts
-from core.estimation.compliance_fit import flexibilities
-from core.estimation.hierarchical_evidence import evidence, usual_flexibility
-from core.log.log import Log
+from gapbridge.bridge.cell import Cell
+from gapbridge.bridge.fleet.diagnosing import facts
+from gapbridge.core.estimation.compliance_fit import flexibilities
+from gapbridge.core.estimation.hierarchical_evidence import evidence, usual_flexibility
+from gapbridge.core.log.log import Log
 
 
 def work(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from bridge.document.output_file import FOLDER_MODE
-from core.errors import InputError
+from gapbridge.bridge.document.output_file import FOLDER_MODE
+from gapbridge.core.errors import InputError
 
 
 def require_folder(path: Path, option: str) -> Path:

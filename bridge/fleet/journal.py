@@ -11,9 +11,9 @@ from typing import Any, Self
 
 from pydantic_core import from_json, to_json
 
-from bridge.document.output_file import private
-from bridge.fleet.task import Outcome
-from core.errors import InputError, RunError
+from gapbridge.bridge.document.output_file import private
+from gapbridge.bridge.fleet.task import Outcome
+from gapbridge.core.errors import InputError, RunError
 
 SYNC = 1.0  # s: what a crash of the machine, not of the program, may cost
 

@@ -15,9 +15,9 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
-from bridge.fleet.task import DEATHS, Outcome, Task, died, perform
-from bridge.fleet.workers import Workers
-from core.errors import RunError
+from gapbridge.bridge.fleet.task import DEATHS, Outcome, Task, died, perform
+from gapbridge.bridge.fleet.workers import Workers
+from gapbridge.core.errors import RunError
 
 # matrices of this size gain nothing from threads, which only get in each other's way
 SINGLE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from bridge.fleet.runner import Done
-from bridge.fleet.session import Found
-from bridge.fleet.task import BAD, CRASHED, DIED, DONE
+from gapbridge.bridge.fleet.runner import Done
+from gapbridge.bridge.fleet.session import Found
+from gapbridge.bridge.fleet.task import BAD, CRASHED, DIED, DONE
 
 STATES = {
     BAD: "cannot be used",

@@ -6,16 +6,16 @@ from pathlib import Path
 
 import numpy as np
 
-from bridge.fleet import tables
-from bridge.fleet.applying import write_cells
-from bridge.fleet.diagnosis_summary import Diagnosed, diagnosed
-from bridge.fleet.fit_summary import Fitted, fitted, rows, session_figures
-from bridge.fleet.outcome_words import counted
-from bridge.fleet.report.page import write_diagnosed_report, write_fitted_report
-from bridge.fleet.report.parameter_words import type_words
-from bridge.fleet.runner import Done
-from bridge.fleet.session import Found
-from bridge.report.words import effect_words, joints_words, told
+from gapbridge.bridge.fleet import tables
+from gapbridge.bridge.fleet.applying import write_cells
+from gapbridge.bridge.fleet.diagnosis_summary import Diagnosed, diagnosed
+from gapbridge.bridge.fleet.fit_summary import Fitted, fitted, rows, session_figures
+from gapbridge.bridge.fleet.outcome_words import counted
+from gapbridge.bridge.fleet.report.page import write_diagnosed_report, write_fitted_report
+from gapbridge.bridge.fleet.report.parameter_words import type_words
+from gapbridge.bridge.fleet.runner import Done
+from gapbridge.bridge.fleet.session import Found
+from gapbridge.bridge.report.words import effect_words, joints_words, told
 
 SHOWN = 8  # lines of a kind on the terminal; all are in the tables
 

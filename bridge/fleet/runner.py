@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bridge.fleet.cell_source import CellSource
-from bridge.fleet.journal import Journal
-from bridge.fleet.session import Session, natural
-from bridge.fleet.task import BAD, Outcome, Task, Work, outcome
-from bridge.fleet.workers import Workers
-from core.errors import InputError
+from gapbridge.bridge.fleet.cell_source import CellSource
+from gapbridge.bridge.fleet.journal import Journal
+from gapbridge.bridge.fleet.session import Session, natural
+from gapbridge.bridge.fleet.task import BAD, Outcome, Task, Work, outcome
+from gapbridge.bridge.fleet.workers import Workers
+from gapbridge.core.errors import InputError
 
 FORM = 1  # of the results: another form is another key
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from core.errors import InputError
+from gapbridge.core.errors import InputError
 
 LOGS = (".csv", ".parquet", ".pq")
 WILDCARDS = re.compile(r"[*?\[]")

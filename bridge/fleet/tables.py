@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bridge.document.output_file import replacing_bytes
-from bridge.fleet.task import Outcome
+from gapbridge.bridge.document.output_file import replacing_bytes
+from gapbridge.bridge.fleet.task import Outcome
 
 RESULTS, SESSIONS = "results.parquet", "sessions.parquet"
 CHANNELS = ("position", "wrench", "tracking", "torque")

@@ -10,10 +10,10 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from bridge.cell import Cell, load_cell
-from bridge.cell.opened_log import open_log
-from core.errors import GapbridgeError
-from core.log.log import Log
+from gapbridge.bridge.cell import Cell, load_cell
+from gapbridge.bridge.cell.opened_log import open_log
+from gapbridge.core.errors import GapbridgeError
+from gapbridge.core.log.log import Log
 
 Work = Callable[[Cell, Log, Mapping[str, Any]], dict[str, Any]]
 DONE, BAD, CRASHED, DIED = "done", "bad", "crashed", "died"

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from types import TracebackType
 from typing import Self
 
-from bridge.fleet.task import Outcome, Task
+from gapbridge.bridge.fleet.task import Outcome, Task
 
 
 class Workers(ABC):

@@ -15,7 +15,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from bridge.ipc.sealed_memory import make_memory, map_as_reader, map_as_writer
+from gapbridge.bridge.ipc.sealed_memory import make_memory, map_as_reader, map_as_writer
 
 _SIZE, _WORD = 4096, 8  # bytes
 

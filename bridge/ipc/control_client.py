@@ -8,8 +8,8 @@ import socket
 from pathlib import Path
 from typing import Any
 
-from bridge.cell.runtime_folder import candidates, cell_key
-from core.errors import InputError, RunError
+from gapbridge.bridge.cell.runtime_folder import candidates, cell_key
+from gapbridge.core.errors import InputError, RunError
 
 PATIENCE = 60.0  # s: a loop may have to start anew, arming uploads a program to the robot
 

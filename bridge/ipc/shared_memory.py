@@ -21,8 +21,14 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.ipc.counts import Count
-from bridge.ipc.sealed_memory import is_sealed, make_memory, map_as_reader, map_as_writer, seal
+from gapbridge.bridge.ipc.counts import Count
+from gapbridge.bridge.ipc.sealed_memory import (
+    is_sealed,
+    make_memory,
+    map_as_reader,
+    map_as_writer,
+    seal,
+)
 
 Array = NDArray[np.float64]
 WORDS = 128

@@ -18,8 +18,8 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from bridge.cell.daemon_settings import DaemonSettings
-from bridge.ipc.shared_memory import FollowedPage, Page
+from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.ipc.shared_memory import FollowedPage, Page
 
 FAREWELL = 5.0  # s that a side process may take to end after the daemon
 NICENESS = 5  # the loop comes first

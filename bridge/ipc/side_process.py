@@ -16,8 +16,8 @@ import termios
 import time
 from typing import IO, Any
 
-from bridge.ipc.shared_memory import Page
-from bridge.ipc.side_main import EventLines, EventWriter
+from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.side_main import EventLines, EventWriter
 
 BACKOFF = (0.2, 10.0)  # s before a restart: first, most
 HEALTHY = 10.0  # s after which a restart counts as the first again

@@ -8,17 +8,17 @@ from typing import Any
 from numpy import float64
 from numpy.typing import NDArray
 
-from bridge.ipc.counts import Count
-from bridge.ipc.shared_memory import Page
-from bridge.loop.frozen_watch import FrozenWatch
-from bridge.loop.link_monitor import hold_time
-from bridge.loop.overrun_watch import OverrunWatch
-from bridge.loop.readiness import RateCheck
-from bridge.loop.saturation_watch import SaturationWatch
-from bridge.loop.supervisor import Cause, State, Supervisor
-from core.state import RobotState
-from drivers.driver import Driver
-from drivers.robot_modes import NORMAL, REDUCED, RUNNING
+from gapbridge.bridge.ipc.counts import Count
+from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.loop.frozen_watch import FrozenWatch
+from gapbridge.bridge.loop.link_monitor import hold_time
+from gapbridge.bridge.loop.overrun_watch import OverrunWatch
+from gapbridge.bridge.loop.readiness import RateCheck
+from gapbridge.bridge.loop.saturation_watch import SaturationWatch
+from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.robot_modes import NORMAL, REDUCED, RUNNING
 
 SAFE = (NORMAL, REDUCED)  # safety_mode
 STOPS = 0b111_1111_1100  # safety_status_bits: all but normal and reduced mode

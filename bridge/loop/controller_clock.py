@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from core.state import RobotState
+from gapbridge.core.state import RobotState
 
 DRIFT = 5e-3  # s per s: how fast the bound follows a clock that drifts or stumbles
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.state import RobotState
+from gapbridge.core.state import RobotState
 
 Vector = NDArray[np.float64]
 STILL = 1.0  # s for which joints may be the same to the last bit while they should move

@@ -7,14 +7,14 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from bridge.ipc.counts import Count
-from bridge.ipc.shared_memory import Page
-from bridge.loop.sample_check import SampleCheck
-from bridge.loop.supervisor import Cause, Supervisor
-from core.arm import Arm
-from core.errors import InvalidStateError, LinkError, StaleStateError
-from core.state import RobotState
-from drivers.driver import Driver
+from gapbridge.bridge.ipc.counts import Count
+from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.loop.sample_check import SampleCheck
+from gapbridge.bridge.loop.supervisor import Cause, Supervisor
+from gapbridge.core.arm import Arm
+from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.driver import Driver
 
 INVALID_IN_A_ROW = 3  # states that cannot be believed, after which they count as silence
 OLD_IN_A_ROW = 2  # states too old to write by, after which they count as none

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from core.load_bounds import LoadBounds
-from core.loads import Loads
-from core.state import RobotState
+from gapbridge.core.load_bounds import LoadBounds
+from gapbridge.core.loads import Loads
+from gapbridge.core.state import RobotState
 
 Vector = NDArray[np.float64]
 MOVED = 1e-5  # rad: a joint that has come this far has moved, in that direction

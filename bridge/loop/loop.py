@@ -14,28 +14,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell.daemon_settings import DaemonSettings
-from bridge.ipc.command_page import Command, Commands
-from bridge.ipc.counts import Count
-from bridge.ipc.cycle_row import fill_row
-from bridge.ipc.shared_memory import Page, Phase
-from bridge.loop.checks import NOTHING, RAMPING_OUT, UNSOLVED, LoopChecks
-from bridge.loop.controller_clock import ControllerClock
-from bridge.loop.link_monitor import StateWatch, hold_time
-from bridge.loop.live_loads import LiveLoads
-from bridge.loop.offset_in_force import OffsetInForce
-from bridge.loop.readiness import ModelCheck
-from bridge.loop.setpoint_stream import SetpointStream, longest_withdrawal
-from bridge.loop.supervisor import Cause, State, Supervisor
-from bridge.loop.writing import Writing
-from bridge.setpoint_source.source import Source, Told
-from core.errors import InvalidStateError, LinkError
-from core.load_bounds import LoadBounds
-from core.loads import Loads
-from core.model import Model
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.driver import Driver
+from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.ipc.command_page import Command, Commands
+from gapbridge.bridge.ipc.counts import Count
+from gapbridge.bridge.ipc.cycle_row import fill_row
+from gapbridge.bridge.ipc.shared_memory import Page, Phase
+from gapbridge.bridge.loop.checks import NOTHING, RAMPING_OUT, UNSOLVED, LoopChecks
+from gapbridge.bridge.loop.controller_clock import ControllerClock
+from gapbridge.bridge.loop.link_monitor import StateWatch, hold_time
+from gapbridge.bridge.loop.live_loads import LiveLoads
+from gapbridge.bridge.loop.offset_in_force import OffsetInForce
+from gapbridge.bridge.loop.readiness import ModelCheck
+from gapbridge.bridge.loop.setpoint_stream import SetpointStream, longest_withdrawal
+from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
+from gapbridge.bridge.loop.writing import Writing
+from gapbridge.bridge.setpoint_source.source import Source, Told
+from gapbridge.core.errors import InvalidStateError, LinkError
+from gapbridge.core.load_bounds import LoadBounds
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.driver import Driver
 
 Vector = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""The loop's process: ``python -m bridge.loop.main``, started by the daemon and by nobody else.
+"""The loop's process: ``python -m gapbridge.bridge.loop.main``, started by the daemon alone.
 
 It holds the loop and one driver, and is expendable: the robot's library can abort it, crash it or
 hang it. Settings come as one line of JSON on stdin, requests through memory that only the daemon
@@ -24,25 +24,25 @@ from typing import Any
 
 import numpy as np
 
-from bridge.cell.daemon_settings import DaemonSettings
-from bridge.cell.sections import SetpointSettings
-from bridge.ipc.command_page import Commands
-from bridge.ipc.sealed_memory import all_bytes
-from bridge.ipc.shared_memory import Page, Phase
-from bridge.loop.loop import Exit, Loop
-from bridge.loop.realtime import become_realtime
-from bridge.loop.replay import ReplayedLoop
-from bridge.loop.setpoint_stream import SetpointStream, gate_bounds
-from bridge.setpoint_source import make_source
-from bridge.setpoint_source.source import Source
-from core.errors import GapbridgeError, InputError
-from core.files import read_only_from
-from core.loads import Loads
-from core.model import Model
-from drivers import make_driver
-from drivers.driver import Driver
-from drivers.ft_sensor.joined import DriverWithSensor
-from drivers.replay import ReplayDriver
+from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.cell.sections import SetpointSettings
+from gapbridge.bridge.ipc.command_page import Commands
+from gapbridge.bridge.ipc.sealed_memory import all_bytes
+from gapbridge.bridge.ipc.shared_memory import Page, Phase
+from gapbridge.bridge.loop.loop import Exit, Loop
+from gapbridge.bridge.loop.realtime import become_realtime
+from gapbridge.bridge.loop.replay import ReplayedLoop
+from gapbridge.bridge.loop.setpoint_stream import SetpointStream, gate_bounds
+from gapbridge.bridge.setpoint_source import make_source
+from gapbridge.bridge.setpoint_source.source import Source
+from gapbridge.core.errors import GapbridgeError, InputError
+from gapbridge.core.files import read_only_from
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
+from gapbridge.drivers import make_driver
+from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.ft_sensor.joined import DriverWithSensor
+from gapbridge.drivers.replay import ReplayDriver
 
 _PR_SET_PDEATHSIG = 1
 LONGEST_WORDS = 1000  # of an event

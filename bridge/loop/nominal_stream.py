@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.kernels.reference import JIT
+from gapbridge.core.kernels.reference import JIT
 
 Vector = NDArray[np.float64]
 DECELERATION = 8.0  # rad/s^2 of the fastest joint

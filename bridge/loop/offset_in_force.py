@@ -15,9 +15,9 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell.runtime_folder import runtime_folder
-from drivers.controller_address import address_of
-from drivers.driver import DriverSettings
+from gapbridge.bridge.cell.runtime_folder import runtime_folder
+from gapbridge.drivers.controller_address import address_of
+from gapbridge.drivers.driver import DriverSettings
 
 Vector = NDArray[np.float64]
 STAYED = 0.02  # rad: an arm that is farther from its last setpoint has been moved by somebody

@@ -7,9 +7,9 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from core.compensation import Compensator
-from core.loads import Loads
-from core.model import Model
+from gapbridge.core.compensation import Compensator
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 Vector = NDArray[np.float64]
 LEAST = 1e-9  # m, rad: a smaller offset is none

@@ -11,19 +11,19 @@ from typing import Any, cast
 
 import numpy as np
 
-from bridge.loop.checks import RAMPING_OUT, RESYNC
-from bridge.loop.live_loads import LiveLoads
-from bridge.loop.loop import UNSENT, Exit, Loop
-from bridge.loop.offset_in_force import InForce, OffsetInForce
-from bridge.loop.setpoint_stream import SetpointStream
-from bridge.loop.supervisor import Cause, State
-from core.errors import GateError, LimitError
-from core.load_bounds import LoadBounds
-from core.loads import Loads
-from core.model import Model
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.replay import Cycle, EndOfRecordingError, ReplayDriver
+from gapbridge.bridge.loop.checks import RAMPING_OUT, RESYNC
+from gapbridge.bridge.loop.live_loads import LiveLoads
+from gapbridge.bridge.loop.loop import UNSENT, Exit, Loop
+from gapbridge.bridge.loop.offset_in_force import InForce, OffsetInForce
+from gapbridge.bridge.loop.setpoint_stream import SetpointStream
+from gapbridge.bridge.loop.supervisor import Cause, State
+from gapbridge.core.errors import GateError, LimitError
+from gapbridge.core.load_bounds import LoadBounds
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.replay import Cycle, EndOfRecordingError, ReplayDriver
 
 
 class _Followed(StrEnum):

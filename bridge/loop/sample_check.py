@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.ipc.counts import Count
-from core.arm import Arm
-from core.state import RobotState
-from drivers.state_check import FASTEST, LARGEST, JointCheck
+from gapbridge.bridge.ipc.counts import Count
+from gapbridge.core.arm import Arm
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.state_check import FASTEST, LARGEST, JointCheck
 
 Vector = NDArray[np.float64]
 HASTE = 1.5  # times its velocity limit: a joint that moved faster is a mistake

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from core.limits import ENVELOPE, JOINT_LIMIT, JOINT_OFFSET
+from gapbridge.core.limits import ENVELOPE, JOINT_LIMIT, JOINT_OFFSET
 
 LONGEST = 1.0  # s
 _AT_LIMIT = 1 << ENVELOPE | 1 << JOINT_OFFSET | 1 << JOINT_LIMIT

@@ -8,18 +8,18 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell.sections import LimitSettings
-from bridge.loop.nominal_stream import NominalStream
-from bridge.loop.offset_in_force import InForce
-from core.arm import Arm
-from core.compensation import Compensator, Correction
-from core.errors import StaleStateError
-from core.limits import LONGEST_GAP, Limiter, Limits
-from core.loads import Loads
-from core.model import Model
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.gate import GateBounds
+from gapbridge.bridge.cell.sections import LimitSettings
+from gapbridge.bridge.loop.nominal_stream import NominalStream
+from gapbridge.bridge.loop.offset_in_force import InForce
+from gapbridge.core.arm import Arm
+from gapbridge.core.compensation import Compensator, Correction
+from gapbridge.core.errors import StaleStateError
+from gapbridge.core.limits import LONGEST_GAP, Limiter, Limits
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.gate import GateBounds
 
 Vector = NDArray[np.float64]
 SOLVED = 1e-5  # m: corrections that miss the wanted pose by more are not used

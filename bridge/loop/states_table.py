@@ -1,8 +1,8 @@
-"""The supervisor's table as documentation: ``python -m bridge.loop.states_table`` prints it."""
+"""The supervisor's table as documentation: ``python -m gapbridge.bridge.loop.states_table``."""
 
 from __future__ import annotations
 
-from bridge.loop.supervisor import TRANSITIONS, Cause, State
+from gapbridge.bridge.loop.supervisor import TRANSITIONS, Cause, State
 
 
 def states_table() -> str:

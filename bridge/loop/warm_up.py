@@ -1,4 +1,4 @@
-"""Compile the inner loops: ``python -m bridge.loop.warm_up``, once per installation.
+"""Compile the inner loops: ``python -m gapbridge.bridge.loop.warm_up``, once per installation.
 
 Numba keeps what it has compiled beside the sources. Without this, the first command of a new
 installation spends half a minute on it, in the middle of its work.
@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from bridge.loop.nominal_stream import NominalStream
-from core.arm import builtin_arm
-from core.compensation import correct
-from core.estimation.pose_jacobian import pose_columns
-from core.kernels.factor import factor_blocks
-from core.limits import Limiter, Limits
-from core.model import Model
-from drivers.offset_inverse import Nominal
-from drivers.ur_rtde.state import plausible
+from gapbridge.bridge.loop.nominal_stream import NominalStream
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.compensation import correct
+from gapbridge.core.estimation.pose_jacobian import pose_columns
+from gapbridge.core.kernels.factor import factor_blocks
+from gapbridge.core.limits import Limiter, Limits
+from gapbridge.core.model import Model
+from gapbridge.drivers.offset_inverse import Nominal
+from gapbridge.drivers.ur_rtde.state import plausible
 
 
 def warm_up() -> None:

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell.sections import SetpointSettings
-from bridge.ipc.counts import Count
-from bridge.ipc.shared_memory import Page, Phase
-from bridge.loop.link_monitor import hold_time
-from bridge.loop.offset_in_force import OffsetInForce
-from bridge.loop.setpoint_stream import SetpointStream
-from bridge.loop.supervisor import Cause, State, Supervisor
-from bridge.setpoint_source.source import Source, SourceDryError
-from core.errors import (
+from gapbridge.bridge.cell.sections import SetpointSettings
+from gapbridge.bridge.ipc.counts import Count
+from gapbridge.bridge.ipc.shared_memory import Page, Phase
+from gapbridge.bridge.loop.link_monitor import hold_time
+from gapbridge.bridge.loop.offset_in_force import OffsetInForce
+from gapbridge.bridge.loop.setpoint_stream import SetpointStream
+from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
+from gapbridge.bridge.setpoint_source.source import Source, SourceDryError
+from gapbridge.core.errors import (
     ForeignCommandError,
     GateError,
     IneffectiveWriteError,
@@ -26,10 +26,10 @@ from core.errors import (
     StaleStateError,
     WriteError,
 )
-from core.loads import Loads
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.driver import Driver
+from gapbridge.core.loads import Loads
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.driver import Driver
 
 Vector = NDArray[np.float64]
 SETTLED, LONGEST_SETTLING = 2e-6, 0.3  # rad, s

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell.daemon_settings import DaemonSettings
-from bridge.cell.reread import RereadSettings
-from bridge.ipc.shared_memory import Page
-from core.limits import CLAMPS
+from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.cell.reread import RereadSettings
+from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.core.limits import CLAMPS
 
 Array = NDArray[np.float64]
 AGE_BOUNDS = (0.00025, 0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128)  # s

@@ -17,8 +17,8 @@ from prometheus_client.core import (
 )
 from prometheus_client.registry import Collector
 
-from bridge.loop.supervisor import State
-from bridge.metrics.counts import Buckets, Counts
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.metrics.counts import Buckets, Counts
 
 AXES = ("x", "y", "z")
 DROPPED = "dropped_"  # what counts of samples that could not be believed begin with

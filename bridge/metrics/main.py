@@ -1,4 +1,4 @@
-"""The metrics' process: ``python -m bridge.metrics.main``, started by the daemon.
+"""The metrics' process: ``python -m gapbridge.bridge.metrics.main``, started by the daemon.
 
 It reads along as the status page does, and answers Prometheus at /metrics.
 """
@@ -13,13 +13,13 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from bridge.ipc.side_main import Order, take_order
-from bridge.metrics.counts import Counts
-from bridge.metrics.families import Families
-from bridge.served.credentials import read_token
-from bridge.served.guard import Guard
-from bridge.served.server import serve
-from core.errors import GapbridgeError
+from gapbridge.bridge.ipc.side_main import Order, take_order
+from gapbridge.bridge.metrics.counts import Counts
+from gapbridge.bridge.metrics.families import Families
+from gapbridge.bridge.served.credentials import read_token
+from gapbridge.bridge.served.guard import Guard
+from gapbridge.bridge.served.server import serve
+from gapbridge.core.errors import GapbridgeError
 
 TURN = 0.25  # s between two looks at the shared page
 TEXT = "text/plain; version=0.0.4; charset=utf-8"

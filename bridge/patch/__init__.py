@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bridge.patch.changes import ModelChanges, changes_of
-from bridge.patch.mjcf import Mjcf
-from bridge.patch.model_format import ModelFormat, Patched, PatchOptions
-from bridge.patch.urdf import Urdf
-from core.errors import InputError
+from gapbridge.bridge.patch.changes import ModelChanges, changes_of
+from gapbridge.bridge.patch.mjcf import Mjcf
+from gapbridge.bridge.patch.model_format import ModelFormat, Patched, PatchOptions
+from gapbridge.bridge.patch.urdf import Urdf
+from gapbridge.core.errors import InputError
 
 FORMATS: tuple[ModelFormat, ...] = (Mjcf(), Urdf())
 

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.effects import CATALOGUE
-from core.effects.effect import Effect
-from core.effects.simulator import Kind, SimulatorChange
-from core.errors import InputError
-from core.model import Model
-from core.rotation import rotation_matrix, transform
+from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.effects.effect import Effect
+from gapbridge.core.effects.simulator import Kind, SimulatorChange
+from gapbridge.core.errors import InputError
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rotation_matrix, transform
 
 Array = NDArray[np.float64]
 ANGLE, DISTANCE = 1e-3, 1e-3  # rad, m: by which an axis may be off and still be the same arm's

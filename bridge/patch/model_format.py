@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from bridge.patch.changes import ModelChanges
-from core.errors import InputError
-from core.log.sources.joint_order import order_joints
+from gapbridge.bridge.patch.changes import ModelChanges
+from gapbridge.core.errors import InputError
+from gapbridge.core.log.sources.joint_order import order_joints
 
 
 @dataclass(frozen=True)

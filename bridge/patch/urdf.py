@@ -10,17 +10,17 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.patch.changes import TINY, Axes, ModelChanges, base_in_world
-from bridge.patch.model_format import (
+from gapbridge.bridge.patch.changes import TINY, Axes, ModelChanges, base_in_world
+from gapbridge.bridge.patch.model_format import (
     ModelFormat,
     Patched,
     PatchOptions,
     named_one,
     pick_joints,
 )
-from core.effects.simulator import Kind
-from core.errors import InputError
-from core.rotation import rpy_matrix, transform
+from gapbridge.core.effects.simulator import Kind
+from gapbridge.core.errors import InputError
+from gapbridge.core.rotation import rpy_matrix, transform
 
 Array = NDArray[np.float64]
 TURNING = ("revolute", "continuous")

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.document.output_file import replacing_bytes
-from bridge.recording.finishing import finish_recording
-from core.errors import InputError, LogError
-from core.log.columns import COLUMNS
-from core.log.mcap_reading import Batch, read_batches
-from core.log.mcap_schema import ENUM_FIELD
+from gapbridge.bridge.document.output_file import replacing_bytes
+from gapbridge.bridge.recording.finishing import finish_recording
+from gapbridge.core.errors import InputError, LogError
+from gapbridge.core.log.columns import COLUMNS
+from gapbridge.core.log.mcap_reading import Batch, read_batches
+from gapbridge.core.log.mcap_schema import ENUM_FIELD
 
 if TYPE_CHECKING:
     import pyarrow

@@ -31,10 +31,10 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
-from bridge.recording.folder import NAME
-from core.errors import LogError
-from core.log import mcap_records as records
-from core.log.mcap_reading import files_of
+from gapbridge.bridge.recording.folder import NAME
+from gapbridge.core.errors import LogError
+from gapbridge.core.log import mcap_records as records
+from gapbridge.core.log.mcap_reading import files_of
 
 _FOOTER = struct.Struct("<BQQQ")
 FOOTER_SIZE = 20

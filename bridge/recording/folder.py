@@ -8,9 +8,9 @@ import re
 import time
 from pathlib import Path
 
-from bridge.document.output_file import FOLDER_MODE
-from core.errors import InputError
-from core.log.mcap_reading import SUFFIX, last_batch
+from gapbridge.bridge.document.output_file import FOLDER_MODE
+from gapbridge.core.errors import InputError
+from gapbridge.core.log.mcap_reading import SUFFIX, last_batch
 
 NAME = re.compile(r"(?P<session>.+)-(?P<number>\d{3,})\.mcap$")
 LOOP_LOG = ".loop.log"

@@ -1,4 +1,4 @@
-"""The recorder's process: ``python -m bridge.recording.main``, started by the daemon.
+"""The recorder's process: ``python -m gapbridge.bridge.recording.main``, started by the daemon.
 
 It reads along in the shared page and can be stalled, killed and started anew without the loop
 noticing. It outlives a daemon that was killed for as long as the loop still ramps out.
@@ -13,9 +13,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from bridge.ipc.side_main import Order, take_order
-from bridge.recording.recorder import Recorder
-from bridge.recording.redaction import redacted
+from gapbridge.bridge.ipc.side_main import Order, take_order
+from gapbridge.bridge.recording.recorder import Recorder
+from gapbridge.bridge.recording.redaction import redacted
 
 LOOK_EVERY = 0.1  # s
 QUIET = 0.6  # s without a heartbeat of the loop after which a lost daemon's run is over

@@ -16,16 +16,16 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from bridge.cell.settings.recording import RecordingSettings
-from bridge.document.output_file import FOLDER_MODE
-from bridge.ipc.shared_memory import Page
-from bridge.loop.supervisor import State
-from bridge.recording.finishing import finish, unfinished
-from bridge.recording.folder import next_path, number_after, prune, segments
-from bridge.recording.segment import Segment
-from bridge.recording.words import LEVELS, level_of, words_of
-from core.errors import LogError
-from core.log.mcap_schema import CONFIGURATION, EVENTS, LOG, STATUS
+from gapbridge.bridge.cell.settings.recording import RecordingSettings
+from gapbridge.bridge.document.output_file import FOLDER_MODE
+from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.recording.finishing import finish, unfinished
+from gapbridge.bridge.recording.folder import next_path, number_after, prune, segments
+from gapbridge.bridge.recording.segment import Segment
+from gapbridge.bridge.recording.words import LEVELS, level_of, words_of
+from gapbridge.core.errors import LogError
+from gapbridge.core.log.mcap_schema import CONFIGURATION, EVENTS, LOG, STATUS
 
 FLUSH_EVERY = 0.4  # s
 RETRY_EVERY = 2.0  # s after which a disk that refused is tried again

@@ -20,9 +20,9 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
-from bridge.document.output_file import MODE
-from core.log.mcap_layout import layout_of
-from core.log.mcap_schema import (
+from gapbridge.bridge.document.output_file import MODE
+from gapbridge.core.log.mcap_layout import layout_of
+from gapbridge.core.log.mcap_schema import (
     CYCLE_CHANNELS,
     JSON_CHANNELS,
     PACKAGE,

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from bridge.report.answer_picture import picture
-from bridge.report.fragment import badge, figure_block, html_of, paragraph
-from bridge.report.material import Material, after, chosen_channel, unexplained
-from bridge.report.words import (
+from gapbridge.bridge.report.answer_picture import picture
+from gapbridge.bridge.report.fragment import badge, figure_block, html_of, paragraph
+from gapbridge.bridge.report.material import Material, after, chosen_channel, unexplained
+from gapbridge.bridge.report.words import (
     CHANNELS,
     VERDICTS,
     effect_words,
@@ -16,8 +16,8 @@ from bridge.report.words import (
     quantity_words,
     told,
 )  # fmt: skip
-from core.diagnosis.diagnosis import ChannelDiagnosis
-from core.diagnosis.result import Cause
+from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
+from gapbridge.core.diagnosis.result import Cause
 
 KINDS = {"no_gap": "good", "explained": "good", "partly_explained": "doubtful",
          "unexplained": "bad"}  # fmt: skip

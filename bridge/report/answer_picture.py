@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from bridge.report.fragment import AFTER, BEFORE, EXPLAINED, FLOOR, LEFT, Figure
-from bridge.report.material import after, shares
-from bridge.report.words import CHANNELS, percent, told, unit_of
-from core.diagnosis.diagnosis import ChannelDiagnosis
+from gapbridge.bridge.report.fragment import AFTER, BEFORE, EXPLAINED, FLOOR, LEFT, Figure
+from gapbridge.bridge.report.material import after, shares
+from gapbridge.bridge.report.words import CHANNELS, percent, told, unit_of
+from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
 
 ROW = 190  # pixels of picture a channel
 LABELS = 150  # pixels beside the bars

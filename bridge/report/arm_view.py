@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from bridge.report.fragment import AFTER, BEFORE, Figure
-from bridge.report.material import Array, Index, Material, per_sample, thinned
-from core.diagnosis.diagnosis import ChannelDiagnosis
-from core.model import Model
-from core.rotation import rotation_matrix
+from gapbridge.bridge.report.fragment import AFTER, BEFORE, Figure
+from gapbridge.bridge.report.material import Array, Index, Material, per_sample, thinned
+from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rotation_matrix
 
 ARROWS = 250
 DRAWN = 4  # poses in which the arm is drawn

@@ -1,6 +1,6 @@
 """The catalogue as a page of the documentation, generated from the effects' own docstrings.
 
-Example: python -m bridge.report.catalogue_page docs/catalogue.md
+Example: python -m gapbridge.bridge.report.catalogue_page docs/catalogue.md
 """
 
 from __future__ import annotations
@@ -9,16 +9,17 @@ import inspect
 import sys
 from pathlib import Path
 
-from bridge.report.words import CHANNELS as CHANNEL_WORDS
-from bridge.report.words import effect_words
-from core.arm import builtin_arm
-from core.effects import CATALOGUE, CHANNELS, Effect
+from gapbridge.bridge.report.words import CHANNELS as CHANNEL_WORDS
+from gapbridge.bridge.report.words import effect_words
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.effects import CATALOGUE, CHANNELS, Effect
 
 PAGE = Path(__file__).parents[2] / "docs" / "catalogue.md"
 HEAD = """\
 # The catalogue of effects
 
-Generated from the effects' docstrings by `python -m bridge.report.catalogue_page`; do not edit.
+Generated from the effects' docstrings by `python -m gapbridge.bridge.report.catalogue_page`;
+do not edit.
 `gapbridge explain EFFECT` prints the same text. Parameters are what the real arm has more than the
 model, in SI units.
 """

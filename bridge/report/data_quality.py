@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from bridge.report.fragment import bullets, heading, paragraph, table
-from bridge.report.material import Material, own_coordinates, per_sample
-from bridge.report.words import CHANNELS, told
-from core.diagnosis.diagnosis import ChannelDiagnosis
-from core.log.log import Log
+from gapbridge.bridge.report.fragment import bullets, heading, paragraph, table
+from gapbridge.bridge.report.material import Material, own_coordinates, per_sample
+from gapbridge.bridge.report.words import CHANNELS, told
+from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
+from gapbridge.core.log.log import Log
 
 WILD = 20  # wild readings listed a channel
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bridge.report.fragment import (
+from gapbridge.bridge.report.fragment import (
     AFTER,
     BEFORE,
     EXPLAINED,
@@ -17,9 +17,9 @@ from bridge.report.fragment import (
     paragraph,
     table,
 )
-from bridge.report.material import Array, Material, held_out_pair, shares, thinned
-from bridge.report.words import CHANNELS, effect_words, percent, told, unit_of
-from core.diagnosis.diagnosis import ChannelDiagnosis
+from gapbridge.bridge.report.material import Array, Material, held_out_pair, shares, thinned
+from gapbridge.bridge.report.words import CHANNELS, effect_words, percent, told, unit_of
+from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
 
 BINS = 40
 

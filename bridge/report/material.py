@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
-from core.diagnosis.held_out import HeldOut
-from core.log.log import Log
-from core.model import Model
+from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
+from gapbridge.core.diagnosis.held_out import HeldOut
+from gapbridge.core.log.log import Log
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

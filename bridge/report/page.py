@@ -8,12 +8,12 @@ from pathlib import Path
 
 from plotly.offline import get_plotlyjs
 
-from bridge.document.output_file import write_text
-from bridge.report.material import Material
-from bridge.report.section import SECTIONS
-from core.diagnosis.diagnosis import Diagnosis
-from core.log.log import Log
-from core.model import Model
+from gapbridge.bridge.document.output_file import write_text
+from gapbridge.bridge.report.material import Material
+from gapbridge.bridge.report.section import SECTIONS
+from gapbridge.core.diagnosis.diagnosis import Diagnosis
+from gapbridge.core.log.log import Log
+from gapbridge.core.model import Model
 
 FILE = "report.html"
 
@@ -66,4 +66,4 @@ def _arm_words(name: str) -> str:
 
 
 def _own(name: str) -> str:
-    return files("bridge.report").joinpath(name).read_text(encoding="utf-8")
+    return files("gapbridge.bridge.report").joinpath(name).read_text(encoding="utf-8")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from bridge.report.fragment import Cell, Raw, bullets, heading, html_of, paragraph, table
-from bridge.report.material import Material
-from bridge.report.words import effect_words, joints_words, listed, number, unit_of
-from core.diagnosis.result import Cause
-from core.diagnosis.separation import Measurement
-from core.effects import Reported
+from gapbridge.bridge.report.fragment import Cell, Raw, bullets, heading, html_of, paragraph, table
+from gapbridge.bridge.report.material import Material
+from gapbridge.bridge.report.words import effect_words, joints_words, listed, number, unit_of
+from gapbridge.core.diagnosis.result import Cause
+from gapbridge.core.diagnosis.separation import Measurement
+from gapbridge.core.effects import Reported
 
 SIDE = 1.96  # standard deviations of a 95 % interval
 SHOWN = 12

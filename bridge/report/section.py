@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from bridge.report import answer, data_quality, how_far, parameters, where, which
-from bridge.report.material import Material
+from gapbridge.bridge.report import answer, data_quality, how_far, parameters, where, which
+from gapbridge.bridge.report.material import Material
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from bridge.report.arm_view import arm_figure
-from bridge.report.fragment import (
+from gapbridge.bridge.report.arm_view import arm_figure
+from gapbridge.bridge.report.fragment import (
     AFTER,
     BEFORE,
     Cell,
@@ -19,9 +19,16 @@ from bridge.report.fragment import (
     paragraph,
     table,
 )  # fmt: skip
-from bridge.report.material import Array, Index, Material, own_coordinates, per_sample, thinned
-from bridge.report.words import CHANNELS, percent, quantity_unit, quantity_words, unit_of
-from core.diagnosis.diagnosis import ChannelDiagnosis
+from gapbridge.bridge.report.material import (
+    Array,
+    Index,
+    Material,
+    own_coordinates,
+    per_sample,
+    thinned,
+)
+from gapbridge.bridge.report.words import CHANNELS, percent, quantity_unit, quantity_words, unit_of
+from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
 
 MOST_QUANTITIES = 14
 STATED = 0.02  # share below which a dependence is not worth a line

@@ -2,11 +2,28 @@
 
 from __future__ import annotations
 
-from bridge.report.fragment import AFTER, FLOOR, Cell, Raw, badge, bar, html_of, paragraph, table
-from bridge.report.material import Material
-from bridge.report.words import CHANNELS, effect_words, joints_words, likelihood, listed, percent
-from core.diagnosis.diagnosis import ChannelDiagnosis
-from core.diagnosis.result import Cause, Considered
+from gapbridge.bridge.report.fragment import (
+    AFTER,
+    FLOOR,
+    Cell,
+    Raw,
+    badge,
+    bar,
+    html_of,
+    paragraph,
+    table,
+)
+from gapbridge.bridge.report.material import Material
+from gapbridge.bridge.report.words import (
+    CHANNELS,
+    effect_words,
+    joints_words,
+    likelihood,
+    listed,
+    percent,
+)
+from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
+from gapbridge.core.diagnosis.result import Cause, Considered
 
 HEADS = ("effect", "verdict", "shrinks alone", "probability", "why")
 

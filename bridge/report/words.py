@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 
-from core.effects import CATALOGUE
+from gapbridge.core.effects import CATALOGUE
 
 CHANNELS = {
     "position": "Position of the tool",

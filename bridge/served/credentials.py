@@ -6,9 +6,9 @@ import ssl
 import stat
 from pathlib import Path
 
-from bridge.served.settings import ServedSettings
-from core.errors import InputError
-from core.files import is_given, read_bytes
+from gapbridge.bridge.served.settings import ServedSettings
+from gapbridge.core.errors import InputError
+from gapbridge.core.files import is_given, read_bytes
 
 SHORTEST_TOKEN = 32  # characters: beyond guessing, however fast
 LONGEST_TOKEN = 1024

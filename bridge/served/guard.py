@@ -12,8 +12,8 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from bridge.served.protocol import LARGEST_HEAD
-from bridge.served.settings import ServedSettings
+from gapbridge.bridge.served.protocol import LARGEST_HEAD
+from gapbridge.bridge.served.settings import ServedSettings
 
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "

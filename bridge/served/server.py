@@ -12,10 +12,10 @@ from collections.abc import Callable
 import uvicorn
 from starlette.types import ASGIApp
 
-from bridge.served.credentials import tls_context
-from bridge.served.protocol import LARGEST_HEAD, MOST_CONNECTIONS, GuardedProtocol
-from bridge.served.settings import ServedSettings
-from core.errors import LinkError
+from gapbridge.bridge.served.credentials import tls_context
+from gapbridge.bridge.served.protocol import LARGEST_HEAD, MOST_CONNECTIONS, GuardedProtocol
+from gapbridge.bridge.served.settings import ServedSettings
+from gapbridge.core.errors import LinkError
 
 SEND_BUFFER = 64 * 1024  # bytes that the system holds for a client that is slow
 GONE = 20_000  # ms without a sign from the other side

@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
-    from bridge.cell.sections import SetpointSettings
-    from bridge.setpoint_source.source import Source
+    from gapbridge.bridge.cell.sections import SetpointSettings
+    from gapbridge.bridge.setpoint_source.source import Source
 
 SOURCES: dict[str, str] = {
-    "target": "bridge.setpoint_source.target:TargetSource",
-    "trajectory": "bridge.setpoint_source.trajectory:TrajectorySource",
-    "modbus": "bridge.setpoint_source.modbus:ModbusSource",
-    "planner": "bridge.setpoint_source.planner:PlannerSource",
-    "tcp": "bridge.setpoint_source.tcp:TcpSource",
+    "target": "gapbridge.bridge.setpoint_source.target:TargetSource",
+    "trajectory": "gapbridge.bridge.setpoint_source.trajectory:TrajectorySource",
+    "modbus": "gapbridge.bridge.setpoint_source.modbus:ModbusSource",
+    "planner": "gapbridge.bridge.setpoint_source.planner:PlannerSource",
+    "tcp": "gapbridge.bridge.setpoint_source.tcp:TcpSource",
 }
 """Name in a cell file (setpoints.source) -> ``module:Class``, imported when it is used."""
 

@@ -7,7 +7,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.setpoint_source.source import SourceDryError
+from gapbridge.bridge.setpoint_source.source import SourceDryError
 
 Vector = NDArray[np.float64]
 LONGEST_GLIDE = 0.1  # s

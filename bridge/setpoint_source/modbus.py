@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell.sections import SetpointSettings
-from bridge.setpoint_source.glide import Glide
-from bridge.setpoint_source.modbus_page import MOST_JOINTS, PlcPage
-from bridge.setpoint_source.source import Source, Told
-from core.errors import InputError, RunError
+from gapbridge.bridge.cell.sections import SetpointSettings
+from gapbridge.bridge.setpoint_source.glide import Glide
+from gapbridge.bridge.setpoint_source.modbus_page import MOST_JOINTS, PlcPage
+from gapbridge.bridge.setpoint_source.source import Source, Told
+from gapbridge.core.errors import InputError, RunError
 
 Vector = NDArray[np.float64]
 WRITTEN, LIMITED = 1, 2  # flags
@@ -45,7 +45,7 @@ class ModbusSource(Source):
         page = self._page = PlcPage(self.n)
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
         server = self._server = subprocess.Popen(
-            [sys.executable, "-m", "bridge.setpoint_source.modbus_server"],
+            [sys.executable, "-m", "gapbridge.bridge.setpoint_source.modbus_server"],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment,
             pass_fds=page.fds,
         )  # fmt: skip

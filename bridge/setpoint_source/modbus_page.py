@@ -9,7 +9,7 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.ipc.sealed_memory import is_sealed, make_memory, map_as_reader, map_as_writer
+from gapbridge.bridge.ipc.sealed_memory import is_sealed, make_memory, map_as_reader, map_as_writer
 
 Vector = NDArray[np.float64]
 MOST_JOINTS = 10

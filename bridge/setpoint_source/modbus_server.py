@@ -1,4 +1,4 @@
-"""The Modbus TCP server that a PLC talks to: ``python -m bridge.setpoint_source.modbus_server``.
+"""The server that a PLC talks to: ``python -m gapbridge.bridge.setpoint_source.modbus_server``.
 
 A process of its own, so that a client's traffic never delays the loop. Numbers are signed 32 bit,
 high word first, in 1e-6 rad or 1e-6 m.
@@ -32,8 +32,8 @@ import numpy as np
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from bridge.setpoint_source.modbus_page import PlcPage
-from drivers.modbus.registers import Coding
+from gapbridge.bridge.setpoint_source.modbus_page import PlcPage
+from gapbridge.drivers.modbus.registers import Coding
 
 VERSION = 1
 UNIT = 1e-6  # rad or m a count

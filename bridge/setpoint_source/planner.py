@@ -24,11 +24,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell.sections import SetpointSettings
-from bridge.ipc.control_socket import peer_of
-from bridge.setpoint_source.glide import Glide
-from bridge.setpoint_source.source import Source
-from core.errors import RunError
+from gapbridge.bridge.cell.sections import SetpointSettings
+from gapbridge.bridge.ipc.control_socket import peer_of
+from gapbridge.bridge.setpoint_source.glide import Glide
+from gapbridge.bridge.setpoint_source.source import Source
+from gapbridge.core.errors import RunError
 
 Vector = NDArray[np.float64]
 LONGEST_LINE = 4096  # bytes

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell.sections import SetpointSettings
-from core.errors import RunError
+from gapbridge.bridge.cell.sections import SetpointSettings
+from gapbridge.core.errors import RunError
 
 Vector = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell.sections import SetpointSettings
-from bridge.setpoint_source.source import Source
+from gapbridge.bridge.cell.sections import SetpointSettings
+from gapbridge.bridge.setpoint_source.source import Source
 
 Vector = NDArray[np.float64]
 

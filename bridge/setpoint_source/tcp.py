@@ -11,9 +11,9 @@ import ipaddress
 import socket
 import time
 
-from bridge.served.credentials import read_token
-from bridge.setpoint_source.planner import Connection, PlannerSource
-from core.errors import InputError
+from gapbridge.bridge.served.credentials import read_token
+from gapbridge.bridge.setpoint_source.planner import Connection, PlannerSource
+from gapbridge.core.errors import InputError
 
 FIRST_LINE = 2.0  # s in which the token has to come
 

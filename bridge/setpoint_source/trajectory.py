@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell.sections import SetpointSettings
-from bridge.setpoint_source.source import Source
-from core.errors import LogError
-from core.log.log import read_log
+from gapbridge.bridge.cell.sections import SetpointSettings
+from gapbridge.bridge.setpoint_source.source import Source
+from gapbridge.core.errors import LogError
+from gapbridge.core.log.log import read_log
 
 Vector = NDArray[np.float64]
 

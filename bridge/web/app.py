@@ -15,10 +15,10 @@ from starlette.responses import PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
-from bridge.cell.settings.web import WebSettings
-from bridge.served.guard import WRONG_TOKEN_DELAY, Guard, cookie_name, cookie_of
-from bridge.web.stream import Stream, message
-from bridge.web.watched import Watched, encoded
+from gapbridge.bridge.cell.settings.web import WebSettings
+from gapbridge.bridge.served.guard import WRONG_TOKEN_DELAY, Guard, cookie_name, cookie_of
+from gapbridge.bridge.web.stream import Stream, message
+from gapbridge.bridge.web.watched import Watched, encoded
 
 FILES = {
     "index.html": "text/html", "style.css": "text/css", "page.js": "text/javascript",
@@ -129,7 +129,7 @@ def _file(name: str) -> Callable[[Request], Awaitable[Response]]:
 
 
 def _read(name: str) -> bytes:
-    return files("bridge.web").joinpath("page", name).read_bytes()
+    return files("gapbridge.bridge.web").joinpath("page", name).read_bytes()
 
 
 def _json(text: str) -> Response:

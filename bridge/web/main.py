@@ -1,4 +1,4 @@
-"""The status page's process: ``python -m bridge.web.main``, started by the daemon.
+"""The status page's process: ``python -m gapbridge.bridge.web.main``, started by the daemon.
 
 It reads along - the shared page through a descriptor that cannot be written to - and answers
 browsers. It has no way to the robot and none to arm anything.
@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import sys
 
-from bridge.ipc.side_main import Order, take_order
-from bridge.served.credentials import read_token
-from bridge.served.server import serve
-from bridge.web.app import make_app
-from bridge.web.stream import Stream
-from bridge.web.watched import Watched, encoded
-from core.errors import GapbridgeError
+from gapbridge.bridge.ipc.side_main import Order, take_order
+from gapbridge.bridge.served.credentials import read_token
+from gapbridge.bridge.served.server import serve
+from gapbridge.bridge.web.app import make_app
+from gapbridge.bridge.web.stream import Stream
+from gapbridge.bridge.web.watched import Watched, encoded
+from gapbridge.core.errors import GapbridgeError
 
 TURN = 0.1  # s between two looks at the shared page
 

@@ -9,12 +9,12 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell.daemon_settings import DaemonSettings
-from core.dynamics import predict_wrench
-from core.errors import GapbridgeError
-from core.loads import Loads
-from core.model import Model
-from core.motion import Motion
+from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.core.dynamics import predict_wrench
+from gapbridge.core.errors import GapbridgeError
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
+from gapbridge.core.motion import Motion
 
 Array = NDArray[np.float64]
 

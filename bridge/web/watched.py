@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell.daemon_settings import DaemonSettings
-from bridge.cell.reread import RereadSettings
-from bridge.ipc.shared_memory import ROWS, Page
-from bridge.loop.supervisor import State
-from bridge.web.history import COLUMNS, STEP, History
-from bridge.web.prediction import WrenchPrediction
-from bridge.web.timing import Timing
-from core.limits import CLAMPS
+from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.cell.reread import RereadSettings
+from gapbridge.bridge.ipc.shared_memory import ROWS, Page
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.web.history import COLUMNS, STEP, History
+from gapbridge.bridge.web.prediction import WrenchPrediction
+from gapbridge.bridge.web.timing import Timing
+from gapbridge.core.limits import CLAMPS
 
 Array = NDArray[np.float64]
 Message = tuple[str, dict[str, Any]]  # kind, data

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.noise import Noise
-from core.calibration.observables.nuisance import Nuisance
-from core.calibration.problem import Problem, cost, weighed_system
-from core.errors import InputError
-from core.estimation.linear_system import Mask, System, posterior, solve
+from gapbridge.core.calibration.noise import Noise
+from gapbridge.core.calibration.observables.nuisance import Nuisance
+from gapbridge.core.calibration.problem import Problem, cost, weighed_system
+from gapbridge.core.errors import InputError
+from gapbridge.core.estimation.linear_system import Mask, System, posterior, solve
 
 Array = NDArray[np.float64]
 Columns = tuple[Array, Array]

@@ -9,23 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from core.calibration.lacking import lacking
-from core.calibration.noise import Noise
-from core.calibration.observables import make_observable
-from core.calibration.observables.nuisance import Nuisance
-from core.calibration.observables.observable import Observable
-from core.calibration.parameters import Parameters
-from core.calibration.plan import Expectation
-from core.calibration.problem import Problem
-from core.calibration.readings import Readings
-from core.calibration.remainder import carried, diagnosed, repeatability_of
-from core.calibration.rest import Rest, come_to_rest
-from core.calibration.result import Calibration, Errors, Estimate
-from core.calibration.staging import at_odds
-from core.calibration.telling import combinations, notes_of, verdict_of
-from core.errors import ExcitationError
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.core.calibration.lacking import lacking
+from gapbridge.core.calibration.noise import Noise
+from gapbridge.core.calibration.observables import make_observable
+from gapbridge.core.calibration.observables.nuisance import Nuisance
+from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.plan import Expectation
+from gapbridge.core.calibration.problem import Problem
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.calibration.remainder import carried, diagnosed, repeatability_of
+from gapbridge.core.calibration.rest import Rest, come_to_rest
+from gapbridge.core.calibration.result import Calibration, Errors, Estimate
+from gapbridge.core.calibration.staging import at_odds
+from gapbridge.core.calibration.telling import combinations, notes_of, verdict_of
+from gapbridge.core.errors import ExcitationError
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]

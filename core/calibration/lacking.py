@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.parameters import Parameters
-from core.calibration.problem import Problem
-from core.calibration.rest import Rest
-from core.effects import CATALOGUE
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.problem import Problem
+from gapbridge.core.calibration.rest import Rest
+from gapbridge.core.effects import CATALOGUE
 
 Array = NDArray[np.float64]
 TOLD = 3  # effects at most

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.observables.nuisance import Nuisance
-from core.calibration.observables.observable import Observable
-from core.calibration.readings import Readings
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.core.calibration.observables.nuisance import Nuisance
+from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 STEP = 1e-5  # rad, for derivatives by joint angles

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.observables.observable import Observable
-from core.calibration.redundancy import Redundancy, redundancy
-from core.effects import CATALOGUE, Site, Term, effect_named
-from core.errors import InputError
-from core.model import Model
+from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.redundancy import Redundancy, redundancy
+from gapbridge.core.effects import CATALOGUE, Site, Term, effect_named
+from gapbridge.core.errors import InputError
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 DEFAULT = tuple(  # what a calibration looks for that names no effects; earlier ones come first

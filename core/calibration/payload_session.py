@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.result import Estimate
-from core.effects import CATALOGUE, Site, Term, acting, correcting
-from core.errors import ExcitationError, InputError
-from core.estimation.robust import weighed
-from core.log.log import Log
-from core.model import Model
-from core.motion import Motion, motion_of
+from gapbridge.core.calibration.result import Estimate
+from gapbridge.core.effects import CATALOGUE, Site, Term, acting, correcting
+from gapbridge.core.errors import ExcitationError, InputError
+from gapbridge.core.estimation.robust import weighed
+from gapbridge.core.log.log import Log
+from gapbridge.core.model import Model
+from gapbridge.core.motion import Motion, motion_of
 
 Array = NDArray[np.float64]
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")

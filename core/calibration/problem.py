@@ -7,16 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.noise import Known, Noise
-from core.calibration.observables.nuisance import Nuisance
-from core.calibration.observables.observable import Observable
-from core.calibration.parameters import Parameters
-from core.calibration.readings import Readings
-from core.calibration.staging import Stages
-from core.effects import CATALOGUE
-from core.errors import ExcitationError, InputError
-from core.estimation.linear_system import Bounds, System
-from core.estimation.robust import scaled_length, weights_of
+from gapbridge.core.calibration.noise import Known, Noise
+from gapbridge.core.calibration.observables.nuisance import Nuisance
+from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.calibration.staging import Stages
+from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.errors import ExcitationError, InputError
+from gapbridge.core.estimation.linear_system import Bounds, System
+from gapbridge.core.estimation.robust import scaled_length, weights_of
 
 Array = NDArray[np.float64]
 HELD = 10.0  # usual sizes within which a parameter is weakly held at its beginning

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.parameters import Parameters
-from core.calibration.redundancy import Redundancy
-from core.calibration.result import Calibration
-from core.effects import CATALOGUE
-from core.errors import InputError
-from core.model import Model
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.redundancy import Redundancy
+from gapbridge.core.calibration.result import Calibration
+from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.errors import InputError
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 SCHEMA = "gapbridge.calibration/1"

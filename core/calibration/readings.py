@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.loads import Loads
+from gapbridge.core.loads import Loads
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

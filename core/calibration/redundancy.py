@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.observables.foreseen import foreseen, somewhere
-from core.calibration.observables.nuisance import Nuisance
-from core.calibration.observables.observable import Observable
-from core.calibration.readings import Readings
-from core.effects import CATALOGUE
-from core.loads import Loads
-from core.model import Model
+from gapbridge.core.calibration.observables.foreseen import foreseen, somewhere
+from gapbridge.core.calibration.observables.nuisance import Nuisance
+from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 if TYPE_CHECKING:
-    from core.calibration.parameters import Parameters
+    from gapbridge.core.calibration.parameters import Parameters
 
 Array = NDArray[np.float64]
 POSES = 120

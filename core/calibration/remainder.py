@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import f as fisher
 
-from core.calibration.noise import presumed
-from core.calibration.problem import Problem
-from core.calibration.readings import Readings
-from core.calibration.rest import Rest
-from core.diagnosis.diagnosis import Diagnosis, diagnose
-from core.errors import InputError
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model
-from core.rotation import rotation_matrix, rotation_vector
+from gapbridge.core.calibration.noise import presumed
+from gapbridge.core.calibration.problem import Problem
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.calibration.rest import Rest
+from gapbridge.core.diagnosis.diagnosis import Diagnosis, diagnose
+from gapbridge.core.errors import InputError
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 Array = NDArray[np.float64]
 SURPRISE = 1e-3  # chance below which held-out poses are no longer like the fitted ones

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.descent import Standing, descended, standing
-from core.calibration.noise import Noise, estimated, presumed
-from core.calibration.observables.nuisance import Nuisance
-from core.calibration.observables.observable import Observable
-from core.calibration.parameters import Parameters
-from core.calibration.problem import Problem, bounds_of, cost, require_enough
-from core.calibration.readings import Readings
-from core.calibration.staging import staged_step, stages_of
-from core.estimation.linear_system import Mask, System
-from core.metrology import Metrology
+from gapbridge.core.calibration.descent import Standing, descended, standing
+from gapbridge.core.calibration.noise import Noise, estimated, presumed
+from gapbridge.core.calibration.observables.nuisance import Nuisance
+from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.problem import Problem, bounds_of, cost, require_enough
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.calibration.staging import staged_step, stages_of
+from gapbridge.core.estimation.linear_system import Mask, System
+from gapbridge.core.metrology import Metrology
 
 Array = NDArray[np.float64]
 NOISES = 6  # times at most that the noise is estimated anew

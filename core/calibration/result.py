@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from core.calibration.readings import Readings
-from core.diagnosis.diagnosis import Diagnosis
-from core.estimation.registration import Registration
-from core.model import Model
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.diagnosis.diagnosis import Diagnosis
+from gapbridge.core.estimation.registration import Registration
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from core.calibration.parameters import Parameters
-from core.calibration.readings import Readings
-from core.effects import CATALOGUE
-from core.estimation.identification import pose_groups
-from core.estimation.linear_system import Bounds, Mask, System, posterior, solve
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.estimation.identification import pose_groups
+from gapbridge.core.estimation.linear_system import Bounds, Mask, System, posterior, solve
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.lacking import Lack
-from core.calibration.parameters import Parameters
-from core.calibration.problem import Problem
-from core.calibration.remainder import Remainder
-from core.calibration.rest import Rest
-from core.calibration.result import Errors, Estimate
-from core.calibration.staging import DOUBT
-from core.diagnosis.diagnosis import Diagnosis
+from gapbridge.core.calibration.lacking import Lack
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.problem import Problem
+from gapbridge.core.calibration.remainder import Remainder
+from gapbridge.core.calibration.rest import Rest
+from gapbridge.core.calibration.result import Errors, Estimate
+from gapbridge.core.calibration.staging import DOUBT
+from gapbridge.core.diagnosis.diagnosis import Diagnosis
 
 Array = NDArray[np.float64]
 CLOSE = 0.98  # correlation from which two parameters count as one combination

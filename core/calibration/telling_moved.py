@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from core.calibration.result import Errors, Estimate
-from core.effects import CATALOGUE
+from gapbridge.core.calibration.result import Errors, Estimate
+from gapbridge.core.effects import CATALOGUE
 
 if TYPE_CHECKING:
-    from core.calibration.verify import Suspect
+    from gapbridge.core.calibration.verify import Suspect
 
 FACTORS = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "kg": (1.0, "kg")}
 

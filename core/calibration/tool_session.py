@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.result import Estimate
-from core.effects import correcting
-from core.errors import ExcitationError, InputError
-from core.estimation.robust import Weighed, weighed
-from core.loads import Loads
-from core.model import Model
+from gapbridge.core.calibration.result import Estimate
+from gapbridge.core.effects import correcting
+from gapbridge.core.errors import ExcitationError, InputError
+from gapbridge.core.estimation.robust import Weighed, weighed
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 NAMES = tuple(f"tool_tcp_{k}" for k in "xyz")

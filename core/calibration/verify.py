@@ -16,20 +16,20 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from scipy.stats import f as fisher
 
-from core.calibration.noise import presumed
-from core.calibration.observables import make_observable
-from core.calibration.observables.nuisance import Nuisance
-from core.calibration.observables.observable import Observable
-from core.calibration.parameters import Parameters
-from core.calibration.promise import Promise, promise_in
-from core.calibration.readings import Readings
-from core.calibration.result import Errors, Estimate
-from core.calibration.telling_moved import moved_words, verdict_words
-from core.effects import CATALOGUE
-from core.errors import ExcitationError
-from core.estimation.registration import Registration
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.core.calibration.noise import presumed
+from gapbridge.core.calibration.observables import make_observable
+from gapbridge.core.calibration.observables.nuisance import Nuisance
+from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.promise import Promise, promise_in
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.calibration.result import Errors, Estimate
+from gapbridge.core.calibration.telling_moved import moved_words, verdict_words
+from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.errors import ExcitationError
+from gapbridge.core.estimation.registration import Registration
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 BROKEN = 1e-3  # chance below which a promise counts as broken

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.residual_structure import basis_of
-from core.diagnosis.selection.candidate import joint_quantity
-from core.diagnosis.selection.problem import SMOOTH_PRICE
-from core.diagnosis.selection.selection import Selection
+from gapbridge.core.diagnosis.residual_structure import basis_of
+from gapbridge.core.diagnosis.selection.candidate import joint_quantity
+from gapbridge.core.diagnosis.selection.problem import SMOOTH_PRICE
+from gapbridge.core.diagnosis.selection.selection import Selection
 
 Array = NDArray[np.float64]
 PLACES, WIDTHS = 13, (0.05, 0.1, 0.2)  # where a bump is first looked for, in shares of the range

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arm import Arm
-from core.diagnosis.selection.candidate import Candidate
-from core.diagnosis.selection.selection import Selection
-from core.effects import CATALOGUE, Reported
+from gapbridge.core.arm import Arm
+from gapbridge.core.diagnosis.selection.candidate import Candidate
+from gapbridge.core.diagnosis.selection.selection import Selection
+from gapbridge.core.effects import CATALOGUE, Reported
 
 Array = NDArray[np.float64]
 CHANCE = 0.001  # probability below which the values differ by more than chance

@@ -10,31 +10,31 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from core.diagnosis.carrying import Carried, carried
-from core.diagnosis.channels import position, torque, tracking, wrench
-from core.diagnosis.channels.simulation import joined, predicted_by
-from core.diagnosis.every_row import on_every_row, still_accused
-from core.diagnosis.generalisation import NOWHERE, Generalisation, generalisation
-from core.diagnosis.held_out import HeldOut
-from core.diagnosis.judgement import Judgement, judge, with_stand_ins
-from core.diagnosis.location import Where, locate
-from core.diagnosis.log_checks.units_and_clocks import check_units, findings
-from core.diagnosis.noise_floor import Floor, noise_floor, own_coordinates, whiteness
-from core.diagnosis.observation import NotObservable, Observation, thinned
-from core.diagnosis.residual_structure import dependence
-from core.diagnosis.result import Cause, Considered, causes_of, considered_of
-from core.diagnosis.rigid_suspicion import softness_findings
-from core.diagnosis.selection.moments import slip_sentences
-from core.diagnosis.selection.selection import Selection, select, standing
-from core.diagnosis.separation import Measurement, next_measurements
-from core.effects import CATALOGUE, Term, flexibility_effects
-from core.errors import LogError
-from core.log.columns import COLUMNS, misspelt
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model
-from core.ranges import outside_findings
-from core.sessions import session_of, sessions_in, with_sessions
+from gapbridge.core.diagnosis.carrying import Carried, carried
+from gapbridge.core.diagnosis.channels import position, torque, tracking, wrench
+from gapbridge.core.diagnosis.channels.simulation import joined, predicted_by
+from gapbridge.core.diagnosis.every_row import on_every_row, still_accused
+from gapbridge.core.diagnosis.generalisation import NOWHERE, Generalisation, generalisation
+from gapbridge.core.diagnosis.held_out import HeldOut
+from gapbridge.core.diagnosis.judgement import Judgement, judge, with_stand_ins
+from gapbridge.core.diagnosis.location import Where, locate
+from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units, findings
+from gapbridge.core.diagnosis.noise_floor import Floor, noise_floor, own_coordinates, whiteness
+from gapbridge.core.diagnosis.observation import NotObservable, Observation, thinned
+from gapbridge.core.diagnosis.residual_structure import dependence
+from gapbridge.core.diagnosis.result import Cause, Considered, causes_of, considered_of
+from gapbridge.core.diagnosis.rigid_suspicion import softness_findings
+from gapbridge.core.diagnosis.selection.moments import slip_sentences
+from gapbridge.core.diagnosis.selection.selection import Selection, select, standing
+from gapbridge.core.diagnosis.separation import Measurement, next_measurements
+from gapbridge.core.effects import CATALOGUE, Term, flexibility_effects
+from gapbridge.core.errors import LogError
+from gapbridge.core.log.columns import COLUMNS, misspelt
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
+from gapbridge.core.ranges import outside_findings
+from gapbridge.core.sessions import session_of, sessions_in, with_sessions
 
 Array = NDArray[np.float64]
 Observe = Callable[[Model, Log, Metrology], Observation | NotObservable]

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from core.diagnosis.carrying import Carried
-from core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
-from core.diagnosis.result import Cause
-from core.effects import CATALOGUE
+from gapbridge.core.diagnosis.carrying import Carried
+from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
+from gapbridge.core.diagnosis.result import Cause
+from gapbridge.core.effects import CATALOGUE
 
 SCHEMA = "gapbridge.diagnosis/1"
 

@@ -12,22 +12,22 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.criteria import TIE
-from core.diagnosis.held_out import HeldOut
-from core.diagnosis.judgement import Judgement
-from core.diagnosis.observation import Observation
-from core.diagnosis.selection.candidate import Candidate
-from core.diagnosis.selection.following import exact_columns
-from core.diagnosis.selection.geometry import links_of
-from core.diagnosis.selection.local_search import rivals
-from core.diagnosis.selection.noise import carried_to
-from core.diagnosis.selection.outliers import inliers
-from core.diagnosis.selection.problem import fit
-from core.diagnosis.selection.refit import refit
-from core.diagnosis.selection.selection import Selection, standing
-from core.diagnosis.selection.state import Work, sample_space
-from core.effects import Term
-from core.model import Model
+from gapbridge.core.diagnosis.criteria import TIE
+from gapbridge.core.diagnosis.held_out import HeldOut
+from gapbridge.core.diagnosis.judgement import Judgement
+from gapbridge.core.diagnosis.observation import Observation
+from gapbridge.core.diagnosis.selection.candidate import Candidate
+from gapbridge.core.diagnosis.selection.following import exact_columns
+from gapbridge.core.diagnosis.selection.geometry import links_of
+from gapbridge.core.diagnosis.selection.local_search import rivals
+from gapbridge.core.diagnosis.selection.noise import carried_to
+from gapbridge.core.diagnosis.selection.outliers import inliers
+from gapbridge.core.diagnosis.selection.problem import fit
+from gapbridge.core.diagnosis.selection.refit import refit
+from gapbridge.core.diagnosis.selection.selection import Selection, standing
+from gapbridge.core.diagnosis.selection.state import Work, sample_space
+from gapbridge.core.effects import Term
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 MOST_RIVALS = 12  # of all causes together

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.observation import Observation
-from core.diagnosis.selection.refit import WEAK
-from core.diagnosis.selection.selection import Selection
-from core.estimation.regions import joint_regions
+from gapbridge.core.diagnosis.observation import Observation
+from gapbridge.core.diagnosis.selection.refit import WEAK
+from gapbridge.core.diagnosis.selection.selection import Selection
+from gapbridge.core.estimation.regions import joint_regions
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

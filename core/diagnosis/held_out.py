@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.selection.selection import Selection
+from gapbridge.core.diagnosis.selection.selection import Selection
 
 Array = NDArray[np.float64]
 FOLDS = 10

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincc
 
-from core.diagnosis.bump import bumps
-from core.diagnosis.criteria import (
+from gapbridge.core.diagnosis.bump import bumps
+from gapbridge.core.diagnosis.criteria import (
     ENOUGH_REPEATS,
     GAIN,
     HINT,
@@ -28,14 +28,14 @@ from core.diagnosis.criteria import (
     TIE,
     USUAL,
 )
-from core.diagnosis.held_out import HeldOut
-from core.diagnosis.regions import parts
-from core.diagnosis.remainder import links_withstand, withstanding
-from core.diagnosis.residual_structure import dependence, structure_p_value
-from core.diagnosis.selection.bent import not_bent
-from core.diagnosis.selection.local_search import rivals
-from core.diagnosis.selection.problem import Found, Space
-from core.diagnosis.selection.selection import Selection
+from gapbridge.core.diagnosis.held_out import HeldOut
+from gapbridge.core.diagnosis.regions import parts
+from gapbridge.core.diagnosis.remainder import links_withstand, withstanding
+from gapbridge.core.diagnosis.residual_structure import dependence, structure_p_value
+from gapbridge.core.diagnosis.selection.bent import not_bent
+from gapbridge.core.diagnosis.selection.local_search import rivals
+from gapbridge.core.diagnosis.selection.problem import Found, Space
+from gapbridge.core.diagnosis.selection.selection import Selection
 
 Array = NDArray[np.float64]
 BESIDE = "it does not keep its value beside the unknown that is left"

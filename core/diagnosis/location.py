@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.residual_structure import basis_of, dependence
-from core.diagnosis.selection.selection import Selection
+from gapbridge.core.diagnosis.residual_structure import basis_of, dependence
+from gapbridge.core.diagnosis.selection.selection import Selection
 
 Array = NDArray[np.float64]
 

@@ -12,12 +12,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.dynamics import predict_torque, predict_tracking, predict_wrench, with_held, with_pieces
-from core.effects import Term
-from core.loads import Loads
-from core.log.log import Log
-from core.model import Model
-from core.motion import Motion
+from gapbridge.core.dynamics import (
+    predict_torque,
+    predict_tracking,
+    predict_wrench,
+    with_held,
+    with_pieces,
+)
+from gapbridge.core.effects import Term
+from gapbridge.core.loads import Loads
+from gapbridge.core.log.log import Log
+from gapbridge.core.model import Model
+from gapbridge.core.motion import Motion
 
 Array = NDArray[np.float64]
 Predict = Callable[[Sequence[Term]], Array]

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.observation import Observation
-from core.diagnosis.selection.selection import Selection
+from gapbridge.core.diagnosis.observation import Observation
+from gapbridge.core.diagnosis.selection.selection import Selection
 
 Array = NDArray[np.float64]
 ENOUGH_REPEATS = 10  # degrees of freedom from which repeats measure the noise

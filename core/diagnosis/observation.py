@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.effects import Term
+from gapbridge.core.effects import Term
 
 Array = NDArray[np.float64]
 HELD = "held_torque"  # Nm that a joint holds at rest: a quantity beside the columns of the log

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.observation import Observation
+from gapbridge.core.diagnosis.observation import Observation
 
 REGIONS = 24  # of joint space, or stretches of time
 PARTS = 8  # left out in turn, each of several regions that lie scattered

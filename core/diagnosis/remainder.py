@@ -13,15 +13,15 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.criteria import DRIFT, SIBLING, SIGMAS, STAND_IN_GAIN, UNKNOWNS
-from core.diagnosis.held_out import HeldOut
-from core.diagnosis.observation import Observation
-from core.diagnosis.regions import parts
-from core.diagnosis.residual_structure import basis_of
-from core.diagnosis.selection.candidate import Candidate, carrying
-from core.diagnosis.selection.problem import gains
-from core.diagnosis.selection.selection import Selection
-from core.diagnosis.selection.smooth import targets
+from gapbridge.core.diagnosis.criteria import DRIFT, SIBLING, SIGMAS, STAND_IN_GAIN, UNKNOWNS
+from gapbridge.core.diagnosis.held_out import HeldOut
+from gapbridge.core.diagnosis.observation import Observation
+from gapbridge.core.diagnosis.regions import parts
+from gapbridge.core.diagnosis.residual_structure import basis_of
+from gapbridge.core.diagnosis.selection.candidate import Candidate, carrying
+from gapbridge.core.diagnosis.selection.problem import gains
+from gapbridge.core.diagnosis.selection.selection import Selection
+from gapbridge.core.diagnosis.selection.smooth import targets
 
 Array = NDArray[np.float64]
 TAKEN = 1e-5  # eigenvalue of unit columns below which a direction is the unnamed functions' own

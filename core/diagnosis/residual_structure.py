@@ -14,8 +14,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.observation import HELD
-from core.diagnosis.selection.problem import Space
+from gapbridge.core.diagnosis.observation import HELD
+from gapbridge.core.diagnosis.selection.problem import Space
 
 Array = NDArray[np.float64]
 DRAWS = 1500

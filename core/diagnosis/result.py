@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arm import Arm
-from core.diagnosis.held_out import HeldOut, Shrink
-from core.diagnosis.judgement import Judgement
-from core.diagnosis.selection.forward import children
-from core.diagnosis.selection.problem import Found, fit
-from core.diagnosis.selection.selection import Selection
-from core.effects import CATALOGUE, Reported, Term
+from gapbridge.core.arm import Arm
+from gapbridge.core.diagnosis.held_out import HeldOut, Shrink
+from gapbridge.core.diagnosis.judgement import Judgement
+from gapbridge.core.diagnosis.selection.forward import children
+from gapbridge.core.diagnosis.selection.problem import Found, fit
+from gapbridge.core.diagnosis.selection.selection import Selection
+from gapbridge.core.effects import CATALOGUE, Reported, Term
 
 Array = NDArray[np.float64]
 SHOWN = 3.0  # whitened length of an effect of usual size from which it counts as excited

@@ -6,12 +6,12 @@ a fit that asks for the softness alone does not.
 
 from __future__ import annotations
 
-from core.errors import GapbridgeError
-from core.estimation.compliance_fit import flexibilities
-from core.estimation.identification import identify_compliance
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.core.errors import GapbridgeError
+from gapbridge.core.estimation.compliance_fit import flexibilities
+from gapbridge.core.estimation.identification import identify_compliance
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 SHARE = 0.5  # of the gap on unseen poses: where more remains, softness is not the main thing
 

@@ -16,17 +16,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.next_measurements import PREDICTED, Predict, Trials, draw_trials
-from core.diagnosis.selection.local_search import rivals
-from core.diagnosis.selection.problem import Found, Space, fit
-from core.effects import CATALOGUE, Site, Term
-from core.errors import InputError
-from core.estimation.registration import frame_columns
-from core.log.log import Log
-from core.model import Model
+from gapbridge.core.diagnosis.next_measurements import PREDICTED, Predict, Trials, draw_trials
+from gapbridge.core.diagnosis.selection.local_search import rivals
+from gapbridge.core.diagnosis.selection.problem import Found, Space, fit
+from gapbridge.core.effects import CATALOGUE, Site, Term
+from gapbridge.core.errors import InputError
+from gapbridge.core.estimation.registration import frame_columns
+from gapbridge.core.log.log import Log
+from gapbridge.core.model import Model
 
 if TYPE_CHECKING:
-    from core.diagnosis.diagnosis import ChannelDiagnosis
+    from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
 
 Array = NDArray[np.float64]
 EACH = 2  # measurements proposed per open question

@@ -5,41 +5,41 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
-from core.effects.axial_compliance import AxialCompliance
-from core.effects.backlash import Backlash
-from core.effects.base_compliance import BaseCompliance
-from core.effects.coulomb_friction import CoulombFriction
-from core.effects.dead_band import DeadBand
-from core.effects.effect import CHANNELS, Effect, Parameter, Reported, Site, Term
-from core.effects.ft_bias import FtBias
-from core.effects.ft_drift import FtDrift
-from core.effects.ft_gain import FtGain
-from core.effects.ft_misalignment import FtMisalignment
-from core.effects.gravity_direction import GravityDirection
-from core.effects.joint_offset import JointOffset
-from core.effects.joint_slip import JointSlip
-from core.effects.latency import Latency
-from core.effects.link_cog import LinkCog
-from core.effects.link_flexibility import LinkFlexibility
-from core.effects.link_geometry import LinkGeometry
-from core.effects.link_inertia import LinkInertia
-from core.effects.load_friction import LoadFriction
-from core.effects.payload import Payload
-from core.effects.payload_cog import PayloadCog
-from core.effects.radial_compliance import RadialCompliance
-from core.effects.rotor_inertia import RotorInertia
-from core.effects.servo_droop import ServoDroop
-from core.effects.stiffness_nonlinearity import StiffnessNonlinearity
-from core.effects.stribeck_friction import StribeckFriction
-from core.effects.target_slip import TargetSlip
-from core.effects.thermal_drift import ThermalDrift
-from core.effects.tool_frame import ToolFrame
-from core.effects.torque_constant import TorqueConstant
-from core.effects.torque_offset import TorqueOffset
-from core.effects.tracking_lag import TrackingLag
-from core.effects.transmission_error import TransmissionError
-from core.effects.viscous_friction import ViscousFriction
-from core.errors import InputError
+from gapbridge.core.effects.axial_compliance import AxialCompliance
+from gapbridge.core.effects.backlash import Backlash
+from gapbridge.core.effects.base_compliance import BaseCompliance
+from gapbridge.core.effects.coulomb_friction import CoulombFriction
+from gapbridge.core.effects.dead_band import DeadBand
+from gapbridge.core.effects.effect import CHANNELS, Effect, Parameter, Reported, Site, Term
+from gapbridge.core.effects.ft_bias import FtBias
+from gapbridge.core.effects.ft_drift import FtDrift
+from gapbridge.core.effects.ft_gain import FtGain
+from gapbridge.core.effects.ft_misalignment import FtMisalignment
+from gapbridge.core.effects.gravity_direction import GravityDirection
+from gapbridge.core.effects.joint_offset import JointOffset
+from gapbridge.core.effects.joint_slip import JointSlip
+from gapbridge.core.effects.latency import Latency
+from gapbridge.core.effects.link_cog import LinkCog
+from gapbridge.core.effects.link_flexibility import LinkFlexibility
+from gapbridge.core.effects.link_geometry import LinkGeometry
+from gapbridge.core.effects.link_inertia import LinkInertia
+from gapbridge.core.effects.load_friction import LoadFriction
+from gapbridge.core.effects.payload import Payload
+from gapbridge.core.effects.payload_cog import PayloadCog
+from gapbridge.core.effects.radial_compliance import RadialCompliance
+from gapbridge.core.effects.rotor_inertia import RotorInertia
+from gapbridge.core.effects.servo_droop import ServoDroop
+from gapbridge.core.effects.stiffness_nonlinearity import StiffnessNonlinearity
+from gapbridge.core.effects.stribeck_friction import StribeckFriction
+from gapbridge.core.effects.target_slip import TargetSlip
+from gapbridge.core.effects.thermal_drift import ThermalDrift
+from gapbridge.core.effects.tool_frame import ToolFrame
+from gapbridge.core.effects.torque_constant import TorqueConstant
+from gapbridge.core.effects.torque_offset import TorqueOffset
+from gapbridge.core.effects.tracking_lag import TrackingLag
+from gapbridge.core.effects.transmission_error import TransmissionError
+from gapbridge.core.effects.viscous_friction import ViscousFriction
+from gapbridge.core.errors import InputError
 
 CATALOGUE: dict[str, Effect] = {
     effect.identifier: effect

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from core.effects.effect import Effect, Parameter, Site, Term, typical_moment
+from gapbridge.core.effects.effect import Effect, Parameter, Site, Term, typical_moment
 
 if TYPE_CHECKING:
-    from core.arm import Arm
-    from core.kernels.rates import ChainRate
-    from core.kernels.reference import Chain
+    from gapbridge.core.arm import Arm
+    from gapbridge.core.kernels.rates import ChainRate
+    from gapbridge.core.kernels.reference import Chain
 
 
 class BaseCompliance(Effect):

@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from core.arm import Arm
-    from core.effects.simulator import SimulatorChange
-    from core.kernels.rates import ChainRate
-    from core.kernels.reference import Chain, Rows
-    from core.loads import Loads
-    from core.motion import Motion
+    from gapbridge.core.arm import Arm
+    from gapbridge.core.effects.simulator import SimulatorChange
+    from gapbridge.core.kernels.rates import ChainRate
+    from gapbridge.core.kernels.reference import Chain, Rows
+    from gapbridge.core.loads import Loads
+    from gapbridge.core.motion import Motion
 
 Array = NDArray[np.float64]
 CHANNELS = {"position": "m", "wrench": "N", "tracking": "rad", "torque": "Nm"}

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from core.effects.effect import Effect, Parameter, Site, Term
+from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from core.arm import Arm
-    from core.motion import Motion
+    from gapbridge.core.arm import Arm
+    from gapbridge.core.motion import Motion
 
 
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from core.effects.effect import Effect, Parameter, Site, Term
-from core.rotation import rotation_matrix
+from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
+from gapbridge.core.rotation import rotation_matrix
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from core.arm import Arm
-    from core.motion import Motion
+    from gapbridge.core.arm import Arm
+    from gapbridge.core.motion import Motion
 
 
 class FtMisalignment(Effect):

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from core.effects.effect import Effect, Parameter, Site, Term
-from core.rotation import left_jacobian, rotation_matrix
+from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
+from gapbridge.core.rotation import left_jacobian, rotation_matrix
 
 if TYPE_CHECKING:
-    from core.arm import Arm
-    from core.kernels.rates import ChainRate
-    from core.kernels.reference import Chain
+    from gapbridge.core.arm import Arm
+    from gapbridge.core.kernels.rates import ChainRate
+    from gapbridge.core.kernels.reference import Chain
 
 
 class GravityDirection(Effect):

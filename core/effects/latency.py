@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from core.effects.effect import JointEffect, Parameter, Site, Term
-from core.effects.simulator import Kind, SimulatorChange
-from core.interpolation import interpolate, stretches
+from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
+from gapbridge.core.effects.simulator import Kind, SimulatorChange
+from gapbridge.core.interpolation import interpolate, stretches
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from core.arm import Arm
-    from core.motion import Motion
+    from gapbridge.core.arm import Arm
+    from gapbridge.core.motion import Motion
 
 
 class Latency(JointEffect):

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from core.effects.effect import Effect, Parameter, Site, Term, typical_moment
+from gapbridge.core.effects.effect import Effect, Parameter, Site, Term, typical_moment
 
 if TYPE_CHECKING:
-    from core.arm import Arm
-    from core.kernels.reference import Chain
+    from gapbridge.core.arm import Arm
+    from gapbridge.core.kernels.reference import Chain
 
 
 class LinkFlexibility(Effect):

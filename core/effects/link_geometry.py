@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from core.effects.effect import Effect, Parameter, Site, Term
-from core.rotation import one_rotation_matrix
+from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
+from gapbridge.core.rotation import one_rotation_matrix
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from core.arm import Arm
-    from core.kernels.rates import ChainRate
-    from core.kernels.reference import Chain
+    from gapbridge.core.arm import Arm
+    from gapbridge.core.kernels.rates import ChainRate
+    from gapbridge.core.kernels.reference import Chain
 
 PARALLEL = 1e-6  # sine of the angle below which two axes count as parallel
 

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from core.effects.effect import Effect, Parameter, Site, Term
+from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from core.arm import Arm
-    from core.kernels.reference import Rows
-    from core.loads import Loads
-    from core.motion import Motion
+    from gapbridge.core.arm import Arm
+    from gapbridge.core.kernels.reference import Rows
+    from gapbridge.core.loads import Loads
+    from gapbridge.core.motion import Motion
 
 
 class PayloadCog(Effect):

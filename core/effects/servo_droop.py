@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from core.effects.effect import JointEffect, Parameter, Site, Term, typical_moment
-from core.effects.simulator import Kind, SimulatorChange
+from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term, typical_moment
+from gapbridge.core.effects.simulator import Kind, SimulatorChange
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from core.arm import Arm
+    from gapbridge.core.arm import Arm
 
 
 class ServoDroop(JointEffect):

@@ -6,14 +6,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from core.effects.effect import JointEffect, Parameter, Reported, Site, Term, typical_moment
+from gapbridge.core.effects.effect import (
+    JointEffect,
+    Parameter,
+    Reported,
+    Site,
+    Term,
+    typical_moment,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from core.arm import Arm
-    from core.kernels.rates import ChainRate
-    from core.kernels.reference import Chain
+    from gapbridge.core.arm import Arm
+    from gapbridge.core.kernels.rates import ChainRate
+    from gapbridge.core.kernels.reference import Chain
 
 
 class StiffnessNonlinearity(JointEffect):

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from core.effects.effect import Effect, Parameter, Site, Term
+from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from core.arm import Arm
-    from core.kernels.reference import Rows
-    from core.loads import Loads
+    from gapbridge.core.arm import Arm
+    from gapbridge.core.kernels.reference import Rows
+    from gapbridge.core.loads import Loads
 
 
 class ThermalDrift(Effect):

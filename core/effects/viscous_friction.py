@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from core.effects.coulomb_friction import joint_scale
-from core.effects.effect import JointEffect, Parameter, Site, Term
-from core.effects.simulator import Kind, SimulatorChange
+from gapbridge.core.effects.coulomb_friction import joint_scale
+from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
+from gapbridge.core.effects.simulator import Kind, SimulatorChange
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from core.arm import Arm
-    from core.motion import Motion
+    from gapbridge.core.arm import Arm
+    from gapbridge.core.motion import Motion
 
 
 class ViscousFriction(JointEffect):

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.effects import flexibility_effects
-from core.estimation.compliance_fit import Linear, Mask, solve
+from gapbridge.core.effects import flexibility_effects
+from gapbridge.core.estimation.compliance_fit import Linear, Mask, solve
 
 Array = NDArray[np.float64]
 VAGUE = 0.3  # of the prior's sigma: what is known no better is not shown

@@ -13,11 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.effects import CATALOGUE
-from core.estimation.registration import IDENTITY, Registration, frame_columns, register_robustly
-from core.loads import Loads
-from core.model import Model, Poses
-from core.rotation import rotation_vector
+from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.estimation.registration import (
+    IDENTITY,
+    Registration,
+    frame_columns,
+    register_robustly,
+)
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model, Poses
+from gapbridge.core.rotation import rotation_vector
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from core.estimation.hierarchical_evidence import Evidence
-from core.estimation.hierarchical_prior import (
+from gapbridge.core.estimation.hierarchical_evidence import Evidence
+from gapbridge.core.estimation.hierarchical_prior import (
     Information,
     Type,
     arm_posterior,
@@ -26,7 +26,7 @@ from core.estimation.hierarchical_prior import (
     through,
     with_mean,
 )
-from core.estimation.hierarchical_sampling import draws
+from gapbridge.core.estimation.hierarchical_sampling import draws
 
 Array = NDArray[np.float64]
 MOST = 400  # arms from which scatters are estimated: more tell hardly more

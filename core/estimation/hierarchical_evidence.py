@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.effects.effect import typical_moment
-from core.errors import ExcitationError
-from core.estimation.compliance_fit import (
+from gapbridge.core.effects.effect import typical_moment
+from gapbridge.core.errors import ExcitationError
+from gapbridge.core.estimation.compliance_fit import (
     WILD,
     Data,
     Fit,
@@ -24,10 +24,10 @@ from core.estimation.compliance_fit import (
     orthonormal,
     residual,
 )
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model
-from core.rotation import rotation_matrix
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rotation_matrix
 
 Array = NDArray[np.float64]
 FEWEST = 4  # poses, where nobody has registered the instrument: three place its frame and tool

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from core.estimation.hierarchical_prior import (
+from gapbridge.core.estimation.hierarchical_prior import (
     BEGIN,
     LARGEST,
     SMALLEST,

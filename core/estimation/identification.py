@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.effects.effect import typical_moment
-from core.errors import ExcitationError, LogError
-from core.estimation import base_parameters
-from core.estimation.compliance_fit import (
+from gapbridge.core.effects.effect import typical_moment
+from gapbridge.core.errors import ExcitationError, LogError
+from gapbridge.core.estimation import base_parameters
+from gapbridge.core.estimation.compliance_fit import (
     Data,
     Fit,
     Mask,
@@ -29,13 +29,13 @@ from core.estimation.compliance_fit import (
     placed_gap,
     residual,
 )
-from core.estimation.regions import joint_regions
-from core.estimation.registration import Registration
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model
-from core.rotation import rotation_matrix
-from core.sessions import session_of
+from gapbridge.core.estimation.regions import joint_regions
+from gapbridge.core.estimation.registration import Registration
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rotation_matrix
+from gapbridge.core.sessions import session_of
 
 Array = NDArray[np.float64]
 FOLDS = 5

@@ -14,15 +14,15 @@ import numpy as np
 from numba import config
 from numpy.typing import NDArray
 
-from core.effects import CATALOGUE
-from core.effects.effect import Effect
-from core.kernels.pose_slopes import slope_blocks
-from core.kernels.rates import chain_rate, of_rows, slots
-from core.kernels.reference import Chain, Rows
-from core.kernels.threads import in_ranges
-from core.loads import Loads
-from core.model import Model, Poses
-from core.rotation import rotation_vector
+from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.effects.effect import Effect
+from gapbridge.core.kernels.pose_slopes import slope_blocks
+from gapbridge.core.kernels.rates import chain_rate, of_rows, slots
+from gapbridge.core.kernels.reference import Chain, Rows
+from gapbridge.core.kernels.threads import in_ranges
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model, Poses
+from gapbridge.core.rotation import rotation_vector
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

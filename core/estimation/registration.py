@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.rotation import rotation_matrix, skew
+from gapbridge.core.rotation import rotation_matrix, skew
 
 Array = NDArray[np.float64]
 

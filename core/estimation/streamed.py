@@ -13,10 +13,17 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from core.effects.effect import typical_moment
-from core.estimation import base_parameters
-from core.estimation.compliance_fit import Data, Fit, Mask, flexibilities, residual, weights_at
-from core.estimation.identification import (
+from gapbridge.core.effects.effect import typical_moment
+from gapbridge.core.estimation import base_parameters
+from gapbridge.core.estimation.compliance_fit import (
+    Data,
+    Fit,
+    Mask,
+    flexibilities,
+    residual,
+    weights_at,
+)
+from gapbridge.core.estimation.identification import (
     FOLDS,
     LOOK,
     Identification,
@@ -24,7 +31,7 @@ from core.estimation.identification import (
     notes_of,
     require_excitation,
 )
-from core.estimation.streamed_fit import (
+from gapbridge.core.estimation.streamed_fit import (
     NONE,
     Piece,
     Settled,
@@ -32,10 +39,10 @@ from core.estimation.streamed_fit import (
     fit_flexibilities,
     fit_nuisances,
 )
-from core.loads import Loads
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.core.loads import Loads
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.estimation.compliance_fit import (
+from gapbridge.core.estimation.compliance_fit import (
     NUISANCE_ROUNDS,
     RANK,
     ROUNDS,
@@ -29,11 +29,11 @@ from core.estimation.compliance_fit import (
     stepped,
     weights_at,
 )
-from core.estimation.registration import IDENTITY, register_robustly
-from core.estimation.spool import Spool
-from core.kernels.factor import factor_blocks
-from core.kernels.threads import in_ranges
-from core.model import Model
+from gapbridge.core.estimation.registration import IDENTITY, register_robustly
+from gapbridge.core.estimation.spool import Spool
+from gapbridge.core.kernels.factor import factor_blocks
+from gapbridge.core.kernels.threads import in_ranges
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 NONE = np.zeros(0)  # weights of a fit whose rows nobody keeps

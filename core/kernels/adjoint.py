@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from core.kernels.layout import (
+from gapbridge.core.kernels.layout import (
     BEND,
     COG,
     FAST,
@@ -27,7 +27,7 @@ from core.kernels.layout import (
     WRENCH,
     U,
 )
-from core.kernels.reference import JIT
+from gapbridge.core.kernels.reference import JIT
 
 # slots of a record of this workspace; records as in layout
 SWING, GIVE, BODY, PULL, PUSH, SHIFT, TWIST = 0, 9, 12, 15, 18, 21, 24

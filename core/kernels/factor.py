@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from core.kernels.lanes import bends, gather, lanes_of, settle
-from core.kernels.layout import (
+from gapbridge.core.kernels.lanes import bends, gather, lanes_of, settle
+from gapbridge.core.kernels.layout import (
     FAST,
     LANES,
     MOMENT,
@@ -17,8 +17,8 @@ from core.kernels.layout import (
     TCP_ROTATION,
     U,
 )
-from core.kernels.reference import JIT
-from core.kernels.sums import add_products, fold
+from gapbridge.core.kernels.reference import JIT
+from gapbridge.core.kernels.sums import add_products, fold
 
 NUISANCES = 9  # instrument's frame (6), tool point (3)
 

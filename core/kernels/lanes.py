@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from core.kernels.layout import (
+from gapbridge.core.kernels.layout import (
     ANGLE,
     BEND,
     CHANGE,
@@ -31,7 +31,7 @@ from core.kernels.layout import (
     WRENCH,
     U,
 )
-from core.kernels.mechanics import (
+from gapbridge.core.kernels.mechanics import (
     bend_base,
     bend_joint,
     load_flange,
@@ -41,7 +41,7 @@ from core.kernels.mechanics import (
     sines,
     turn_joint,
 )
-from core.kernels.reference import JIT, TOLERANCE
+from gapbridge.core.kernels.reference import JIT, TOLERANCE
 
 
 @njit(**JIT)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.kernels.reference import JIT
+from gapbridge.core.kernels.reference import JIT
 
 FAST = {**JIT, "fastmath": {"contract", "nsz"}}  # nothing that reorders sums
 SUMS = {**JIT, "fastmath": {"contract", "nsz", "reassoc"}}  # sums over lanes, in any order

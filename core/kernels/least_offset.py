@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from core.kernels.reference import JIT
+from gapbridge.core.kernels.reference import JIT
 
 LARGEST_OFFSET = 0.1  # rad: joint offset (norm) beyond which the correction is damped
 REGULAR = 1e-4  # smallest over largest pivot from which elimination is as good as eigenvalues

@@ -6,10 +6,10 @@ import numpy as np
 from numba import config
 from numpy.typing import NDArray
 
-from core.kernels import reference as kernel
-from core.kernels.predict import linear_blocks, predict_blocks
-from core.kernels.reference import Chain, Rows
-from core.kernels.threads import in_ranges
+from gapbridge.core.kernels import reference as kernel
+from gapbridge.core.kernels.predict import linear_blocks, predict_blocks
+from gapbridge.core.kernels.reference import Chain, Rows
+from gapbridge.core.kernels.threads import in_ranges
 
 Array = NDArray[np.float64]
 FEW = 2  # rows that are not worth a block

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from core.kernels.layout import (
+from gapbridge.core.kernels.layout import (
     ANGLE,
     AXIS,
     BEND,

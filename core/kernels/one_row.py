@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from core.kernels.layout import FAST, U
-from core.kernels.packed import sizes_of
-from core.kernels.reference import MAX_ITERATIONS, TOLERANCE
+from gapbridge.core.kernels.layout import FAST, U
+from gapbridge.core.kernels.packed import sizes_of
+from gapbridge.core.kernels.reference import MAX_ITERATIONS, TOLERANCE
 
 # the workspace: a record per joint, the flange's record with the TCP, the Jacobian's columns
 ROTATION, ORIGIN, AXIS, MOMENT, BEND = 0, 9, 12, 15, 18

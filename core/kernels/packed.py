@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.kernels.reference import JIT, Chain, Rows, Shape, new_shape
+from gapbridge.core.kernels.reference import JIT, Chain, Rows, Shape, new_shape
 
 Array = NDArray[np.float64]
 

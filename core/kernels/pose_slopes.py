@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from core.kernels.adjoint import (
+from gapbridge.core.kernels.adjoint import (
     BESIDE,
     BODY,
     OWN,
@@ -17,8 +17,8 @@ from core.kernels.adjoint import (
     prepare,
     solve,
 )
-from core.kernels.lanes import bends, gather, lanes_of, settle
-from core.kernels.layout import (
+from gapbridge.core.kernels.lanes import bends, gather, lanes_of, settle
+from gapbridge.core.kernels.layout import (
     AXIS,
     COG,
     FAST,
@@ -34,8 +34,8 @@ from core.kernels.layout import (
     WRENCH,
     U,
 )
-from core.kernels.rates import slots
-from core.kernels.reference import JIT
+from gapbridge.core.kernels.rates import slots
+from gapbridge.core.kernels.reference import JIT
 
 _L = LANES
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from core.kernels import reference as kernel
-from core.kernels.factor import flexibility_columns
-from core.kernels.lanes import bends, gather, lanes_of, settle
-from core.kernels.layout import AXIS, LANES, MOMENT, ORIGIN, RECORD, TCP, TCP_ROTATION
-from core.kernels.reference import JIT, Shape
+from gapbridge.core.kernels import reference as kernel
+from gapbridge.core.kernels.factor import flexibility_columns
+from gapbridge.core.kernels.lanes import bends, gather, lanes_of, settle
+from gapbridge.core.kernels.layout import AXIS, LANES, MOMENT, ORIGIN, RECORD, TCP, TCP_ROTATION
+from gapbridge.core.kernels.reference import JIT, Shape
 
 
 @njit(**JIT)

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.kernels.reference import JIT
+from gapbridge.core.kernels.reference import JIT
 
 Array = NDArray[np.float64]
 

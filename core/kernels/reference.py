@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.kernels.machine_code import keep_by_all_sources
+from gapbridge.core.kernels.machine_code import keep_by_all_sources
 
 keep_by_all_sources()
 Array = NDArray[np.float64]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from core.kernels.layout import FAST, U
-from core.kernels.least_offset import LARGEST_OFFSET, REGULAR, smallest_offset
-from core.kernels.one_row import (
+from gapbridge.core.kernels.layout import FAST, U
+from gapbridge.core.kernels.least_offset import LARGEST_OFFSET, REGULAR, smallest_offset
+from gapbridge.core.kernels.one_row import (
     AXIS,
     FLANGE,
     ORIGIN,
@@ -18,8 +18,8 @@ from core.kernels.one_row import (
     place,
     turn,
 )
-from core.kernels.packed import sizes_of
-from core.kernels.reference import JIT
+from gapbridge.core.kernels.packed import sizes_of
+from gapbridge.core.kernels.reference import JIT
 
 LEVER = 0.5  # m: weighs a rotation against a shift
 TOLERANCE = 1e-9  # m, and rad times the lever: where the pose counts as reached

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from core.kernels.layout import SUMS, U
-from core.kernels.reference import JIT
+from gapbridge.core.kernels.layout import SUMS, U
+from gapbridge.core.kernels.reference import JIT
 
 
 @njit(**SUMS)

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable
 from typing import TypeVar
 
-from core.kernels.layout import LANES
+from gapbridge.core.kernels.layout import LANES
 
 Result = TypeVar("Result")
 FEWEST = 100 * LANES  # rows of one thread from which it pays

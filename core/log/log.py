@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import LogError
-from core.files import is_file, is_given, read_bytes
-from core.loads import Loads
-from core.log.columns import COLUMNS, INDEXED, is_known, misspelt, nearest, written
+from gapbridge.core.errors import LogError
+from gapbridge.core.files import is_file, is_given, read_bytes
+from gapbridge.core.loads import Loads
+from gapbridge.core.log.columns import COLUMNS, INDEXED, is_known, misspelt, nearest, written
 
 Array = NDArray[np.float64]
 GZIP = b"\x1f\x8b"

@@ -14,7 +14,7 @@ import numpy as np
 from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto
 from numpy.typing import NDArray
 
-from core.log.mcap_schema import ENUM_FIELD, LOOP, Sizes
+from gapbridge.core.log.mcap_schema import ENUM_FIELD, LOOP, Sizes
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]

@@ -13,10 +13,10 @@ import numpy as np
 from google.protobuf.descriptor_pb2 import DescriptorProto
 from numpy.typing import NDArray
 
-from core.errors import LogError
-from core.log import mcap_records as records
-from core.log.mcap_layout import Layout, layout_in
-from core.log.mcap_schema import (
+from gapbridge.core.errors import LogError
+from gapbridge.core.log import mcap_records as records
+from gapbridge.core.log.mcap_layout import Layout, layout_in
+from gapbridge.core.log.mcap_schema import (
     CONFIGURATION,
     CYCLE_CHANNELS,
     EVENTS,

@@ -22,7 +22,7 @@ from mcap.records import Channel, Chunk, Schema
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 
-from core.errors import LogError
+from gapbridge.core.errors import LogError
 
 LARGEST_CHUNK = 1 << 28  # bytes, unpacked: one that says more is garbage
 _HEAD = struct.Struct("<BQ")

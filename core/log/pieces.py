@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import LogError
-from core.log.columns import is_known
-from core.log.log import (
+from gapbridge.core.errors import LogError
+from gapbridge.core.log.columns import is_known
+from gapbridge.core.log.log import (
     GZIP,
     Log,
     cell_number,
@@ -144,7 +144,7 @@ def _csv(path: Path, rows: int) -> Iterator[tuple[list[str], Array]]:
 
 
 def _recording(path: Path) -> Iterator[tuple[list[str], Array]]:
-    from core.log.mcap_reading import read_batches
+    from gapbridge.core.log.mcap_reading import read_batches
 
     for batch in read_batches(path):
         names, parts = [], []

@@ -8,16 +8,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.observables.fixed_point import fixed_at
-from core.calibration.observables.foreseen import beside, empty_readings, foreseen
-from core.calibration.observables.nuisance import Nuisance
-from core.calibration.observables.observable import Observable
-from core.calibration.parameters import Parameters
-from core.calibration.plan import Payload
-from core.calibration.readings import Readings
-from core.errors import PlanError
-from core.loads import Loads
-from core.planning.workspace import Place, Space
+from gapbridge.core.calibration.observables.fixed_point import fixed_at
+from gapbridge.core.calibration.observables.foreseen import beside, empty_readings, foreseen
+from gapbridge.core.calibration.observables.nuisance import Nuisance
+from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.plan import Payload
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.errors import PlanError
+from gapbridge.core.loads import Loads
+from gapbridge.core.planning.workspace import Place, Space
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

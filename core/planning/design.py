@@ -9,20 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from core.calibration.observables.observable import Observable
-from core.calibration.parameters import Parameters
-from core.calibration.plan import Payload, Plan
-from core.effects import flexibility_effects
-from core.errors import PlanError
-from core.loads import Loads
-from core.planning.candidates import STOPS, Candidates, candidates_of, joined
-from core.planning.exchange import Choice, exchanged, grown, shrunk
-from core.planning.information import Reference, blocks, expectation_of, gathered, inverse
-from core.planning.refinement import Refined, Refiner
-from core.planning.route import Stop, itinerary
-from core.planning.travel import joint_speed, leg_times
-from core.planning.workspace import Space
-from core.planning.worst_places import evened, leaning
+from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.plan import Payload, Plan
+from gapbridge.core.effects import flexibility_effects
+from gapbridge.core.errors import PlanError
+from gapbridge.core.loads import Loads
+from gapbridge.core.planning.candidates import STOPS, Candidates, candidates_of, joined
+from gapbridge.core.planning.exchange import Choice, exchanged, grown, shrunk
+from gapbridge.core.planning.information import Reference, blocks, expectation_of, gathered, inverse
+from gapbridge.core.planning.refinement import Refined, Refiner
+from gapbridge.core.planning.route import Stop, itinerary
+from gapbridge.core.planning.travel import joint_speed, leg_times
+from gapbridge.core.planning.workspace import Space
+from gapbridge.core.planning.worst_places import evened, leaning
 
 Array = NDArray[np.float64]
 REFERENCE = 200  # poses over which the predicted TCP is judged

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.planning.information import gathered, inverse
+from gapbridge.core.planning.information import gathered, inverse
 
 Array = NDArray[np.float64]
 SETTLED = 2e-3  # relative gain of a whole round of exchanges that ends the search

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.observables.nuisance import Nuisance
-from core.calibration.observables.observable import Observable
-from core.calibration.parameters import Parameters
-from core.calibration.plan import Expectation
-from core.calibration.readings import Readings
-from core.loads import Loads
-from core.planning.information import Reference, blocks, expectation_of
+from gapbridge.core.calibration.observables.nuisance import Nuisance
+from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.plan import Expectation
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.loads import Loads
+from gapbridge.core.planning.information import Reference, blocks, expectation_of
 
 Array = NDArray[np.float64]
 

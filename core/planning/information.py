@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.observables.nuisance import Layout, Nuisance
-from core.calibration.observables.observable import Observable
-from core.calibration.parameters import Parameters
-from core.calibration.plan import Expectation
-from core.calibration.readings import Readings
-from core.loads import Loads
+from gapbridge.core.calibration.observables.nuisance import Layout, Nuisance
+from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.plan import Expectation
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.loads import Loads
 
 Array = NDArray[np.float64]
 UNSHOWN = 0.95  # of the prior's sigma: what readings leave no better known they do not show

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.payload_session import NAMES, UNITS, weight_columns
-from core.errors import ExcitationError
-from core.model import Model
+from gapbridge.core.calibration.payload_session import NAMES, UNITS, weight_columns
+from gapbridge.core.errors import ExcitationError
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 WRIST = 3  # joints at the end that turn the flange and hardly move the arm

@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.observables.observable import Observable
-from core.calibration.parameters import Parameters
-from core.calibration.readings import Readings
-from core.planning.candidates import Candidates, readable
-from core.planning.exchange import Choice
-from core.planning.information import blocks, gathered, inverse
-from core.planning.workspace import Space
+from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.planning.candidates import Candidates, readable
+from gapbridge.core.planning.exchange import Choice
+from gapbridge.core.planning.information import blocks, gathered, inverse
+from gapbridge.core.planning.workspace import Space
 
 Array = NDArray[np.float64]
 NUDGE = 0.02  # rad, for the gradient

@@ -9,10 +9,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.plan import PlannedPose
-from core.planning.candidates import Candidates
-from core.planning.travel import joint_speed, leg_times, shortest_way
-from core.planning.workspace import Space
+from gapbridge.core.calibration.plan import PlannedPose
+from gapbridge.core.planning.candidates import Candidates
+from gapbridge.core.planning.travel import joint_speed, leg_times, shortest_way
+from gapbridge.core.planning.workspace import Space
 
 Array = NDArray[np.float64]
 BETWEEN = 9  # poses looked at on a leg

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.tool_session import NAMES, touch_columns
-from core.errors import ExcitationError
-from core.model import Model
-from core.planning.payload_plan import ROOM, greedy, tour
-from core.rotation import rotation_matrix, rotation_vector
+from gapbridge.core.calibration.tool_session import NAMES, touch_columns
+from gapbridge.core.errors import ExcitationError
+from gapbridge.core.model import Model
+from gapbridge.core.planning.payload_plan import ROOM, greedy, tour
+from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 Array = NDArray[np.float64]
 CANDIDATES = 80

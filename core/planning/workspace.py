@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.errors import PlanError
-from core.model import Model
-from core.planning.capsules import Box, Capsules, below, hidden, in_box, touching
+from gapbridge.core.errors import PlanError
+from gapbridge.core.model import Model
+from gapbridge.core.planning.capsules import Box, Capsules, below, hidden, in_box, touching
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

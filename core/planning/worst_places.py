@@ -15,8 +15,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.planning.information import Reference, gathered, inverse
-from core.planning.refinement import Refined, Refiner
+from gapbridge.core.planning.information import Reference, gathered, inverse
+from gapbridge.core.planning.refinement import Refined, Refiner
 
 Array = NDArray[np.float64]
 LEANING = 4  # power of a place's variance in its weight

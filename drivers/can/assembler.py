@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.can.codec import Reading
-from drivers.can.profile import CanProfile, Incoming, Key
+from gapbridge.drivers.can.codec import Reading
+from gapbridge.drivers.can.profile import CanProfile, Incoming, Key
 
 Vector = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.kernels.reference import JIT
-from drivers.can.profile import CanProfile, Incoming, Key, Outgoing
+from gapbridge.core.kernels.reference import JIT
+from gapbridge.drivers.can.profile import CanProfile, Incoming, Key, Outgoing
 
 Vector = NDArray[np.float64]
 Places = NDArray[np.int64]  # (m, 7): slot, start bit, length, big endian, signed, float, target

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from core.files import read_text
-from drivers.profile_file import ProfileError
+from gapbridge.core.files import read_text
+from gapbridge.drivers.profile_file import ProfileError
 
 _MESSAGE = re.compile(r"^\s*BO_\s+\d+\s+(\w+)\s*:")
 _SIGNAL = re.compile(r"^\s+SG_\s+(\w+)\b")

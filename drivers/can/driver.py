@@ -8,23 +8,23 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import (
+from gapbridge.core.errors import (
     ForeignCommandError,
     InvalidStateError,
     LinkError,
     StaleStateError,
     WriteError,
 )
-from core.model import Model
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.can.assembler import Sample
-from drivers.can.loading import read_profile
-from drivers.can.reader import FrameReader
-from drivers.can.settings import CanSettings
-from drivers.can.state import StateBuilder
-from drivers.can.writer import FrameWriter
-from drivers.driver import Driver
+from gapbridge.core.model import Model
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.can.assembler import Sample
+from gapbridge.drivers.can.loading import read_profile
+from gapbridge.drivers.can.reader import FrameReader
+from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.can.state import StateBuilder
+from gapbridge.drivers.can.writer import FrameWriter
+from gapbridge.drivers.driver import Driver
 
 Vector = NDArray[np.float64]
 FIRST_SAMPLE = 2.0  # s in which an arm on the bus must have told everything once

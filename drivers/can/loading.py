@@ -9,13 +9,21 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from drivers.can.dbc import Dbc, read_dbc
-from drivers.can.loading_outgoing import OutgoingLoading
-from drivers.can.names import Keys, Names
-from drivers.can.profile import CanProfile, Check, Incoming, JointMap, Key, Reading, Vector
-from drivers.can.schema import ProfileFile, Quantity
-from drivers.can.units import UNITS
-from drivers.profile_file import ProfileDocument, ProfileError, read_profile_document
+from gapbridge.drivers.can.dbc import Dbc, read_dbc
+from gapbridge.drivers.can.loading_outgoing import OutgoingLoading
+from gapbridge.drivers.can.names import Keys, Names
+from gapbridge.drivers.can.profile import (
+    CanProfile,
+    Check,
+    Incoming,
+    JointMap,
+    Key,
+    Reading,
+    Vector,
+)
+from gapbridge.drivers.can.schema import ProfileFile, Quantity
+from gapbridge.drivers.can.units import UNITS
+from gapbridge.drivers.profile_file import ProfileDocument, ProfileError, read_profile_document
 
 SHIPPED = Path(__file__).with_name("profiles")
 

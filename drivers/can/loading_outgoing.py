@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from drivers.can.names import Keys, Names
-from drivers.can.profile import Action, CanProfile, Key, Outgoing
-from drivers.can.schema import FrameEntry, Step
+from gapbridge.drivers.can.names import Keys, Names
+from gapbridge.drivers.can.profile import Action, CanProfile, Key, Outgoing
+from gapbridge.drivers.can.schema import FrameEntry, Step
 
 
 class OutgoingLoading:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from drivers.can.dbc import Dbc
-from drivers.can.profile import Key
-from drivers.can.schema import ProfileFile
-from drivers.profile_file import ProfileDocument, ProfileError
+from gapbridge.drivers.can.dbc import Dbc
+from gapbridge.drivers.can.profile import Key
+from gapbridge.drivers.can.schema import ProfileFile
+from gapbridge.drivers.profile_file import ProfileDocument, ProfileError
 
 Keys = tuple[str | int, ...]
 

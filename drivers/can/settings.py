@@ -7,9 +7,9 @@ from typing import Literal, Self
 
 from pydantic import Field
 
-from core.errors import InputError
-from drivers.can_bus.bus import BusSettings
-from drivers.driver import DriverSettings
+from gapbridge.core.errors import InputError
+from gapbridge.drivers.can_bus.bus import BusSettings
+from gapbridge.drivers.driver import DriverSettings
 
 SHIPPED = Path(__file__).with_name("profiles")
 
@@ -69,7 +69,7 @@ class CanSettings(DriverSettings, BusSettings):
 
     def read_files(self) -> None:
         """Read profile and DBC; see DriverSettings."""
-        from drivers.can.loading import read_profile
+        from gapbridge.drivers.can.loading import read_profile
 
         read_profile(self.profile_path, self.installation)
 

@@ -6,15 +6,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.arm import Arm
-from core.errors import InvalidStateError
-from core.kernels.reference import JIT
-from core.state import RobotState
-from drivers.can.assembler import Sample
-from drivers.can.codec import ORDER
-from drivers.can.profile import CanProfile
-from drivers.robot_modes import modes_of
-from drivers.state_check import FASTEST, JITTER, LARGEST, JointCheck
+from gapbridge.core.arm import Arm
+from gapbridge.core.errors import InvalidStateError
+from gapbridge.core.kernels.reference import JIT
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.can.assembler import Sample
+from gapbridge.drivers.can.codec import ORDER
+from gapbridge.drivers.can.profile import CanProfile
+from gapbridge.drivers.robot_modes import modes_of
+from gapbridge.drivers.state_check import FASTEST, JITTER, LARGEST, JointCheck
 
 Vector = NDArray[np.float64]
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import PartialWriteError, WriteError
-from drivers.can.codec import Writing
-from drivers.can.profile import Action, CanProfile, Key, Outgoing
-from drivers.can.settings import CanSettings
-from drivers.can_bus.bus import first_line
+from gapbridge.core.errors import PartialWriteError, WriteError
+from gapbridge.drivers.can.codec import Writing
+from gapbridge.drivers.can.profile import Action, CanProfile, Key, Outgoing
+from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.can_bus.bus import first_line
 
 Vector = NDArray[np.float64]
 Frames = list[tuple[Key, bytes]]

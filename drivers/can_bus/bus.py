@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, Field, field_validator
 
-from core.errors import LinkError
+from gapbridge.core.errors import LinkError
 
 if TYPE_CHECKING:
     import can
@@ -110,7 +110,7 @@ def _open_socketcand(settings: BusSettings, filters: Any) -> Any:
         raise LinkError(f"{settings.where()}: cannot be reached: {why}") from None
     import can
 
-    from drivers.can_bus.socketcand import SocketcandBus
+    from gapbridge.drivers.can_bus.socketcand import SocketcandBus
 
     options = {"tcp_tune": True, **settings.options}
     try:

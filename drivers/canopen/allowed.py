@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from core.errors import WriteError
-from drivers.canopen.objects import (
+from gapbridge.core.errors import WriteError
+from gapbridge.drivers.canopen.objects import (
     HEARTBEAT_BASE,
     NMT,
     PDO_COUNT,
@@ -11,7 +11,7 @@ from drivers.canopen.objects import (
     SYNC,
     Address,
 )
-from drivers.canopen.profile import CanopenProfile
+from gapbridge.drivers.canopen.profile import CanopenProfile
 
 ALWAYS: tuple[Address, ...] = (
     Address(0x1006, 0),  # SYNC period

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import LinkError, WriteError
-from drivers.canopen.master import Master
-from drivers.canopen.profile import CanopenProfile
+from gapbridge.core.errors import LinkError, WriteError
+from gapbridge.drivers.canopen.master import Master
+from gapbridge.drivers.canopen.profile import CanopenProfile
 
 Vector = NDArray[np.float64]
 Frames = list[tuple[int, bytes, str]]

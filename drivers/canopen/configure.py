@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arm import Arm
-from core.errors import InputError, LinkError
-from drivers.canopen.master import Master
-from drivers.canopen.objects import PDO_COUNT, Address
-from drivers.canopen.pdo import PdoLayout
-from drivers.canopen.profile import CanopenProfile
+from gapbridge.core.arm import Arm
+from gapbridge.core.errors import InputError, LinkError
+from gapbridge.drivers.canopen.master import Master
+from gapbridge.drivers.canopen.objects import PDO_COUNT, Address
+from gapbridge.drivers.canopen.pdo import PdoLayout
+from gapbridge.drivers.canopen.profile import CanopenProfile
 
 Vector = NDArray[np.float64]
 

@@ -9,21 +9,32 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import InputError, InvalidStateError, LinkError, StaleStateError, WriteError
-from core.model import Model
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.canopen.command import RpdoWriter
-from drivers.canopen.configure import check_identity, check_units, interpolation_period, set_up
-from drivers.canopen.listening import OPERATIONAL, Emergency, Foreign
-from drivers.canopen.master import Master
-from drivers.canopen.power import Power
-from drivers.canopen.profile import WINDOW, read_profile
-from drivers.canopen.rhythm import Rhythm
-from drivers.canopen.settings import CanopenSettings
-from drivers.canopen.state import StateBuilder, not_following, positions, states
-from drivers.canopen.sync_set import SyncSet
-from drivers.driver import Driver
+from gapbridge.core.errors import (
+    InputError,
+    InvalidStateError,
+    LinkError,
+    StaleStateError,
+    WriteError,
+)
+from gapbridge.core.model import Model
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.canopen.command import RpdoWriter
+from gapbridge.drivers.canopen.configure import (
+    check_identity,
+    check_units,
+    interpolation_period,
+    set_up,
+)
+from gapbridge.drivers.canopen.listening import OPERATIONAL, Emergency, Foreign
+from gapbridge.drivers.canopen.master import Master
+from gapbridge.drivers.canopen.power import Power
+from gapbridge.drivers.canopen.profile import WINDOW, read_profile
+from gapbridge.drivers.canopen.rhythm import Rhythm
+from gapbridge.drivers.canopen.settings import CanopenSettings
+from gapbridge.drivers.canopen.state import StateBuilder, not_following, positions, states
+from gapbridge.drivers.canopen.sync_set import SyncSet
+from gapbridge.drivers.driver import Driver
 
 Vector = NDArray[np.float64]
 log = logging.getLogger("drivers.canopen")

@@ -8,10 +8,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from core.files import read_text
-from drivers.can_bus.bus import first_line
-from drivers.canopen.objects import Address
-from drivers.profile_file import ProfileError
+from gapbridge.core.files import read_text
+from gapbridge.drivers.can_bus.bus import first_line
+from gapbridge.drivers.canopen.objects import Address
+from gapbridge.drivers.profile_file import ProfileError
 
 SUFFIXES = (".eds", ".dcf")
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from canopen.network import MessageListener, Network
 
-from drivers.canopen.objects import (
+from gapbridge.drivers.canopen.objects import (
     HEARTBEAT_BASE,
     NMT,
     PDO_COUNT,
@@ -18,8 +18,8 @@ from drivers.canopen.objects import (
     SDO_REQUEST_BASE,
     SYNC,
 )
-from drivers.canopen.profile import CanopenProfile
-from drivers.canopen.sync_set import SyncCollector
+from gapbridge.drivers.canopen.profile import CanopenProfile
+from gapbridge.drivers.canopen.sync_set import SyncCollector
 
 KEPT = 64  # emergencies remembered
 PAUSE = 0.02  # s between two readings of a bus that has gone

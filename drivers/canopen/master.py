@@ -13,14 +13,14 @@ from typing import Any
 
 import canopen
 
-from core.errors import LinkError
-from drivers.can_bus.bus import close_bus, first_line, open_bus
-from drivers.canopen.allowed import AllowedFrames
-from drivers.canopen.listening import BusListener, Life
-from drivers.canopen.objects import HEARTBEAT_BASE, SYNC, Address
-from drivers.canopen.profile import CanopenProfile
-from drivers.canopen.settings import CanopenSettings
-from drivers.canopen.sync_set import SyncCollector
+from gapbridge.core.errors import LinkError
+from gapbridge.drivers.can_bus.bus import close_bus, first_line, open_bus
+from gapbridge.drivers.canopen.allowed import AllowedFrames
+from gapbridge.drivers.canopen.listening import BusListener, Life
+from gapbridge.drivers.canopen.objects import HEARTBEAT_BASE, SYNC, Address
+from gapbridge.drivers.canopen.profile import CanopenProfile
+from gapbridge.drivers.canopen.settings import CanopenSettings
+from gapbridge.drivers.canopen.sync_set import SyncCollector
 
 ABSENT = (0x06020000, 0x06090011)  # SDO aborts: no such object, no such subindex
 OPERATIONAL_STATE = 5

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from drivers.canopen.objects import PDO_STEP, RPDO_BASE, TPDO_BASE, Address
+from gapbridge.drivers.canopen.objects import PDO_STEP, RPDO_BASE, TPDO_BASE, Address
 
 
 @dataclass(frozen=True, slots=True)

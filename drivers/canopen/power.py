@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import LinkError, WriteError
-from drivers.canopen.command import RpdoWriter
-from drivers.canopen.master import Master
-from drivers.canopen.objects import (
+from gapbridge.core.errors import LinkError, WriteError
+from gapbridge.drivers.canopen.command import RpdoWriter
+from gapbridge.drivers.canopen.master import Master
+from gapbridge.drivers.canopen.objects import (
     DISABLE_VOLTAGE,
     ENABLE_INTERPOLATION,
     ENABLE_OPERATION,
@@ -21,9 +21,9 @@ from drivers.canopen.objects import (
     Address,
     State,
 )
-from drivers.canopen.profile import CanopenProfile
-from drivers.canopen.state import not_following, positions, states
-from drivers.canopen.sync_set import SyncSet
+from gapbridge.drivers.canopen.profile import CanopenProfile
+from gapbridge.drivers.canopen.state import not_following, positions, states
+from gapbridge.drivers.canopen.sync_set import SyncSet
 
 Vector = NDArray[np.float64]
 MODES_OF_OPERATION, CONSUMER_HEARTBEAT = Address(0x6060, 0), Address(0x1016, 1)

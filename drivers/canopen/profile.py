@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from drivers.canopen.eds import Eds, read_eds
-from drivers.canopen.objects import MODES, OBJECTS, Address
-from drivers.canopen.pdo import Entry, PdoLayout
-from drivers.canopen.schema import Heartbeat, Joint, ProfileFile
-from drivers.profile_file import ProfileDocument, ProfileError, read_profile_document
+from gapbridge.drivers.canopen.eds import Eds, read_eds
+from gapbridge.drivers.canopen.objects import MODES, OBJECTS, Address
+from gapbridge.drivers.canopen.pdo import Entry, PdoLayout
+from gapbridge.drivers.canopen.schema import Heartbeat, Joint, ProfileFile
+from gapbridge.drivers.profile_file import ProfileDocument, ProfileError, read_profile_document
 
 Vector = NDArray[np.float64]
 Keys = tuple[str | int, ...]

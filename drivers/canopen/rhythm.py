@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 
-from drivers.canopen.command import RpdoWriter
-from drivers.canopen.master import Master
-from drivers.canopen.sync_set import SyncSet
+from gapbridge.drivers.canopen.command import RpdoWriter
+from gapbridge.drivers.canopen.master import Master
+from gapbridge.drivers.canopen.sync_set import SyncSet
 
 MOST_LEFT_OUT = 3  # SYNCs after a torn set
 

@@ -7,10 +7,10 @@ from typing import Literal, Self
 
 from pydantic import Field
 
-from core.errors import InputError
-from core.files import read_bytes
-from drivers.can_bus.bus import BusSettings
-from drivers.driver import DriverSettings
+from gapbridge.core.errors import InputError
+from gapbridge.core.files import read_bytes
+from gapbridge.drivers.can_bus.bus import BusSettings
+from gapbridge.drivers.driver import DriverSettings
 
 SHIPPED = Path(__file__).with_name("profiles")
 
@@ -63,7 +63,7 @@ class CanopenSettings(DriverSettings, BusSettings):
 
     def read_files(self) -> None:
         """Read profile and EDS; see DriverSettings."""
-        from drivers.canopen.profile import read_profile
+        from gapbridge.drivers.canopen.profile import read_profile
 
         read_bytes(read_profile(self.profile_path).eds.path)
 

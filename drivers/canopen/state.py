@@ -7,14 +7,14 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arm import Arm
-from core.errors import InvalidStateError
-from core.state import RobotState
-from drivers.canopen.objects import MODE_ACTIVE, State, state_of
-from drivers.canopen.profile import CanopenProfile
-from drivers.canopen.sync_set import SyncSet
-from drivers.robot_modes import modes_of
-from drivers.state_check import JointCheck
+from gapbridge.core.arm import Arm
+from gapbridge.core.errors import InvalidStateError
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.canopen.objects import MODE_ACTIVE, State, state_of
+from gapbridge.drivers.canopen.profile import CanopenProfile
+from gapbridge.drivers.canopen.sync_set import SyncSet
+from gapbridge.drivers.robot_modes import modes_of
+from gapbridge.drivers.state_check import JointCheck
 
 Vector = NDArray[np.float64]
 SPAN, OLDEST = 5, 0.1  # samples, s: what a velocity is reckoned from where drives tell none

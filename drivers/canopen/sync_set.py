@@ -7,8 +7,8 @@ import time
 from collections import Counter
 from typing import NamedTuple
 
-from drivers.canopen.pdo import PdoLayout
-from drivers.canopen.profile import CanopenProfile
+from gapbridge.drivers.canopen.pdo import PdoLayout
+from gapbridge.drivers.canopen.profile import CanopenProfile
 
 
 class SyncSet(NamedTuple):

@@ -5,16 +5,16 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, cast
 
-from core.errors import LinkError
+from gapbridge.core.errors import LinkError
 
 if TYPE_CHECKING:
-    from drivers.ft_sensor.sensor import ForceTorqueSensor
-    from drivers.ft_sensor.settings import FtSensorSettings
+    from gapbridge.drivers.ft_sensor.sensor import ForceTorqueSensor
+    from gapbridge.drivers.ft_sensor.settings import FtSensorSettings
 
 FT_SENSORS: dict[str, str] = {
-    "robotous_rft": "drivers.ft_sensor.robotous_rft:RobotousRft",
-    "ati_netcanoem": "drivers.ft_sensor.ati_netcanoem:AtiNetCanOem",
-    "robotiq_ft300": "drivers.ft_sensor.robotiq_ft300:RobotiqFt300",
+    "robotous_rft": "gapbridge.drivers.ft_sensor.robotous_rft:RobotousRft",
+    "ati_netcanoem": "gapbridge.drivers.ft_sensor.ati_netcanoem:AtiNetCanOem",
+    "robotiq_ft300": "gapbridge.drivers.ft_sensor.robotiq_ft300:RobotiqFt300",
 }
 """Sensor name in a cell file -> ``module:Class``, imported when it is used."""
 

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import LinkError
-from drivers.can_bus.bus import close_bus, first_line, open_bus
-from drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
-from drivers.ft_sensor.settings import AtiSettings
+from gapbridge.core.errors import LinkError
+from gapbridge.drivers.can_bus.bus import close_bus, first_line, open_bus
+from gapbridge.drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
+from gapbridge.drivers.ft_sensor.settings import AtiSettings
 
 GAUGES, MATRIX, COUNTS, UNITS = 0x0, 0x2, 0x7, 0x8
 ANSWER = 0.1  # s: an answer about the calibration that has not come by then is asked for again

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
-from core.model import Model
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.controller_facts import ControllerFacts, Difference
-from drivers.driver import Driver
-from drivers.ft_sensor import make_sensor
-from drivers.ft_sensor.clock_offset import ClockOffset
-from drivers.ft_sensor.reader import SensorReader
-from drivers.ft_sensor.settings import FtSensorSettings
-from drivers.ft_sensor.wrench import TcpForce, sensor_to_flange
+from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
+from gapbridge.core.model import Model
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.controller_facts import ControllerFacts, Difference
+from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.ft_sensor import make_sensor
+from gapbridge.drivers.ft_sensor.clock_offset import ClockOffset
+from gapbridge.drivers.ft_sensor.reader import SensorReader
+from gapbridge.drivers.ft_sensor.settings import FtSensorSettings
+from gapbridge.drivers.ft_sensor.wrench import TcpForce, sensor_to_flange
 
 Vector = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ import threading
 import time
 from collections import deque
 
-from core.errors import InvalidStateError, LinkError, StaleStateError
-from drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
-from drivers.ft_sensor.settings import FtSensorSettings
+from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
+from gapbridge.drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
+from gapbridge.drivers.ft_sensor.settings import FtSensorSettings
 
 KEPT = 64  # samples: enough to look up what was sampled when an arm's state was
 LISTEN = 0.1  # s that one read may take

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from core.errors import LinkError
-from drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
-from drivers.ft_sensor.settings import RobotiqSettings
+from gapbridge.core.errors import LinkError
+from gapbridge.drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
+from gapbridge.drivers.ft_sensor.settings import RobotiqSettings
 
 REGISTER, STREAM_REGISTER, STREAM = 180, 410, 0x0200
 STREAM_RATE = 100.0  # Hz

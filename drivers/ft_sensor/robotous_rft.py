@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from core.errors import LinkError
-from drivers.can_bus.bus import close_bus, first_line, open_bus
-from drivers.ft_sensor.clock_offset import ClockOffset
-from drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
-from drivers.ft_sensor.settings import RobotousSettings
+from gapbridge.core.errors import LinkError
+from gapbridge.drivers.can_bus.bus import close_bus, first_line, open_bus
+from gapbridge.drivers.ft_sensor.clock_offset import ClockOffset
+from gapbridge.drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
+from gapbridge.drivers.ft_sensor.settings import RobotousSettings
 
 START, STOP = 0x0B, 0x0C
 LAYOUT = struct.Struct(">B6hB2x")

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.effects import CATALOGUE, acting
-from core.kernels import reference as kernel
-from core.loads import Loads
-from core.model import Model
-from core.motion import Motion
-from core.rotation import rpy_matrix, skew
-from core.state import RobotState
-from drivers.ft_sensor.settings import SensorFrame
+from gapbridge.core.effects import CATALOGUE, acting
+from gapbridge.core.kernels import reference as kernel
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
+from gapbridge.core.motion import Motion
+from gapbridge.core.rotation import rpy_matrix, skew
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.ft_sensor.settings import SensorFrame
 
 Array = NDArray[np.float64]
 

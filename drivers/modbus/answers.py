@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from core.errors import InvalidStateError
-from drivers.modbus.registers import wire_of
-from drivers.modbus.tcp_requests import refusal
+from gapbridge.core.errors import InvalidStateError
+from gapbridge.drivers.modbus.registers import wire_of
+from gapbridge.drivers.modbus.tcp_requests import refusal
 
 
 def check_answer(answer: Any, function: int, count: int, where: str) -> bytes:

@@ -11,14 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import InvalidStateError
-from drivers.modbus.encode import units_of
-from drivers.modbus.map import RegisterMap, place_in
-from drivers.modbus.plan import TURN, BlockPlan
-from drivers.modbus.profile import ECHO_WORDS, addresses, turns_of, vectors
-from drivers.modbus.registers import BIT_TABLES, UNITS, Coding, words_in
-from drivers.modbus.schema import Condition, Mailbox, Place, ProfileFile, Trouble, Vector
-from drivers.state_check import JITTER, LARGEST
+from gapbridge.core.errors import InvalidStateError
+from gapbridge.drivers.modbus.encode import units_of
+from gapbridge.drivers.modbus.map import RegisterMap, place_in
+from gapbridge.drivers.modbus.plan import TURN, BlockPlan
+from gapbridge.drivers.modbus.profile import ECHO_WORDS, addresses, turns_of, vectors
+from gapbridge.drivers.modbus.registers import BIT_TABLES, UNITS, Coding, words_in
+from gapbridge.drivers.modbus.schema import Condition, Mailbox, Place, ProfileFile, Trouble, Vector
+from gapbridge.drivers.state_check import JITTER, LARGEST
 
 Array = NDArray[np.float64]
 Registers = Sequence[bytes]  # of each of RegisterMap.blocks, two bytes each, as on the wire

@@ -7,23 +7,23 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from core.compensation import wanted_pose
-from core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
-from core.model import Model
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.driver import Driver
-from drivers.modbus.decode import Decoder, Sample, check_identity, check_step
-from drivers.modbus.freshness import Freshness
-from drivers.modbus.map import compile_map
-from drivers.modbus.profile import read_profile
-from drivers.modbus.registers import UNITS
-from drivers.modbus.settings import ModbusSettings
-from drivers.modbus.transport import Transport
-from drivers.modbus.write import make_writer
-from drivers.offset_inverse import Nominal
-from drivers.robot_modes import NORMAL, REDUCED, RUNNING, modes_of
-from drivers.state_check import JointCheck
+from gapbridge.core.compensation import wanted_pose
+from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
+from gapbridge.core.model import Model
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.modbus.decode import Decoder, Sample, check_identity, check_step
+from gapbridge.drivers.modbus.freshness import Freshness
+from gapbridge.drivers.modbus.map import compile_map
+from gapbridge.drivers.modbus.profile import read_profile
+from gapbridge.drivers.modbus.registers import UNITS
+from gapbridge.drivers.modbus.settings import ModbusSettings
+from gapbridge.drivers.modbus.transport import Transport
+from gapbridge.drivers.modbus.write import make_writer
+from gapbridge.drivers.offset_inverse import Nominal
+from gapbridge.drivers.robot_modes import NORMAL, REDUCED, RUNNING, modes_of
+from gapbridge.drivers.state_check import JointCheck
 
 Vector = NDArray[np.float64]
 SLOW_EVERY = 0.2  # s between two readings of conditions that lie apart

@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 from operator import mul
 
-from drivers.modbus.profile import addresses, turns_of
-from drivers.modbus.registers import UNITS, Coding
-from drivers.modbus.schema import Mailbox, Vector
+from gapbridge.drivers.modbus.profile import addresses, turns_of
+from gapbridge.drivers.modbus.registers import UNITS, Coding
+from gapbridge.drivers.modbus.schema import Mailbox, Vector
 
 SEQUENCES = 0x8000  # sequence numbers and heartbeats run from 1 to this less one; 0: nothing sent
 MODULUS, SEED = 65521, 0x4742  # of the checksum: the largest prime below 65536

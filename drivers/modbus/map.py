@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from drivers.modbus.profile import MAILBOX_WORDS, Keys, Span, spans
-from drivers.modbus.registers import BIT_TABLES, MOST_REGISTERS, Table
-from drivers.modbus.schema import ProfileFile
+from gapbridge.drivers.modbus.profile import MAILBOX_WORDS, Keys, Span, spans
+from gapbridge.drivers.modbus.registers import BIT_TABLES, MOST_REGISTERS, Table
+from gapbridge.drivers.modbus.schema import ProfileFile
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,8 +13,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.kernels.reference import JIT
-from drivers.modbus.registers import Coding
+from gapbridge.core.kernels.reference import JIT
+from gapbridge.drivers.modbus.registers import Coding
 
 Array = NDArray[np.float64]
 TURN = 2.0 * math.pi

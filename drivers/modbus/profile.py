@@ -11,9 +11,9 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from drivers.modbus.registers import BIT_TABLES, LAST_ADDRESS, UNITS, Table
-from drivers.modbus.schema import Condition, Order, Place, ProfileFile, Turns, Vector
-from drivers.profile_file import ProfileDocument, ProfileError, read_profile_document
+from gapbridge.drivers.modbus.registers import BIT_TABLES, LAST_ADDRESS, UNITS, Table
+from gapbridge.drivers.modbus.schema import Condition, Order, Place, ProfileFile, Turns, Vector
+from gapbridge.drivers.profile_file import ProfileDocument, ProfileError, read_profile_document
 
 Keys = tuple[str | int, ...]
 MAILBOX_WORDS, ECHO_WORDS = 11, 8

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from drivers.modbus.registers import LAST_ADDRESS, Coding, Table, TypeName, WordOrder
+from gapbridge.drivers.modbus.registers import LAST_ADDRESS, Coding, Table, TypeName, WordOrder
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0)]

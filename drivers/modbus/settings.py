@@ -7,8 +7,8 @@ from typing import Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from core.errors import InputError
-from drivers.driver import DriverSettings
+from gapbridge.core.errors import InputError
+from gapbridge.drivers.driver import DriverSettings
 
 SHIPPED = Path(__file__).with_name("profiles")
 
@@ -90,7 +90,7 @@ class ModbusSettings(DriverSettings):
 
         With a mailbox they ride on the robot's own.
         """
-        from drivers.modbus.profile import read_profile
+        from gapbridge.drivers.modbus.profile import read_profile
 
         return read_profile(self.profile_path).write.mode != "mailbox"
 
@@ -111,7 +111,7 @@ class ModbusSettings(DriverSettings):
 
     def read_files(self) -> None:
         """Read the profile; see DriverSettings."""
-        from drivers.modbus.profile import read_profile
+        from gapbridge.drivers.modbus.profile import read_profile
 
         read_profile(self.profile_path)
 

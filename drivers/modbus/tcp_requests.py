@@ -20,7 +20,7 @@ from typing import Any
 
 from pymodbus.framer import FramerBase
 
-from core.errors import InvalidStateError
+from gapbridge.core.errors import InvalidStateError
 
 LONGEST = 260  # bytes of header and PDU
 REFUSED = 0x80  # added to the function where the controller refuses

@@ -6,8 +6,8 @@ import hashlib
 import ssl
 from typing import Any
 
-from core.errors import InputError
-from drivers.modbus.settings import ModbusSettings
+from gapbridge.core.errors import InputError
+from gapbridge.drivers.modbus.settings import ModbusSettings
 
 
 class CheckedContext(ssl.SSLContext):

@@ -16,14 +16,14 @@ from pymodbus.client import ModbusSerialClient, ModbusTcpClient, ModbusTlsClient
 from pymodbus.exceptions import ModbusException, ModbusIOException
 from pymodbus.pdu import ModbusPDU
 
-from core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
-from drivers.modbus import tcp_requests
-from drivers.modbus.answers import check_answer, check_written
-from drivers.modbus.map import Block, RegisterMap
-from drivers.modbus.registers import BIT_TABLES, Table
-from drivers.modbus.settings import ModbusSettings
-from drivers.modbus.tcp_requests import TcpRequests
-from drivers.modbus.tls import CheckedContext, checked_context
+from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
+from gapbridge.drivers.modbus import tcp_requests
+from gapbridge.drivers.modbus.answers import check_answer, check_written
+from gapbridge.drivers.modbus.map import Block, RegisterMap
+from gapbridge.drivers.modbus.registers import BIT_TABLES, Table
+from gapbridge.drivers.modbus.settings import ModbusSettings
+from gapbridge.drivers.modbus.tcp_requests import TcpRequests
+from gapbridge.drivers.modbus.tls import CheckedContext, checked_context
 
 READ_FUNCTIONS: dict[Table, int] = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 

@@ -13,14 +13,19 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import ForeignCommandError, IneffectiveWriteError, StaleStateError, WriteError
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.modbus import encode
-from drivers.modbus.decode import Sample
-from drivers.modbus.registers import UNITS, Table
-from drivers.modbus.schema import Mailbox, Order, ProfileFile, ReadOnly, TargetTrigger
-from drivers.modbus.transport import Transport
+from gapbridge.core.errors import (
+    ForeignCommandError,
+    IneffectiveWriteError,
+    StaleStateError,
+    WriteError,
+)
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.modbus import encode
+from gapbridge.drivers.modbus.decode import Sample
+from gapbridge.drivers.modbus.registers import UNITS, Table
+from gapbridge.drivers.modbus.schema import Mailbox, Order, ProfileFile, ReadOnly, TargetTrigger
+from gapbridge.drivers.modbus.transport import Transport
 
 Array = NDArray[np.float64]
 Rates = Callable[[], tuple[float, float]]

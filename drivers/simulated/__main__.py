@@ -1,4 +1,4 @@
-"""Run a simulated controller: ``python -m drivers.simulated --arm ur10e --host 127.0.0.2``."""
+"""A simulated controller: ``python -m gapbridge.drivers.simulated --arm ur10e``."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ import sys
 import threading
 from dataclasses import replace
 
-from core.errors import GapbridgeError
-from drivers.simulated.ur import settings as defaults
-from drivers.simulated.ur.server import serve
-from drivers.simulated.ur.settings import ServerSettings, from_json, simulated_cell
+from gapbridge.core.errors import GapbridgeError
+from gapbridge.drivers.simulated.ur import settings as defaults
+from gapbridge.drivers.simulated.ur.server import serve
+from gapbridge.drivers.simulated.ur.settings import ServerSettings, from_json, simulated_cell
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m drivers.simulated", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m gapbridge.drivers.simulated", description=__doc__
+    )
     parser.add_argument("--arm", default="ur10e", help="a built-in arm")
     parser.add_argument("--host", default="127.0.0.2", help="loopback address to bind")
     parser.add_argument("--seed", type=int, default=0)

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from core.errors import WriteError
-from drivers.ur_rtde import registers
+from gapbridge.core.errors import WriteError
+from gapbridge.drivers.ur_rtde import registers
 
 CONTROL = (
     "setWatchdog", "kickWatchdog", "servoJ", "servoStop", "stopScript", "reuploadScript",

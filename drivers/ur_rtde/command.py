@@ -13,14 +13,14 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from core.errors import WriteError
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.ur_rtde import registers
-from drivers.ur_rtde.allowed import AllowedControl, AllowedInputs
-from drivers.ur_rtde.no_delay import send_at_once
-from drivers.ur_rtde.registers import Program
-from drivers.ur_rtde.settings import UrRtdeSettings
+from gapbridge.core.errors import WriteError
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.ur_rtde import registers
+from gapbridge.drivers.ur_rtde.allowed import AllowedControl, AllowedInputs
+from gapbridge.drivers.ur_rtde.no_delay import send_at_once
+from gapbridge.drivers.ur_rtde.registers import Program
+from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
 ROBOT_RUNNING, PLAYING = 7, 2
 SAFE = (1, 2)  # safety_mode: normal, reduced

@@ -7,20 +7,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from core.compensation import wanted_pose
-from core.errors import InvalidStateError, LinkError, WriteError
-from core.model import Model
-from core.rotation import one_rotation_matrix
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.controller_facts import TCP_TURNED, ControllerFacts, Difference, differences
-from drivers.driver import Driver
-from drivers.offset_inverse import Nominal
-from drivers.ur_rtde.command import OffsetWriter, ServoWriter, Writer
-from drivers.ur_rtde.enquiry import enquire
-from drivers.ur_rtde.round_trip import round_trip
-from drivers.ur_rtde.settings import UrRtdeSettings
-from drivers.ur_rtde.state import StateReader
+from gapbridge.core.compensation import wanted_pose
+from gapbridge.core.errors import InvalidStateError, LinkError, WriteError
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import one_rotation_matrix
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.controller_facts import TCP_TURNED, ControllerFacts, Difference, differences
+from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.offset_inverse import Nominal
+from gapbridge.drivers.ur_rtde.command import OffsetWriter, ServoWriter, Writer
+from gapbridge.drivers.ur_rtde.enquiry import enquire
+from gapbridge.drivers.ur_rtde.round_trip import round_trip
+from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
+from gapbridge.drivers.ur_rtde.state import StateReader
 
 Vector = NDArray[np.float64]
 OFFSET_SCRIPT = Path(__file__).with_name("gapbridge_offset.script")

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arm import builtin_arm, builtin_names, builtin_rows
-from core.errors import LinkError
-from core.rotation import rotation_matrix, transform
-from drivers.controller_facts import ControllerFacts
+from gapbridge.core.arm import builtin_arm, builtin_names, builtin_rows
+from gapbridge.core.errors import LinkError
+from gapbridge.core.rotation import rotation_matrix, transform
+from gapbridge.drivers.controller_facts import ControllerFacts
 
 Array = NDArray[np.float64]
 RTDE, PRIMARY = 30004, 30001

@@ -11,7 +11,7 @@ import struct
 import time
 from collections.abc import Callable
 
-from core.errors import WriteError
+from gapbridge.core.errors import WriteError
 
 PORT = 30004
 LONGEST = 1.0  # s that an answer may take

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, field_validator
 
-from drivers.driver import DriverSettings
+from gapbridge.drivers.driver import DriverSettings
 
 
 class UrRtdeSettings(DriverSettings):

@@ -17,12 +17,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from core.errors import InvalidStateError, LinkError, StaleStateError
-from core.kernels.reference import JIT
-from core.state import RobotState
-from drivers.state_check import FASTEST, JITTER, LARGEST
-from drivers.ur_rtde.registers import APPLIED, ECHO, PROGRAM
-from drivers.ur_rtde.settings import UrRtdeSettings
+from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
+from gapbridge.core.kernels.reference import JIT
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.state_check import FASTEST, JITTER, LARGEST
+from gapbridge.drivers.ur_rtde.registers import APPLIED, ECHO, PROGRAM
+from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
 Vector = NDArray[np.float64]
 N = 6

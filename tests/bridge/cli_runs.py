@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cli import main
-from core.arm import builtin_arm
-from core.loads import Loads
-from core.model import Model
+from gapbridge.bridge.cli import main
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 CELL = """\

@@ -19,14 +19,14 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell import load_cell
-from bridge.daemon.daemon import Daemon, settings_of
-from bridge.daemon.summary import RunSummary
-from bridge.loop.supervisor import State
-from core.log.mcap_reading import read_columns
-from drivers.simulated.ur.process import SimulatedController
-from drivers.simulated.ur.settings import BENCH_PORT, ServerSettings, simulated_cell
-from drivers.ur_rtde.driver import OFFSET_SCRIPT
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.daemon.daemon import Daemon, settings_of
+from gapbridge.bridge.daemon.summary import RunSummary
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.core.log.mcap_reading import read_columns
+from gapbridge.drivers.simulated.ur.process import SimulatedController
+from gapbridge.drivers.simulated.ur.settings import BENCH_PORT, ServerSettings, simulated_cell
+from gapbridge.drivers.ur_rtde.driver import OFFSET_SCRIPT
 
 Array = NDArray[np.float64]
 TCP = (0.0, 0.0, 0.18, 0.0, 0.0, 0.0)
@@ -220,6 +220,6 @@ def gapbridge(*arguments: object, folder: Path) -> subprocess.Popen[str]:
     """Start the command line in a process of its own."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     return subprocess.Popen(
-        [sys.executable, "-m", "bridge.cli", *map(str, arguments)],
+        [sys.executable, "-m", "gapbridge", *map(str, arguments)],
         cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip

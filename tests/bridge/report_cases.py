@@ -7,12 +7,12 @@ from functools import cache
 
 import numpy as np
 
-from core.arm import builtin_arm
-from core.diagnosis.diagnosis import Diagnosis, diagnose
-from core.effects import Site, Term
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.diagnosis.diagnosis import Diagnosis, diagnose
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 CASES = ("no gap", "explained", "unexplained", "partly explained", "rotations and forces")
 METROLOGY = Metrology(registered=False, sigma=2e-5, repeatability=2e-5)

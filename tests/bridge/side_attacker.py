@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from bridge.ipc.side_main import take_order
+from gapbridge.bridge.ipc.side_main import take_order
 
 FORGED = [
     {"kind": "request", "command": "arm", "number": 1, "by": "forged", "detail": "forged"},

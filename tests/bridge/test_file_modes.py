@@ -9,16 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from bridge.calibration.session.journal import Journal as SessionJournal
-from bridge.cell import load_cell
-from bridge.cell.saving import save_cell
-from bridge.document.output_file import write_text
-from bridge.fleet.folder import require_folder as require_fleet_folder
-from bridge.fleet.journal import Journal as FleetJournal
-from bridge.ipc.shared_memory import slices_of
-from bridge.loop.supervisor import State
-from bridge.recording.folder import require_folder
-from bridge.recording.segment import Segment
+from gapbridge.bridge.calibration.session.journal import Journal as SessionJournal
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cell.saving import save_cell
+from gapbridge.bridge.document.output_file import write_text
+from gapbridge.bridge.fleet.folder import require_folder as require_fleet_folder
+from gapbridge.bridge.fleet.journal import Journal as FleetJournal
+from gapbridge.bridge.ipc.shared_memory import slices_of
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.recording.folder import require_folder
+from gapbridge.bridge.recording.segment import Segment
 
 CELL = "robot: {model: ur10e}\npayload: {mass: 5.0}\n"
 

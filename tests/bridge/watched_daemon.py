@@ -40,7 +40,7 @@ class Watched:
         self.log = robot.folder / "daemon.log"
         with self.log.open("wb") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "bridge.cli", "run", self.cell, "--log", "json", *options],
+                [sys.executable, "-m", "gapbridge", "run", self.cell, "--log", "json", *options],
                 stdout=subprocess.DEVNULL, stderr=log,
             )  # fmt: skip
 
@@ -63,7 +63,7 @@ class Watched:
         wait_for(there, limit, f"{state} ({self.log.read_text()[-2000:]})")
 
     def command(self, name: str) -> int:
-        return subprocess.run([sys.executable, "-m", "bridge.cli", name, self.cell]).returncode
+        return subprocess.run([sys.executable, "-m", "gapbridge", name, self.cell]).returncode
 
     def arm(self) -> None:
         """Have a person at the machine arm; what a busy machine made of the link is cleared."""

@@ -16,11 +16,11 @@ import httpx
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell import load_cell
-from bridge.cell.daemon_settings import DaemonSettings
-from bridge.ipc.shared_memory import Page, Phase
-from bridge.ipc.side_process import SideProcess
-from bridge.loop.supervisor import State
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.ipc.shared_memory import Page, Phase
+from gapbridge.bridge.ipc.side_process import SideProcess
+from gapbridge.bridge.loop.supervisor import State
 
 Array = NDArray[np.float64]
 N, RATE = 6, 125.0

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from core.arm import Arm
-from core.effects import CATALOGUE
-from core.log.log import Log
-from core.model import Model
-from core.urdf import arm_from_urdf
+from gapbridge.core.arm import Arm
+from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.log.log import Log
+from gapbridge.core.model import Model
+from gapbridge.core.urdf import arm_from_urdf
 
 TOOL = np.array([0.01, -0.02, 0.15])  # m, TCP in the flange, not turned
 COG = np.array([0.02, 0.03, 0.08])  # m, payload in the flange

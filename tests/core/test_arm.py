@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from oracle import rigid
 from scipy.spatial.transform import Rotation
 
-from core.arm import JointLimits, arm_from_dh, builtin_arm, builtin_names, builtin_rows
-from core.errors import ArmError
-from core.model import Model
+from gapbridge.core.arm import JointLimits, arm_from_dh, builtin_arm, builtin_names, builtin_rows
+from gapbridge.core.errors import ArmError
+from gapbridge.core.model import Model
 
 # Universal Robots' published tables: a2, a3, d1, d4, d5, d6 (m), link masses (kg), rated payload
 PUBLISHED = {

@@ -10,8 +10,8 @@ from hypothesis.extra.numpy import arrays
 from oracle import equilibrium as oracle
 from test_equilibrium import SEVEN
 
-from core.arm import arm_from_dh, builtin_arm, builtin_rows
-from core.compensation import (
+from gapbridge.core.arm import arm_from_dh, builtin_arm, builtin_rows
+from gapbridge.core.compensation import (
     LARGEST_OFFSET,
     LEVER,
     TOLERANCE,
@@ -19,11 +19,11 @@ from core.compensation import (
     correct,
     wanted_pose,
 )
-from core.effects import Site, Term
-from core.kernels.least_offset import smallest_offset
-from core.loads import Loads
-from core.model import Model
-from core.rotation import rotation_matrix, rotation_vector
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.kernels.least_offset import smallest_offset
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 SIX = Model(builtin_arm("ur10e"), payload_mass=8.0).with_compliance([1e-5] * 6, [5e-6] * 6)
 WIDE = Model(arm_from_dh(SEVEN), payload_mass=8.0).with_compliance([2e-5] * 7, [1e-5] * 7)

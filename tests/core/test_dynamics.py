@@ -6,9 +6,9 @@ import moving_truth as truth
 import numpy as np
 import pytest
 
-from core.dynamics import predict_torque, predict_wrench
-from core.loads import Loads
-from core.motion import Motion
+from gapbridge.core.dynamics import predict_torque, predict_wrench
+from gapbridge.core.loads import Loads
+from gapbridge.core.motion import Motion
 
 
 def motion_at(q, qd, qdd, loads):

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from test_equilibrium import SEVEN
 
-from core.arm import arm_from_dh, builtin_rows
-from core.dynamics import predict_torque, predict_tracking, predict_wrench, with_pieces
-from core.effects import CATALOGUE, CHANNELS, Site, Term, effect_named
-from core.errors import InputError
-from core.loads import Loads
-from core.log.log import Log
-from core.model import Model
-from core.motion import motion_of
+from gapbridge.core.arm import arm_from_dh, builtin_rows
+from gapbridge.core.dynamics import predict_torque, predict_tracking, predict_wrench, with_pieces
+from gapbridge.core.effects import CATALOGUE, CHANNELS, Site, Term, effect_named
+from gapbridge.core.errors import InputError
+from gapbridge.core.loads import Loads
+from gapbridge.core.log.log import Log
+from gapbridge.core.model import Model
+from gapbridge.core.motion import motion_of
 
 DH = {"ur10e": builtin_rows("ur10e")["dh"], "seven": SEVEN}
 WITHOUT_UNIT = ("ft_gain", "link_inertia", "load_friction", "torque_constant")  # shares
@@ -25,8 +25,8 @@ def test_name_file_class_and_identifier_are_one(name):
     member = CATALOGUE[name]
     words = "".join(word.capitalize() for word in name.split("_"))
     assert (member.identifier, type(member).__name__) == (name, words)
-    assert type(member).__module__ == f"core.effects.{name}"
-    module = importlib.import_module(f"core.effects.{name}")
+    assert type(member).__module__ == f"gapbridge.core.effects.{name}"
+    module = importlib.import_module(f"gapbridge.core.effects.{name}")
     assert getattr(module, words) is type(member)
 
 

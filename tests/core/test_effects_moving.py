@@ -6,9 +6,9 @@ import moving_truth as truth
 import numpy as np
 import pytest
 
-from core.dynamics import predict_torque, predict_tracking, predict_wrench, with_pieces
-from core.effects import CATALOGUE, Site, Term
-from core.motion import motion_of
+from gapbridge.core.dynamics import predict_torque, predict_tracking, predict_wrench, with_pieces
+from gapbridge.core.effects import CATALOGUE, Site, Term
+from gapbridge.core.motion import motion_of
 
 COURSE = truth.course(6, 3)
 WRENCH = ("ft_bias", "ft_drift", "ft_gain", "ft_misalignment", "payload")

@@ -7,10 +7,10 @@ from scipy.optimize import brentq, root
 from scipy.spatial.transform import Rotation
 from test_equilibrium import SEVEN
 
-from core.arm import arm_from_dh, builtin_rows
-from core.effects import CATALOGUE, Site, Term
-from core.loads import Loads
-from core.model import Model
+from gapbridge.core.arm import arm_from_dh, builtin_rows
+from gapbridge.core.effects import CATALOGUE, Site, Term
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 DH = {"ur10e": builtin_rows("ur10e")["dh"], "seven": SEVEN}
 TOOL = np.array([0.03, -0.05, 0.18])

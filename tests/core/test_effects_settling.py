@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from core.arm import builtin_arm
-from core.compensation import Compensator, correct
-from core.dynamics import predict_tracking
-from core.effects import Site, Term
-from core.loads import Loads
-from core.log.log import Log
-from core.model import Model
-from core.motion import motion_of
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.compensation import Compensator, correct
+from gapbridge.core.dynamics import predict_tracking
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.loads import Loads
+from gapbridge.core.log.log import Log
+from gapbridge.core.model import Model
+from gapbridge.core.motion import motion_of
 
 DROOP = [
     Term("servo_droop", Site(j + 1), (c,)) for j, c in enumerate([0, 4e-5, 5e-5, 2e-4, 3e-4, 0])

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from oracle import equilibrium as oracle
 
-from core.arm import arm_from_dh, builtin_rows
-from core.errors import InputError
-from core.loads import Loads
-from core.model import Model
+from gapbridge.core.arm import arm_from_dh, builtin_rows
+from gapbridge.core.errors import InputError
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 SEVEN = [
     {"a": 0.0, "alpha": -np.pi / 2, "d": 0.34, "offset": 0.3, "mass": 4.0, "cog": [0, 0.1, 0.03]},

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from core.files import read_bytes, read_text, recorded
+from gapbridge.core.files import read_bytes, read_text, recorded
 
 CODE = """
 import pickle, sys
 from pathlib import Path
-from core.files import is_file, read_bytes, read_only_from, read_text
+from gapbridge.core.files import is_file, read_bytes, read_only_from, read_text
 read_only_from(pickle.loads(sys.stdin.buffer.read()))
 path, link, other = map(Path, sys.argv[1:])
 assert read_text(path) == read_text(link) == "as it was", read_text(path)

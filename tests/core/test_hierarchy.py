@@ -9,15 +9,15 @@ import pytest
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from core.arm import builtin_arm
-from core.errors import ExcitationError
-from core.estimation.hierarchical import TypeFit, fit_type
-from core.estimation.hierarchical_evidence import Evidence, evidence
-from core.loads import Loads
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model
-from core.rotation import rotation_matrix, rotation_vector
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.errors import ExcitationError
+from gapbridge.core.estimation.hierarchical import TypeFit, fit_type
+from gapbridge.core.estimation.hierarchical_evidence import Evidence, evidence
+from gapbridge.core.loads import Loads
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 Array = NDArray[np.float64]
 AXIAL = np.array([3e-6, 8e-6, 7e-6, 1e-5, 1.2e-5, 2e-5])  # rad/Nm

@@ -5,8 +5,8 @@ import pytest
 from oracle import rigid
 from test_equilibrium import SEVEN
 
-from core.arm import arm_from_dh, builtin_arm, builtin_names, builtin_rows
-from core.model import Model
+from gapbridge.core.arm import arm_from_dh, builtin_arm, builtin_names, builtin_rows
+from gapbridge.core.model import Model
 
 TCP = np.array([0.03, -0.05, 0.18])
 ROWS = {name: builtin_rows(name)["dh"] for name in builtin_names()} | {"seven": SEVEN}

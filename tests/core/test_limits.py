@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from core.errors import LimitError
-from core.limits import CLAMPS, ENVELOPE, JOINT_LIMIT, JOINT_OFFSET, RATE, Limiter, Limits
+from gapbridge.core.errors import LimitError
+from gapbridge.core.limits import CLAMPS, ENVELOPE, JOINT_LIMIT, JOINT_OFFSET, RATE, Limiter, Limits
 
 Array = NDArray[np.float64]
 N = 6

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from core.arm import arm_from_dh, builtin_arm, builtin_names
-from core.load_bounds import GRAVITY, HEAVIEST, LEVER, STRONGEST, UNKNOWN, LoadBounds
-from core.model import Model
+from gapbridge.core.arm import arm_from_dh, builtin_arm, builtin_names
+from gapbridge.core.load_bounds import GRAVITY, HEAVIEST, LEVER, STRONGEST, UNKNOWN, LoadBounds
+from gapbridge.core.model import Model
 
 COG = np.array([0.0, 0.0, 0.05])
 

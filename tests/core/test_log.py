@@ -8,12 +8,12 @@ import pyarrow
 import pytest
 from pyarrow import parquet
 
-from core.arm import builtin_arm
-from core.diagnosis.log_checks.units_and_clocks import check_units
-from core.errors import LogError
-from core.log.log import last_motion, read_log
-from core.log.pieces import LogPieces
-from core.model import Model
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units
+from gapbridge.core.errors import LogError
+from gapbridge.core.log.log import last_motion, read_log
+from gapbridge.core.log.pieces import LogPieces
+from gapbridge.core.model import Model
 
 RECORDING = Path(__file__).parents[2] / ".." / "shared" / "data" / "rad_ur3e_rtde" / "log.csv"
 JOINTS = [f"actual_q_{i}" for i in range(6)]

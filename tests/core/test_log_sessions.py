@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from core.arm import builtin_arm
-from core.errors import LogError
-from core.log.log import Log
-from core.model import Model
-from core.motion import motion_of
-from core.ranges import merged, outside, range_of
-from core.sessions import join_sessions, session_of, sessions_in, with_sessions
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.errors import LogError
+from gapbridge.core.log.log import Log
+from gapbridge.core.model import Model
+from gapbridge.core.motion import motion_of
+from gapbridge.core.ranges import merged, outside, range_of
+from gapbridge.core.sessions import join_sessions, session_of, sessions_in, with_sessions
 
 MODEL = replace(
     Model(builtin_arm("ur5e")), payload_mass=2.5, payload_cog=np.array([0.0, 0.01, 0.05])

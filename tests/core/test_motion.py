@@ -8,9 +8,9 @@ import moving_truth as truth
 import numpy as np
 import pytest
 
-from core.derivatives import differentiate, signal_noise
-from core.errors import LogError
-from core.motion import motion_of, time_finding
+from gapbridge.core.derivatives import differentiate, signal_noise
+from gapbridge.core.errors import LogError
+from gapbridge.core.motion import motion_of, time_finding
 
 COURSE = truth.course(6, 1)
 ENCODER = 1.2e-5  # rad

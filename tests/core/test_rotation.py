@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from core.rotation import (
+from gapbridge.core.rotation import (
     one_rotation_matrix,
     rotation_matrix,
     rotation_vector,

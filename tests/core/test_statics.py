@@ -5,8 +5,8 @@ import pytest
 from oracle import rigid
 from test_kinematics import ROWS, TCP, model_of
 
-from core.loads import Loads
-from core.model import Model
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 
 @pytest.mark.parametrize("name", ROWS)

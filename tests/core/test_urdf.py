@@ -5,10 +5,10 @@ import pinocchio as pin
 import pytest
 from oracle import rigid
 
-from core.errors import ArmError
-from core.loads import Loads
-from core.model import Model
-from core.urdf import arm_from_urdf
+from gapbridge.core.errors import ArmError
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
+from gapbridge.core.urdf import arm_from_urdf
 
 INERTIA = '<inertia ixx="0.02" iyy="0.03" izz="0.01" ixy="0.001" ixz="0.002" iyz="-0.001"/>'
 AXES = ("0 0 1", "0 1 0", "0 -1 0", "1 0 0", "0.6 0 0.8", "0 0 -1", "-1 0 0")

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from bridge.cell.sections import link_settings
-from core.arm import Arm, builtin_arm
-from core.errors import LinkError
-from core.model import Model
-from drivers import DRIVERS, make_driver
-from drivers.driver import Driver, DriverSettings
+from gapbridge.bridge.cell.sections import link_settings
+from gapbridge.core.arm import Arm, builtin_arm
+from gapbridge.core.errors import LinkError
+from gapbridge.core.model import Model
+from gapbridge.drivers import DRIVERS, make_driver
+from gapbridge.drivers.driver import Driver, DriverSettings
 
 
 @pytest.fixture
@@ -72,7 +72,7 @@ def test_an_unknown_driver_is_told_with_those_that_exist(model: Model) -> None:
 
 
 def test_a_library_that_is_missing_is_told(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(DRIVERS, "ur_rtde", "drivers.nowhere:Nothing")
+    monkeypatch.setitem(DRIVERS, "ur_rtde", "gapbridge.drivers.nowhere:Nothing")
     with pytest.raises(LinkError, match="its library cannot be imported"):
         make_driver(link(), model)
 
@@ -97,8 +97,8 @@ def _grown(values: Any) -> Any:
 
 def test_a_robots_library_is_loaded_only_when_its_driver_connects() -> None:
     code = (
-        "import sys, drivers, bridge.cell.sections\n"
-        "import drivers.ur_rtde.driver\n"
+        "import sys, drivers, gapbridge.bridge.cell.sections\n"
+        "import gapbridge.drivers.ur_rtde.driver\n"
         "assert not {'rtde_receive', 'rtde_control', 'rtde_io'} & set(sys.modules)\n"
     )
     paths = [p for p in sys.path if p]

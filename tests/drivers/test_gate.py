@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from test_drivers import WIRED, link
 
-from bridge.cell.sections import LimitSettings
-from bridge.loop.setpoint_stream import gate_bounds, limits_of
-from core.arm import builtin_arm
-from core.errors import GateError, WriteError
-from core.limits import Limiter
-from core.model import Model
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers import DRIVERS, gate, make_driver
-from drivers.driver import GATED, Driver
-from drivers.gate import Gate, GateBounds
+from gapbridge.bridge.cell.sections import LimitSettings
+from gapbridge.bridge.loop.setpoint_stream import gate_bounds, limits_of
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.errors import GateError, WriteError
+from gapbridge.core.limits import Limiter
+from gapbridge.core.model import Model
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers import DRIVERS, gate, make_driver
+from gapbridge.drivers.driver import GATED, Driver
+from gapbridge.drivers.gate import Gate, GateBounds
 
 Q = np.array([0.0, -1.5, 1.8, -1.87, -1.57, 0.0])
 RATE = 500.0
@@ -129,7 +129,7 @@ def test_every_driver_of_the_table_has_its_write_from_the_base() -> None:
 
 def test_the_gate_shares_nothing_with_the_limiter() -> None:
     source = inspect.getsource(gate)
-    assert "core.limits" not in source.split('"""', 2)[2]
+    assert "gapbridge.core.limits" not in source.split('"""', 2)[2]
     assert "compensation" not in source
 
 

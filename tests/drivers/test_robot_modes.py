@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.arm import builtin_arm
-from drivers.robot_modes import MODES, modes_of
-from drivers.simulated.ur.modes import SAFETY_BITS
-from drivers.state_check import BEYOND, FASTEST, JITTER, JointCheck
+from gapbridge.core.arm import builtin_arm
+from gapbridge.drivers.robot_modes import MODES, modes_of
+from gapbridge.drivers.simulated.ur.modes import SAFETY_BITS
+from gapbridge.drivers.state_check import BEYOND, FASTEST, JITTER, JointCheck
 
 ARM = builtin_arm("ur10e")
 

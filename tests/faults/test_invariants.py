@@ -16,9 +16,9 @@ from benchmarks.faults.wire.modbus import ModbusDecoder
 from benchmarks.faults.wire.rtde import RtdeDecoder
 from benchmarks.faults.wire.seen import Fresh, Write
 from benchmarks.faults.wire.socketcand import PiperDecoder
-from drivers.simulated.plant.kinematics import frame_of
-from drivers.simulated.plant.plant_arm import plant_arm
-from drivers.simulated.ur.settings import START_Q
+from gapbridge.drivers.simulated.plant.kinematics import frame_of
+from gapbridge.drivers.simulated.plant.plant_arm import plant_arm
+from gapbridge.drivers.simulated.ur.settings import START_Q
 
 CYCLE = 0.008
 BOUNDS = Bounds(

@@ -13,7 +13,7 @@ from benchmarks.faults.mischief import Mischief, Outcome, changing, losing
 from benchmarks.faults.proxy import DOWN
 from benchmarks.faults.rig import Rig
 from benchmarks.faults.running import Running
-from core.errors import LinkError
+from gapbridge.core.errors import LinkError
 
 pytestmark = pytest.mark.slow
 STARTING = 60.0  # s that a busy machine takes for imports and compilation

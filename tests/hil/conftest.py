@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from bridge.cell import Cell, load_cell
-from core.errors import GapbridgeError
-from drivers import make_driver
-from drivers.driver import Driver
+from gapbridge.bridge.cell import Cell, load_cell
+from gapbridge.core.errors import GapbridgeError
+from gapbridge.drivers import make_driver
+from gapbridge.drivers.driver import Driver
 
 CONTRACT = Path(__file__).parents[1] / "drivers" / "contract"
 if str(CONTRACT) not in sys.path:

@@ -15,11 +15,11 @@ from contract_checks import (
     stream,
 )
 
-from bridge.cell import Cell
-from core.errors import WriteError
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.driver import Driver
+from gapbridge.bridge.cell import Cell
+from gapbridge.core.errors import WriteError
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.driver import Driver
 
 SHIFT = 2e-4  # m, along base z
 TURN = np.radians(0.5)  # of the last joint

@@ -30,7 +30,7 @@ def test_it_only_reads_unless_motion_is_allowed(tmp_path: Path) -> None:
     cell = tmp_path / "cell.yaml"
     cell.write_text(CELL % {"host": "127.9.8.7"})
     served = subprocess.Popen(
-        [sys.executable, "-m", "bridge.cli", "simulate", str(cell)],
+        [sys.executable, "-m", "gapbridge", "simulate", str(cell)],
         stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:

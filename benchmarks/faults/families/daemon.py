@@ -14,9 +14,9 @@ from benchmarks.faults.process_run import END_LIMIT, ProcessRun
 from benchmarks.faults.rig import RECOVERY_LIMIT, START_LIMIT, Rig
 from benchmarks.faults.row import Apart, Result, Row, seconds
 from benchmarks.faults.running import Running
-from bridge.loop.supervisor import State
-from core.errors import GapbridgeError
-from drivers import modbus
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.core.errors import GapbridgeError
+from gapbridge.drivers import modbus
 
 PROFILES = Path(modbus.__path__[0]) / "profiles"
 LONGEST_END = 1.8  # s from SIGTERM to the end, on a busy machine: 1 s of ramp, 0.4 s of patience

@@ -20,10 +20,10 @@ from benchmarks.faults.bad_model import FLAG
 from benchmarks.faults.links import LIMITS, Link, own_address
 from benchmarks.faults.rig import Rig
 from benchmarks.faults.row import Row, cycles, seconds
-from bridge.cell import load_cell
-from drivers.can_bus.bus import BusSettings
-from drivers.simulated.can.hub import Hub
-from drivers.simulated.ft_sensor.robotous_node import RobotousNode
+from gapbridge.bridge.cell import load_cell
+from gapbridge.drivers.can_bus.bus import BusSettings
+from gapbridge.drivers.simulated.can.hub import Hub
+from gapbridge.drivers.simulated.ft_sensor.robotous_node import RobotousNode
 
 MOVING, GOES_ON = ("ur_servoj", "can"), ("compensating",)
 REACH = 1.3  # m from the farthest joint's axis to the TCP, of the longer arm

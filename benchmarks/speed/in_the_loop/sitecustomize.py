@@ -7,12 +7,12 @@ go into a file that ``benchmarks.speed.loop`` has made and reads afterwards.
 import os
 import sys
 
-if "bridge.loop.main" in sys.orig_argv and "ADVANCE_TIMES" in os.environ:
+if "gapbridge.bridge.loop.main" in sys.orig_argv and "ADVANCE_TIMES" in os.environ:
     import time
 
     import numpy as np
 
-    from bridge.loop.setpoint_stream import SetpointStream
+    from gapbridge.bridge.loop.setpoint_stream import SetpointStream
 
     taken = np.memmap(os.environ["ADVANCE_TIMES"], dtype=np.float64, mode="r+").reshape(-1, 2)
     taken[:] = 0.0  # all pages are there before the loop begins

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.kernels.reference import Chain, Rows
+from gapbridge.core.kernels.reference import Chain, Rows
 
 Array = NDArray[np.float64]
 

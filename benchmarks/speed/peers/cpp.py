@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.kernels.reference import Chain, Rows
+from gapbridge.core.kernels.reference import Chain, Rows
 
 Array = NDArray[np.float64]
 FLAGS = ("-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-shared", "-fPIC")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.kernels.reference import Chain, Rows
+from gapbridge.core.kernels.reference import Chain, Rows
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import pinocchio
 from numba import njit
 from numpy.typing import NDArray
 
-from core.kernels.reference import Chain, Rows
+from gapbridge.core.kernels.reference import Chain, Rows
 
 Array = NDArray[np.float64]
 

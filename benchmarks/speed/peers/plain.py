@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from core.kernels.reference import Chain, Rows
+from gapbridge.core.kernels.reference import Chain, Rows
 
 Array = NDArray[np.float64]
 ROUNDS = 60

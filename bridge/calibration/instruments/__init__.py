@@ -6,10 +6,10 @@ import importlib
 from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
-    from bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
-    from bridge.cell.settings.instruments import InstrumentSettings
+    from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
+    from gapbridge.bridge.cell.settings.instruments import InstrumentSettings
 
-_HERE = "bridge.calibration.instruments"
+_HERE = "gapbridge.bridge.calibration.instruments"
 INSTRUMENTS: dict[str, str] = {
     "typed": f"{_HERE}.manual:Typed",
     "file": f"{_HERE}.file:File",

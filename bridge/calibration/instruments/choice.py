@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
-from bridge.calibration.instruments import INSTRUMENTS
-from bridge.cell.settings.instruments import InstrumentSettings
-from core.errors import InputError
+from gapbridge.bridge.calibration.instruments import INSTRUMENTS
+from gapbridge.bridge.cell.settings.instruments import InstrumentSettings
+from gapbridge.core.errors import InputError
 
 if TYPE_CHECKING:
-    from bridge.cell import Cell
+    from gapbridge.bridge.cell import Cell
 
 _SETTINGS: TypeAdapter[InstrumentSettings] = TypeAdapter(InstrumentSettings)
 

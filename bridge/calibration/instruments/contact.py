@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from bridge.calibration.instruments.instrument import Instrument, Samples, Where
-from bridge.cell.settings.instruments import SphereSettings
+from gapbridge.bridge.calibration.instruments.instrument import Instrument, Samples, Where
+from gapbridge.bridge.cell.settings.instruments import SphereSettings
 
 
 class Sphere(Instrument[SphereSettings]):

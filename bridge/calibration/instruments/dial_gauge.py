@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from bridge.calibration.instruments.instrument import Instrument, ReadingError, Samples, Where
-from bridge.calibration.instruments.numbers import FARTHEST, numbers
-from bridge.cell.settings.instruments import METRES, DialGaugeSettings
+from gapbridge.bridge.calibration.instruments.instrument import (
+    Instrument,
+    ReadingError,
+    Samples,
+    Where,
+)
+from gapbridge.bridge.calibration.instruments.numbers import FARTHEST, numbers
+from gapbridge.bridge.cell.settings.instruments import METRES, DialGaugeSettings
 
 
 class DialGauge(Instrument[DialGaugeSettings]):

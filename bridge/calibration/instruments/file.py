@@ -6,11 +6,16 @@ import time
 
 import numpy as np
 
-from bridge.calibration.instruments.instrument import Instrument, ReadingError, Samples, Where
-from bridge.calibration.instruments.numbers import coordinates
-from bridge.calibration.instruments.table import Row, Table, read_table
-from bridge.cell.settings.instruments import FileSettings
-from core.errors import InputError
+from gapbridge.bridge.calibration.instruments.instrument import (
+    Instrument,
+    ReadingError,
+    Samples,
+    Where,
+)
+from gapbridge.bridge.calibration.instruments.numbers import coordinates
+from gapbridge.bridge.calibration.instruments.table import Row, Table, read_table
+from gapbridge.bridge.cell.settings.instruments import FileSettings
+from gapbridge.core.errors import InputError
 
 LOOK = 0.1  # s between two looks at the file
 

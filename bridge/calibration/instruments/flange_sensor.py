@@ -6,8 +6,13 @@ from typing import Self
 
 import numpy as np
 
-from bridge.calibration.instruments.instrument import Instrument, Samples, Surroundings, Where
-from bridge.cell.settings.instruments import Base
+from gapbridge.bridge.calibration.instruments.instrument import (
+    Instrument,
+    Samples,
+    Surroundings,
+    Where,
+)
+from gapbridge.bridge.cell.settings.instruments import Base
 
 
 class FlangeSensor(Instrument[Base]):

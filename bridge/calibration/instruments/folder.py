@@ -7,11 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from bridge.calibration.instruments.instrument import Instrument, ReadingError, Samples, Where
-from bridge.calibration.instruments.numbers import coordinates
-from bridge.calibration.instruments.table import read_table
-from bridge.cell.settings.instruments import FolderSettings
-from core.errors import InputError
+from gapbridge.bridge.calibration.instruments.instrument import (
+    Instrument,
+    ReadingError,
+    Samples,
+    Where,
+)
+from gapbridge.bridge.calibration.instruments.numbers import coordinates
+from gapbridge.bridge.calibration.instruments.table import read_table
+from gapbridge.bridge.cell.settings.instruments import FolderSettings
+from gapbridge.core.errors import InputError
 
 LOOK = 0.1  # s between two looks into the folder
 WHOLE = 0.3  # s for which a file must not have grown

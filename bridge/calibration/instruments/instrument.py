@@ -10,7 +10,7 @@ from typing import Any, Generic, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell.settings.instruments import Base
+from gapbridge.bridge.cell.settings.instruments import Base
 
 Array = NDArray[np.float64]
 S = TypeVar("S", bound=Base)

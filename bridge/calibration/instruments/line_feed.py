@@ -7,10 +7,15 @@ import time
 
 import numpy as np
 
-from bridge.calibration.instruments.instrument import Instrument, ReadingError, Samples, Where
-from bridge.calibration.instruments.numbers import coordinates, numbers
-from bridge.cell.settings.instruments import LineFeedSettings
-from core.errors import LinkError
+from gapbridge.bridge.calibration.instruments.instrument import (
+    Instrument,
+    ReadingError,
+    Samples,
+    Where,
+)
+from gapbridge.bridge.calibration.instruments.numbers import coordinates, numbers
+from gapbridge.bridge.cell.settings.instruments import LineFeedSettings
+from gapbridge.core.errors import LinkError
 
 LONGEST_LINE = 4096  # bytes
 CONNECTING = 5.0  # s

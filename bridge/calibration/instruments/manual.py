@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from bridge.calibration.instruments.instrument import Instrument, Samples, Where
-from bridge.calibration.instruments.numbers import coordinates, numbers
-from bridge.cell.settings.instruments import TypedSettings
+from gapbridge.bridge.calibration.instruments.instrument import Instrument, Samples, Where
+from gapbridge.bridge.calibration.instruments.numbers import coordinates, numbers
+from gapbridge.bridge.cell.settings.instruments import TypedSettings
 
 
 class Typed(Instrument[TypedSettings]):

@@ -8,9 +8,9 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.instruments.instrument import ReadingError
-from bridge.cell.settings.instruments import METRES, RADIANS, Coordinates
-from core.rotation import rotation_vector, rpy_matrix
+from gapbridge.bridge.calibration.instruments.instrument import ReadingError
+from gapbridge.bridge.cell.settings.instruments import METRES, RADIANS, Coordinates
+from gapbridge.core.rotation import rotation_vector, rpy_matrix
 
 Array = NDArray[np.float64]
 FARTHEST = 100.0  # m: no instrument of this kind looks farther

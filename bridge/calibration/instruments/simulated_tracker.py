@@ -6,9 +6,9 @@ import socket
 
 import numpy as np
 
-from bridge.calibration.instruments.instrument import Instrument, Samples, Where
-from bridge.cell.settings.instruments import SimulatedTrackerSettings
-from core.errors import LinkError
+from gapbridge.bridge.calibration.instruments.instrument import Instrument, Samples, Where
+from gapbridge.bridge.cell.settings.instruments import SimulatedTrackerSettings
+from gapbridge.core.errors import LinkError
 
 PERIOD_LIMIT = 5.0  # s
 

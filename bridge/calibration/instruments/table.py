@@ -7,9 +7,9 @@ import io
 from dataclasses import dataclass
 from pathlib import Path
 
-from bridge.calibration.instruments.instrument import ReadingError
-from bridge.calibration.instruments.numbers import numbers
-from core.errors import InputError
+from gapbridge.bridge.calibration.instruments.instrument import ReadingError
+from gapbridge.bridge.calibration.instruments.numbers import numbers
+from gapbridge.core.errors import InputError
 
 STOP = "stop"  # name of the column that tells which stop of the plan a row belongs to
 

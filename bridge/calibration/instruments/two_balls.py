@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from bridge.calibration.instruments.instrument import Instrument, ReadingError, Samples, Where
-from bridge.calibration.instruments.numbers import numbers
-from bridge.cell.settings.instruments import METRES, TwoBallsSettings
+from gapbridge.bridge.calibration.instruments.instrument import (
+    Instrument,
+    ReadingError,
+    Samples,
+    Where,
+)
+from gapbridge.bridge.calibration.instruments.numbers import numbers
+from gapbridge.bridge.cell.settings.instruments import METRES, TwoBallsSettings
 
 NEAREST = 1e-3  # m between two balls
 

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.format import duration, load_text, millimetres, parameter
-from bridge.calibration.jobs.fitting import fitted, tell_calibration
-from bridge.calibration.jobs.job import Job, write_document
-from bridge.calibration.jobs.log_of import write_log
-from bridge.calibration.planning import metrology_of, planned
-from bridge.calibration.session.pace import seconds_left
-from core.calibration.plan import Plan
-from core.calibration.promise import document_of
-from core.calibration.result import Calibration, Errors
+from gapbridge.bridge.calibration.format import duration, load_text, millimetres, parameter
+from gapbridge.bridge.calibration.jobs.fitting import fitted, tell_calibration
+from gapbridge.bridge.calibration.jobs.job import Job, write_document
+from gapbridge.bridge.calibration.jobs.log_of import write_log
+from gapbridge.bridge.calibration.planning import metrology_of, planned
+from gapbridge.bridge.calibration.session.pace import seconds_left
+from gapbridge.core.calibration.plan import Plan
+from gapbridge.core.calibration.promise import document_of
+from gapbridge.core.calibration.result import Calibration, Errors
 
 Array = NDArray[np.float64]
 REFITS = 3  # times at most that the readings may ask for more
@@ -112,8 +112,10 @@ class WholeJob(Job):
         write_log(found.readings, metrology.registered, folder / "readings.csv")
         promise = document_of(found, sigma=metrology.sigma)
         write_document(folder / "promise.json", promise)
-        from bridge.calibration.jobs.facts import session_facts  # pictures take their time
-        from bridge.calibration.report import write_report
+        from gapbridge.bridge.calibration.jobs.facts import (
+            session_facts,  # pictures take their time
+        )
+        from gapbridge.bridge.calibration.report import write_report
 
         facts = session_facts(self.cell, order, self.book)
         for file in write_report(found, self.book.plan, facts, folder):

@@ -6,10 +6,10 @@ from datetime import datetime
 
 import numpy as np
 
-from bridge.calibration.options import Order
-from bridge.calibration.report import InstrumentFacts, SessionFacts
-from bridge.calibration.session.session import Book
-from bridge.cell import Cell
+from gapbridge.bridge.calibration.options import Order
+from gapbridge.bridge.calibration.report import InstrumentFacts, SessionFacts
+from gapbridge.bridge.calibration.session.session import Book
+from gapbridge.bridge.cell import Cell
 
 NAMES = {
     "typed": "readings typed at the terminal",

@@ -6,15 +6,15 @@ import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from bridge.calibration.format import TOLD_IN, figure, millimetres
-from bridge.calibration.options import Order
-from bridge.calibration.planning import effects_of, metrology_of, observable_of
-from bridge.calibration.session.prompt import Talk
-from bridge.calibration.session.session import Book
-from bridge.cell import Cell
-from core.calibration.fit import calibrate
-from core.calibration.parameters import Parameters
-from core.calibration.result import Calibration, Errors
+from gapbridge.bridge.calibration.format import TOLD_IN, figure, millimetres
+from gapbridge.bridge.calibration.options import Order
+from gapbridge.bridge.calibration.planning import effects_of, metrology_of, observable_of
+from gapbridge.bridge.calibration.session.prompt import Talk
+from gapbridge.bridge.calibration.session.session import Book
+from gapbridge.bridge.cell import Cell
+from gapbridge.core.calibration.fit import calibrate
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.result import Calibration, Errors
 
 LEAST_TOLD = 2e-6  # m: a repeatability below this is none that was seen
 DIAGNOSED = ("position", "pose")  # kinds whose remainder the diagnosis can judge

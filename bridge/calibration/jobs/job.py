@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.instruments import make_instrument
-from bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
-from bridge.calibration.options import Order
-from bridge.calibration.planning import effects_of, loads_of, metrology_of
-from bridge.calibration.session.prompt import Talk
-from bridge.calibration.session.reading_check import Foresight
-from bridge.calibration.session.session import Book
-from bridge.cell import Cell, save_cell
-from bridge.document.output_file import require_writable, write_text
-from core.calibration.plan import Expectation, Payload, Plan, PlannedPose
-from core.model import Model
+from gapbridge.bridge.calibration.instruments import make_instrument
+from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
+from gapbridge.bridge.calibration.options import Order
+from gapbridge.bridge.calibration.planning import effects_of, loads_of, metrology_of
+from gapbridge.bridge.calibration.session.prompt import Talk
+from gapbridge.bridge.calibration.session.reading_check import Foresight
+from gapbridge.bridge.calibration.session.session import Book
+from gapbridge.bridge.cell import Cell, save_cell
+from gapbridge.bridge.document.output_file import require_writable, write_text
+from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 NO_EXPECTATION = Expectation((), (), np.zeros(0), np.zeros(0), float("nan"), float("nan"))

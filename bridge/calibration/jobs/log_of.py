@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bridge.document.output_file import write_table
-from core.calibration.readings import Readings
+from gapbridge.bridge.document.output_file import write_table
+from gapbridge.core.calibration.readings import Readings
 
 
 def write_log(readings: Readings, registered: bool, path: Path) -> None:

@@ -7,19 +7,19 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.format import figure
-from bridge.calibration.instruments.flange_sensor import FlangeSensor
-from bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
-from bridge.calibration.jobs.job import Job, bare_plan
-from bridge.calibration.options import Order
-from bridge.calibration.session.prompt import Talk
-from bridge.calibration.session.reading_check import Foresight
-from bridge.calibration.session.session import Book
-from bridge.cell import Cell
-from core.calibration.payload_session import calibrate_payload
-from core.calibration.plan import Expectation, Payload, Plan, PlannedPose
-from core.errors import CellError
-from core.planning.payload_plan import plan_payload
+from gapbridge.bridge.calibration.format import figure
+from gapbridge.bridge.calibration.instruments.flange_sensor import FlangeSensor
+from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
+from gapbridge.bridge.calibration.jobs.job import Job, bare_plan
+from gapbridge.bridge.calibration.options import Order
+from gapbridge.bridge.calibration.session.prompt import Talk
+from gapbridge.bridge.calibration.session.reading_check import Foresight
+from gapbridge.bridge.calibration.session.session import Book
+from gapbridge.bridge.cell import Cell
+from gapbridge.core.calibration.payload_session import calibrate_payload
+from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
+from gapbridge.core.errors import CellError
+from gapbridge.core.planning.payload_plan import plan_payload
 
 Array = NDArray[np.float64]
 
@@ -81,8 +81,8 @@ class PayloadJob(Job):
             )
         for note in found.notes:
             talk.say(f"  note: {note}")
-        from bridge.calibration.jobs.facts import session_facts
-        from bridge.calibration.report import write_payload
+        from gapbridge.bridge.calibration.jobs.facts import session_facts
+        from gapbridge.bridge.calibration.report import write_payload
 
         facts = session_facts(
             self.cell, self.order, self.book, ("the force sensor of the flange", "wrench")

@@ -6,17 +6,17 @@ import importlib
 from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
-    from bridge.calibration.jobs.job import Job
-    from bridge.calibration.options import Order
-    from bridge.calibration.session.prompt import Talk
-    from bridge.calibration.session.session import Book
-    from bridge.cell import Cell
+    from gapbridge.bridge.calibration.jobs.job import Job
+    from gapbridge.bridge.calibration.options import Order
+    from gapbridge.bridge.calibration.session.prompt import Talk
+    from gapbridge.bridge.calibration.session.session import Book
+    from gapbridge.bridge.cell import Cell
 
 JOBS: dict[str, str] = {
-    "whole": "bridge.calibration.jobs.calibrate:WholeJob",
-    "verify": "bridge.calibration.jobs.verify:VerifyJob",
-    "payload": "bridge.calibration.jobs.payload:PayloadJob",
-    "tool": "bridge.calibration.jobs.tool:ToolJob",
+    "whole": "gapbridge.bridge.calibration.jobs.calibrate:WholeJob",
+    "verify": "gapbridge.bridge.calibration.jobs.verify:VerifyJob",
+    "payload": "gapbridge.bridge.calibration.jobs.payload:PayloadJob",
+    "tool": "gapbridge.bridge.calibration.jobs.tool:ToolJob",
 }
 """Order.kind -> ``module:Class``, imported on use."""
 

@@ -8,21 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bridge.calibration.format import millimetres
-from bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
-from bridge.calibration.instruments.point import TipOnPoint
-from bridge.calibration.jobs.job import Job, bare_plan
-from bridge.calibration.options import Order
-from bridge.calibration.planning import loads_of
-from bridge.calibration.session.prompt import Talk
-from bridge.calibration.session.reading_check import Foresight
-from bridge.calibration.session.session import Book
-from bridge.cell import Cell
-from bridge.cell.settings.instruments import PointSettings
-from core.calibration.plan import Plan, PlannedPose
-from core.calibration.tool_session import calibrate_tool
-from core.errors import CellError
-from core.planning.tool_plan import plan_tool
+from gapbridge.bridge.calibration.format import millimetres
+from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
+from gapbridge.bridge.calibration.instruments.point import TipOnPoint
+from gapbridge.bridge.calibration.jobs.job import Job, bare_plan
+from gapbridge.bridge.calibration.options import Order
+from gapbridge.bridge.calibration.planning import loads_of
+from gapbridge.bridge.calibration.session.prompt import Talk
+from gapbridge.bridge.calibration.session.reading_check import Foresight
+from gapbridge.bridge.calibration.session.session import Book
+from gapbridge.bridge.cell import Cell
+from gapbridge.bridge.cell.settings.instruments import PointSettings
+from gapbridge.core.calibration.plan import Plan, PlannedPose
+from gapbridge.core.calibration.tool_session import calibrate_tool
+from gapbridge.core.errors import CellError
+from gapbridge.core.planning.tool_plan import plan_tool
 
 Array = NDArray[np.float64]
 POSES = 6
@@ -80,8 +80,8 @@ class ToolJob(Job):
             )
         for note in found.notes:
             talk.say(f"  note: {note}")
-        from bridge.calibration.jobs.facts import session_facts
-        from bridge.calibration.report import write_tool
+        from gapbridge.bridge.calibration.jobs.facts import session_facts
+        from gapbridge.bridge.calibration.report import write_tool
 
         facts = session_facts(self.cell, self.order, self.book, ("tip on a fixed point", "touch"))
         for file in write_tool(found, facts, self.folder, model):

@@ -10,24 +10,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.format import duration, millimetres, parameter
-from bridge.calibration.jobs.calibrate import promise_beside
-from bridge.calibration.jobs.job import Job, bare_plan
-from bridge.calibration.jobs.log_of import write_log
-from bridge.calibration.planning import (
+from gapbridge.bridge.calibration.format import duration, millimetres, parameter
+from gapbridge.bridge.calibration.jobs.calibrate import promise_beside
+from gapbridge.bridge.calibration.jobs.job import Job, bare_plan
+from gapbridge.bridge.calibration.jobs.log_of import write_log
+from gapbridge.bridge.calibration.planning import (
     loads_of,
     metrology_of,
     observable_of,
     space_of,
     with_loads,
 )
-from bridge.calibration.session.pace import seconds_left
-from core.calibration.plan import Plan, PlannedPose
-from core.calibration.promise import promise_in
-from core.calibration.verify import Verification, verify
-from core.errors import InputError
-from core.planning.candidates import candidates_of
-from core.planning.travel import joint_speed, leg_times, shortest_way
+from gapbridge.bridge.calibration.session.pace import seconds_left
+from gapbridge.core.calibration.plan import Plan, PlannedPose
+from gapbridge.core.calibration.promise import promise_in
+from gapbridge.core.calibration.verify import Verification, verify
+from gapbridge.core.errors import InputError
+from gapbridge.core.planning.candidates import candidates_of
+from gapbridge.core.planning.travel import joint_speed, leg_times, shortest_way
 
 Array = NDArray[np.float64]
 POSES = 10
@@ -102,8 +102,8 @@ class VerifyJob(Job):
         talk.say()
         self._tell(found)
         write_log(readings, metrology.registered, folder / "readings.csv")
-        from bridge.calibration.jobs.facts import session_facts
-        from bridge.calibration.report import write_verification
+        from gapbridge.bridge.calibration.jobs.facts import session_facts
+        from gapbridge.bridge.calibration.report import write_verification
 
         facts = session_facts(self.cell, order, self.book)
         for file in write_verification(found, facts, folder, readings):

@@ -11,10 +11,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.instruments.instrument import Ask, ReadingError
-from bridge.calibration.instruments.numbers import numbers
-from core.calibration.plan import PlannedPose
-from core.errors import RunError
+from gapbridge.bridge.calibration.instruments.instrument import Ask, ReadingError
+from gapbridge.bridge.calibration.instruments.numbers import numbers
+from gapbridge.core.calibration.plan import PlannedPose
+from gapbridge.core.errors import RunError
 
 Array = NDArray[np.float64]
 

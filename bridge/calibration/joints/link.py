@@ -14,19 +14,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.instruments.instrument import ReadingError
-from bridge.calibration.joints.joint_source import JointSource, Stand
-from bridge.calibration.joints.move import write_move
-from bridge.calibration.joints.watched_run import WatchedRun
-from bridge.cell import Cell, load_cell
-from bridge.cell.daemon_settings import DaemonSettings
-from bridge.cell.sections import SetpointSettings
-from bridge.cell.settings.recording import RecordingSettings
-from bridge.daemon.daemon import settings_of
-from bridge.ipc.shared_memory import Phase
-from bridge.loop.supervisor import State
-from core.calibration.plan import PlannedPose
-from core.errors import LinkError, RunError
+from gapbridge.bridge.calibration.instruments.instrument import ReadingError
+from gapbridge.bridge.calibration.joints.joint_source import JointSource, Stand
+from gapbridge.bridge.calibration.joints.move import write_move
+from gapbridge.bridge.calibration.joints.watched_run import WatchedRun
+from gapbridge.bridge.cell import Cell, load_cell
+from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.cell.sections import SetpointSettings
+from gapbridge.bridge.cell.settings.recording import RecordingSettings
+from gapbridge.bridge.daemon.daemon import settings_of
+from gapbridge.bridge.ipc.shared_memory import Phase
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.core.calibration.plan import PlannedPose
+from gapbridge.core.errors import LinkError, RunError
 
 Array = NDArray[np.float64]
 STILL = 0.003  # rad/s: slower than this, the arm stands
@@ -56,7 +56,8 @@ class LinkedJoints(JointSource):
             update={
                 "recording": RecordingSettings(folder=None), "web": None, "metrics": None,
                 "setpoints": SetpointSettings(source="target"),
-                "model_source": "bridge.calibration.joints.link:uncorrected", "uncorrected": True,
+                "model_source": "gapbridge.bridge.calibration.joints.link:uncorrected",
+                "uncorrected": True,
             }
         )  # fmt: skip
         self._run: WatchedRun | None = None

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.document.output_file import write_table
+from gapbridge.bridge.document.output_file import write_table
 
 Array = NDArray[np.float64]
 PERIOD = 0.01  # s; between rows the daemon's source goes straight

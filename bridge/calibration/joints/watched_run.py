@@ -7,10 +7,10 @@ import threading
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell.daemon_settings import DaemonSettings
-from bridge.daemon.daemon import Daemon
-from bridge.ipc.shared_memory import PageReader
-from core.errors import GapbridgeError, LinkError
+from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.daemon.daemon import Daemon
+from gapbridge.bridge.ipc.shared_memory import PageReader
+from gapbridge.core.errors import GapbridgeError, LinkError
 
 Array = NDArray[np.float64]
 KEPT = 20.0  # s of cycles that are kept

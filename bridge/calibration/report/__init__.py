@@ -1,7 +1,7 @@
 """Reports of calibration sessions, for customers: one HTML file and a PDF."""
 
-from bridge.calibration.report.facts import InstrumentFacts, SessionFacts
-from bridge.calibration.report.report import (
+from gapbridge.bridge.calibration.report.facts import InstrumentFacts, SessionFacts
+from gapbridge.bridge.calibration.report.report import (
     write_payload,
     write_report,
     write_tool,

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.report.figures import degrees, fixed
-from bridge.calibration.report.material import Material
-from bridge.document.blocks import Block, Cell, Table
-from bridge.document.section import Section
+from gapbridge.bridge.calibration.report.figures import degrees, fixed
+from gapbridge.bridge.calibration.report.material import Material
+from gapbridge.bridge.document.blocks import Block, Cell, Table
+from gapbridge.bridge.document.section import Section
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

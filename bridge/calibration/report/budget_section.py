@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from bridge.calibration.report.figures import fine, mm
-from bridge.calibration.report.material import Material
-from bridge.calibration.report.names import parameter_words
-from bridge.document.blocks import (
+from gapbridge.bridge.calibration.report.figures import fine, mm
+from gapbridge.bridge.calibration.report.material import Material
+from gapbridge.bridge.calibration.report.names import parameter_words
+from gapbridge.bridge.document.blocks import (
     Bar,
     Block,
     Bullets,
@@ -17,10 +17,10 @@ from bridge.document.blocks import (
     Strong,
     Table,
 )
-from bridge.document.section import Section
-from bridge.report.words import number, percent, told, unit_of
-from core.calibration.budget.budget import Budget, Input
-from core.calibration.budget.sensitivity import Sensitivities, Sensitivity
+from gapbridge.bridge.document.section import Section
+from gapbridge.bridge.report.words import number, percent, told, unit_of
+from gapbridge.core.calibration.budget.budget import Budget, Input
+from gapbridge.core.calibration.budget.sensitivity import Sensitivities, Sensitivity
 
 OUTSIDE = (
     "where the robot's base stands in the hall: everything here is seen from the base",

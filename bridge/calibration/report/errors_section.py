@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from bridge.calibration.report.figures import fixed, mm
-from bridge.calibration.report.material import Material
-from bridge.document.axes import Chart, logarithmic, named, scale, visible
-from bridge.document.blocks import Block, Paragraph, Pictures, Table
-from bridge.document.drawing import AFTER, BEFORE, Drawing
-from bridge.document.section import Section
-from core.calibration.result import Errors
+from gapbridge.bridge.calibration.report.figures import fixed, mm
+from gapbridge.bridge.calibration.report.material import Material
+from gapbridge.bridge.document.axes import Chart, logarithmic, named, scale, visible
+from gapbridge.bridge.document.blocks import Block, Paragraph, Pictures, Table
+from gapbridge.bridge.document.drawing import AFTER, BEFORE, Drawing
+from gapbridge.bridge.document.section import Section
+from gapbridge.core.calibration.result import Errors
 
 LEGEND = (("before", BEFORE), ("after", AFTER))
 

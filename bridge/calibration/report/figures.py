@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from bridge.document.axes import plain
-from bridge.report.words import unit_of
-from core.calibration.result import Estimate
+from gapbridge.bridge.document.axes import plain
+from gapbridge.bridge.report.words import unit_of
+from gapbridge.core.calibration.result import Estimate
 
 
 def mm(length: float) -> str:

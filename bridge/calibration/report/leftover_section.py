@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 
-from bridge.calibration.report.figures import degrees
-from bridge.calibration.report.material import Material
-from bridge.calibration.report.names import sentence
-from bridge.document.axes import plain
-from bridge.document.blocks import (
+from gapbridge.bridge.calibration.report.figures import degrees
+from gapbridge.bridge.calibration.report.material import Material
+from gapbridge.bridge.calibration.report.names import sentence
+from gapbridge.bridge.document.axes import plain
+from gapbridge.bridge.document.blocks import (
     DOUBTFUL,
     GOOD,
     QUIET,
@@ -20,11 +20,11 @@ from bridge.document.blocks import (
     Table,
     Verdict,
 )
-from bridge.document.section import Section
-from bridge.report.answer import one_line, sentences
-from bridge.report.material import chosen_channel
-from bridge.report.words import CHANNELS, effect_words, listed
-from core.diagnosis.diagnosis import Diagnosis
+from gapbridge.bridge.document.section import Section
+from gapbridge.bridge.report.answer import one_line, sentences
+from gapbridge.bridge.report.material import chosen_channel
+from gapbridge.bridge.report.words import CHANNELS, effect_words, listed
+from gapbridge.core.diagnosis.diagnosis import Diagnosis
 
 SHOWN = 8  # measurements proposed
 

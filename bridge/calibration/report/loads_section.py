@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.report.figures import load_words, mm
-from bridge.calibration.report.material import Material
-from bridge.document.axes import Chart, logarithmic, named, plain, visible
-from bridge.document.blocks import Block, Pictures, Table
-from bridge.document.drawing import AFTER, BEFORE, Drawing
-from bridge.document.section import Section
+from gapbridge.bridge.calibration.report.figures import load_words, mm
+from gapbridge.bridge.calibration.report.material import Material
+from gapbridge.bridge.document.axes import Chart, logarithmic, named, plain, visible
+from gapbridge.bridge.document.blocks import Block, Pictures, Table
+from gapbridge.bridge.document.drawing import AFTER, BEFORE, Drawing
+from gapbridge.bridge.document.section import Section
 
 Index = NDArray[np.int64]
 

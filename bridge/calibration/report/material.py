@@ -8,11 +8,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.report.facts import SessionFacts
-from core.calibration.budget.budget import Budget, Stated, budget, wild_readings
-from core.calibration.budget.pose_accuracy import KINDS, PoseAccuracy, pose_accuracies
-from core.calibration.plan import Plan
-from core.calibration.result import Calibration, Errors
+from gapbridge.bridge.calibration.report.facts import SessionFacts
+from gapbridge.core.calibration.budget.budget import Budget, Stated, budget, wild_readings
+from gapbridge.core.calibration.budget.pose_accuracy import KINDS, PoseAccuracy, pose_accuracies
+from gapbridge.core.calibration.plan import Plan
+from gapbridge.core.calibration.result import Calibration, Errors
 
 Array = NDArray[np.float64]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 
-from bridge.report.words import effect_words
-from core.effects import CATALOGUE
+from gapbridge.bridge.report.words import effect_words
+from gapbridge.core.effects import CATALOGUE
 
 OF_SESSIONS = {  # what sessions find that is no effect
     "tool_tcp": "tool centre {part}",

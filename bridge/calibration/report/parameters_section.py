@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from bridge.calibration.report.figures import decimals_of, estimate_words, fixed
-from bridge.calibration.report.material import Material
-from bridge.calibration.report.names import parameter_words, spoken
-from bridge.document.blocks import Block, Bullets, Cell, Heading, Paragraph, Table
-from bridge.document.section import Section
-from bridge.report.words import unit_of
-from core.calibration.result import Estimate
+from gapbridge.bridge.calibration.report.figures import decimals_of, estimate_words, fixed
+from gapbridge.bridge.calibration.report.material import Material
+from gapbridge.bridge.calibration.report.names import parameter_words, spoken
+from gapbridge.bridge.document.blocks import Block, Bullets, Cell, Heading, Paragraph, Table
+from gapbridge.bridge.document.section import Section
+from gapbridge.bridge.report.words import unit_of
+from gapbridge.core.calibration.result import Estimate
 
 
 class ParametersSection(Section[Material]):

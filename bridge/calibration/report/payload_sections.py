@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bridge.calibration.report.facts import SessionFacts
-from bridge.calibration.report.figures import fixed
-from bridge.calibration.report.names import sentence
-from bridge.calibration.report.parameters_section import estimates_table
-from bridge.calibration.report.session_section import facts_blocks
-from bridge.document.axes import Chart, named, scale
-from bridge.document.blocks import (
+from gapbridge.bridge.calibration.report.facts import SessionFacts
+from gapbridge.bridge.calibration.report.figures import fixed
+from gapbridge.bridge.calibration.report.names import sentence
+from gapbridge.bridge.calibration.report.parameters_section import estimates_table
+from gapbridge.bridge.calibration.report.session_section import facts_blocks
+from gapbridge.bridge.document.axes import Chart, named, scale
+from gapbridge.bridge.document.blocks import (
     DOUBTFUL,
     GOOD,
     Badge,
@@ -24,10 +24,10 @@ from bridge.document.blocks import (
     Tiles,
     Verdict,
 )
-from bridge.document.drawing import AFTER, BAD_DOT, Drawing
-from bridge.document.section import Section
-from core.calibration.payload_session import PayloadCalibration
-from core.model import Model
+from gapbridge.bridge.document.drawing import AFTER, BAD_DOT, Drawing
+from gapbridge.bridge.document.section import Section
+from gapbridge.core.calibration.payload_session import PayloadCalibration
+from gapbridge.core.model import Model
 
 
 @dataclass(frozen=True)

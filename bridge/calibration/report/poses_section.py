@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from bridge.calibration.report.figures import mm
-from bridge.calibration.report.material import Material
-from bridge.document.axes import Chart, scale
-from bridge.document.blocks import Block, Paragraph, Pictures
-from bridge.document.drawing import AFTER, EDGE, INK, LIMIT, Circle, Drawing
-from bridge.document.section import Section
-from bridge.report.arm_view import joint_origins
-from core.calibration.plan import Plan
+from gapbridge.bridge.calibration.report.figures import mm
+from gapbridge.bridge.calibration.report.material import Material
+from gapbridge.bridge.document.axes import Chart, scale
+from gapbridge.bridge.document.blocks import Block, Paragraph, Pictures
+from gapbridge.bridge.document.drawing import AFTER, EDGE, INK, LIMIT, Circle, Drawing
+from gapbridge.bridge.document.section import Section
+from gapbridge.bridge.report.arm_view import joint_origins
+from gapbridge.core.calibration.plan import Plan
 
 VIEWS = (("The poses, from above", 0, 1), ("The poses, from the side", 0, 2))
 AXES = ("x, m", "y, m", "z, m")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.report.figures import counted, fixed, mm, mrad
-from bridge.calibration.report.material import Material
-from bridge.document.axes import plain
-from bridge.document.blocks import Block, Paragraph, Table
-from bridge.document.section import Section
-from core.calibration.budget.pose_accuracy import PoseAccuracy
+from gapbridge.bridge.calibration.report.figures import counted, fixed, mm, mrad
+from gapbridge.bridge.calibration.report.material import Material
+from gapbridge.bridge.document.axes import plain
+from gapbridge.bridge.document.blocks import Block, Paragraph, Table
+from gapbridge.bridge.document.section import Section
+from gapbridge.core.calibration.budget.pose_accuracy import PoseAccuracy
 
 ASKED = 30  # visits that the standard asks for
 

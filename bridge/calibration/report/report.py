@@ -6,23 +6,26 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from bridge.calibration.report.facts import SessionFacts
-from bridge.calibration.report.material import Material
-from bridge.calibration.report.payload_sections import PAYLOAD, PayloadMaterial
-from bridge.calibration.report.sections import CALIBRATION
-from bridge.calibration.report.tool_sections import TOOL, ToolMaterial
-from bridge.calibration.report.verification_sections import VERIFICATION, VerificationMaterial
-from bridge.document.blocks import Document
-from bridge.document.html import html
-from bridge.document.output_file import replacing_bytes, write_text
-from bridge.document.section import Section
-from core.calibration.payload_session import PayloadCalibration
-from core.calibration.plan import Plan
-from core.calibration.readings import Readings
-from core.calibration.result import Calibration
-from core.calibration.tool_session import ToolCalibration
-from core.calibration.verify import Verification
-from core.model import Model
+from gapbridge.bridge.calibration.report.facts import SessionFacts
+from gapbridge.bridge.calibration.report.material import Material
+from gapbridge.bridge.calibration.report.payload_sections import PAYLOAD, PayloadMaterial
+from gapbridge.bridge.calibration.report.sections import CALIBRATION
+from gapbridge.bridge.calibration.report.tool_sections import TOOL, ToolMaterial
+from gapbridge.bridge.calibration.report.verification_sections import (
+    VERIFICATION,
+    VerificationMaterial,
+)
+from gapbridge.bridge.document.blocks import Document
+from gapbridge.bridge.document.html import html
+from gapbridge.bridge.document.output_file import replacing_bytes, write_text
+from gapbridge.bridge.document.section import Section
+from gapbridge.core.calibration.payload_session import PayloadCalibration
+from gapbridge.core.calibration.plan import Plan
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.calibration.result import Calibration
+from gapbridge.core.calibration.tool_session import ToolCalibration
+from gapbridge.core.calibration.verify import Verification
+from gapbridge.core.model import Model
 
 M = TypeVar("M")
 
@@ -87,7 +90,7 @@ def _document(
 
 
 def _written(document: Document, out: Path, name: str) -> tuple[Path, Path]:
-    from bridge.document.pdf import pdf
+    from gapbridge.bridge.document.pdf import pdf
 
     page, paper = out / f"{name}.html", out / f"{name}.pdf"
     write_text(page, html(document))

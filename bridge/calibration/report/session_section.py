@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from bridge.calibration.report.facts import SessionFacts
-from bridge.calibration.report.figures import load_words, mm
-from bridge.calibration.report.material import Material
-from bridge.calibration.report.names import sentence
-from bridge.document.axes import plain
-from bridge.document.blocks import Block, Bullets, Columns, Heading, Pairs
-from bridge.document.section import Section
+from gapbridge.bridge.calibration.report.facts import SessionFacts
+from gapbridge.bridge.calibration.report.figures import load_words, mm
+from gapbridge.bridge.calibration.report.material import Material
+from gapbridge.bridge.calibration.report.names import sentence
+from gapbridge.bridge.document.axes import plain
+from gapbridge.bridge.document.blocks import Block, Bullets, Columns, Heading, Pairs
+from gapbridge.bridge.document.section import Section
 
 KINDS = {
     "position": "position of a target on the tool, three coordinates",

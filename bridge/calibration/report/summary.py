@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from bridge.calibration.report.figures import mm
-from bridge.calibration.report.material import Material
-from bridge.calibration.report.names import sentence
-from bridge.document.blocks import (
+from gapbridge.bridge.calibration.report.figures import mm
+from gapbridge.bridge.calibration.report.material import Material
+from gapbridge.bridge.calibration.report.names import sentence
+from gapbridge.bridge.document.blocks import (
     BAD,
     DOUBTFUL,
     GOOD,
@@ -16,8 +16,8 @@ from bridge.document.blocks import (
     Tiles,
     Verdict,
 )
-from bridge.document.section import Section
-from bridge.report.words import listed
+from gapbridge.bridge.document.section import Section
+from gapbridge.bridge.report.words import listed
 
 
 class Summary(Section[Material]):

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bridge.calibration.report.facts import SessionFacts
-from bridge.calibration.report.figures import degrees, fixed, mm
-from bridge.calibration.report.names import parameter_words, sentence
-from bridge.calibration.report.parameters_section import estimates_table
-from bridge.calibration.report.session_section import facts_blocks
-from bridge.document.axes import Chart, named, scale
-from bridge.document.blocks import (
+from gapbridge.bridge.calibration.report.facts import SessionFacts
+from gapbridge.bridge.calibration.report.figures import degrees, fixed, mm
+from gapbridge.bridge.calibration.report.names import parameter_words, sentence
+from gapbridge.bridge.calibration.report.parameters_section import estimates_table
+from gapbridge.bridge.calibration.report.session_section import facts_blocks
+from gapbridge.bridge.document.axes import Chart, named, scale
+from gapbridge.bridge.document.blocks import (
     BAD,
     GOOD,
     Badge,
@@ -26,12 +26,12 @@ from bridge.document.blocks import (
     Tiles,
     Verdict,
 )
-from bridge.document.drawing import AFTER, EDGE, Drawing
-from bridge.document.section import Section
-from bridge.report.words import effect_words, likelihood
-from core.calibration.readings import Readings
-from core.calibration.verify import Suspect, Verification
-from core.effects import CATALOGUE
+from gapbridge.bridge.document.drawing import AFTER, EDGE, Drawing
+from gapbridge.bridge.document.section import Section
+from gapbridge.bridge.report.words import effect_words, likelihood
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.calibration.verify import Suspect, Verification
+from gapbridge.core.effects import CATALOGUE
 
 TWICE = 2.0  # promised deviations that an error hardly exceeds
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.report.figures import mm
-from bridge.calibration.report.material import Material
-from bridge.document.axes import Chart, scale
-from bridge.document.blocks import Block, Paragraph, Pictures, Table
-from bridge.document.drawing import AFTER, BEFORE, EDGE, INK, Circle, Drawing
-from bridge.document.section import Section
-from core.calibration.result import Errors
+from gapbridge.bridge.calibration.report.figures import mm
+from gapbridge.bridge.calibration.report.material import Material
+from gapbridge.bridge.document.axes import Chart, scale
+from gapbridge.bridge.document.blocks import Block, Paragraph, Pictures, Table
+from gapbridge.bridge.document.drawing import AFTER, BEFORE, EDGE, INK, Circle, Drawing
+from gapbridge.bridge.document.section import Section
+from gapbridge.core.calibration.result import Errors
 
 Array = NDArray[np.float64]
 LONGEST = 0.16  # of the workspace's size: how long a large error is drawn

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.instruments.instrument import AnyInstrument, ReadingError, Where
-from bridge.calibration.joints.joint_source import JointSource, Stand
-from core.calibration.plan import PlannedPose
-from core.errors import LinkError
-from core.rotation import rotation_matrix, rotation_vector
+from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, ReadingError, Where
+from gapbridge.bridge.calibration.joints.joint_source import JointSource, Stand
+from gapbridge.core.calibration.plan import PlannedPose
+from gapbridge.core.errors import LinkError
+from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 Array = NDArray[np.float64]
 

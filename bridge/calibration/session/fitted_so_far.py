@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from core.calibration.observables.nuisance import Nuisance
-from core.calibration.observables.observable import Observable
-from core.calibration.parameters import Parameters
-from core.calibration.readings import Readings
-from core.loads import Loads
-from core.model import Model
+from gapbridge.core.calibration.observables.nuisance import Nuisance
+from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 RARE = 1e-5  # chance with which a good reading is doubted

@@ -6,11 +6,11 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from bridge.calibration.options import Order
-from bridge.calibration.session.journal import FILE, VERSION, Entry, read_entries
-from bridge.cell import Cell
-from bridge.cell.settings.instruments import InstrumentSettings
-from core.errors import InputError
+from gapbridge.bridge.calibration.options import Order
+from gapbridge.bridge.calibration.session.journal import FILE, VERSION, Entry, read_entries
+from gapbridge.bridge.cell import Cell
+from gapbridge.bridge.cell.settings.instruments import InstrumentSettings
+from gapbridge.core.errors import InputError
 
 SAME = (
     "robot", "tool", "payload", "gravity", "reference_temperature", "compliance", "effects",

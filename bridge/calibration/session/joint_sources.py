@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bridge.calibration.instruments.instrument import Ask
-from bridge.calibration.joints.joint_source import JointSource, PlannedJoints, TypedJoints
-from bridge.calibration.options import Order
-from bridge.calibration.planning import TOUCHED
-from bridge.cell import Cell
-from core.errors import CellError
+from gapbridge.bridge.calibration.instruments.instrument import Ask
+from gapbridge.bridge.calibration.joints.joint_source import JointSource, PlannedJoints, TypedJoints
+from gapbridge.bridge.calibration.options import Order
+from gapbridge.bridge.calibration.planning import TOUCHED
+from gapbridge.bridge.cell import Cell
+from gapbridge.core.errors import CellError
 
 
 def make_joints(cell: Cell, order: Order, ask: Ask, folder: Path) -> JointSource:
@@ -30,6 +30,6 @@ def make_joints(cell: Cell, order: Order, ask: Ask, folder: Path) -> JointSource
             f"{cell.path}: link.driver: found {cell.link.driver!r}, which cannot move the arm; "
             "expected another for --move, or jog it"
         )
-    from bridge.calibration.joints.link import LinkedJoints
+    from gapbridge.bridge.calibration.joints.link import LinkedJoints
 
     return LinkedJoints(cell, given.settle, given.speed, folder, order.move)

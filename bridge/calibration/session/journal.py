@@ -16,8 +16,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from bridge.document.output_file import FOLDER_MODE, MODE
-from core.errors import InputError, RunError
+from gapbridge.bridge.document.output_file import FOLDER_MODE, MODE
+from gapbridge.core.errors import InputError, RunError
 
 FILE = "journal.jsonl"
 VERSION = 1

@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.format import force, millimetres, point
-from bridge.calibration.instruments.instrument import AnyInstrument, ReadingError, Where
-from bridge.calibration.joints.joint_source import Stand, TypedJoints
-from bridge.calibration.session.capture import Captured, capture
-from bridge.calibration.session.pace import header
-from bridge.calibration.session.positioning import Bringing
-from bridge.calibration.session.prompt import Talk, Word
-from bridge.calibration.session.reading import Taken
-from bridge.calibration.session.reading_check import NOTHING, Foresight, Verdict
-from bridge.calibration.session.revisit import look_back
-from bridge.calibration.session.session import Book
+from gapbridge.bridge.calibration.format import force, millimetres, point
+from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, ReadingError, Where
+from gapbridge.bridge.calibration.joints.joint_source import Stand, TypedJoints
+from gapbridge.bridge.calibration.session.capture import Captured, capture
+from gapbridge.bridge.calibration.session.pace import header
+from gapbridge.bridge.calibration.session.positioning import Bringing
+from gapbridge.bridge.calibration.session.prompt import Talk, Word
+from gapbridge.bridge.calibration.session.reading import Taken
+from gapbridge.bridge.calibration.session.reading_check import NOTHING, Foresight, Verdict
+from gapbridge.bridge.calibration.session.revisit import look_back
+from gapbridge.bridge.calibration.session.session import Book
 
 Array = NDArray[np.float64]
 SHAKY = 10.0  # times the instrument's sigma: samples that scatter more are doubted

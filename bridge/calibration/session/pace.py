@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from statistics import median
 
-from bridge.calibration.format import duration
-from bridge.calibration.session.session import Book
+from gapbridge.bridge.calibration.format import duration
+from gapbridge.bridge.calibration.session.session import Book
 
 FIRST = 60.0  # s a stop, before anyone knows
 PAUSE = 600.0  # s: a longer time between two readings was a pause

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from bridge.document.output_file import write_table
-from core.calibration.plan import Expectation, Payload, Plan, PlannedPose
+from gapbridge.bridge.document.output_file import write_table
+from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
 
 
 def plan_entry(plan: Plan) -> dict[str, Any]:

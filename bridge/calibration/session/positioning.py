@@ -7,14 +7,14 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.format import degrees, load_text
-from bridge.calibration.instruments.instrument import AnyInstrument, ReadingError
-from bridge.calibration.joints.joint_source import JointSource, PlannedJoints, Stand
-from bridge.calibration.session.prompt import Talk
-from bridge.calibration.session.route import route
-from bridge.calibration.session.session import Book
-from core.calibration.plan import PlannedPose
-from core.errors import RunError
+from gapbridge.bridge.calibration.format import degrees, load_text
+from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, ReadingError
+from gapbridge.bridge.calibration.joints.joint_source import JointSource, PlannedJoints, Stand
+from gapbridge.bridge.calibration.session.prompt import Talk
+from gapbridge.bridge.calibration.session.route import route
+from gapbridge.bridge.calibration.session.session import Book
+from gapbridge.core.calibration.plan import PlannedPose
+from gapbridge.core.errors import RunError
 
 Array = NDArray[np.float64]
 FAR = np.radians(3.0)  # an arm farther from the pose than this is asked about

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.session.fitted_so_far import AXES, FittedSoFar, here
-from core.calibration.observables import make_observable
-from core.calibration.parameters import Parameters
-from core.calibration.plan import Payload
-from core.calibration.readings import Readings
-from core.errors import GapbridgeError
-from core.metrology import Metrology
-from core.model import Model, Poses
+from gapbridge.bridge.calibration.session.fitted_so_far import AXES, FittedSoFar, here
+from gapbridge.core.calibration.observables import make_observable
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.plan import Payload
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.errors import GapbridgeError
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model, Poses
 
 Array = NDArray[np.float64]
 REPEATABILITY = 1e-4  # m, 1 sigma of one coordinate: of an arm of which nobody knows it

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.format import millimetres
-from bridge.calibration.session.reading import Taken
-from core.estimation.registration import register
+from gapbridge.bridge.calibration.format import millimetres
+from gapbridge.bridge.calibration.session.reading import Taken
+from gapbridge.core.estimation.registration import register
 
 if TYPE_CHECKING:
-    from bridge.calibration.session.measuring import Conversation
+    from gapbridge.bridge.calibration.session.measuring import Conversation
 
 Array = NDArray[np.float64]
 POSES = 3  # measured once more where the first of them has changed

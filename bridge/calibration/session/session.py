@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.session.journal import Entry, Journal
-from bridge.calibration.session.plan_document import plan_entry, plan_of
-from bridge.calibration.session.reading import Taken
-from core.calibration.plan import Plan, PlannedPose
-from core.calibration.readings import Readings
-from core.loads import Loads
+from gapbridge.bridge.calibration.session.journal import Entry, Journal
+from gapbridge.bridge.calibration.session.plan_document import plan_entry, plan_of
+from gapbridge.bridge.calibration.session.reading import Taken
+from gapbridge.core.calibration.plan import Plan, PlannedPose
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.loads import Loads
 
 Array = NDArray[np.float64]
 

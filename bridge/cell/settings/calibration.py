@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from bridge.cell.settings.instruments import InstrumentSettings, TypedSettings
+from gapbridge.bridge.cell.settings.instruments import InstrumentSettings, TypedSettings
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 NotNegative = Annotated[Number, Field(ge=0)]

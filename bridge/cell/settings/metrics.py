@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from bridge.served.settings import ServedSettings
+from gapbridge.bridge.served.settings import ServedSettings
 
 METRICS_PORT = 30390
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from bridge.demo.links.can import CanLink
-from bridge.demo.links.link import DemoLink
-from bridge.demo.links.modbus import ModbusLink
-from bridge.demo.links.ur_rtde import UrRtdeLink
-from core.errors import InputError
+from gapbridge.bridge.demo.links.can import CanLink
+from gapbridge.bridge.demo.links.link import DemoLink
+from gapbridge.bridge.demo.links.modbus import ModbusLink
+from gapbridge.bridge.demo.links.ur_rtde import UrRtdeLink
+from gapbridge.core.errors import InputError
 
 LINKS: dict[str, type[DemoLink]] = {link.name: link for link in (UrRtdeLink, CanLink, ModbusLink)}
 

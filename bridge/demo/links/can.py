@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.daemon.daemon import Daemon
-from bridge.demo.links.peer import PeerLink
-from bridge.demo.poses import Load, Scene, Workspace
-from bridge.demo.result import Resolution, reach
-from bridge.demo.trajectory import visits, write_trajectory
-from drivers.can.loading import read_profile
-from drivers.can.settings import CanSettings
-from drivers.can_bus.bus import SOCKETCAND_PORT
-from drivers.simulated.plant.plant_arm import plant_arm
-from drivers.simulated.plant.plant_settings import draw_plant_settings
-from drivers.simulated.ur.settings import BENCH_PORT
+from gapbridge.bridge.daemon.daemon import Daemon
+from gapbridge.bridge.demo.links.peer import PeerLink
+from gapbridge.bridge.demo.poses import Load, Scene, Workspace
+from gapbridge.bridge.demo.result import Resolution, reach
+from gapbridge.bridge.demo.trajectory import visits, write_trajectory
+from gapbridge.drivers.can.loading import read_profile
+from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.can_bus.bus import SOCKETCAND_PORT
+from gapbridge.drivers.simulated.plant.plant_arm import plant_arm
+from gapbridge.drivers.simulated.plant.plant_settings import draw_plant_settings
+from gapbridge.drivers.simulated.ur.settings import BENCH_PORT
 
 Array = NDArray[np.float64]
 SOFTNESS = 40.0

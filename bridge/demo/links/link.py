@@ -13,14 +13,14 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell import Cell, load_cell
-from bridge.daemon.daemon import Daemon
-from bridge.demo.bench import Bench
-from bridge.demo.poses import Load, Scene
-from bridge.demo.rests import SETTLING
-from bridge.demo.result import Resolution
-from bridge.document.output_file import write_text
-from core.errors import RunError
+from gapbridge.bridge.cell import Cell, load_cell
+from gapbridge.bridge.daemon.daemon import Daemon
+from gapbridge.bridge.demo.bench import Bench
+from gapbridge.bridge.demo.poses import Load, Scene
+from gapbridge.bridge.demo.rests import SETTLING
+from gapbridge.bridge.demo.result import Resolution
+from gapbridge.bridge.document.output_file import write_text
+from gapbridge.core.errors import RunError
 
 Array = NDArray[np.float64]
 LAST_HOST = 60  # 127.0.0.2 to this are tried
@@ -44,7 +44,7 @@ class DemoLink(ABC):
 
     def _write_cell(self, out: Path) -> Cell:
         """Write the demo's cell, and what it names, into ``out``."""
-        package = resources.files("bridge.demo")
+        package = resources.files("gapbridge.bridge.demo")
         for name in (self.template, *self.files):
             text = package.joinpath(name).read_text(encoding="utf-8")
             path = out / ("cell.yaml" if name == self.template else name)

@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.daemon.daemon import Daemon
-from bridge.demo.links.peer import PeerLink
-from bridge.demo.own_program import LONGEST_VISIT, OwnProgram
-from bridge.demo.poses import UR10E, Load, Workspace
-from bridge.demo.result import Resolution, reach
-from drivers.modbus.profile import read_profile
-from drivers.modbus.registers import UNITS
-from drivers.modbus.schema import Mailbox
-from drivers.modbus.settings import ModbusSettings
-from drivers.simulated.ur.settings import BENCH_PORT
+from gapbridge.bridge.daemon.daemon import Daemon
+from gapbridge.bridge.demo.links.peer import PeerLink
+from gapbridge.bridge.demo.own_program import LONGEST_VISIT, OwnProgram
+from gapbridge.bridge.demo.poses import UR10E, Load, Workspace
+from gapbridge.bridge.demo.result import Resolution, reach
+from gapbridge.drivers.modbus.profile import read_profile
+from gapbridge.drivers.modbus.registers import UNITS
+from gapbridge.drivers.modbus.schema import Mailbox
+from gapbridge.drivers.modbus.settings import ModbusSettings
+from gapbridge.drivers.simulated.ur.settings import BENCH_PORT
 
 Array = NDArray[np.float64]
 PORT = 15020  # below 1024 only root may listen; a real controller's is 502

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell import Cell, load_cell
-from bridge.demo.bench import Bench
-from bridge.demo.links.link import DemoLink
-from bridge.demo.poses import Load
-from bridge.demo.served_cell import ServedCell
-from bridge.document.output_file import write_text
-from core.errors import CellError
-from drivers.simulated.ur.settings import BENCH_PORT
+from gapbridge.bridge.cell import Cell, load_cell
+from gapbridge.bridge.demo.bench import Bench
+from gapbridge.bridge.demo.links.link import DemoLink
+from gapbridge.bridge.demo.poses import Load
+from gapbridge.bridge.demo.served_cell import ServedCell
+from gapbridge.bridge.document.output_file import write_text
+from gapbridge.core.errors import CellError
+from gapbridge.drivers.simulated.ur.settings import BENCH_PORT
 
 Array = NDArray[np.float64]
 PAYLOAD = re.compile(r"^payload:.*$", re.MULTILINE)

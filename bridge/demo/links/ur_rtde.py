@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell.simulation import server_settings
-from bridge.daemon.daemon import Daemon
-from bridge.demo.bench import Bench, UrBench
-from bridge.demo.links.link import DemoLink
-from bridge.demo.poses import UR10E
-from bridge.demo.result import Resolution
-from bridge.demo.trajectory import visits, write_trajectory
-from drivers.simulated.ur.process import SimulatedController
-from drivers.simulated.ur.settings import (
+from gapbridge.bridge.cell.simulation import server_settings
+from gapbridge.bridge.daemon.daemon import Daemon
+from gapbridge.bridge.demo.bench import Bench, UrBench
+from gapbridge.bridge.demo.links.link import DemoLink
+from gapbridge.bridge.demo.poses import UR10E
+from gapbridge.bridge.demo.result import Resolution
+from gapbridge.bridge.demo.trajectory import visits, write_trajectory
+from gapbridge.drivers.simulated.ur.process import SimulatedController
+from gapbridge.drivers.simulated.ur.settings import (
     BENCH_PORT,
     DASHBOARD_PORT,
     PRIMARY_PORT,

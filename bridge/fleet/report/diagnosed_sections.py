@@ -5,13 +5,13 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 
-from bridge.fleet.diagnosis_summary import Diagnosed, Onset, Recurrence
-from bridge.fleet.outcome_words import counted
-from bridge.fleet.report.shared_sections import unbroken
-from bridge.fleet.runner import Done
-from bridge.fleet.session import natural
-from bridge.fleet.task import DONE, Outcome
-from bridge.report.fragment import (
+from gapbridge.bridge.fleet.diagnosis_summary import Diagnosed, Onset, Recurrence
+from gapbridge.bridge.fleet.outcome_words import counted
+from gapbridge.bridge.fleet.report.shared_sections import unbroken
+from gapbridge.bridge.fleet.runner import Done
+from gapbridge.bridge.fleet.session import natural
+from gapbridge.bridge.fleet.task import DONE, Outcome
+from gapbridge.bridge.report.fragment import (
     AFTER,
     EXPLAINED,
     Cell,
@@ -24,7 +24,7 @@ from bridge.report.fragment import (
     paragraph,
     table,
 )
-from bridge.report.words import (
+from gapbridge.bridge.report.words import (
     CHANNELS,
     VERDICTS,
     effect_words,

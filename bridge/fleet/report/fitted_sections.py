@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from bridge.fleet.fit_summary import Fitted, FittedArm, FittedSession, FittedType
-from bridge.fleet.outcome_words import counted
-from bridge.fleet.report.parameter_words import parameter_words, type_words
-from bridge.fleet.report.shared_sections import MOST, unbroken
-from bridge.fleet.task import Outcome
-from bridge.report.fragment import (
+from gapbridge.bridge.fleet.fit_summary import Fitted, FittedArm, FittedSession, FittedType
+from gapbridge.bridge.fleet.outcome_words import counted
+from gapbridge.bridge.fleet.report.parameter_words import parameter_words, type_words
+from gapbridge.bridge.fleet.report.shared_sections import MOST, unbroken
+from gapbridge.bridge.fleet.task import Outcome
+from gapbridge.bridge.report.fragment import (
     AFTER,
     BEFORE,
     FLOOR,
@@ -26,7 +26,7 @@ from bridge.report.fragment import (
     paragraph,
     table,
 )
-from bridge.report.words import number, percent, told
+from gapbridge.bridge.report.words import number, percent, told
 
 SESSION_HEADS = ("poses", "gap with the cell", "with the fit", "foretold by the others")
 MICRO = 1e6

@@ -10,13 +10,13 @@ from pathlib import Path
 
 from plotly.offline import get_plotlyjs
 
-from bridge.document.output_file import write_text
-from bridge.fleet.diagnosis_summary import Diagnosed
-from bridge.fleet.fit_summary import Fitted
-from bridge.fleet.outcome_words import counted
-from bridge.fleet.report import diagnosed_sections, fitted_sections, shared_sections
-from bridge.fleet.runner import Done
-from bridge.fleet.session import Found
+from gapbridge.bridge.document.output_file import write_text
+from gapbridge.bridge.fleet.diagnosis_summary import Diagnosed
+from gapbridge.bridge.fleet.fit_summary import Fitted
+from gapbridge.bridge.fleet.outcome_words import counted
+from gapbridge.bridge.fleet.report import diagnosed_sections, fitted_sections, shared_sections
+from gapbridge.bridge.fleet.runner import Done
+from gapbridge.bridge.fleet.session import Found
 
 FILE = "report.html"
 
@@ -95,4 +95,4 @@ def _page(title: str, parts: Sequence[Part], done: Done, found: Found) -> str:
 
 
 def _own(name: str) -> str:
-    return files("bridge.report").joinpath(name).read_text(encoding="utf-8")
+    return files("gapbridge.bridge.report").joinpath(name).read_text(encoding="utf-8")

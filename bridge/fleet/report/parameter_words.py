@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 
-from bridge.report.words import CHANNELS, effect_words
-from core.effects import CATALOGUE
+from gapbridge.bridge.report.words import CHANNELS, effect_words
+from gapbridge.core.effects import CATALOGUE
 
 
 def parameter_words(name: str) -> str:

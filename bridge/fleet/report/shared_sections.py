@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from bridge.fleet.drift import Drift
-from bridge.fleet.outlying import Outlier
-from bridge.fleet.report.parameter_words import parameter_words
-from bridge.fleet.runner import Done
-from bridge.fleet.task import DONE, Outcome
-from bridge.report.fragment import (
+from gapbridge.bridge.fleet.drift import Drift
+from gapbridge.bridge.fleet.outlying import Outlier
+from gapbridge.bridge.fleet.report.parameter_words import parameter_words
+from gapbridge.bridge.fleet.runner import Done
+from gapbridge.bridge.fleet.task import DONE, Outcome
+from gapbridge.bridge.report.fragment import (
     AFTER,
     Cell,
     Figure,
@@ -23,7 +23,7 @@ from bridge.report.fragment import (
     paragraph,
     table,
 )
-from bridge.report.words import number, told, unit_of
+from gapbridge.bridge.report.words import number, told, unit_of
 
 MOST = 40  # rows of a table: the Parquet files have all
 DRAWN = 6  # drifts in the picture

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtr, stdtr, stdtrit
 
-from core.calibration.budget.inputs import (
+from gapbridge.core.calibration.budget.inputs import (
     Input,
     Stated,
     instrument_error,
@@ -26,9 +26,9 @@ from core.calibration.budget.inputs import (
     temperature_growth,
     wild_readings,
 )
-from core.calibration.budget.pose_accuracy import KINDS
-from core.calibration.budget.sensitivity import Sensitivities, sensitivities
-from core.calibration.result import Calibration
+from gapbridge.core.calibration.budget.pose_accuracy import KINDS
+from gapbridge.core.calibration.budget.sensitivity import Sensitivities, sensitivities
+from gapbridge.core.calibration.result import Calibration
 
 Array = NDArray[np.float64]
 COVERAGE = 2.0  # k

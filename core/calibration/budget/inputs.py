@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.budget.pose_accuracy import KINDS, repeats
-from core.calibration.budget.sensitivity import Sensitivities
-from core.calibration.result import Calibration
+from gapbridge.core.calibration.budget.pose_accuracy import KINDS, repeats
+from gapbridge.core.calibration.budget.sensitivity import Sensitivities
+from gapbridge.core.calibration.result import Calibration
 
 Array = NDArray[np.float64]
 ALUMINIUM = 23e-6  # 1/K; steel grows half as much

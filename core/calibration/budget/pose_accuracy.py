@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.readings import Readings
-from core.calibration.result import Calibration, Errors
-from core.rotation import rotation_matrix, rotation_vector
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.calibration.result import Calibration, Errors
+from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

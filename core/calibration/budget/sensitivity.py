@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.parameters import Parameters
-from core.calibration.promise import effects_of
-from core.calibration.result import Calibration
-from core.errors import InputError
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.promise import effects_of
+from gapbridge.core.calibration.result import Calibration
+from gapbridge.core.errors import InputError
 
 Array = NDArray[np.float64]
 STEP = 1e-3  # usual sizes

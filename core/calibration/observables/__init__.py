@@ -5,16 +5,16 @@ from __future__ import annotations
 import difflib
 from typing import Any
 
-from core.calibration.observables.distance import Distance
-from core.calibration.observables.fixed_point import fixed_at, point_of
-from core.calibration.observables.nuisance import Layout, Nuisance
-from core.calibration.observables.observable import Observable
-from core.calibration.observables.point import Point
-from core.calibration.observables.pose import Pose
-from core.calibration.observables.position import Position
-from core.calibration.observables.relative import Relative
-from core.calibration.observables.sphere import Sphere
-from core.errors import InputError
+from gapbridge.core.calibration.observables.distance import Distance
+from gapbridge.core.calibration.observables.fixed_point import fixed_at, point_of
+from gapbridge.core.calibration.observables.nuisance import Layout, Nuisance
+from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.observables.point import Point
+from gapbridge.core.calibration.observables.pose import Pose
+from gapbridge.core.calibration.observables.position import Position
+from gapbridge.core.calibration.observables.relative import Relative
+from gapbridge.core.calibration.observables.sphere import Sphere
+from gapbridge.core.errors import InputError
 
 OBSERVABLES: dict[str, type[Observable]] = {
     observable.kind: observable

@@ -8,12 +8,12 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.observables.fixed_point import point_of
-from core.calibration.observables.nuisance import Nuisance
-from core.calibration.observables.observable import Observable
-from core.calibration.readings import Readings
-from core.model import Model, Poses
-from core.rotation import skew
+from gapbridge.core.calibration.observables.fixed_point import point_of
+from gapbridge.core.calibration.observables.nuisance import Nuisance
+from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.model import Model, Poses
+from gapbridge.core.rotation import skew
 
 Array = NDArray[np.float64]
 NEWTON_ROUNDS = 25

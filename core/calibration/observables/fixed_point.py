@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.estimation.registration import Registration
+from gapbridge.core.estimation.registration import Registration
 
 Array = NDArray[np.float64]
 TINY = 1e-9  # m: nearer to the point than this, no direction is known

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.observables.fixed_point import fixed_at
-from core.calibration.observables.nuisance import Nuisance
-from core.calibration.observables.observable import Observable
-from core.calibration.readings import Readings
-from core.loads import Loads
-from core.model import Model
+from gapbridge.core.calibration.observables.fixed_point import fixed_at
+from gapbridge.core.calibration.observables.nuisance import Nuisance
+from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 TOUCHED = 0.03  # m, usual radius of sphere and ball together

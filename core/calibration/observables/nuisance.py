@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.estimation.registration import IDENTITY, Registration
+from gapbridge.core.estimation.registration import IDENTITY, Registration
 
 Array = NDArray[np.float64]
 

@@ -8,19 +8,19 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.observables.nuisance import Nuisance
-from core.calibration.observables.observable import Observable
-from core.calibration.observables.position import (
+from gapbridge.core.calibration.observables.nuisance import Nuisance
+from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.observables.position import (
     FEWEST,
     in_instrument,
     measured_in_base,
     station_frame,
     with_targets,
 )
-from core.calibration.readings import Readings
-from core.estimation.registration import Registration
-from core.model import Poses
-from core.rotation import rotation_matrix, rotation_vector
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.estimation.registration import Registration
+from gapbridge.core.model import Poses
+from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 Array = NDArray[np.float64]
 

@@ -8,11 +8,11 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.observables.nuisance import Nuisance
-from core.calibration.observables.observable import Observable
-from core.calibration.readings import Readings
-from core.estimation.registration import IDENTITY, Registration
-from core.model import Poses
+from gapbridge.core.calibration.observables.nuisance import Nuisance
+from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.estimation.registration import IDENTITY, Registration
+from gapbridge.core.model import Poses
 
 Array = NDArray[np.float64]
 

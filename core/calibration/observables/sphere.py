@@ -8,11 +8,16 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration.observables.closure import Closure
-from core.calibration.observables.fixed_point import TINY, fixed_at, sphere_through, trilaterated
-from core.calibration.observables.nuisance import Nuisance
-from core.calibration.readings import Readings
-from core.model import Poses
+from gapbridge.core.calibration.observables.closure import Closure
+from gapbridge.core.calibration.observables.fixed_point import (
+    TINY,
+    fixed_at,
+    sphere_through,
+    trilaterated,
+)
+from gapbridge.core.calibration.observables.nuisance import Nuisance
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.model import Poses
 
 Array = NDArray[np.float64]
 

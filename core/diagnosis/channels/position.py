@@ -8,19 +8,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.observation import NotObservable, Observation, Predict, stacked
-from core.diagnosis.selection.unnamed import unnamed_rivals
-from core.effects import Term
-from core.errors import LogError
-from core.estimation.compliance_fit import Data, fit_nuisances
-from core.estimation.identification import pose_groups
-from core.estimation.registration import IDENTITY, Registration, frame_columns, register_robustly
-from core.loads import Loads
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model, Poses
-from core.rotation import rotation_matrix, rotation_vector
-from core.sessions import session_of, sessions_in
+from gapbridge.core.diagnosis.observation import NotObservable, Observation, Predict, stacked
+from gapbridge.core.diagnosis.selection.unnamed import unnamed_rivals
+from gapbridge.core.effects import Term
+from gapbridge.core.errors import LogError
+from gapbridge.core.estimation.compliance_fit import Data, fit_nuisances
+from gapbridge.core.estimation.identification import pose_groups
+from gapbridge.core.estimation.registration import (
+    IDENTITY,
+    Registration,
+    frame_columns,
+    register_robustly,
+)
+from gapbridge.core.loads import Loads
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model, Poses
+from gapbridge.core.rotation import rotation_matrix, rotation_vector
+from gapbridge.core.sessions import session_of, sessions_in
 
 Array = NDArray[np.float64]
 LEVER = 0.2  # m/rad: first weight of a rotation against a position

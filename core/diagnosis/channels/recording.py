@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.derivatives import signal_noise
-from core.diagnosis.observation import HELD
-from core.estimation.identification import pose_groups
-from core.log.log import Log
-from core.motion import Motion
+from gapbridge.core.derivatives import signal_noise
+from gapbridge.core.diagnosis.observation import HELD
+from gapbridge.core.estimation.identification import pose_groups
+from gapbridge.core.log.log import Log
+from gapbridge.core.motion import Motion
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -12,12 +12,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.observation import NotObservable, Observation
-from core.effects import Term
-from core.errors import LogError
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.core.diagnosis.observation import NotObservable, Observation
+from gapbridge.core.effects import Term
+from gapbridge.core.errors import LogError
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 Observe = Callable[[Model, Log, Metrology], Observation | NotObservable]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.channels.recording import (
+from gapbridge.core.diagnosis.channels.recording import (
     conditions,
     instrument_noise,
     joint_axes,
@@ -15,15 +15,15 @@ from core.diagnosis.channels.recording import (
     picked,
     quantities,
 )
-from core.diagnosis.observation import NotObservable, Observation
-from core.diagnosis.selection.unnamed import unnamed_pulls
-from core.dynamics import predict_torque, with_pieces
-from core.effects import Term
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model
-from core.motion import Motion, motion_of
-from core.sessions import session_of
+from gapbridge.core.diagnosis.observation import NotObservable, Observation
+from gapbridge.core.diagnosis.selection.unnamed import unnamed_pulls
+from gapbridge.core.dynamics import predict_torque, with_pieces
+from gapbridge.core.effects import Term
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
+from gapbridge.core.motion import Motion, motion_of
+from gapbridge.core.sessions import session_of
 
 Array = NDArray[np.float64]
 ENOUGH = 0.4  # share of rows that must remain for rests to be left out too

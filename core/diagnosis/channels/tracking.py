@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.channels.recording import (
+from gapbridge.core.diagnosis.channels.recording import (
     Index,
     conditions,
     held_torques,
@@ -18,14 +18,14 @@ from core.diagnosis.channels.recording import (
     picked,
     quantities,
 )
-from core.diagnosis.observation import NotObservable, Observation, Predict
-from core.dynamics import predict_tracking, with_held
-from core.effects import Term
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model
-from core.motion import Motion, motion_of
-from core.sessions import session_of
+from gapbridge.core.diagnosis.observation import NotObservable, Observation, Predict
+from gapbridge.core.dynamics import predict_tracking, with_held
+from gapbridge.core.effects import Term
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
+from gapbridge.core.motion import Motion, motion_of
+from gapbridge.core.sessions import session_of
 
 Array = NDArray[np.float64]
 SHORTEST_LEAD = 0.1  # s left out at the start of each stretch, whose past is unknown

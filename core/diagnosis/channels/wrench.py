@@ -7,23 +7,23 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from core.derivatives import signal_noise
-from core.diagnosis.channels.recording import (
+from gapbridge.core.derivatives import signal_noise
+from gapbridge.core.diagnosis.channels.recording import (
     VARIES,
     conditions,
     instrument_noise,
     picked,
     quantities,
 )
-from core.diagnosis.observation import NotObservable, Observation
-from core.diagnosis.selection.unnamed import unnamed_pulls
-from core.dynamics import predict_wrench, with_pieces
-from core.effects import Term
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model
-from core.motion import Motion, motion_of
-from core.sessions import session_of
+from gapbridge.core.diagnosis.observation import NotObservable, Observation
+from gapbridge.core.diagnosis.selection.unnamed import unnamed_pulls
+from gapbridge.core.dynamics import predict_wrench, with_pieces
+from gapbridge.core.effects import Term
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
+from gapbridge.core.motion import Motion, motion_of
+from gapbridge.core.sessions import session_of
 
 Array = NDArray[np.float64]
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")

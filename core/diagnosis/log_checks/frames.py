@@ -11,13 +11,13 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.log_checks.kinematics import best_order, inverted, other_models
-from core.errors import InputError
-from core.estimation.registration import register_robustly
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model
-from core.rotation import rotation_matrix, rotation_vector
+from gapbridge.core.diagnosis.log_checks.kinematics import best_order, inverted, other_models
+from gapbridge.core.errors import InputError
+from gapbridge.core.estimation.registration import register_robustly
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 Array = NDArray[np.float64]
 MOST = 200  # rows looked at

@@ -13,10 +13,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arm import Arm
-from core.estimation.registration import register
-from core.model import Model
-from core.rotation import rotation_matrix
+from gapbridge.core.arm import Arm
+from gapbridge.core.estimation.registration import register
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rotation_matrix
 
 Array = NDArray[np.float64]
 MANY = 6  # joints up to which all orders are tried: 720

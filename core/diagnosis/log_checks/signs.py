@@ -13,13 +13,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.dynamics import predict_torque, predict_wrench
-from core.errors import InputError
-from core.estimation.registration import frame_columns, register_robustly
-from core.loads import Loads
-from core.log.log import Log
-from core.model import Model
-from core.motion import Motion
+from gapbridge.core.dynamics import predict_torque, predict_wrench
+from gapbridge.core.errors import InputError
+from gapbridge.core.estimation.registration import frame_columns, register_robustly
+from gapbridge.core.loads import Loads
+from gapbridge.core.log.log import Log
+from gapbridge.core.model import Model
+from gapbridge.core.motion import Motion
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

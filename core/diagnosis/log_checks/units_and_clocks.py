@@ -8,14 +8,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.log_checks.frames import frame_findings
-from core.diagnosis.log_checks.signs import sign_findings
-from core.errors import LogError
-from core.log.columns import COLUMNS, misspelt
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model
-from core.motion import time_finding
+from gapbridge.core.diagnosis.log_checks.frames import frame_findings
+from gapbridge.core.diagnosis.log_checks.signs import sign_findings
+from gapbridge.core.errors import LogError
+from gapbridge.core.log.columns import COLUMNS, misspelt
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
+from gapbridge.core.motion import time_finding
 
 Array = NDArray[np.float64]
 TURNS = 25.0  # rad: joints do not turn further; degrees do

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.selection.problem import Space
-from core.effects import CATALOGUE, Term
+from gapbridge.core.diagnosis.selection.problem import Space
+from gapbridge.core.effects import CATALOGUE, Term
 
 Array = NDArray[np.float64]
 BENT = 10.8  # gain of a bent stiffness curve over a straight one that makes it one

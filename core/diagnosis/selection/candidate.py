@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arm import Arm
-from core.diagnosis.observation import HELD, Observation
-from core.effects import CATALOGUE, Effect, Parameter, Site, Term
-from core.errors import InputError
+from gapbridge.core.arm import Arm
+from gapbridge.core.diagnosis.observation import HELD, Observation
+from gapbridge.core.effects import CATALOGUE, Effect, Parameter, Site, Term
+from gapbridge.core.errors import InputError
 
 Array = NDArray[np.float64]
 STEP = 1e-2  # of a parameter's usual scale, for central differences

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.observation import Observation
-from core.diagnosis.selection.candidate import Candidate, named_columns
-from core.diagnosis.selection.problem import Found, Space, fit
-from core.effects import CATALOGUE, Term
+from gapbridge.core.diagnosis.observation import Observation
+from gapbridge.core.diagnosis.selection.candidate import Candidate, named_columns
+from gapbridge.core.diagnosis.selection.problem import Found, Space, fit
+from gapbridge.core.effects import CATALOGUE, Term
 
 Array = NDArray[np.float64]
 SHORTEST = 1e-3  # usual sizes of the value: a chord needs a length

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.selection.problem import Found, Space, fit, gains
+from gapbridge.core.diagnosis.selection.problem import Found, Space, fit, gains
 
 Array = NDArray[np.float64]
 BEAM = 6

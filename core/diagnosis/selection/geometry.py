@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.criteria import ANGLE, GEOMETRIC, LENGTH, SHARES
-from core.diagnosis.selection.candidate import Candidate
-from core.diagnosis.selection.problem import MARGIN, Found, Space
-from core.diagnosis.selection.search import screened_search
+from gapbridge.core.diagnosis.criteria import ANGLE, GEOMETRIC, LENGTH, SHARES
+from gapbridge.core.diagnosis.selection.candidate import Candidate
+from gapbridge.core.diagnosis.selection.problem import MARGIN, Found, Space
+from gapbridge.core.diagnosis.selection.search import screened_search
 
 Array = NDArray[np.float64]
 NEVER = 1e9  # a price that no fit is worth

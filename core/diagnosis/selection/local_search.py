@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.selection.forward import children, clash, grow, offspring, projected
-from core.diagnosis.selection.problem import Found, Space, fit, gains
+from gapbridge.core.diagnosis.selection.forward import children, clash, grow, offspring, projected
+from gapbridge.core.diagnosis.selection.problem import Found, Space, fit, gains
 
 Array = NDArray[np.float64]
 MERGED = 9  # terms up to which every pair is tried against one

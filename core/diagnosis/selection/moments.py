@@ -15,11 +15,11 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arm import Arm
-from core.diagnosis.observation import Observation
-from core.diagnosis.selection.candidate import Candidate
-from core.diagnosis.selection.state import Work, flat
-from core.effects import CATALOGUE, Effect, Site, Term
+from gapbridge.core.arm import Arm
+from gapbridge.core.diagnosis.observation import Observation
+from gapbridge.core.diagnosis.selection.candidate import Candidate
+from gapbridge.core.diagnosis.selection.state import Work, flat
+from gapbridge.core.effects import CATALOGUE, Effect, Site, Term
 
 Array = NDArray[np.float64]
 Pair = tuple[Candidate, Array]

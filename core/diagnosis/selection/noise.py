@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.observation import Observation
+from gapbridge.core.diagnosis.observation import Observation
 
 Array = NDArray[np.float64]
 LARGE = 150  # samples from which every coordinate is taken to scatter alike

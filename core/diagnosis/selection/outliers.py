@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.selection.candidate import Candidate
-from core.diagnosis.selection.forward import children
-from core.diagnosis.selection.noise import estimate_noise
-from core.diagnosis.selection.problem import Found, Space, fit
-from core.diagnosis.selection.state import Raw, Work, sample_space
-from core.effects import Term
+from gapbridge.core.diagnosis.selection.candidate import Candidate
+from gapbridge.core.diagnosis.selection.forward import children
+from gapbridge.core.diagnosis.selection.noise import estimate_noise
+from gapbridge.core.diagnosis.selection.problem import Found, Space, fit
+from gapbridge.core.diagnosis.selection.state import Raw, Work, sample_space
+from gapbridge.core.effects import Term
 
 Array = NDArray[np.float64]
 WILD_SHARE = 0.1  # of the samples: more of them is structure, not bad luck

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.selection.candidate import Candidate
+from gapbridge.core.diagnosis.selection.candidate import Candidate
 
 Array = NDArray[np.float64]
 RANK = 1e-10  # share of a column's square below which it counts as already explained

@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arm import Arm
-from core.diagnosis.selection.candidate import Candidate, angle_columns
-from core.diagnosis.selection.problem import Found, Space
-from core.diagnosis.selection.state import Work, flat
-from core.effects import Term
-from core.errors import InputError
+from gapbridge.core.arm import Arm
+from gapbridge.core.diagnosis.selection.candidate import Candidate, angle_columns
+from gapbridge.core.diagnosis.selection.problem import Found, Space
+from gapbridge.core.diagnosis.selection.state import Work, flat
+from gapbridge.core.effects import Term
+from gapbridge.core.errors import InputError
 
 Array = NDArray[np.float64]
 REFITS = 8

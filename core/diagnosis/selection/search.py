@@ -14,9 +14,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.selection.candidate import Candidate
-from core.diagnosis.selection.forward import DEPTH, beam_search, children, projected
-from core.diagnosis.selection.local_search import (
+from gapbridge.core.diagnosis.selection.candidate import Candidate
+from gapbridge.core.diagnosis.selection.forward import DEPTH, beam_search, children, projected
+from gapbridge.core.diagnosis.selection.local_search import (
     gathered,
     grown,
     improve,
@@ -25,7 +25,7 @@ from core.diagnosis.selection.local_search import (
     pruned,
     unpack,
 )
-from core.diagnosis.selection.problem import USUAL_ORDERS, Found, Space, fit, gains
+from gapbridge.core.diagnosis.selection.problem import USUAL_ORDERS, Found, Space, fit, gains
 
 BEST_LINES = 10  # lines of a joint that a search looks at
 BEST_SMOOTH = 60  # smooth functions that a search looks at

@@ -13,29 +13,33 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arm import Arm
-from core.diagnosis.criteria import HEAVIEST
-from core.diagnosis.observation import Observation
-from core.diagnosis.selection.bent import straightened
-from core.diagnosis.selection.candidate import (
+from gapbridge.core.arm import Arm
+from gapbridge.core.diagnosis.criteria import HEAVIEST
+from gapbridge.core.diagnosis.observation import Observation
+from gapbridge.core.diagnosis.selection.bent import straightened
+from gapbridge.core.diagnosis.selection.candidate import (
     Candidate,
     joint_quantity,
     named_candidates,
 )
-from core.diagnosis.selection.following import exact_columns, one_delay
-from core.diagnosis.selection.geometry import Links, links_of, with_links
-from core.diagnosis.selection.local_search import pruned
-from core.diagnosis.selection.moments import step_candidates
-from core.diagnosis.selection.noise import Noise, estimate_noise
-from core.diagnosis.selection.outliers import look_again, look_for_wild, with_wild_explained
-from core.diagnosis.selection.problem import Found, Space, fit
-from core.diagnosis.selection.refit import refit
-from core.diagnosis.selection.search import LARGE, screened_search
-from core.diagnosis.selection.smooth import smooth_candidates
-from core.diagnosis.selection.state import Raw, Work, flat, locate, sample_space
-from core.effects import Term
-from core.errors import InputError
-from core.model import Model
+from gapbridge.core.diagnosis.selection.following import exact_columns, one_delay
+from gapbridge.core.diagnosis.selection.geometry import Links, links_of, with_links
+from gapbridge.core.diagnosis.selection.local_search import pruned
+from gapbridge.core.diagnosis.selection.moments import step_candidates
+from gapbridge.core.diagnosis.selection.noise import Noise, estimate_noise
+from gapbridge.core.diagnosis.selection.outliers import (
+    look_again,
+    look_for_wild,
+    with_wild_explained,
+)
+from gapbridge.core.diagnosis.selection.problem import Found, Space, fit
+from gapbridge.core.diagnosis.selection.refit import refit
+from gapbridge.core.diagnosis.selection.search import LARGE, screened_search
+from gapbridge.core.diagnosis.selection.smooth import smooth_candidates
+from gapbridge.core.diagnosis.selection.state import Raw, Work, flat, locate, sample_space
+from gapbridge.core.effects import Term
+from gapbridge.core.errors import InputError
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 ROUNDS = 5

@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.diagnosis.observation import Observation
-from core.diagnosis.selection.candidate import Candidate, carrying, own_target
-from core.effects import Parameter, Site
+from gapbridge.core.diagnosis.observation import Observation
+from gapbridge.core.diagnosis.selection.candidate import Candidate, carrying, own_target
+from gapbridge.core.effects import Parameter, Site
 
 Array = NDArray[np.float64]
 Pair = tuple[Candidate, Array]

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arm import Arm
-from core.diagnosis.observation import Observation
-from core.diagnosis.selection.candidate import Candidate
-from core.diagnosis.selection.noise import Noise
-from core.diagnosis.selection.problem import AT_ONCE, Space, prices
-from core.effects import CATALOGUE, Term
+from gapbridge.core.arm import Arm
+from gapbridge.core.diagnosis.observation import Observation
+from gapbridge.core.diagnosis.selection.candidate import Candidate
+from gapbridge.core.diagnosis.selection.noise import Noise
+from gapbridge.core.diagnosis.selection.problem import AT_ONCE, Space, prices
+from gapbridge.core.effects import CATALOGUE, Term
 
 Array = NDArray[np.float64]
 DEAD = 1e-7  # share of a column that the nuisance leaves: below, nothing is left

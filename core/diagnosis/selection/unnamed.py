@@ -11,13 +11,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.dynamics import frames_of, pieces_of
-from core.effects.effect import typical_moment
-from core.kernels.reference import Chain, Rows, predict_rows
-from core.loads import Loads
-from core.model import Model
-from core.motion import Motion
-from core.rotation import rotation_vector
+from gapbridge.core.dynamics import frames_of, pieces_of
+from gapbridge.core.effects.effect import typical_moment
+from gapbridge.core.kernels.reference import Chain, Rows, predict_rows
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
+from gapbridge.core.motion import Motion
+from gapbridge.core.rotation import rotation_vector
 
 Array = NDArray[np.float64]
 SHORTEST = 1e-3  # m: shorter links do not bend

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from core.log.sources.lerobot import LeRobot
-from core.log.sources.recording import Recording
-from core.log.sources.ros_bag import RosBag
-from core.log.sources.source import Converted, Source, SourceOptions
-from core.log.sources.text_recording import Libfranka, UrRecorder
+from gapbridge.core.log.sources.lerobot import LeRobot
+from gapbridge.core.log.sources.recording import Recording
+from gapbridge.core.log.sources.ros_bag import RosBag
+from gapbridge.core.log.sources.source import Converted, Source, SourceOptions
+from gapbridge.core.log.sources.text_recording import Libfranka, UrRecorder
 
 SOURCES: tuple[Source, ...] = (RosBag(), LeRobot(), Libfranka(), UrRecorder(), Recording())
 

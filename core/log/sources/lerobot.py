@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import LogError
-from core.log.sources.joint_order import order_joints
-from core.log.sources.source import Converted, Source, SourceOptions
+from gapbridge.core.errors import LogError
+from gapbridge.core.log.sources.joint_order import order_joints
+from gapbridge.core.log.sources.source import Converted, Source, SourceOptions
 
 Array = NDArray[np.float64]
 INFO = Path("meta") / "info.json"

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from core.errors import LogError
-from core.log.mcap_reading import SUFFIX, files_of, read_batches
-from core.log.pieces import LogPieces
-from core.log.sources.source import Converted, Source, SourceOptions
+from gapbridge.core.errors import LogError
+from gapbridge.core.log.mcap_reading import SUFFIX, files_of, read_batches
+from gapbridge.core.log.pieces import LogPieces
+from gapbridge.core.log.sources.source import Converted, Source, SourceOptions
 
 
 class Recording(Source):

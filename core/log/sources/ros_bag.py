@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import LogError
-from core.log.sources.joint_order import order_joints
-from core.log.sources.resampling import Stream, joined
-from core.log.sources.source import Converted, Source, SourceOptions
+from gapbridge.core.errors import LogError
+from gapbridge.core.log.sources.joint_order import order_joints
+from gapbridge.core.log.sources.resampling import Stream, joined
+from gapbridge.core.log.sources.source import Converted, Source, SourceOptions
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader

@@ -11,9 +11,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import LogError
-from core.log.columns import COLUMNS
-from core.log.log import Log
+from gapbridge.core.errors import LogError
+from gapbridge.core.log.columns import COLUMNS
+from gapbridge.core.log.log import Log
 
 Array = NDArray[np.float64]
 

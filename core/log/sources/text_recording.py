@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import LogError
-from core.log.columns import COLUMNS, is_known
-from core.log.sources.source import Converted, Source, SourceOptions
+from gapbridge.core.errors import LogError
+from gapbridge.core.log.columns import COLUMNS, is_known
+from gapbridge.core.log.sources.source import Converted, Source, SourceOptions
 
 Array = NDArray[np.float64]
 FRANKA = {  # libfranka's logToCSV -> the log's columns

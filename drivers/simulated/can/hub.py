@@ -15,9 +15,9 @@ import time
 from types import TracebackType
 from typing import Self
 
-from core.addresses import is_loopback
-from drivers.simulated.can.frame import Frame
-from drivers.simulated.can.port import Port, SerialPort, SocketcandPort
+from gapbridge.core.addresses import is_loopback
+from gapbridge.drivers.simulated.can.frame import Frame
+from gapbridge.drivers.simulated.can.port import Port, SerialPort, SocketcandPort
 
 MOST_PORTS = 64
 

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from drivers.can.loading import read_profile
-from drivers.can.profile import Incoming, Outgoing
-from drivers.can.settings import CanSettings
-from drivers.simulated.can.nodes import CanNodes
-from drivers.simulated.peer.peer import Peer
+from gapbridge.drivers.can.loading import read_profile
+from gapbridge.drivers.can.profile import Incoming, Outgoing
+from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.simulated.can.nodes import CanNodes
+from gapbridge.drivers.simulated.peer.peer import Peer
 
 HEALTHY_EVERY = 5  # cycles between messages that are no part of a sample
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from drivers.can.settings import CanSettings
-from drivers.simulated.can.nodes import CanNodes
-from drivers.simulated.peer.peer import Peer
+from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.simulated.can.nodes import CanNodes
+from gapbridge.drivers.simulated.peer.peer import Peer
 
 
 class Ranges(NamedTuple):

@@ -11,16 +11,16 @@ from typing import Any
 
 import can
 
-from core.errors import InputError, LinkError
-from drivers.can.settings import CanSettings
-from drivers.can_bus.bus import BusSettings, close_bus, open_bus
-from drivers.simulated.can.frame import Frame
-from drivers.simulated.can.hub import Hub
-from drivers.simulated.can.port import InnerPort
-from drivers.simulated.peer.bench import Command
-from drivers.simulated.peer.peer import Peer
-from drivers.simulated.peer.peer_server import PeerServer
-from drivers.simulated.plant.kinematics import Joints
+from gapbridge.core.errors import InputError, LinkError
+from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.can_bus.bus import BusSettings, close_bus, open_bus
+from gapbridge.drivers.simulated.can.frame import Frame
+from gapbridge.drivers.simulated.can.hub import Hub
+from gapbridge.drivers.simulated.can.port import InnerPort
+from gapbridge.drivers.simulated.peer.bench import Command
+from gapbridge.drivers.simulated.peer.peer import Peer
+from gapbridge.drivers.simulated.peer.peer_server import PeerServer
+from gapbridge.drivers.simulated.plant.kinematics import Joints
 
 BACKLOG = 500  # frames taken in one cycle at most
 TORN = 0.05  # rad that the joints of a torn sample are off

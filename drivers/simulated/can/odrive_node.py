@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import struct
 
-from drivers.can.settings import CanSettings
-from drivers.simulated.can.nodes import CanNodes
-from drivers.simulated.peer.peer import Peer
+from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.simulated.can.nodes import CanNodes
+from gapbridge.drivers.simulated.peer.peer import Peer
 
 TURN = 2.0 * math.pi
 IDLE, CLOSED_LOOP = 1, 8

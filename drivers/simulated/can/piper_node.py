@@ -8,9 +8,9 @@ from __future__ import annotations
 import math
 import struct
 
-from drivers.can.settings import CanSettings
-from drivers.simulated.can.nodes import CanNodes
-from drivers.simulated.peer.peer import Peer
+from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.simulated.can.nodes import CanNodes
+from gapbridge.drivers.simulated.peer.peer import Peer
 
 UNIT = math.radians(0.001)
 FACTORS = (1.18125, 1.18125, 1.18125, 0.95844, 0.95844, 0.95844)  # Nm per A, as piper_sdk has them

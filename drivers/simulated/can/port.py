@@ -12,7 +12,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 
-from drivers.simulated.can.frame import Frame
+from gapbridge.drivers.simulated.can.frame import Frame
 
 BACKLOG = 1 << 20  # bytes that a client may leave unread before it is cut off
 LONGEST = 200  # bytes of one message

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import importlib
 
-from core.errors import InputError
-from drivers.can.settings import CanSettings
-from drivers.simulated.peer.peer import Peer
-from drivers.simulated.peer.peer_server import PeerServer
+from gapbridge.core.errors import InputError
+from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.simulated.peer.peer import Peer
+from gapbridge.drivers.simulated.peer.peer_server import PeerServer
 
 NODES: dict[str, str] = {
-    "piper": "drivers.simulated.can.piper_node:PiperNode",
-    "openarm": "drivers.simulated.can.mit_node:MitNodes",
-    "odrive": "drivers.simulated.can.odrive_node:OdriveNodes",
+    "piper": "gapbridge.drivers.simulated.can.piper_node:PiperNode",
+    "openarm": "gapbridge.drivers.simulated.can.mit_node:MitNodes",
+    "odrive": "gapbridge.drivers.simulated.can.odrive_node:OdriveNodes",
 }
 """Shipped profile -> ``module:Class`` of its nodes; any other profile: nodes out of its map."""
-MAPPED = "drivers.simulated.can.mapped_node:MappedNodes"
+MAPPED = "gapbridge.drivers.simulated.can.mapped_node:MappedNodes"
 
 
 def make_servers(link: CanSettings, host: str, peer: Peer) -> list[PeerServer]:

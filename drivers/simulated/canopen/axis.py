@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from drivers.simulated.canopen.machine import Machine, Phase
+from gapbridge.drivers.simulated.canopen.machine import Machine, Phase
 
 BRAKING = 12.0  # rad/s^2, of a quick stop and of a fault's reaction
 FOLLOWING = 0.35  # rad that the joint may be away from its setpoint

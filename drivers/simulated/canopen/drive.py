@@ -13,7 +13,7 @@ from typing import Any
 import canopen
 from canopen.nmt import NmtSlave
 
-from drivers.simulated.canopen.axis import Axis
+from gapbridge.drivers.simulated.canopen.axis import Axis
 
 READ_ONLY_NOW, NOT_MAPPABLE, TOO_LONG, BAD_VALUE = 0x08000022, 0x06040041, 0x06040042, 0x06090030
 MODES = (0, 7, 8)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Protocol
 
-from drivers.canopen.profile import CanopenProfile
-from drivers.simulated.peer.bench import BenchError, Command
+from gapbridge.drivers.canopen.profile import CanopenProfile
+from gapbridge.drivers.simulated.peer.bench import BenchError, Command
 
 
 class Faulty(Protocol):

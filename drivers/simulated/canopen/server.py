@@ -11,17 +11,17 @@ from typing import Any
 import canopen
 from canopen.network import MessageListener
 
-from core.errors import InputError, LinkError
-from drivers.can_bus.bus import BusSettings, close_bus, open_bus
-from drivers.canopen.profile import CanopenProfile, read_profile
-from drivers.canopen.settings import CanopenSettings
-from drivers.simulated.can.hub import Hub
-from drivers.simulated.canopen.drive import COMMUNICATION, Drive, Units
-from drivers.simulated.canopen.faults import bench_commands
-from drivers.simulated.canopen.machine import Phase
-from drivers.simulated.peer.bench import Command
-from drivers.simulated.peer.peer import Peer
-from drivers.simulated.peer.peer_server import PeerServer
+from gapbridge.core.errors import InputError, LinkError
+from gapbridge.drivers.can_bus.bus import BusSettings, close_bus, open_bus
+from gapbridge.drivers.canopen.profile import CanopenProfile, read_profile
+from gapbridge.drivers.canopen.settings import CanopenSettings
+from gapbridge.drivers.simulated.can.hub import Hub
+from gapbridge.drivers.simulated.canopen.drive import COMMUNICATION, Drive, Units
+from gapbridge.drivers.simulated.canopen.faults import bench_commands
+from gapbridge.drivers.simulated.canopen.machine import Phase
+from gapbridge.drivers.simulated.peer.bench import Command
+from gapbridge.drivers.simulated.peer.peer import Peer
+from gapbridge.drivers.simulated.peer.peer_server import PeerServer
 
 SYNC = 0x80
 HEARTBEAT = 0x700

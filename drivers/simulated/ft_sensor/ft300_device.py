@@ -16,9 +16,9 @@ from pymodbus.framer import FramerRTU
 from pymodbus.server import ModbusSerialServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from core.errors import LinkError
-from drivers.simulated.ft_sensor.mounting import Felt
-from drivers.simulated.ft_sensor.node import SimulatedSensor
+from gapbridge.core.errors import LinkError
+from gapbridge.drivers.simulated.ft_sensor.mounting import Felt
+from gapbridge.drivers.simulated.ft_sensor.node import SimulatedSensor
 
 REGISTERS, STREAM_REGISTER, STREAM = 180, 410, 0x0200
 PERIOD = 0.01  # s

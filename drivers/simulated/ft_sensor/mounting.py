@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from drivers.simulated.plant.plant_settings import Vector6
-from drivers.simulated.plant.rotations import (
+from gapbridge.drivers.simulated.plant.plant_settings import Vector6
+from gapbridge.drivers.simulated.plant.rotations import (
     Vector3,
     compose,
     cross,

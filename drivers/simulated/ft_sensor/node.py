@@ -9,7 +9,7 @@ from typing import Self
 
 import numpy as np
 
-from drivers.simulated.ft_sensor.mounting import Felt
+from gapbridge.drivers.simulated.ft_sensor.mounting import Felt
 
 
 class SimulatedSensor(ABC):

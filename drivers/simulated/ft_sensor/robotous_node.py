@@ -7,9 +7,9 @@ from typing import Any
 
 import can
 
-from drivers.can_bus.bus import BusSettings, close_bus, open_bus
-from drivers.simulated.ft_sensor.mounting import Felt
-from drivers.simulated.ft_sensor.node import SimulatedSensor
+from gapbridge.drivers.can_bus.bus import BusSettings, close_bus, open_bus
+from gapbridge.drivers.simulated.ft_sensor.mounting import Felt
+from gapbridge.drivers.simulated.ft_sensor.node import SimulatedSensor
 
 
 class RobotousNode(SimulatedSensor):

@@ -7,21 +7,21 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from core.addresses import is_loopback
-from core.errors import InputError, LinkError
-from drivers.can_bus.bus import BusSettings
-from drivers.ft_sensor.settings import (
+from gapbridge.core.addresses import is_loopback
+from gapbridge.core.errors import InputError, LinkError
+from gapbridge.drivers.can_bus.bus import BusSettings
+from gapbridge.drivers.ft_sensor.settings import (
     AtiSettings,
     FtSensorSettings,
     RobotiqSettings,
     RobotousSettings,
 )
-from drivers.simulated.can.hub import Hub
-from drivers.simulated.ft_sensor.ati_node import AtiNode
-from drivers.simulated.ft_sensor.ft300_device import Ft300Device
-from drivers.simulated.ft_sensor.mounting import Felt, felt_by
-from drivers.simulated.ft_sensor.node import SimulatedSensor
-from drivers.simulated.ft_sensor.robotous_node import RobotousNode
+from gapbridge.drivers.simulated.can.hub import Hub
+from gapbridge.drivers.simulated.ft_sensor.ati_node import AtiNode
+from gapbridge.drivers.simulated.ft_sensor.ft300_device import Ft300Device
+from gapbridge.drivers.simulated.ft_sensor.mounting import Felt, felt_by
+from gapbridge.drivers.simulated.ft_sensor.node import SimulatedSensor
+from gapbridge.drivers.simulated.ft_sensor.robotous_node import RobotousNode
 
 RETRY = 0.1  # s between two tries at a bus that somebody else serves
 BETWEEN_PROCESSES = ("socketcand", "socketcan")

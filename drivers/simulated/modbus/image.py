@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from drivers.modbus.encode import vector_registers
-from drivers.modbus.profile import addresses, spans, turns_of
-from drivers.modbus.registers import BIT_TABLES, UNITS, Table
-from drivers.modbus.schema import Clock, Condition, Place, ProfileFile, Trouble, Vector
-from drivers.simulated.peer.peer import Peer
+from gapbridge.drivers.modbus.encode import vector_registers
+from gapbridge.drivers.modbus.profile import addresses, spans, turns_of
+from gapbridge.drivers.modbus.registers import BIT_TABLES, UNITS, Table
+from gapbridge.drivers.modbus.schema import Clock, Condition, Place, ProfileFile, Trouble, Vector
+from gapbridge.drivers.simulated.peer.peer import Peer
 
 Image = dict[Table, dict[int, int]]
 TABLES: tuple[Table, ...] = ("coil", "discrete", "holding", "input")

@@ -6,17 +6,17 @@ import logging
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from drivers.modbus import encode
-from drivers.modbus.profile import ECHO_WORDS, MAILBOX_WORDS, addresses
-from drivers.modbus.registers import UNITS, Table
-from drivers.modbus.schema import Condition, Mailbox, ProfileFile, TargetTrigger
-from drivers.simulated.modbus.image import bad
-from drivers.simulated.peer.bench import BenchError
-from drivers.simulated.peer.peer import BRAKING, HOLD, Peer
-from drivers.simulated.plant.kinematics import Joints, offset_frame, solve, tcp_in_base
-from drivers.simulated.plant.motion import Hold, Stop
-from drivers.simulated.plant.plant_settings import Vector6
-from drivers.simulated.ur.offset_program import NOTHING, SHIFT_STEP, TURN_STEP, approach
+from gapbridge.drivers.modbus import encode
+from gapbridge.drivers.modbus.profile import ECHO_WORDS, MAILBOX_WORDS, addresses
+from gapbridge.drivers.modbus.registers import UNITS, Table
+from gapbridge.drivers.modbus.schema import Condition, Mailbox, ProfileFile, TargetTrigger
+from gapbridge.drivers.simulated.modbus.image import bad
+from gapbridge.drivers.simulated.peer.bench import BenchError
+from gapbridge.drivers.simulated.peer.peer import BRAKING, HOLD, Peer
+from gapbridge.drivers.simulated.plant.kinematics import Joints, offset_frame, solve, tcp_in_base
+from gapbridge.drivers.simulated.plant.motion import Hold, Stop
+from gapbridge.drivers.simulated.plant.plant_settings import Vector6
+from gapbridge.drivers.simulated.ur.offset_program import NOTHING, SHIFT_STEP, TURN_STEP, approach
 
 log = logging.getLogger("drivers.simulated")
 

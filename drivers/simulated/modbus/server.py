@@ -18,18 +18,18 @@ from typing import Any
 from pymodbus.server import ModbusSerialServer, ModbusTcpServer, ModbusTlsServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from core.errors import LinkError
-from drivers.modbus.map import compile_map
-from drivers.modbus.profile import read_profile
-from drivers.modbus.registers import BIT_TABLES, Table
-from drivers.modbus.schema import ProfileFile, Trouble
-from drivers.modbus.settings import ModbusSettings
-from drivers.simulated.modbus import image
-from drivers.simulated.modbus.image import Image
-from drivers.simulated.modbus.programs import MailboxProgram, make_program
-from drivers.simulated.peer.bench import Command
-from drivers.simulated.peer.peer import Peer
-from drivers.simulated.peer.peer_server import PeerServer
+from gapbridge.core.errors import LinkError
+from gapbridge.drivers.modbus.map import compile_map
+from gapbridge.drivers.modbus.profile import read_profile
+from gapbridge.drivers.modbus.registers import BIT_TABLES, Table
+from gapbridge.drivers.modbus.schema import ProfileFile, Trouble
+from gapbridge.drivers.modbus.settings import ModbusSettings
+from gapbridge.drivers.simulated.modbus import image
+from gapbridge.drivers.simulated.modbus.image import Image
+from gapbridge.drivers.simulated.modbus.programs import MailboxProgram, make_program
+from gapbridge.drivers.simulated.peer.bench import Command
+from gapbridge.drivers.simulated.peer.peer import Peer
+from gapbridge.drivers.simulated.peer.peer_server import PeerServer
 
 FUNCTIONS: dict[int, Table] = {
     1: "coil", 5: "coil", 15: "coil", 2: "discrete", 4: "input",

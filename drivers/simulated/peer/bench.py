@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from drivers.simulated.peer.connection import Connection
-from drivers.simulated.plant.kinematics import pose_of
-from drivers.simulated.plant.plant import Load, Plant
-from drivers.simulated.plant.plant_arm import place
-from drivers.simulated.plant.rotations import compose, from_vector, to_vector
+from gapbridge.drivers.simulated.peer.connection import Connection
+from gapbridge.drivers.simulated.plant.kinematics import pose_of
+from gapbridge.drivers.simulated.plant.plant import Load, Plant
+from gapbridge.drivers.simulated.plant.plant_arm import place
+from gapbridge.drivers.simulated.plant.rotations import compose, from_vector, to_vector
 
 if TYPE_CHECKING:
-    from drivers.simulated.plant.plant_arm import Frame
+    from gapbridge.drivers.simulated.plant.plant_arm import Frame
 
 log = logging.getLogger("drivers.simulated")
 

@@ -9,14 +9,14 @@ import logging
 from collections.abc import Sequence
 from typing import Any
 
-from drivers.simulated.peer.bench import BenchError
-from drivers.simulated.plant.declared import Declared
-from drivers.simulated.plant.kinematics import Joints, within_limits
-from drivers.simulated.plant.motion import Hold, Motion, MoveJoints, Stop
-from drivers.simulated.plant.plant import Plant
-from drivers.simulated.plant.plant_arm import PlantArm
-from drivers.simulated.plant.plant_settings import PlantSettings
-from drivers.simulated.plant.sensors import Sensors
+from gapbridge.drivers.simulated.peer.bench import BenchError
+from gapbridge.drivers.simulated.plant.declared import Declared
+from gapbridge.drivers.simulated.plant.kinematics import Joints, within_limits
+from gapbridge.drivers.simulated.plant.motion import Hold, Motion, MoveJoints, Stop
+from gapbridge.drivers.simulated.plant.plant import Plant
+from gapbridge.drivers.simulated.plant.plant_arm import PlantArm
+from gapbridge.drivers.simulated.plant.plant_settings import PlantSettings
+from gapbridge.drivers.simulated.plant.sensors import Sensors
 
 log = logging.getLogger("drivers.simulated")
 

@@ -13,11 +13,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import TracebackType
 from typing import Protocol, Self
 
-from core.errors import LinkError
-from drivers.simulated.peer.bench import BenchServer, Command
-from drivers.simulated.peer.connection import Connection, listen
-from drivers.simulated.peer.peer import Peer
-from drivers.simulated.peer.real_time import become_punctual
+from gapbridge.core.errors import LinkError
+from gapbridge.drivers.simulated.peer.bench import BenchServer, Command
+from gapbridge.drivers.simulated.peer.connection import Connection, listen
+from gapbridge.drivers.simulated.peer.peer import Peer
+from gapbridge.drivers.simulated.peer.real_time import become_punctual
 
 LATE = 0.1  # s: behind by more than this, the missed cycles are left out
 COLLECT_EVERY = 2.0  # s

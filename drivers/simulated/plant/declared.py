@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.simulated.plant.kinematics import frame_of
-from drivers.simulated.plant.plant_arm import BASE, Frame
-from drivers.simulated.plant.plant_settings import Vector6
-from drivers.simulated.plant.rotations import Vector3
+from gapbridge.drivers.simulated.plant.kinematics import frame_of
+from gapbridge.drivers.simulated.plant.plant_arm import BASE, Frame
+from gapbridge.drivers.simulated.plant.plant_settings import Vector6
+from gapbridge.drivers.simulated.plant.rotations import Vector3
 
 
 @dataclass(slots=True)

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from drivers.simulated.plant.plant_arm import Frame, PlantArm, place
-from drivers.simulated.plant.plant_settings import Vector6
-from drivers.simulated.plant.rotations import (
+from gapbridge.drivers.simulated.plant.plant_arm import Frame, PlantArm, place
+from gapbridge.drivers.simulated.plant.plant_settings import Vector6
+from gapbridge.drivers.simulated.plant.rotations import (
     Vector3,
     add,
     compose,

@@ -9,8 +9,8 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from drivers.simulated.plant.kinematics import Joints, between, gap, solve, tcp_in_base
-from drivers.simulated.plant.plant_arm import Frame, PlantArm
+from gapbridge.drivers.simulated.plant.kinematics import Joints, between, gap, solve, tcp_in_base
+from gapbridge.drivers.simulated.plant.plant_arm import Frame, PlantArm
 
 
 class Motion(Protocol):

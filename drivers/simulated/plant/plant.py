@@ -15,10 +15,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.simulated.plant.kinematics import holding_torque
-from drivers.simulated.plant.plant_arm import Frame, PlantArm, place
-from drivers.simulated.plant.plant_settings import PlantSettings
-from drivers.simulated.plant.rotations import (
+from gapbridge.drivers.simulated.plant.kinematics import holding_torque
+from gapbridge.drivers.simulated.plant.plant_arm import Frame, PlantArm, place
+from gapbridge.drivers.simulated.plant.plant_settings import PlantSettings
+from gapbridge.drivers.simulated.plant.rotations import (
     IDENTITY,
     Vector3,
     add,

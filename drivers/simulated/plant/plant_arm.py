@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from core.arm import Arm, builtin_arm
-from core.errors import ArmError
-from drivers.simulated.plant.rotations import (
+from gapbridge.core.arm import Arm, builtin_arm
+from gapbridge.core.errors import ArmError
+from gapbridge.drivers.simulated.plant.rotations import (
     IDENTITY,
     Rotation,
     Vector3,

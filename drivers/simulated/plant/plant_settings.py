@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.simulated.plant.plant_arm import PlantArm
-from drivers.simulated.plant.rotations import Vector3
+from gapbridge.drivers.simulated.plant.plant_arm import PlantArm
+from gapbridge.drivers.simulated.plant.rotations import Vector3
 
 Vector6 = tuple[float, float, float, float, float, float]
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from drivers.simulated.plant.declared import Declared
-from drivers.simulated.plant.kinematics import gap, holding_torque, pose_of
-from drivers.simulated.plant.plant import Plant
-from drivers.simulated.plant.plant_arm import Frame, place
-from drivers.simulated.plant.rotations import (
+from gapbridge.drivers.simulated.plant.declared import Declared
+from gapbridge.drivers.simulated.plant.kinematics import gap, holding_torque, pose_of
+from gapbridge.drivers.simulated.plant.plant import Plant
+from gapbridge.drivers.simulated.plant.plant_arm import Frame, place
+from gapbridge.drivers.simulated.plant.rotations import (
     IDENTITY,
     Vector3,
     add,

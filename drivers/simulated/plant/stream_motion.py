@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from drivers.simulated.plant.kinematics import Joints, jacobian
-from drivers.simulated.plant.motion import Stateless
-from drivers.simulated.plant.plant_arm import Frame, PlantArm
+from gapbridge.drivers.simulated.plant.kinematics import Joints, jacobian
+from gapbridge.drivers.simulated.plant.motion import Stateless
+from gapbridge.drivers.simulated.plant.plant_arm import Frame, PlantArm
 
 SERVO_ACCELERATION = 40.0  # rad/s^2
 

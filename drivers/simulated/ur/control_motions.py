@@ -5,30 +5,30 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from drivers.simulated.plant.kinematics import (
+from gapbridge.drivers.simulated.plant.kinematics import (
     Joints,
     frame_of,
     solve,
     tcp_in_base,
 )
-from drivers.simulated.plant.motion import (
+from gapbridge.drivers.simulated.plant.motion import (
     Motion,
     MoveJoints,
     MoveLine,
     Stop,
 )
-from drivers.simulated.plant.plant_arm import BASE, Frame, place
-from drivers.simulated.plant.rotations import Vector3
-from drivers.simulated.plant.stream_motion import Servo, SpeedJoints, SpeedTool
-from drivers.simulated.ur.control_registers import Registers
-from drivers.simulated.ur.controller import (
+from gapbridge.drivers.simulated.plant.plant_arm import BASE, Frame, place
+from gapbridge.drivers.simulated.plant.rotations import Vector3
+from gapbridge.drivers.simulated.plant.stream_motion import Servo, SpeedJoints, SpeedTool
+from gapbridge.drivers.simulated.ur.control_registers import Registers
+from gapbridge.drivers.simulated.ur.controller import (
     CYCLE,
     DEFAULT_STOP,
     Controller,
     ScriptError,
     Steps,
 )
-from drivers.simulated.ur.path_program import path_motion
+from gapbridge.drivers.simulated.ur.path_program import path_motion
 
 CONTACT_FORCE = 10.0  # N: a pull against the way that is taken for a touch
 JOG_ACCELERATION = 0.5  # m/s^2

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from drivers.simulated.plant.kinematics import (
+from gapbridge.drivers.simulated.plant.kinematics import (
     Joints,
     frame_of,
     jacobian,
@@ -16,11 +16,11 @@ from drivers.simulated.plant.kinematics import (
     tcp_in_base,
     within_limits,
 )
-from drivers.simulated.plant.plant_arm import place
-from drivers.simulated.plant.rotations import Vector3
-from drivers.simulated.ur.control_motions import touches
-from drivers.simulated.ur.control_registers import Registers
-from drivers.simulated.ur.controller import CYCLE, ScriptError
+from gapbridge.drivers.simulated.plant.plant_arm import place
+from gapbridge.drivers.simulated.plant.rotations import Vector3
+from gapbridge.drivers.simulated.ur.control_motions import touches
+from gapbridge.drivers.simulated.ur.control_registers import Registers
+from gapbridge.drivers.simulated.ur.controller import CYCLE, ScriptError
 
 STEADY = 1e-4  # rad/s
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from drivers.simulated.plant.kinematics import Joints
-from drivers.simulated.plant.motion import Motion
-from drivers.simulated.plant.plant_settings import Vector6
-from drivers.simulated.ur.controller import Controller
+from gapbridge.drivers.simulated.plant.kinematics import Joints
+from gapbridge.drivers.simulated.plant.motion import Motion
+from gapbridge.drivers.simulated.plant.plant_settings import Vector6
+from gapbridge.drivers.simulated.ur.controller import Controller
 
 RESULTS = 6
 RUNNING_BIT = 1 << 15

@@ -8,14 +8,14 @@ from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from drivers.simulated.plant.declared import Declared
-from drivers.simulated.plant.kinematics import Joints, within_limits
-from drivers.simulated.plant.motion import Hold, Motion, Stop
-from drivers.simulated.plant.plant import Plant
-from drivers.simulated.plant.sensors import Sensors
-from drivers.simulated.ur import modes
-from drivers.simulated.ur.inputs import apply_inputs
-from drivers.simulated.ur.rtde_names import INPUTS, OUTPUTS, blank
+from gapbridge.drivers.simulated.plant.declared import Declared
+from gapbridge.drivers.simulated.plant.kinematics import Joints, within_limits
+from gapbridge.drivers.simulated.plant.motion import Hold, Motion, Stop
+from gapbridge.drivers.simulated.plant.plant import Plant
+from gapbridge.drivers.simulated.plant.sensors import Sensors
+from gapbridge.drivers.simulated.ur import modes
+from gapbridge.drivers.simulated.ur.inputs import apply_inputs
+from gapbridge.drivers.simulated.ur.rtde_names import INPUTS, OUTPUTS, blank
 
 log = logging.getLogger("drivers.simulated")
 

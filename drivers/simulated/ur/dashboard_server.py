@@ -8,9 +8,9 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-from drivers.simulated.peer.connection import Connection
-from drivers.simulated.ur import modes
-from drivers.simulated.ur.controller import Controller, Steps
+from gapbridge.drivers.simulated.peer.connection import Connection
+from gapbridge.drivers.simulated.ur import modes
+from gapbridge.drivers.simulated.ur.controller import Controller, Steps
 
 log = logging.getLogger("drivers.simulated")
 

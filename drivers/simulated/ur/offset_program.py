@@ -23,10 +23,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from drivers.simulated.plant.kinematics import Joints, offset_frame, solve, tcp_in_base
-from drivers.simulated.plant.motion import Hold, Motion
-from drivers.simulated.plant.plant_settings import Vector6
-from drivers.simulated.ur.controller import CYCLE, Controller, ScriptError, Steps
+from gapbridge.drivers.simulated.plant.kinematics import Joints, offset_frame, solve, tcp_in_base
+from gapbridge.drivers.simulated.plant.motion import Hold, Motion
+from gapbridge.drivers.simulated.plant.plant_settings import Vector6
+from gapbridge.drivers.simulated.ur.controller import CYCLE, Controller, ScriptError, Steps
 
 NAME = "gapbridge_offset"
 RUNNING, EXPIRED, REJECTED = 1, 2, 3

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from drivers.simulated.peer.bench import BenchError
-from drivers.simulated.plant.kinematics import Joints
-from drivers.simulated.plant.motion import MoveJoints
-from drivers.simulated.ur.controller import Controller
-from drivers.simulated.ur.offset_program import OffsetMotion
+from gapbridge.drivers.simulated.peer.bench import BenchError
+from gapbridge.drivers.simulated.plant.kinematics import Joints
+from gapbridge.drivers.simulated.plant.motion import MoveJoints
+from gapbridge.drivers.simulated.ur.controller import Controller
+from gapbridge.drivers.simulated.ur.offset_program import OffsetMotion
 
 DEFAULT_SPEED = 0.5  # rad/s
 

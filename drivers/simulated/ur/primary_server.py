@@ -10,9 +10,9 @@ from __future__ import annotations
 import socket
 import struct
 
-from drivers.simulated.peer.connection import Connection
-from drivers.simulated.ur import modes
-from drivers.simulated.ur.controller import Controller
+from gapbridge.drivers.simulated.peer.connection import Connection
+from gapbridge.drivers.simulated.ur import modes
+from gapbridge.drivers.simulated.ur.controller import Controller
 
 EVERY = 50  # cycles of 2 ms between two states: 10 Hz
 STATE, MESSAGE, VERSION = 16, 20, 3

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import IO, Self
 
-from core.errors import LinkError
-from drivers.simulated.ur.settings import ServerSettings, to_json
+from gapbridge.core.errors import LinkError
+from gapbridge.drivers.simulated.ur.settings import ServerSettings, to_json
 
 START_LIMIT = 20.0  # s
 STOP_LIMIT = 3.0  # s
@@ -57,7 +57,7 @@ class SimulatedController:
     def start(self) -> None:
         """Start the server and wait until every port listens."""
         errors = tempfile.NamedTemporaryFile("w+", prefix="simulated-", suffix=".log")  # noqa: SIM115
-        command = [sys.executable, "-m", "drivers.simulated", "--settings", "-"]
+        command = [sys.executable, "-m", "gapbridge.drivers.simulated", "--settings", "-"]
         process = subprocess.Popen(
             [*command, "--log", self._log_level],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True,

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.simulated.ur.rtde_names import FORMATS, INPUTS, OUTPUTS
+from gapbridge.drivers.simulated.ur.rtde_names import FORMATS, INPUTS, OUTPUTS
 
 REQUEST_VERSION = ord("V")
 CONTROLLER_VERSION = ord("v")

@@ -6,10 +6,10 @@ import logging
 import socket
 import struct
 
-from drivers.simulated.peer.connection import Connection
-from drivers.simulated.ur import rtde_protocol as wire
-from drivers.simulated.ur.controller import Controller
-from drivers.simulated.ur.rtde_names import INPUTS
+from gapbridge.drivers.simulated.peer.connection import Connection
+from gapbridge.drivers.simulated.ur import rtde_protocol as wire
+from gapbridge.drivers.simulated.ur.controller import Controller
+from gapbridge.drivers.simulated.ur.rtde_names import INPUTS
 
 log = logging.getLogger("drivers.simulated")
 

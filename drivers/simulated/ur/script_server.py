@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 
-from drivers.simulated.peer.connection import Connection
-from drivers.simulated.ur import offset_program
-from drivers.simulated.ur.control_script import control_script, read_control_text
-from drivers.simulated.ur.controller import Controller
-from drivers.simulated.ur.script_programs import script_program
-from drivers.simulated.ur.script_text import ScriptText, take_script
+from gapbridge.drivers.simulated.peer.connection import Connection
+from gapbridge.drivers.simulated.ur import offset_program
+from gapbridge.drivers.simulated.ur.control_script import control_script, read_control_text
+from gapbridge.drivers.simulated.ur.controller import Controller
+from gapbridge.drivers.simulated.ur.script_programs import script_program
+from gapbridge.drivers.simulated.ur.script_text import ScriptText, take_script
 
 log = logging.getLogger("drivers.simulated")
 

@@ -13,17 +13,17 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 
-from core.errors import LinkError
-from drivers.simulated.peer.bench import BenchServer
-from drivers.simulated.peer.connection import Connection, listen
-from drivers.simulated.peer.real_time import become_punctual
-from drivers.simulated.ur.controller import CYCLE, Controller
-from drivers.simulated.ur.dashboard_server import DashboardServer
-from drivers.simulated.ur.own_motion import move_own
-from drivers.simulated.ur.primary_server import PrimaryServer
-from drivers.simulated.ur.rtde_server import RtdeServer, RtdeSession
-from drivers.simulated.ur.script_server import ScriptServer
-from drivers.simulated.ur.settings import ServerSettings, make_controller
+from gapbridge.core.errors import LinkError
+from gapbridge.drivers.simulated.peer.bench import BenchServer
+from gapbridge.drivers.simulated.peer.connection import Connection, listen
+from gapbridge.drivers.simulated.peer.real_time import become_punctual
+from gapbridge.drivers.simulated.ur.controller import CYCLE, Controller
+from gapbridge.drivers.simulated.ur.dashboard_server import DashboardServer
+from gapbridge.drivers.simulated.ur.own_motion import move_own
+from gapbridge.drivers.simulated.ur.primary_server import PrimaryServer
+from gapbridge.drivers.simulated.ur.rtde_server import RtdeServer, RtdeSession
+from gapbridge.drivers.simulated.ur.script_server import ScriptServer
+from gapbridge.drivers.simulated.ur.settings import ServerSettings, make_controller
 
 log = logging.getLogger("drivers.simulated")
 

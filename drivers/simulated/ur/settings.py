@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from core.arm import Arm, builtin_names, builtin_rows
-from core.errors import ArmError
-from drivers.simulated.plant.declared import Declared
-from drivers.simulated.plant.kinematics import within_limits
-from drivers.simulated.plant.plant import Plant
-from drivers.simulated.plant.plant_arm import Frame, PlantArm, plant_arm
-from drivers.simulated.plant.plant_settings import PlantSettings, draw_plant_settings
-from drivers.simulated.ur.controller import Controller
+from gapbridge.core.arm import Arm, builtin_names, builtin_rows
+from gapbridge.core.errors import ArmError
+from gapbridge.drivers.simulated.plant.declared import Declared
+from gapbridge.drivers.simulated.plant.kinematics import within_limits
+from gapbridge.drivers.simulated.plant.plant import Plant
+from gapbridge.drivers.simulated.plant.plant_arm import Frame, PlantArm, plant_arm
+from gapbridge.drivers.simulated.plant.plant_settings import PlantSettings, draw_plant_settings
+from gapbridge.drivers.simulated.ur.controller import Controller
 
 START_Q = (0.0, -1.5, 1.8, -1.87, -1.57, 0.0)  # rad: elbow up, tool pointing down
 UR_JOINTS = 6  # the fields of its protocols hold six

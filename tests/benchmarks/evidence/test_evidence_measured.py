@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from benchmarks.evidence import DATA, measured
-from bridge.cell import load_cell
-from core.estimation.identification import identify_compliance
-from core.log.log import read_log
+from gapbridge.bridge.cell import load_cell
+from gapbridge.core.estimation.identification import identify_compliance
+from gapbridge.core.log.log import read_log
 
 pytestmark = pytest.mark.skipif(
     not DATA.is_dir(), reason="the measured data sets (../shared/data) are not beside this checkout"

@@ -7,7 +7,7 @@ import time
 
 from benchmarks.links.case import Cycles, nothing
 from benchmarks.links.measure import cpu_clock, measured
-from core.errors import StaleStateError
+from gapbridge.core.errors import StaleStateError
 
 
 def busy(seconds: float) -> None:

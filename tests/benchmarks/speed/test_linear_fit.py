@@ -10,13 +10,13 @@ from scipy.linalg import lstsq
 
 from benchmarks.speed.first_order import block_of, first_order
 from benchmarks.speed.linear_fit import fit_linear
-from core.arm import builtin_arm
-from core.compensation import correct
-from core.effects import Site, Term
-from core.errors import InputError
-from core.kernels.packed import pack
-from core.loads import Loads
-from core.model import Model
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.compensation import correct
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.errors import InputError
+from gapbridge.core.kernels.packed import pack
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 
 def model_of() -> Model:

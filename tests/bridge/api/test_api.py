@@ -20,7 +20,7 @@ from cli_runs import (
     table_of,
 )
 
-from bridge import api
+from gapbridge.bridge import api
 
 PAGE = Path(__file__).parents[3] / "docs" / "python.md"
 

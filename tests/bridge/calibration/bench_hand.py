@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from technician import PATIENCE, Hands, Terminal
 
-from core.model import Model
-from core.rotation import rotation_matrix
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rotation_matrix
 
 Array = NDArray[np.float64]
 THERE = 1e-4  # m: nearer than this to where it was sent, the arm has arrived

@@ -13,16 +13,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.calibration.session.journal import FILE, read_entries
-from bridge.calibration.session.plan_document import plan_of
-from bridge.cli import main
-from core.arm import builtin_arm
-from core.calibration.plan import Plan
-from core.effects import Site, Term
-from core.estimation.registration import Registration
-from core.loads import Loads
-from core.model import Model
-from core.rotation import rotation_matrix
+from gapbridge.bridge.calibration.session.journal import FILE, read_entries
+from gapbridge.bridge.calibration.session.plan_document import plan_of
+from gapbridge.bridge.cli import main
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.calibration.plan import Plan
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.estimation.registration import Registration
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rotation_matrix
 
 Array = NDArray[np.float64]
 CELL = """\

@@ -17,9 +17,9 @@ import numpy as np
 import pexpect
 from numpy.typing import NDArray
 
-from core.estimation.registration import Registration
-from core.rotation import rotation_matrix
-from drivers.simulated.ur.settings import BENCH_PORT, SCRIPT_PORT
+from gapbridge.core.estimation.registration import Registration
+from gapbridge.core.rotation import rotation_matrix
+from gapbridge.drivers.simulated.ur.settings import BENCH_PORT, SCRIPT_PORT
 
 Array = NDArray[np.float64]
 JOINT = re.compile(r"J\d ([+-][\d.]+)°")
@@ -73,7 +73,7 @@ class Terminal:
     """`gapbridge calibrate` in a terminal of its own."""
 
     def __init__(self, cell: Path, *arguments: object) -> None:
-        self.command = [sys.executable, "-m", "bridge.cli", "calibrate", str(cell)]
+        self.command = [sys.executable, "-m", "gapbridge", "calibrate", str(cell)]
         self.command += [str(a) for a in arguments]
         self.shown = ""
         self._child: pexpect.spawn[str] | None = None

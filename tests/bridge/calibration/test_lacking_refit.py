@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from played import FRAME, Played, plan_in, play, script, truth, typed, write_cell
 
-from bridge.cell import load_cell
-from core.calibration.plan import Plan
-from core.effects import Site, Term
-from core.estimation.registration import register
-from core.loads import Loads
-from core.model import Model
+from gapbridge.bridge.cell import load_cell
+from gapbridge.core.calibration.plan import Plan
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.estimation.registration import register
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 WAVE = Term("transmission_error", Site(2, 2.0), (1.8e-4, -1.2e-4))
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from played import FRAME, plan_in, play, positions, typed, write_cell
 
-from bridge.calibration.options import Order
-from bridge.calibration.planning import planned, space_of
-from bridge.calibration.session.journal import FILE, read_entries
-from bridge.cell import load_cell
-from core.calibration.plan import Plan
-from core.model import Model
+from gapbridge.bridge.calibration.options import Order
+from gapbridge.bridge.calibration.planning import planned, space_of
+from gapbridge.bridge.calibration.session.journal import FILE, read_entries
+from gapbridge.bridge.cell import load_cell
+from gapbridge.core.calibration.plan import Plan
+from gapbridge.core.model import Model
 
 AT = (2.5, -0.8, 0.6)
 
@@ -138,7 +138,7 @@ def test_what_cannot_be_meant_is_refused_in_one_line(
 
 
 def test_loads_reach_as_far_on_the_way_as_in_the_plan(tmp_path: Path) -> None:
-    from bridge.calibration.planning import loads_of, with_loads
+    from gapbridge.bridge.calibration.planning import loads_of, with_loads
 
     cell = load_cell(cell_with(tmp_path))
     bare = space_of(cell, "position")

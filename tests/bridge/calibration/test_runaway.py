@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from bridge.calibration.jobs.calibrate import worse_than_before
-from core.calibration.result import Errors
+from gapbridge.bridge.calibration.jobs.calibrate import worse_than_before
+from gapbridge.core.calibration.result import Errors
 
 
 def errors(size: float, count: int = 4) -> Errors:

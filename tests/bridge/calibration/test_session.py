@@ -20,8 +20,8 @@ from played import (
     write_cell,
 )
 
-from bridge.calibration.session.journal import FILE, read_entries
-from bridge.cell import load_cell
+from gapbridge.bridge.calibration.session.journal import FILE, read_entries
+from gapbridge.bridge.cell import load_cell
 
 
 @pytest.fixture(scope="module")
@@ -39,13 +39,13 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Played]:
 
 def remaining(cell: Path, plan_folder: Path) -> np.ndarray:
     """Return how far a cell's prediction is off at the session's poses (N,), m, rigidly fitted."""
-    from core.estimation.registration import register
+    from gapbridge.core.estimation.registration import register
 
     plan = plan_in(plan_folder)
     q = np.array([p.q for p in plan.poses])
     mass = np.array([plan.loads[p.load].mass for p in plan.poses])
     cog = np.array([plan.loads[p.load].cog for p in plan.poses])
-    from core.loads import Loads
+    from gapbridge.core.loads import Loads
 
     loads = Loads(payload_mass=mass, payload_cog=cog)
     there = truth().predict(q, loads).position
@@ -138,7 +138,7 @@ def _kept(folder: Path) -> list[dict[str, object]]:
 def _same_within_intervals(one: Path, other: Path) -> None:
     import json
 
-    from core.calibration.promise import promise_in
+    from gapbridge.core.calibration.promise import promise_in
 
     a, b = (promise_in(json.loads((p / "promise.json").read_text())) for p in (one, other))
     assert a.names == b.names
@@ -226,8 +226,8 @@ def _verified(plan: object, bend: float) -> np.ndarray:
 
     import played as source
 
-    from core.calibration.plan import Plan
-    from core.loads import Loads
+    from gapbridge.core.calibration.plan import Plan
+    from gapbridge.core.loads import Loads
 
     assert isinstance(plan, Plan)
     model = source.truth()

@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 from played import AXIAL, FRAME, Played, plan_in, play, truth, typed, write_cell
 
-from bridge.calibration.planning import observable_of
-from bridge.calibration.session.journal import FILE, read_entries
-from bridge.cell import load_cell
-from core.calibration.observables import Nuisance, fixed_at
-from core.calibration.observables.foreseen import foreseen
-from core.calibration.plan import Plan
-from core.calibration.promise import promise_in
-from core.calibration.readings import Readings
-from core.loads import Loads
+from gapbridge.bridge.calibration.planning import observable_of
+from gapbridge.bridge.calibration.session.journal import FILE, read_entries
+from gapbridge.bridge.cell import load_cell
+from gapbridge.core.calibration.observables import Nuisance, fixed_at
+from gapbridge.core.calibration.observables.foreseen import foreseen
+from gapbridge.core.calibration.plan import Plan
+from gapbridge.core.calibration.promise import promise_in
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.loads import Loads
 
 AT = np.array([0.7, 0.25, 0.5])  # where people say that it is
 TRUE_AT = np.array([0.704, 0.247, 0.505])  # where it is

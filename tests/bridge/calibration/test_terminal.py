@@ -13,11 +13,11 @@ import pytest
 from technician import FRAME, Hands, Terminal, last_pose
 
 from benchmarks.calibration.kills import run as run_kills
-from bridge.calibration.session.journal import FILE, read_entries
-from bridge.cell import load_cell
-from bridge.demo.served_cell import ServedCell
-from core.estimation.registration import Registration
-from core.rotation import rotation_matrix
+from gapbridge.bridge.calibration.session.journal import FILE, read_entries
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.demo.served_cell import ServedCell
+from gapbridge.core.estimation.registration import Registration
+from gapbridge.core.rotation import rotation_matrix
 
 _hosts = itertools.count(2)
 LOADS = ((1.5, (0.0, 0.0, 0.05)), (9.5, (0.0, 0.0, 0.09)))
@@ -132,7 +132,7 @@ def test_a_person_with_mistakes_and_a_power_cut_ends_with_a_valid_cell(tmp_path:
     assert "going on with the session" in terminal.shown
     axial = load_cell(new).model.compliance()[0]
     true = load_cell(cell)
-    from bridge.cell.simulation import server_settings
+    from gapbridge.bridge.cell.simulation import server_settings
 
     hidden = server_settings(true, host, 3).plant.axial
     assert axial[1] == pytest.approx(hidden[1], abs=2e-6)

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bridge.cell import load_cell
-from core.errors import ArmError, CellError
-from core.rotation import rotation_matrix
+from gapbridge.bridge.cell import load_cell
+from gapbridge.core.errors import ArmError, CellError
+from gapbridge.core.rotation import rotation_matrix
 
 CONFIG = Path(__file__).parents[3] / "config"
 DATA = Path(__file__).parents[4] / "shared" / "data"

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bridge.cell import load_cell, save_cell
-from bridge.cell.document import number_text, parse
-from core.arm import Arm, builtin_arm
-from core.effects import CATALOGUE, Site, Term
-from core.errors import RunError
+from gapbridge.bridge.cell import load_cell, save_cell
+from gapbridge.bridge.cell.document import number_text, parse
+from gapbridge.core.arm import Arm, builtin_arm
+from gapbridge.core.effects import CATALOGUE, Site, Term
+from gapbridge.core.errors import RunError
 
 CONFIG = Path(__file__).parents[3] / "config"
 TEXT = """\

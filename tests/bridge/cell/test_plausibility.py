@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from bridge.cell import load_cell
-from bridge.cell.cell import complaints
-from core.arm import builtin_rows
-from core.errors import CellError
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cell.cell import complaints
+from gapbridge.core.arm import builtin_rows
+from gapbridge.core.errors import CellError
 
 ARM = "robot: {model: ur10e}\n"
 URDF = """<robot name="r"><link name="base"/>

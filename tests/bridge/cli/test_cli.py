@@ -15,14 +15,14 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from bridge.cell import load_cell
-from bridge.cli import main
-from bridge.cli.table import COMMANDS
-from core.compensation import correct
-from core.effects import CATALOGUE
-from core.loads import Loads
-from core.log.log import read_log
-from core.model import Model
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cli import main
+from gapbridge.bridge.cli.table import COMMANDS
+from gapbridge.core.compensation import correct
+from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.loads import Loads
+from gapbridge.core.log.log import read_log
+from gapbridge.core.model import Model
 
 CELL = "robot: {model: ur10e}\ntool: {tcp: {xyz: [0, 0, 0.18]}}\nmetrology: {registered: true}\n"
 SOFT = (
@@ -107,7 +107,7 @@ def measured_log(model: Model, count: int = 40, noise: float = 2e-5) -> str:
 
 def test_help_names_every_command_and_imports_none(desk: Desk) -> None:
     code = (
-        "import sys\nfrom bridge.cli import main\ntry:\n    main(['--help'])\n"
+        "import sys\nfrom gapbridge.bridge.cli import main\ntry:\n    main(['--help'])\n"
         "except SystemExit:\n    assert 'numba' not in sys.modules, 'numba was imported'\n"
     )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -119,7 +119,7 @@ def test_help_names_every_command_and_imports_none(desk: Desk) -> None:
 @pytest.mark.parametrize("name", ["predict", "diagnose", "fit", "run"])
 def test_a_command_waits_for_no_solver_before_it_has_work(desk: Desk, name: str) -> None:
     code = (
-        f"import sys\nimport bridge.cli.{name}\n"
+        f"import sys\nimport gapbridge.bridge.cli.{name}\n"
         "found = {'scipy.optimize', 'scipy.linalg', 'scipy.stats'} & set(sys.modules)\n"
         "assert not found, found\n"
     )
@@ -287,7 +287,7 @@ def test_unusable_paths_are_refused_in_one_line(desk: Desk, command: str) -> Non
 def test_an_unknown_key_of_a_cell_is_told_by_the_real_command(desk: Desk) -> None:
     desk.write("cell.yaml", CELL + "payloda: {mass: 5}\n")
     desk.write("log.csv", f"{Q1}\n{ROW}\n")
-    command = [sys.executable, "-m", "bridge.cli", "predict", "log.csv", "--cell", "cell.yaml"]
+    command = [sys.executable, "-m", "gapbridge", "predict", "log.csv", "--cell", "cell.yaml"]
     ran = subprocess.run(
         [*command, "--out", "o.csv"], capture_output=True, text=True, check=False, cwd=desk.folder,
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
@@ -305,7 +305,7 @@ def test_an_unforeseen_failure_is_one_line_and_a_file(
     def broken(*_: object) -> None:
         raise ZeroDivisionError("by nothing")
 
-    monkeypatch.setattr("bridge.cli.predict.open_cell", broken)
+    monkeypatch.setattr("gapbridge.bridge.cli.predict.open_cell", broken)
     ran = desk.run("predict", "@log.csv", "--cell", "@cell.yaml", "--out", "@o.csv")
     assert ran.code == 1
     assert ran.err.startswith("error: ZeroDivisionError: by nothing (details: ")
@@ -363,7 +363,7 @@ def test_explain_lists_the_catalogue_and_names_the_nearest(desk: Desk) -> None:
 def test_simulate_serves_until_it_is_told_to_stop(desk: Desk) -> None:
     host = f"127.{1 + os.getpid() // 250 % 250}.{os.getpid() % 250}.77"
     desk.write("cell.yaml", SOFT + f"simulation: {{host: {host}, seed: 3}}\n")
-    command = [sys.executable, "-m", "bridge.cli", "simulate", str(desk.folder / "cell.yaml")]
+    command = [sys.executable, "-m", "gapbridge", "simulate", str(desk.folder / "cell.yaml")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
         told = [server.stdout.readline() for _ in range(2)]

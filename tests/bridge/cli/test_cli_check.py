@@ -11,12 +11,12 @@ import pytest
 from cli_runs import gapbridge, refused
 from daemon_cell import plant
 
-from bridge.cell import load_cell
-from core.arm import builtin_arm
-from core.plausibility import flange_in_first
-from drivers.simulated.ur.process import SimulatedController
-from drivers.simulated.ur.settings import announced_rows
-from drivers.ur_rtde.enquiry import enquire
+from gapbridge.bridge.cell import load_cell
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.plausibility import flange_in_first
+from gapbridge.drivers.simulated.ur.process import SimulatedController
+from gapbridge.drivers.simulated.ur.settings import announced_rows
+from gapbridge.drivers.ur_rtde.enquiry import enquire
 
 DELTAS = {
     "delta_theta": [1e-7, -1e-4, 2e-4, 1e-4, 0.0, 0.0],

@@ -18,7 +18,7 @@ metrology: {registered: true, sigma: 2.0e-5}
 
 def gapbridge(*words: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "bridge.cli", *map(str, words)], capture_output=True, text=True,
+        [sys.executable, "-m", "gapbridge", *map(str, words)], capture_output=True, text=True,
         timeout=120, check=False,
     )  # fmt: skip
 
@@ -77,7 +77,7 @@ def test_predictions_under_a_parquet_name_are_parquet(recording: Path) -> None:
 )
 def test_what_cannot_be_converted_is_one_line(recording: Path, words: list[str], said: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "bridge.cli", "convert", *words], capture_output=True, text=True,
+        [sys.executable, "-m", "gapbridge", "convert", *words], capture_output=True, text=True,
         timeout=120, check=False, cwd=recording.parent,
     )  # fmt: skip
     assert done.returncode == 2

@@ -22,12 +22,12 @@ from cli_runs import (
     table_of,
 )
 
-import bridge.cli.diagnose as command
-from bridge.cell import load_cell
-from core.arm import builtin_arm
-from core.effects import Site, Term
-from core.log.log import Log
-from core.model import Model
+import gapbridge.bridge.cli.diagnose as command
+from gapbridge.bridge.cell import load_cell
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.log.log import Log
+from gapbridge.core.model import Model
 
 SOFT = Model(builtin_arm("ur10e")).with_terms([Term("axial_compliance", Site(2), (2e-5,))])
 

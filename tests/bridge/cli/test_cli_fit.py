@@ -21,8 +21,8 @@ from cli_runs import (
     table_of,
 )
 
-from bridge.cell import load_cell, save_cell
-from core.rotation import rotation_matrix
+from gapbridge.bridge.cell import load_cell, save_cell
+from gapbridge.core.rotation import rotation_matrix
 
 
 def bent_cell(folder: Path) -> Path:

@@ -10,9 +10,9 @@ import pytest
 from cli_runs import bent_model, cell_in, columns_of, gapbridge, measured, poses_and_loads, refused
 from pyarrow import parquet
 
-from bridge.cell import load_cell
-from bridge.cli import large_log
-from core.log.pieces import LogPieces
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cli import large_log
+from gapbridge.core.log.pieces import LogPieces
 
 Columns = dict[str, np.ndarray]
 
@@ -56,9 +56,9 @@ def test_a_log_is_large_from_its_number_of_rows_on(tmp_path, rows, large):
 
 
 def test_a_recording_that_holds_no_measured_poses_says_so(tmp_path):
-    from bridge.cell.settings.recording import RecordingSettings
-    from bridge.ipc.shared_memory import Page
-    from bridge.recording.recorder import Recorder
+    from gapbridge.bridge.cell.settings.recording import RecordingSettings
+    from gapbridge.bridge.ipc.shared_memory import Page
+    from gapbridge.bridge.recording.recorder import Recorder
 
     page = Page(6)
     settings = RecordingSettings(folder=tmp_path, keep_free=0.0)

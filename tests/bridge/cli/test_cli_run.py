@@ -9,16 +9,16 @@ from types import ModuleType
 import pytest
 from cli_runs import cell_in, gapbridge, refused
 
-from bridge.cell import Cell
-from bridge.cli.blind import benchmark
-from bridge.cli.optional import member
-from core.errors import LinkError, RunError
+from gapbridge.bridge.cell import Cell
+from gapbridge.bridge.cli.blind import benchmark
+from gapbridge.bridge.cli.optional import member
+from gapbridge.core.errors import LinkError, RunError
 
 
 def daemon(monkeypatch: pytest.MonkeyPatch, run_cell: object) -> None:
-    module = ModuleType("bridge.daemon.run")
+    module = ModuleType("gapbridge.bridge.daemon.run")
     module.run_cell = run_cell  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "bridge.daemon.run", module)
+    monkeypatch.setitem(sys.modules, "gapbridge.bridge.daemon.run", module)
 
 
 def test_run_hands_the_cell_and_its_options_to_the_daemon(

@@ -22,11 +22,11 @@ from cli_runs import (
     cell_in as registered_cell_in,
 )
 
-from bridge.cell import load_cell
-from core.arm import builtin_arm
-from core.effects import Site, Term
-from core.model import Model
-from core.rotation import rotation_matrix
+from gapbridge.bridge.cell import load_cell
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rotation_matrix
 
 SOFT = Model(builtin_arm("ur10e")).with_terms([Term("axial_compliance", Site(2), (2e-5,))])
 FRAMES = {"a.csv": (np.array([0.2, -0.4, 1.0]), 1.0), "b.csv": (np.array([-1.0, 0.3, 0.2]), -2.0)}

@@ -12,24 +12,24 @@ import pytest
 from cli_runs import CELL, cell_in, columns_of, gapbridge, log_in, measured, names, poses_and_loads
 from cli_runs import table_of as read
 
-from bridge.cell import load_cell
-from bridge.report.words import effect_words
-from core.arm import builtin_arm
-from core.compensation import Compensator
-from core.dynamics import predict_torque, predict_tracking, predict_wrench, with_pieces
-from core.effects import CATALOGUE, Site, Term
-from core.log.log import Log
-from core.model import Model
-from core.motion import Motion, motion_of
-from core.state import RobotState
-from drivers.ft_sensor.wrench import TcpForce
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.report.words import effect_words
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.compensation import Compensator
+from gapbridge.core.dynamics import predict_torque, predict_tracking, predict_wrench, with_pieces
+from gapbridge.core.effects import CATALOGUE, Site, Term
+from gapbridge.core.log.log import Log
+from gapbridge.core.model import Model
+from gapbridge.core.motion import Motion, motion_of
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.ft_sensor.wrench import TcpForce
 
 FILE = '''
 """A made-up effect."""
 
 import numpy as np
 
-from core.effects.effect import JointEffect, Parameter
+from gapbridge.core.effects.effect import JointEffect, Parameter
 
 
 class {name}(JointEffect):

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from daemon_cell import Robot, Run, offsets, wait_for
 
-from bridge.cell.run_settings import read_configuration
-from bridge.loop.supervisor import State
+from gapbridge.bridge.cell.run_settings import read_configuration
+from gapbridge.bridge.loop.supervisor import State
 
 PATIENT = ", state_timeout: 0.25"
 

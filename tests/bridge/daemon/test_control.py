@@ -15,14 +15,14 @@ from typing import Any
 import pytest
 from daemon_cell import Robot, Run, gapbridge, wait_for
 
-from bridge.cell.runtime_folder import cell_key, runtime_folder
-from bridge.daemon import control
-from bridge.ipc import control_socket
-from bridge.ipc.control_client import ask, ask_socket, running
-from bridge.ipc.control_socket import ControlSocket, Peer
-from bridge.ipc.shared_memory import Phase
-from bridge.loop.supervisor import State
-from core.errors import InputError, RunError
+from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
+from gapbridge.bridge.daemon import control
+from gapbridge.bridge.ipc import control_socket
+from gapbridge.bridge.ipc.control_client import ask, ask_socket, running
+from gapbridge.bridge.ipc.control_socket import ControlSocket, Peer
+from gapbridge.bridge.ipc.shared_memory import Phase
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.core.errors import InputError, RunError
 
 PATIENT = ", state_timeout: 0.25"  # a busy machine holds the simulated controller up
 

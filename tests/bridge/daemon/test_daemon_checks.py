@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from daemon_cell import Robot, Run, offsets, wait_for
 
-from bridge.daemon.status_document import lines
-from bridge.loop.supervisor import State
+from gapbridge.bridge.daemon.status_document import lines
+from gapbridge.bridge.loop.supervisor import State
 
 PATIENT = ", state_timeout: 0.2"
 

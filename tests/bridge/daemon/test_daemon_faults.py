@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from daemon_cell import Robot, Run, gapbridge, offsets, only_recording, read_cycles, wait_for
 
-from bridge.loop.supervisor import State
-from core.errors import CellError, InputError, LinkError
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.core.errors import CellError, InputError, LinkError
 
 
 @pytest.fixture

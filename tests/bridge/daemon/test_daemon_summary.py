@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bridge.daemon.summary import Histogram, RunSummary, Tally
-from bridge.ipc.shared_memory import slices_of
-from core.limits import CLAMPS, RATE, VELOCITY
+from gapbridge.bridge.daemon.summary import Histogram, RunSummary, Tally
+from gapbridge.bridge.ipc.shared_memory import slices_of
+from gapbridge.core.limits import CLAMPS, RATE, VELOCITY
 
 N, RATE_HZ = 6, 500.0
 

@@ -14,12 +14,12 @@ from typing import Any
 import pytest
 from daemon_cell import Robot, Run, gapbridge, wait_for
 
-from bridge.cell.sections import link_settings
-from bridge.daemon.host import OwnerLock
-from bridge.ipc.control_client import ask
-from bridge.loop.supervisor import State
-from core.errors import InputError
-from drivers.controller_address import address_of
+from gapbridge.bridge.cell.sections import link_settings
+from gapbridge.bridge.daemon.host import OwnerLock
+from gapbridge.bridge.ipc.control_client import ask
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.core.errors import InputError
+from gapbridge.drivers.controller_address import address_of
 
 
 @pytest.fixture(autouse=True)
@@ -37,7 +37,7 @@ CELL = Path("cell.yaml")
 HOLD = """
 import sys, time
 from pathlib import Path
-from bridge.daemon.host import OwnerLock
+from gapbridge.bridge.daemon.host import OwnerLock
 OwnerLock("host 192.0.2.7", Path("first.yaml")).acquire()
 print("held", flush=True)
 time.sleep(1000)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from daemon_cell import Robot, Run, offsets, wait_for
 
-from bridge.loop.supervisor import State
+from gapbridge.bridge.loop.supervisor import State
 
 PATIENT = ", state_timeout: 0.25"
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from daemon_cell import Robot, gapbridge, wait_for
 
-from bridge.daemon.service_manager import ServiceManager
+from gapbridge.bridge.daemon.service_manager import ServiceManager
 
 UNIT = Path(__file__).parents[3] / "config" / "gapbridge@.service"
 

@@ -12,9 +12,9 @@ import pytest
 from daemon_cell import Robot, Run, wait_for
 from watched_feed import free_port
 
-from bridge.daemon import sides as daemon_sides
-from bridge.ipc.control_client import ask
-from bridge.loop.supervisor import State
+from gapbridge.bridge.daemon import sides as daemon_sides
+from gapbridge.bridge.ipc.control_client import ask
+from gapbridge.bridge.loop.supervisor import State
 
 SIDES = tuple(daemon_sides.SIDES)
 

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from bridge.cell import load_cell
-from bridge.demo.job import PORTS, free_address, run_demo
-from core.errors import InputError
-from core.log.log import read_log
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.demo.job import PORTS, free_address, run_demo
+from gapbridge.core.errors import InputError
+from gapbridge.core.log.log import read_log
 
 ROOT = Path(__file__).parents[3]
 
@@ -37,7 +37,7 @@ def test_an_address_that_is_taken_is_passed_over() -> None:
 @pytest.mark.timeout(600)
 def test_the_demo_shows_what_it_promises(tmp_path: Path) -> None:
     out = tmp_path / "out" / "demo"
-    command = [sys.executable, "-m", "bridge.cli", "demo", "--seed", "5", "--out", str(out)]
+    command = [sys.executable, "-m", "gapbridge", "demo", "--seed", "5", "--out", str(out)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     ran = subprocess.run(
         command, capture_output=True, text=True, check=False, cwd=tmp_path, env=environment

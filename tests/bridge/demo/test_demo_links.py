@@ -14,19 +14,19 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from bridge.cell import load_cell
-from bridge.demo.links import LINKS, DemoLink
-from bridge.demo.own_program import travel_time
-from bridge.demo.poses import candidates, plan
-from bridge.demo.rests import rests, write_log
-from bridge.demo.result import reach
-from core.errors import LinkError
-from core.log.log import read_log
-from drivers.simulated.peer.peer import OWN_ACCELERATION, OWN_SPEED
-from drivers.simulated.plant.kinematics import within_limits
-from drivers.simulated.plant.motion import MoveJoints
-from drivers.simulated.plant.plant_arm import plant_arm
-from drivers.simulated.ur.settings import BENCH_PORT
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.demo.links import LINKS, DemoLink
+from gapbridge.bridge.demo.own_program import travel_time
+from gapbridge.bridge.demo.poses import candidates, plan
+from gapbridge.bridge.demo.rests import rests, write_log
+from gapbridge.bridge.demo.result import reach
+from gapbridge.core.errors import LinkError
+from gapbridge.core.log.log import read_log
+from gapbridge.drivers.simulated.peer.peer import OWN_ACCELERATION, OWN_SPEED
+from gapbridge.drivers.simulated.plant.kinematics import within_limits
+from gapbridge.drivers.simulated.plant.motion import MoveJoints
+from gapbridge.drivers.simulated.plant.plant_arm import plant_arm
+from gapbridge.drivers.simulated.ur.settings import BENCH_PORT
 
 ROOT = Path(__file__).parents[3]
 PEERS = ("can", "modbus")
@@ -143,7 +143,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Shown]:
     running = []
     for name in PEERS:
         told = folder / f"{name}.txt"
-        command = [sys.executable, "-m", "bridge.cli", "demo", "--link", name, "--seed", "3"]
+        command = [sys.executable, "-m", "gapbridge", "demo", "--link", name, "--seed", "3"]
         with told.open("w") as output:
             running.append(subprocess.Popen(
                 [*command, "--out", str(folder / name)], stdout=output, stderr=output, cwd=folder,
@@ -188,7 +188,8 @@ def test_the_demo_shows_on_every_link_what_it_promises(name: str, shown: dict[st
 
 def test_a_demo_that_is_killed_leaves_no_controller_behind(tmp_path: Path) -> None:
     script = (
-        "import sys, time; from pathlib import Path; from bridge.demo.links import LINKS\n"
+        "import sys, time; from pathlib import Path\n"
+        "from gapbridge.bridge.demo.links import LINKS\n"
         "link = LINKS['can'](Path(sys.argv[1]), 1)\n"
         "with link.served():\n    print(link.host, flush=True); time.sleep(60)\n"
     )

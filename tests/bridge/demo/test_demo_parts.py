@@ -8,23 +8,23 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from bridge.cell import load_cell
-from bridge.demo.page import page
-from bridge.demo.picture import picture
-from bridge.demo.poses import CALIBRATION_LOADS, TEST_LOADS, candidates, plan
-from bridge.demo.rests import Rests, joined, rests, write_log
-from bridge.demo.result import LoopFigures, Result, repeatability
-from bridge.demo.session import Session
-from bridge.demo.terminal import bar
-from bridge.demo.trajectory import ACCELERATION, PERIOD, SPEED, visits, write_trajectory
-from core.arm import builtin_arm
-from core.compensation import correct
-from core.errors import RunError
-from core.estimation.identification import identify_compliance
-from core.log.log import read_log
-from core.metrology import Metrology
-from core.model import Model
-from core.rotation import rotation_vector, transform
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.demo.page import page
+from gapbridge.bridge.demo.picture import picture
+from gapbridge.bridge.demo.poses import CALIBRATION_LOADS, TEST_LOADS, candidates, plan
+from gapbridge.bridge.demo.rests import Rests, joined, rests, write_log
+from gapbridge.bridge.demo.result import LoopFigures, Result, repeatability
+from gapbridge.bridge.demo.session import Session
+from gapbridge.bridge.demo.terminal import bar
+from gapbridge.bridge.demo.trajectory import ACCELERATION, PERIOD, SPEED, visits, write_trajectory
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.compensation import correct
+from gapbridge.core.errors import RunError
+from gapbridge.core.estimation.identification import identify_compliance
+from gapbridge.core.log.log import read_log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rotation_vector, transform
 
 HOME = np.array([0.0, -1.5, 1.8, -1.87, -1.57, 0.0])
 MODEL = Model(builtin_arm("ur10e"), transform(np.eye(3), np.array([0, 0, 0.18])))

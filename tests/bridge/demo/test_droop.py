@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from core.arm import builtin_arm
-from core.compensation import Compensator
-from core.diagnosis.diagnosis import diagnose
-from core.log.log import Log
-from core.model import Model
-from drivers.simulated.plant.plant import Plant
-from drivers.simulated.plant.plant_arm import plant_arm
-from drivers.simulated.plant.plant_settings import draw_plant_settings
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.compensation import Compensator
+from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.log.log import Log
+from gapbridge.core.model import Model
+from gapbridge.drivers.simulated.plant.plant import Plant
+from gapbridge.drivers.simulated.plant.plant_arm import plant_arm
+from gapbridge.drivers.simulated.plant.plant_settings import draw_plant_settings
 
 ARM = builtin_arm("ur3e")
 DROOP = (0.0, 1.6e-4, 3e-4, 1.5e-3, 1e-3, 0.0)  # rad/Nm: some 5 mrad where the arm is stretched out

@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bridge.fleet.cell_source import OneCell
-from bridge.fleet.runner import tasks_of
-from bridge.fleet.session import find_sessions
-from bridge.fleet.task import Task, Work
+from gapbridge.bridge.fleet.cell_source import OneCell
+from gapbridge.bridge.fleet.runner import tasks_of
+from gapbridge.bridge.fleet.session import find_sessions
+from gapbridge.bridge.fleet.task import Task, Work
 from tests.bridge.cli_runs import (
     bent_model,
     cell_in,

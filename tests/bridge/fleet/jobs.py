@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bridge.cell import Cell
-from core.log.log import Log
+from gapbridge.bridge.cell import Cell
+from gapbridge.core.log.log import Log
 
 
 def count_rows(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 from pyarrow import parquet
 
-from bridge.cell import load_cell
-from core.arm import builtin_arm
-from core.model import Model
+from gapbridge.bridge.cell import load_cell
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.model import Model
 from tests.bridge.cli_runs import (
     AXIAL,
     bent_model,
@@ -150,7 +150,7 @@ def test_a_run_that_is_killed_loses_nothing(tmp_path: Path) -> None:
     cell_in(tmp_path)
     out = tmp_path / "out"
     command = [
-        sys.executable, "-m", "bridge.cli", "fleet", "fit", str(logs), "--cell",
+        sys.executable, "-m", "gapbridge", "fleet", "fit", str(logs), "--cell",
         str(tmp_path / "cell.yaml"), "--out", str(out), "--workers", "1",
     ]  # fmt: skip
     journal = out / "fit.jsonl"

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from distributed import LocalCluster
 
-from bridge.fleet.dask_workers import DaskWorkers
-from bridge.fleet.task import BAD, DIED, DONE
-from core.errors import RunError
+from gapbridge.bridge.fleet.dask_workers import DaskWorkers
+from gapbridge.bridge.fleet.task import BAD, DIED, DONE
+from gapbridge.core.errors import RunError
 from tests.bridge.fleet.fleet_in import tasks_in
 from tests.bridge.fleet.jobs import count_rows, kill_itself
 

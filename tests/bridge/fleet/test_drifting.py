@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from bridge.fleet.drift import DAY, Series, drifts, places
-from bridge.fleet.outlying import far_from_median
+from gapbridge.bridge.fleet.drift import DAY, Series, drifts, places
+from gapbridge.bridge.fleet.outlying import far_from_median
 
 SESSIONS = 6
 

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from bridge.fleet.cell_source import OneCell
-from bridge.fleet.journal import Journal
-from bridge.fleet.runner import run, tasks_of
-from bridge.fleet.session import find_sessions
-from bridge.fleet.task import BAD, DIED, DONE, Outcome, Task, perform
-from bridge.fleet.workers import Workers
-from core.errors import RunError
+from gapbridge.bridge.fleet.cell_source import OneCell
+from gapbridge.bridge.fleet.journal import Journal
+from gapbridge.bridge.fleet.runner import run, tasks_of
+from gapbridge.bridge.fleet.session import find_sessions
+from gapbridge.bridge.fleet.task import BAD, DIED, DONE, Outcome, Task, perform
+from gapbridge.bridge.fleet.workers import Workers
+from gapbridge.core.errors import RunError
 from tests.bridge.fleet.fleet_in import tasks_in
 from tests.bridge.fleet.jobs import count_rows
 

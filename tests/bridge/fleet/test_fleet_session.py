@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from bridge.fleet.cell_source import CellBeside, CellTable, OneCell, cell_source
-from bridge.fleet.session import Found, find_sessions
-from core.errors import InputError
+from gapbridge.bridge.fleet.cell_source import CellBeside, CellTable, OneCell, cell_source
+from gapbridge.bridge.fleet.session import Found, find_sessions
+from gapbridge.core.errors import InputError
 
 
 def files_in(folder: Path, *names: str) -> Path:

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from bridge.ipc.command_page import Command, CommandPage, Commands
+from gapbridge.bridge.ipc.command_page import Command, CommandPage, Commands
 
 ARM, DISARM, RAMP_OUT, STOP = Command
 
@@ -75,7 +75,7 @@ def test_none_is_lost_however_close_they_come(page: CommandPage) -> None:
     """Four threads ask as fast as they can; the loop takes in a process of its own."""
     code = f"""
 import sys
-from bridge.ipc.command_page import Command, Commands
+from gapbridge.bridge.ipc.command_page import Command, Commands
 commands, counts = Commands({page.fd}), dict.fromkeys(Command, 0)
 print("there", flush=True)
 last = dict.fromkeys(Command, 0)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.ipc.log_lines import JsonLines, log_line
+from gapbridge.bridge.ipc.log_lines import JsonLines, log_line
 
 TEXTS = st.dictionaries(st.text(max_size=8), st.text(max_size=20) | st.floats() | st.none())
 

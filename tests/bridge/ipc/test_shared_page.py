@@ -11,8 +11,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from bridge.ipc.counts import Count
-from bridge.ipc.shared_memory import ROWS, FollowedPage, Page, Phase, RunPage
+from gapbridge.bridge.ipc.counts import Count
+from gapbridge.bridge.ipc.shared_memory import ROWS, FollowedPage, Page, Phase, RunPage
 
 
 @pytest.fixture
@@ -127,7 +127,7 @@ def test_who_only_reads_cannot_write(page: Page) -> None:
     fd = page.open_for_reading()
     code = f"""
 import mmap, os
-from bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import Page
 page = Page(2, {fd}, writable=False)
 assert page.reader().drain()[:, 1].tolist() == [7.0]
 again = os.open("/proc/self/fd/{fd}", os.O_RDWR)

@@ -15,14 +15,14 @@ from typing import Any
 
 import pytest
 
-from bridge.cell.daemon_settings import DaemonSettings
-from bridge.ipc import side_process
-from bridge.ipc.shared_memory import Page
-from bridge.ipc.side_process import SideProcess
+from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.ipc import side_process
+from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.side_process import SideProcess
 
 ECHO = """
     import os
-    from bridge.ipc.side_main import take_order
+    from gapbridge.bridge.ipc.side_main import take_order
 
     order = take_order()
     reader = order.page.reader()
@@ -40,7 +40,7 @@ ECHO = """
 """
 DEAF = """
     import time
-    from bridge.ipc.side_main import take_order
+    from gapbridge.bridge.ipc.side_main import take_order
 
     order = take_order()
     order.events.poll()
@@ -189,9 +189,9 @@ def test_when_the_daemon_is_killed_they_end(
     daemon = f"""
 import json, sys, time
 sys.path.insert(0, {str(tmp_path)!r})
-from bridge.ipc import side_main
-from bridge.ipc.shared_memory import Page
-from bridge.ipc.side_process import SideProcess
+from gapbridge.bridge.ipc import side_main
+from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.side_process import SideProcess
 side = SideProcess("side_under_test", json.loads({json.dumps(order)!r}), Page(2))
 while not side.events():
     time.sleep(0.02)

@@ -10,21 +10,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.ipc.counts import Count
-from bridge.ipc.shared_memory import Page
-from bridge.loop.checks import DEGRADED, LATE, LoopChecks
-from bridge.loop.frozen_watch import FrozenWatch
-from bridge.loop.link_monitor import StateWatch, hold_time
-from bridge.loop.overrun_watch import OverrunWatch
-from bridge.loop.sample_check import SampleCheck
-from bridge.loop.saturation_watch import SaturationWatch
-from bridge.loop.supervisor import State, Supervisor
-from core.arm import builtin_arm
-from core.errors import InvalidStateError, StaleStateError
-from core.limits import ENVELOPE, RATE
-from core.model import Model
-from core.state import RobotState
-from drivers.driver import Driver
+from gapbridge.bridge.ipc.counts import Count
+from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.loop.checks import DEGRADED, LATE, LoopChecks
+from gapbridge.bridge.loop.frozen_watch import FrozenWatch
+from gapbridge.bridge.loop.link_monitor import StateWatch, hold_time
+from gapbridge.bridge.loop.overrun_watch import OverrunWatch
+from gapbridge.bridge.loop.sample_check import SampleCheck
+from gapbridge.bridge.loop.saturation_watch import SaturationWatch
+from gapbridge.bridge.loop.supervisor import State, Supervisor
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.errors import InvalidStateError, StaleStateError
+from gapbridge.core.limits import ENVELOPE, RATE
+from gapbridge.core.model import Model
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.driver import Driver
 
 ARM = builtin_arm("ur10e")
 Q = np.array([0.0, -1.5, 1.8, -1.87, -1.57, 0.0])
@@ -242,7 +242,7 @@ def test_a_state_that_is_late_is_counted_and_only_a_stale_one_holds(
     page: Page, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = [100.0]
-    monkeypatch.setattr("bridge.loop.link_monitor.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("gapbridge.bridge.loop.link_monitor.time.monotonic", lambda: clock[0])
     driver, supervisor, watch, _ = watched(page)
     driver.next = StaleStateError("the clock stands still")
     seen = []
@@ -360,7 +360,7 @@ def test_a_hiccup_while_observing_latches_no_fault(
     page: Page, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = [100.0]
-    monkeypatch.setattr("bridge.loop.link_monitor.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("gapbridge.bridge.loop.link_monitor.time.monotonic", lambda: clock[0])
     driver, supervisor, watch, told = watched(page)
     supervisor.state = State.OBSERVING
     good = driver.next

@@ -10,12 +10,12 @@ import time
 import numpy as np
 import pytest
 
-from bridge.ipc.cycle_row import fill_row
-from bridge.ipc.shared_memory import ROWS, Page, Phase, RunPage
-from bridge.loop.controller_clock import ControllerClock
-from bridge.loop.live_loads import LiveLoads
-from core.load_bounds import LoadBounds
-from core.state import RobotState
+from gapbridge.bridge.ipc.cycle_row import fill_row
+from gapbridge.bridge.ipc.shared_memory import ROWS, Page, Phase, RunPage
+from gapbridge.bridge.loop.controller_clock import ControllerClock
+from gapbridge.bridge.loop.live_loads import LiveLoads
+from gapbridge.core.load_bounds import LoadBounds
+from gapbridge.core.state import RobotState
 
 Q = np.array([0.0, -1.5, 1.8])
 
@@ -218,7 +218,7 @@ def test_another_process_sees_the_same_page_and_its_death_leaves_it_whole() -> N
     page.renew()
     code = f"""
 import os, time
-from bridge.ipc.shared_memory import Page, Phase
+from gapbridge.bridge.ipc.shared_memory import Page, Phase
 page = Page(3, {page.fd})
 page.enter(Phase.RUNNING)
 page.tell_state(3)

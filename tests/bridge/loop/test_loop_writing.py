@@ -13,28 +13,28 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bridge.cell.sections import LimitSettings, SetpointSettings
-from bridge.ipc.shared_memory import Page
-from bridge.loop.live_loads import LiveLoads
-from bridge.loop.offset_in_force import OffsetInForce
-from bridge.loop.setpoint_stream import SetpointStream
-from bridge.loop.supervisor import Cause, State, Supervisor
-from bridge.loop.writing import PARTS_IN_A_ROW, Writing
-from bridge.setpoint_source import make_source
-from core.arm import builtin_arm
-from core.compensation import Correction
-from core.errors import (
+from gapbridge.bridge.cell.sections import LimitSettings, SetpointSettings
+from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.loop.live_loads import LiveLoads
+from gapbridge.bridge.loop.offset_in_force import OffsetInForce
+from gapbridge.bridge.loop.setpoint_stream import SetpointStream
+from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
+from gapbridge.bridge.loop.writing import PARTS_IN_A_ROW, Writing
+from gapbridge.bridge.setpoint_source import make_source
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.compensation import Correction
+from gapbridge.core.errors import (
     ForeignCommandError,
     IneffectiveWriteError,
     LinkError,
     PartialWriteError,
     WriteError,
 )
-from core.loads import Loads
-from core.model import Model
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.driver import Driver
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.driver import Driver
 
 Q = np.array([0.0, -1.5, 1.8, -1.87, -1.57, 0.0])
 T = 0.002
@@ -345,7 +345,7 @@ def test_an_offset_in_force_outlives_the_process_that_left_it(tmp_path: Path) ->
     delta, offset = np.full(6, 1e-3), np.full(6, 2e-3)
     code = (
         "import sys, os, numpy as np; from pathlib import Path\n"
-        "from bridge.loop.offset_in_force import OffsetInForce\n"
+        "from gapbridge.bridge.loop.offset_in_force import OffsetInForce\n"
         f"kept = OffsetInForce(6, Path({str(path)!r}))\n"
         "for k in range(5): kept.note(np.full(6, 0.1 * k), np.full(6, 1e-3), np.full(6, 2e-3))\n"
         "os.kill(os.getpid(), 9)\n"

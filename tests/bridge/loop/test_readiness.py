@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bridge.loop.readiness import GAPS, ModelCheck, RateCheck
-from core.arm import arm_from_dh, builtin_arm
-from core.loads import Loads
-from core.model import Model
+from gapbridge.bridge.loop.readiness import GAPS, ModelCheck, RateCheck
+from gapbridge.core.arm import arm_from_dh, builtin_arm
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 SOFT = [1e-6] * 6
 PULL = Loads(wrench=np.array([[0.0, 0.0, -30.0, 0.0, 0.0, 0.0]]))

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from bridge.loop import realtime
+from gapbridge.bridge.loop import realtime
 
 ASK = """\
 import sys
-from bridge.loop import realtime
+from gapbridge.bridge.loop import realtime
 realtime.LATENCY, realtime.IDLE_DRIVER = sys.argv[1:3]
 print(", ".join(realtime.become_realtime(float(sys.argv[3]))))
 """

@@ -13,14 +13,14 @@ import yaml
 from daemon_cell import Robot, wait_for
 from numpy.typing import NDArray
 
-from bridge.cell.run_settings import read_configuration
-from bridge.cell.settings.recording import RecordingSettings
-from bridge.daemon.processes import LoopProcess
-from bridge.ipc.command_page import Command, CommandPage
-from bridge.ipc.shared_memory import RunPage
-from bridge.loop.supervisor import State
-from bridge.recording.recorder import Recorder
-from core.log.mcap_reading import read_columns
+from gapbridge.bridge.cell.run_settings import read_configuration
+from gapbridge.bridge.cell.settings.recording import RecordingSettings
+from gapbridge.bridge.daemon.processes import LoopProcess
+from gapbridge.bridge.ipc.command_page import Command, CommandPage
+from gapbridge.bridge.ipc.shared_memory import RunPage
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.recording.recorder import Recorder
+from gapbridge.core.log.mcap_reading import read_columns
 
 COMPARED = (
     "timestamp", "state", "written", "attempted", "nominal_q", "corrected_q", "offset", "residual",

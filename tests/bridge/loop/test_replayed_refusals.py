@@ -10,24 +10,24 @@ from typing import Any
 import numpy as np
 from test_replayed_loop import assert_same_bits
 
-from bridge.cell import load_cell
-from bridge.cell.daemon_settings import DaemonSettings
-from bridge.cell.sections import SetpointSettings
-from bridge.cell.settings.recording import RecordingSettings
-from bridge.ipc.command_page import Command, CommandPage, Commands
-from bridge.ipc.shared_memory import Page
-from bridge.loop.loop import Exit, Loop
-from bridge.loop.main import _compile
-from bridge.loop.replay import ReplayedLoop
-from bridge.recording.recorder import Recorder
-from bridge.setpoint_source.target import TargetSource
-from core.errors import LinkError, PartialWriteError
-from core.log.mcap_reading import read_columns
-from core.model import Model
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.driver import Driver
-from drivers.replay import ReplayDriver, ReplaySettings
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.cell.sections import SetpointSettings
+from gapbridge.bridge.cell.settings.recording import RecordingSettings
+from gapbridge.bridge.ipc.command_page import Command, CommandPage, Commands
+from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.loop.loop import Exit, Loop
+from gapbridge.bridge.loop.main import _compile
+from gapbridge.bridge.loop.replay import ReplayedLoop
+from gapbridge.bridge.recording.recorder import Recorder
+from gapbridge.bridge.setpoint_source.target import TargetSource
+from gapbridge.core.errors import LinkError, PartialWriteError
+from gapbridge.core.log.mcap_reading import read_columns
+from gapbridge.core.model import Model
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.replay import ReplayDriver, ReplaySettings
 
 N = 6
 CELL = """\

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bridge.cell.sections import LimitSettings
-from bridge.loop.nominal_stream import DECELERATION, NominalStream
-from bridge.loop.setpoint_stream import SetpointStream, limits_of
-from core.arm import builtin_arm
-from core.compensation import correct
-from core.errors import LimitError
-from core.loads import Loads
-from core.model import Model
-from core.setpoint import Setpoint
-from core.state import RobotState
+from gapbridge.bridge.cell.sections import LimitSettings
+from gapbridge.bridge.loop.nominal_stream import DECELERATION, NominalStream
+from gapbridge.bridge.loop.setpoint_stream import SetpointStream, limits_of
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.compensation import correct
+from gapbridge.core.errors import LimitError
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
 
 Q = np.array([0.0, -1.5, 1.8, -1.87, -1.57, 0.0])
 CYCLE = 0.002

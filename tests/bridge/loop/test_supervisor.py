@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.loop.supervisor import (
+from gapbridge.bridge.loop.supervisor import (
     HEALED_BY_RECONNECTING,
     RAMPS_OUT,
     STOPS_AT_ONCE,

@@ -13,8 +13,8 @@ from prometheus_client.openmetrics.parser import text_string_to_metric_families 
 from prometheus_client.parser import text_string_to_metric_families
 from watched_feed import RATE, Feed
 
-from bridge.loop.supervisor import State
-from bridge.metrics.counts import Buckets
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.metrics.counts import Buckets
 
 
 @pytest.fixture(scope="module")

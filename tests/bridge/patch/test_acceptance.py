@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from core.arm import builtin_arm
+from gapbridge.core.arm import builtin_arm
 from tests.bridge.patch.arms_written import BASE_AT, BASE_TURN, UR_JOINTS, mjcf
 
 mujoco = pytest.importorskip("mujoco")
@@ -102,7 +102,7 @@ def write_log(path: Path, q: np.ndarray, put: Put | None, text: Callable[[float]
 
 def gapbridge(folder: Path, *words: str) -> str:
     done = subprocess.run(
-        [sys.executable, "-m", "bridge.cli", *words], capture_output=True, text=True, timeout=200,
+        [sys.executable, "-m", "gapbridge", *words], capture_output=True, text=True, timeout=200,
         check=False, cwd=folder,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

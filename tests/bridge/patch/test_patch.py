@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bridge.patch import PatchOptions, changes_of, format_of
-from core.arm import builtin_arm
-from core.effects import Site, Term
-from core.errors import InputError
-from core.model import Model
+from gapbridge.bridge.patch import PatchOptions, changes_of, format_of
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.errors import InputError
+from gapbridge.core.model import Model
 from tests.bridge.patch.arms_written import BASE_AT, BASE_TURN, UR_JOINTS, mjcf, urdf
 
 mujoco = pytest.importorskip("mujoco")
@@ -40,7 +40,7 @@ def patched(path: Path, text: str, model: Model, tcp: str) -> tuple[str, list[st
 
 def fitting(terms: tuple[Term, ...]) -> tuple[Term, ...]:
     """Return the terms with as many values as their effects have."""
-    from core.effects import CATALOGUE
+    from gapbridge.core.effects import CATALOGUE
 
     return tuple(
         Term(t.effect, t.site, t.values[: len(CATALOGUE[t.effect].parameters(ARM, t.site))])

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bridge.cell.settings.recording import RecordingSettings
-from bridge.ipc.shared_memory import Page
-from bridge.loop.supervisor import State
-from bridge.recording.recorder import Recorder
+from gapbridge.bridge.cell.settings.recording import RecordingSettings
+from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.recording.recorder import Recorder
 
 N = 6
 SESSION = "run-20260101-000000"

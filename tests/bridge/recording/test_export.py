@@ -12,11 +12,11 @@ from click.testing import CliRunner
 from pyarrow import parquet
 from recorded import Desk, N, publish, same_bits
 
-from bridge.cli.main import gapbridge
-from bridge.recording.export import Span, export, moment
-from core.errors import InputError, LogError
-from core.log.log import read_log
-from core.log.mcap_reading import read_batches
+from gapbridge.bridge.cli.main import gapbridge
+from gapbridge.bridge.recording.export import Span, export, moment
+from gapbridge.core.errors import InputError, LogError
+from gapbridge.core.log.log import read_log
+from gapbridge.core.log.mcap_reading import read_batches
 
 
 @pytest.fixture

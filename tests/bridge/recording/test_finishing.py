@@ -13,13 +13,13 @@ from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader, SeekingReader
 from recorded import SESSION, Desk, publish
 
-from bridge.loop.supervisor import State
-from bridge.recording.export import export
-from bridge.recording.finishing import finish, unfinished
-from bridge.recording.folder import segments
-from bridge.recording.segment import Segment
-from core.log.mcap_reading import read_columns
-from core.log.mcap_records import all_records, chunk_offsets, is_whole
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.recording.export import export
+from gapbridge.bridge.recording.finishing import finish, unfinished
+from gapbridge.bridge.recording.folder import segments
+from gapbridge.bridge.recording.segment import Segment
+from gapbridge.core.log.mcap_reading import read_columns
+from gapbridge.core.log.mcap_records import all_records, chunk_offsets, is_whole
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import pytest
 from recorded import Desk, publish
 from test_recorder import numbers
 
-from bridge.recording import recorder as recorder_module
+from gapbridge.bridge.recording import recorder as recorder_module
 
 
 @pytest.fixture

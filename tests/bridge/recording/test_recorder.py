@@ -14,9 +14,9 @@ from jsonschema import Draft202012Validator, validate
 from mcap.reader import NonSeekingReader, SeekingReader
 from recorded import SESSION, Array, Desk, publish, same_bits
 
-from bridge.recording.folder import new_session, segments
-from core.errors import LogError
-from core.log.mcap_reading import (
+from gapbridge.bridge.recording.folder import new_session, segments
+from gapbridge.core.errors import LogError
+from gapbridge.core.log.mcap_reading import (
     files_of,
     last_batch,
     read_batches,
@@ -24,7 +24,7 @@ from core.log.mcap_reading import (
     read_configuration,
     read_documents,
 )
-from core.log.mcap_records import chunk_offsets, is_whole
+from gapbridge.core.log.mcap_records import chunk_offsets, is_whole
 
 EVENTS: list[dict[str, object]] = [
     {"kind": "transition", "from": "OBSERVING", "to": "FAULT", "cause": "silence", "detail": "-"},
@@ -282,7 +282,7 @@ def test_a_recorder_that_comes_after_a_killed_one_goes_on_behind_it(desk: Desk) 
 
 
 def test_what_the_ring_no_longer_holds_is_told(desk: Desk) -> None:
-    from bridge.ipc.shared_memory import ROWS
+    from gapbridge.bridge.ipc.shared_memory import ROWS
 
     recorder = desk.recorder()
     publish(desk.page, 10)

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from recorded import SESSION, N
 
-from bridge.cell.daemon_settings import DaemonSettings
-from bridge.cell.settings.recording import RecordingSettings
-from bridge.ipc import side_process
-from bridge.ipc.shared_memory import Page
-from bridge.ipc.side_process import SideProcess
-from bridge.loop.supervisor import State
-from core.log.mcap_reading import read_columns, read_configuration, read_documents
-from core.log.mcap_records import is_whole
+from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.cell.settings.recording import RecordingSettings
+from gapbridge.bridge.ipc import side_process
+from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.side_process import SideProcess
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.core.log.mcap_reading import read_columns, read_configuration, read_documents
+from gapbridge.core.log.mcap_records import is_whole
 
 RATE = 500.0
 CELL = "robot: {model: ur10e}\nweb: {token: squeamish}\n"
@@ -67,7 +67,7 @@ class Recording:
         )
         order = {"settings": settings.model_dump(mode="json"), "n": N, "session": SESSION,
                  "extra": {}}  # fmt: skip
-        self.process = SideProcess("bridge.recording.main", order, publisher.page)
+        self.process = SideProcess("gapbridge.bridge.recording.main", order, publisher.page)
         self._seen = 0  # files of former lives
 
     def wait_for_file(self) -> None:

@@ -15,9 +15,9 @@ import pytest
 import yaml
 from daemon_cell import Robot, Run, gapbridge, only_recording, wait_for
 
-from bridge.loop.supervisor import State
-from bridge.recording.export import export
-from core.log.mcap_reading import read_columns, read_documents
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.recording.export import export
+from gapbridge.core.log.mcap_reading import read_columns, read_documents
 
 
 @pytest.fixture

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from recorded import Desk
 
-from bridge.cell import load_cell
-from bridge.cell.sections import link_settings
-from core.arm import builtin_arm
-from core.errors import LogError
-from core.model import Model
-from drivers import make_driver
-from drivers.replay import EndOfRecordingError, ReplayDriver
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cell.sections import link_settings
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.errors import LogError
+from gapbridge.core.model import Model
+from gapbridge.drivers import make_driver
+from gapbridge.drivers.replay import EndOfRecordingError, ReplayDriver
 
 MODEL = Model(builtin_arm("ur5e"))
 

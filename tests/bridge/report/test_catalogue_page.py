@@ -2,13 +2,13 @@
 
 import inspect
 
-from bridge.report.catalogue_page import PAGE, catalogue_page, main
-from core.effects import CATALOGUE
+from gapbridge.bridge.report.catalogue_page import PAGE, catalogue_page, main
+from gapbridge.core.effects import CATALOGUE
 
 
 def test_the_committed_page_is_fresh():
     assert PAGE.read_text(encoding="utf-8") == catalogue_page(), (
-        "run python -m bridge.report.catalogue_page"
+        "run python -m gapbridge.bridge.report.catalogue_page"
     )
 
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from report_cases import CASES, diagnosed
 
-from bridge.report import SECTIONS, write_report
-from bridge.report.arm_view import joint_origins
-from bridge.report.material import SHOWN, shares, thinned, unexplained
-from bridge.report.parameters import _decimals
-from bridge.report.words import (
+from gapbridge.bridge.report import SECTIONS, write_report
+from gapbridge.bridge.report.arm_view import joint_origins
+from gapbridge.bridge.report.material import SHOWN, shares, thinned, unexplained
+from gapbridge.bridge.report.parameters import _decimals
+from gapbridge.bridge.report.words import (
     VERDICTS,
     joints_words,
     likelihood,
@@ -21,10 +21,10 @@ from bridge.report.words import (
     quantity_words,
     told,
 )  # fmt: skip
-from core.arm import builtin_arm
-from core.effects import CATALOGUE
-from core.model import Model
-from core.rotation import rpy_matrix, transform
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rpy_matrix, transform
 
 
 @pytest.fixture(scope="module", params=list(CASES))

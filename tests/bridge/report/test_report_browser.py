@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import pytest
 from report_cases import CASES, diagnosed
 
-from bridge.report import write_report
+from gapbridge.bridge.report import write_report
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

@@ -9,11 +9,11 @@ import time
 import httpx
 import pytest
 
-from bridge.served.protocol import GuardedProtocol
-from bridge.served.server import listen, serve
-from bridge.served.settings import ServedSettings
-from bridge.web.stream import WAITING, Stream
-from core.errors import LinkError
+from gapbridge.bridge.served.protocol import GuardedProtocol
+from gapbridge.bridge.served.server import listen, serve
+from gapbridge.bridge.served.settings import ServedSettings
+from gapbridge.bridge.web.stream import WAITING, Stream
+from gapbridge.core.errors import LinkError
 
 
 @pytest.fixture

@@ -11,10 +11,10 @@ import psutil
 import pytest
 from watched_feed import Feed, self_signed
 
-from bridge.cell import load_cell
-from bridge.served.credentials import check_credentials, read_token
-from bridge.served.protocol import HEADER_TIME, LARGEST_HEAD, MOST_CONNECTIONS
-from core.errors import CellError, InputError
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.served.credentials import check_credentials, read_token
+from gapbridge.bridge.served.protocol import HEADER_TIME, LARGEST_HEAD, MOST_CONNECTIONS
+from gapbridge.core.errors import CellError, InputError
 
 TOKEN = "7d1f0c3a9b8e4f62a5d07c1e93b8462f"
 PATHS = ("", "status", "history", "events", "page.js", "style.css", "words.js", "drawing.js",

@@ -18,9 +18,9 @@ import pytest
 from daemon_cell import Robot, Run
 from watched_feed import free_port
 
-from bridge.cell.sections import SetpointSettings
-from bridge.loop.supervisor import State
-from bridge.setpoint_source import make_source
+from gapbridge.bridge.cell.sections import SetpointSettings
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.setpoint_source import make_source
 
 TOKEN = "0d9b7a63c1f24e58b6a7d3c2e1f09485"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

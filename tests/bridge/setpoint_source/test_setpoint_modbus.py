@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from daemon_cell import Robot, Run, wait_for
 
-from bridge.cell.sections import SetpointSettings
-from bridge.loop.supervisor import State
-from bridge.setpoint_source import make_source
-from bridge.setpoint_source.modbus import ModbusSource
-from bridge.setpoint_source.modbus_page import PlcPage
-from bridge.setpoint_source.source import SourceDryError, Told
-from core.errors import InputError, RunError
+from gapbridge.bridge.cell.sections import SetpointSettings
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.setpoint_source import make_source
+from gapbridge.bridge.setpoint_source.modbus import ModbusSource
+from gapbridge.bridge.setpoint_source.modbus_page import PlcPage
+from gapbridge.bridge.setpoint_source.source import SourceDryError, Told
+from gapbridge.core.errors import InputError, RunError
 
 client_library = pytest.importorskip("pyModbusTCP.client", reason="pyModbusTCP is not installed")
 HERE = np.array([0.1, -0.2, 0.3])

@@ -14,17 +14,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bridge.cell import load_cell
-from bridge.cell.run_settings import settings_of
-from bridge.cell.sections import SetpointSettings
-from bridge.ipc.control_socket import Peer
-from bridge.setpoint_source import make_source
-from bridge.setpoint_source.planner import PlannerSource
-from bridge.setpoint_source.source import Source, SourceDryError
-from bridge.setpoint_source.target import TargetSource
-from bridge.setpoint_source.tcp import TcpSource
-from bridge.setpoint_source.trajectory import TrajectorySource
-from core.errors import CellError, InputError, LogError, RunError
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cell.run_settings import settings_of
+from gapbridge.bridge.cell.sections import SetpointSettings
+from gapbridge.bridge.ipc.control_socket import Peer
+from gapbridge.bridge.setpoint_source import make_source
+from gapbridge.bridge.setpoint_source.planner import PlannerSource
+from gapbridge.bridge.setpoint_source.source import Source, SourceDryError
+from gapbridge.bridge.setpoint_source.target import TargetSource
+from gapbridge.bridge.setpoint_source.tcp import TcpSource
+from gapbridge.bridge.setpoint_source.trajectory import TrajectorySource
+from gapbridge.core.errors import CellError, InputError, LogError, RunError
 
 HERE = np.array([0.1, 0.2, 0.3])
 
@@ -336,7 +336,7 @@ def test_another_users_process_is_refused(
     feed: PlannerSource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stranger = Peer(1, os.geteuid() + 1)
-    monkeypatch.setattr("bridge.setpoint_source.planner.peer_of", lambda _: stranger)
+    monkeypatch.setattr("gapbridge.bridge.setpoint_source.planner.peer_of", lambda _: stranger)
     with planner(feed) as link:
         link.sendall(GOOD)
         assert first_of(feed, 0.1) is None
@@ -365,7 +365,7 @@ def test_over_tcp_the_token_opens_the_feed(tcp: TcpSource) -> None:
 def test_over_tcp_a_token_that_does_not_come_ends_the_connection(
     tcp: TcpSource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bridge.setpoint_source.tcp.FIRST_LINE", 0.1)
+    monkeypatch.setattr("gapbridge.bridge.setpoint_source.tcp.FIRST_LINE", 0.1)
     with planner(tcp) as link:
         turn(tcp, 0.2)
         assert b"no token within" in answer(link)

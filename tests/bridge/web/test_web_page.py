@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import pytest
 from watched_feed import Feed
 
-from bridge.loop.supervisor import State
+from gapbridge.bridge.loop.supervisor import State
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.arm import builtin_arm
-from core.calibration.readings import Readings
-from core.calibration.result import Calibration, Errors, Estimate
-from core.estimation.registration import IDENTITY, Registration
-from core.loads import Loads
-from core.model import Model
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.calibration.result import Calibration, Errors, Estimate
+from gapbridge.core.estimation.registration import IDENTITY, Registration
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 

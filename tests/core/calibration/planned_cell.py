@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.arm import builtin_arm
-from core.calibration.observables import make_observable
-from core.calibration.observables.foreseen import empty_readings
-from core.calibration.parameters import Parameters
-from core.calibration.plan import Payload, Plan
-from core.calibration.readings import Readings
-from core.loads import Loads
-from core.model import Model
-from core.planning.workspace import Place, Space
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.calibration.observables import make_observable
+from gapbridge.core.calibration.observables.foreseen import empty_readings
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.plan import Payload, Plan
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
+from gapbridge.core.planning.workspace import Place, Space
 
 SIGMA = 3e-5
 LOADS = (Payload(4.0, (0.0, 0.02, 0.06), "plate"), Payload(0.0))

@@ -18,14 +18,14 @@ from benchmarks.calibration.laid_out import (
     readings_of,
     with_values,
 )
-from core.calibration.fit import calibrate
-from core.calibration.observables import make_observable
-from core.calibration.parameters import DEFAULT, Parameters
-from core.calibration.problem import bounds_of
-from core.calibration.readings import Readings
-from core.estimation.linear_system import Bounds, System, solve
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.core.calibration.fit import calibrate
+from gapbridge.core.calibration.observables import make_observable
+from gapbridge.core.calibration.parameters import DEFAULT, Parameters
+from gapbridge.core.calibration.problem import bounds_of
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.estimation.linear_system import Bounds, System, solve
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 KIND = ARMS["cobot5"]
 LAYOUT = Layout(poses=18, held_out=10, repeated=3)

@@ -19,14 +19,14 @@ from benchmarks.calibration.laid_out import (
     lay_out,
     readings_of,
 )
-from core.calibration.fit import calibrate
-from core.calibration.observables import make_observable
-from core.calibration.parameters import DEFAULT, Parameters
-from core.calibration.readings import Readings
-from core.calibration.result import Calibration
-from core.errors import ExcitationError
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.core.calibration.fit import calibrate
+from gapbridge.core.calibration.observables import make_observable
+from gapbridge.core.calibration.parameters import DEFAULT, Parameters
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.calibration.result import Calibration
+from gapbridge.core.errors import ExcitationError
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 KIND = ARMS["cobot10"]
 LAYOUT = Layout(poses=18, held_out=12, repeated=6)

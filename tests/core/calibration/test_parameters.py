@@ -7,13 +7,13 @@ import pytest
 
 from benchmarks.blind.arms import ARMS
 from benchmarks.calibration.drawings import model_of, real_arm
-from core.arm import builtin_arm
-from core.calibration.observables import make_observable
-from core.calibration.parameters import DEFAULT, Parameters
-from core.effects import Site, Term
-from core.errors import InputError
-from core.loads import Loads
-from core.model import Model
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.calibration.observables import make_observable
+from gapbridge.core.calibration.parameters import DEFAULT, Parameters
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.errors import InputError
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 POSITION = make_observable("position")
 
@@ -49,7 +49,7 @@ def test_what_is_left_is_told_apart_by_readings(parameters: Parameters) -> None:
 
 
 def test_rank_of_the_kept_is_full_and_of_all_is_not_more(model: Model) -> None:
-    from core.calibration.redundancy import _anywhere
+    from gapbridge.core.calibration.redundancy import _anywhere
 
     observable = make_observable("pose")
     every = Parameters.every(model)

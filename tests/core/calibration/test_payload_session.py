@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from benchmarks.blind.arms import ARMS
 from benchmarks.blind.mechanics import stand
 from benchmarks.calibration.drawings import model_of, real_arm, session_at
-from core.calibration.payload_session import calibrate_payload
-from core.errors import ExcitationError, InputError
-from core.model import Model
-from core.planning.payload_plan import plan_payload
+from gapbridge.core.calibration.payload_session import calibrate_payload
+from gapbridge.core.errors import ExcitationError, InputError
+from gapbridge.core.model import Model
+from gapbridge.core.planning.payload_plan import plan_payload
 
 Array = NDArray[np.float64]
 KIND = ARMS["cobot10"]
@@ -74,7 +74,7 @@ def test_the_model_carries_the_load_and_the_bias_afterwards(model: Model) -> Non
 
 
 def test_a_sensor_known_to_be_turned_is_read_as_it_stands(model: Model) -> None:
-    from core.effects import Site, Term
+    from gapbridge.core.effects import Site, Term
 
     rng = np.random.default_rng(6)
     q = rng.uniform(KIND.low, KIND.high, (10, 6))

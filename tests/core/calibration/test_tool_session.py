@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from benchmarks.blind.arms import ARMS
 from benchmarks.calibration.drawings import model_of, real_arm
-from core.calibration.tool_session import calibrate_tool
-from core.errors import ExcitationError, InputError
-from core.model import Model
-from core.planning.tool_plan import plan_tool
+from gapbridge.core.calibration.tool_session import calibrate_tool
+from gapbridge.core.errors import ExcitationError, InputError
+from gapbridge.core.model import Model
+from gapbridge.core.planning.tool_plan import plan_tool
 
 Array = NDArray[np.float64]
 KIND = ARMS["cobot10"]

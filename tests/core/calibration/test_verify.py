@@ -22,15 +22,15 @@ from benchmarks.calibration.laid_out import (
     readings_of,
     with_values,
 )
-from core.calibration.fit import calibrate
-from core.calibration.observables import make_observable
-from core.calibration.parameters import Parameters
-from core.calibration.promise import document_of, effects_of, promise_in
-from core.calibration.readings import Readings
-from core.calibration.result import Calibration
-from core.calibration.verify import verify
-from core.errors import ExcitationError, InputError
-from core.metrology import Metrology
+from gapbridge.core.calibration.fit import calibrate
+from gapbridge.core.calibration.observables import make_observable
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.promise import document_of, effects_of, promise_in
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.calibration.result import Calibration
+from gapbridge.core.calibration.verify import verify
+from gapbridge.core.errors import ExcitationError, InputError
+from gapbridge.core.metrology import Metrology
 
 KIND = ARMS["cobot10"]
 LAYOUT = Layout(poses=18, held_out=12, repeated=3)

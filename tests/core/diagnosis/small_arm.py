@@ -14,11 +14,11 @@ from benchmarks.blind.arms import ArmKind, Row
 from benchmarks.blind.measuring import Instrument, read_arm
 from benchmarks.blind.mechanics import RealArm, Session, stand, turn
 from benchmarks.blind.session import Plan, draw_session, play
-from core.arm import JointLimits, arm_from_dh
-from core.diagnosis.diagnosis import Diagnosis, diagnose
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.core.arm import JointLimits, arm_from_dh
+from gapbridge.core.diagnosis.diagnosis import Diagnosis, diagnose
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 H = np.pi / 2
 SIGMA = 2e-5  # m

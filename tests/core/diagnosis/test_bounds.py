@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from core.arm import builtin_arm
-from core.diagnosis.selection.candidate import named_candidates
-from core.diagnosis.selection.refit import _step
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.diagnosis.selection.candidate import named_candidates
+from gapbridge.core.diagnosis.selection.refit import _step
 
 ARM = builtin_arm("ur5")
 

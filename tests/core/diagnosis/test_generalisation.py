@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import small_arm as small
 
-from core.diagnosis.generalisation import _solved, regions
+from gapbridge.core.diagnosis.generalisation import _solved, regions
 
 
 def test_regions_are_left_out_whole_and_hold_no_neighbour() -> None:

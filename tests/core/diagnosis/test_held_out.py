@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import small_arm as small
 
-from core.diagnosis.held_out import FOLDS, HeldOut
+from gapbridge.core.diagnosis.held_out import FOLDS, HeldOut
 
 JOLT = 3.0  # whitened
 

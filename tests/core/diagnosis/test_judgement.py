@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.blind.session import Plan
-from core.diagnosis.diagnosis import diagnose
-from core.diagnosis.held_out import HeldOut
-from core.diagnosis.judgement import judge, pure_error
-from core.diagnosis.result import causes_of, considered_of, probability
-from core.effects import CATALOGUE
-from core.metrology import Metrology
+from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.held_out import HeldOut
+from gapbridge.core.diagnosis.judgement import judge, pure_error
+from gapbridge.core.diagnosis.result import causes_of, considered_of, probability
+from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.metrology import Metrology
 
 LOGS = ("none", "backlash", "tool_frame", "cross_coupling", "thermal_drift")
 

@@ -10,7 +10,7 @@ import toy_space as toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from core.diagnosis.residual_structure import basis_of, dependence, structure_p_value
+from gapbridge.core.diagnosis.residual_structure import basis_of, dependence, structure_p_value
 
 ROWS = 90
 CANDIDATES = [

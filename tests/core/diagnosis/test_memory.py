@@ -7,9 +7,9 @@ import tracemalloc
 import pytest
 
 from benchmarks.blind.cases import make_case
-from bridge.cell import load_cell
-from core.diagnosis.diagnosis import diagnose
-from core.log.log import read_log
+from gapbridge.bridge.cell import load_cell
+from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.log.log import read_log
 
 MOST = 65e6  # bytes beside the interpreter and its libraries; 48e6 were measured
 

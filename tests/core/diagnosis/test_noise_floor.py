@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import small_arm as small
 
-import core.diagnosis.diagnosis as whole
-from core.diagnosis.channels.recording import instrument_noise, signal_step
-from core.diagnosis.diagnosis import diagnose
-from core.diagnosis.noise_floor import _portmanteau, noise_floor, repeat_variance
-from core.log.log import Log
-from core.metrology import Metrology
-from core.motion import motion_of
+import gapbridge.core.diagnosis.diagnosis as whole
+from gapbridge.core.diagnosis.channels.recording import instrument_noise, signal_step
+from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.noise_floor import _portmanteau, noise_floor, repeat_variance
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.motion import motion_of
 
 
 @pytest.mark.parametrize("effect", ["none", "cross_coupling"])

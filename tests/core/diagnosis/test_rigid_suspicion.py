@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from benchmarks.fleet.simulating import TYPE, Habits, TrueArm, columns, write_type_cell
-from bridge.cell import load_cell
-from core.diagnosis.diagnosis import diagnose
-from core.diagnosis.rigid_suspicion import softness_findings
-from core.estimation.identification import identify_compliance
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.bridge.cell import load_cell
+from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.rigid_suspicion import softness_findings
+from gapbridge.core.estimation.identification import identify_compliance
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 FREE = Metrology(sigma=2.0e-5)
 STIFF = TrueArm(np.zeros(6), np.zeros(6))

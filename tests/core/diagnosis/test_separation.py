@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.blind.mechanics import Session, stand, turn
 from benchmarks.blind.session import Plan
-from core.arm import JointLimits
-from core.diagnosis.diagnosis import diagnose
-from core.diagnosis.separation import next_measurements
-from core.effects import CATALOGUE, Site
-from core.log.log import Log
-from core.metrology import Metrology
+from gapbridge.core.arm import JointLimits
+from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.separation import next_measurements
+from gapbridge.core.effects import CATALOGUE, Site
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
 
 PLAY = 9e-4  # rad
 OFFSET = small.turned(2, lambda s, q: np.full(len(q), -PLAY / 2))  # all come from below

@@ -6,10 +6,10 @@ import moving_truth as truth
 import numpy as np
 import pytest
 
-from core.arm import builtin_arm
-from core.diagnosis.diagnosis import diagnose
-from core.diagnosis.document import document
-from core.model import Model
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.document import document
+from gapbridge.core.model import Model
 
 N = 6
 MODEL = Model(builtin_arm("ur5e"))

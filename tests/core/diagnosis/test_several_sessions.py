@@ -13,13 +13,13 @@ import pytest
 import small_arm as small
 
 from benchmarks.blind.mechanics import turn
-from core.diagnosis.carrying import carried
-from core.diagnosis.diagnosis import diagnose
-from core.diagnosis.document import document
-from core.errors import LogError
-from core.estimation.identification import identify_compliance
-from core.metrology import Metrology
-from core.sessions import join_sessions
+from gapbridge.core.diagnosis.carrying import carried
+from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.document import document
+from gapbridge.core.errors import LogError
+from gapbridge.core.estimation.identification import identify_compliance
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.sessions import join_sessions
 
 MODEL = small.model_of()
 

@@ -7,13 +7,13 @@ import re
 import numpy as np
 import pytest
 
-from core.arm import builtin_arm
-from core.diagnosis.diagnosis import ChannelDiagnosis, diagnose
-from core.effects import Site, Term
-from core.loads import Loads
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis, diagnose
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.loads import Loads
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 MODEL = Model(builtin_arm("ur10e"), payload_mass=4.0, payload_cog=np.array([0.0, 0.02, 0.1]))
 SIGMA = 3e-5  # m

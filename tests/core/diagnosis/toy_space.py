@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from core.diagnosis.selection.candidate import Candidate
-from core.diagnosis.selection.problem import Space, prices
-from core.effects import Parameter, Site
+from gapbridge.core.diagnosis.selection.candidate import Candidate
+from gapbridge.core.diagnosis.selection.problem import Space, prices
+from gapbridge.core.effects import Parameter, Site
 
 
 def named(family: str, size: int = 1, joint: int | None = None, lower: float = -np.inf, order=None):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from core.estimation.base_parameters import VISIBLE, choose, name, what_is_shown
-from core.estimation.compliance_fit import Linear
+from gapbridge.core.estimation.base_parameters import VISIBLE, choose, name, what_is_shown
+from gapbridge.core.estimation.compliance_fit import Linear
 
 SIGMA = 1e-4  # rad/Nm, the prior's
 

@@ -7,15 +7,15 @@ from test_equilibrium import SEVEN
 
 from benchmarks.evidence import paper, poses
 from benchmarks.evidence.finite_elements import STIFF
-from core.arm import arm_from_dh, builtin_rows
-from core.errors import ExcitationError, LogError
-from core.estimation.base_parameters import name
-from core.estimation.identification import identify_compliance
-from core.loads import Loads
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model
-from core.rotation import rotation_matrix, rotation_vector
+from gapbridge.core.arm import arm_from_dh, builtin_rows
+from gapbridge.core.errors import ExcitationError, LogError
+from gapbridge.core.estimation.base_parameters import name
+from gapbridge.core.estimation.identification import identify_compliance
+from gapbridge.core.loads import Loads
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 DH = {6: builtin_rows("ur10e")["dh"], 7: SEVEN}
 TOOL = np.array([0.05, -0.04, 0.2])

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.arm import builtin_arm
-from core.effects import CATALOGUE, Site, Term
-from core.errors import InputError
-from core.estimation.pose_jacobian import pose_columns
-from core.kernels.layout import LANES
-from core.loads import Loads
-from core.model import Model
-from core.rotation import rotation_vector
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.effects import CATALOGUE, Site, Term
+from gapbridge.core.errors import InputError
+from gapbridge.core.estimation.pose_jacobian import pose_columns
+from gapbridge.core.kernels.layout import LANES
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rotation_vector
 
 Array = NDArray[np.float64]
 COUNT = LANES + 6  # a whole block, and one that is not

@@ -10,16 +10,16 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from core.arm import builtin_arm
-from core.errors import ExcitationError, LogError
-from core.estimation.identification import identify_compliance
-from core.estimation.spool import Spool
-from core.estimation.streamed import fold_of, identify_streamed
-from core.log.log import Log, read_log
-from core.log.pieces import LogPieces
-from core.metrology import Metrology
-from core.model import Model
-from core.rotation import rotation_matrix, rotation_vector
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.errors import ExcitationError, LogError
+from gapbridge.core.estimation.identification import identify_compliance
+from gapbridge.core.estimation.spool import Spool
+from gapbridge.core.estimation.streamed import fold_of, identify_streamed
+from gapbridge.core.log.log import Log, read_log
+from gapbridge.core.log.pieces import LogPieces
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 COUNT, PIECE = 1500, 400
 
@@ -83,7 +83,7 @@ def test_pieces_give_what_the_whole_gives(rotations, shifted, wild):
 
 def test_links_that_bend_go_the_long_way_and_give_the_same():
     log, metrology = measured_log(False, False), Metrology(registered=True)
-    from core.effects import Site, Term
+    from gapbridge.core.effects import Site, Term
 
     model = nominal().with_terms([Term("link_flexibility", Site(2), (1e-6,))])
     log = log.select(slice(0, 150))

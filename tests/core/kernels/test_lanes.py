@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from benchmarks.speed.peers import plain
-from core.arm import builtin_arm
-from core.kernels import many, threads
-from core.kernels import reference as kernel
-from core.kernels.factor import factor_blocks, normal_blocks, regressor_blocks
-from core.kernels.layout import LANES
-from core.kernels.predict import linear_blocks, predict_blocks
-from core.kernels.reference import Chain, Rows
-from core.loads import Loads
-from core.model import Model
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.kernels import many, threads
+from gapbridge.core.kernels import reference as kernel
+from gapbridge.core.kernels.factor import factor_blocks, normal_blocks, regressor_blocks
+from gapbridge.core.kernels.layout import LANES
+from gapbridge.core.kernels.predict import linear_blocks, predict_blocks
+from gapbridge.core.kernels.reference import Chain, Rows
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 COUNT = 2 * LANES + 7  # whole blocks, and one that is not
 

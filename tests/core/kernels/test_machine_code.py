@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.kernels import machine_code
-from core.kernels.machine_code import CORE, FOLDERS, MARK
+from gapbridge.core.kernels import machine_code
+from gapbridge.core.kernels.machine_code import CORE, FOLDERS, MARK
 
 KERNEL = """\
 from numba import njit
-from core.kernels.machine_code import keep_by_all_sources
+from gapbridge.core.kernels.machine_code import keep_by_all_sources
 keep_by_all_sources()
 @njit(cache=True)
 def statics(x):
@@ -24,7 +24,7 @@ def statics(x):
 """
 CORRECTION = """\
 from numba import njit
-from core.kernels.reference import statics
+from gapbridge.core.kernels.reference import statics
 @njit(cache=True)
 def correct(x):
     return statics(x) + 1.0
@@ -37,8 +37,9 @@ class Package:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.core = folder / "core"
+        self.core = folder / "gapbridge" / "core"
         (self.core / "kernels").mkdir(parents=True)
+        (self.core.parent / "__init__.py").write_text("")
         (self.core / "__init__.py").write_text("")
         shutil.copy(CORE / "kernels" / "machine_code.py", self.core / "kernels")
         (self.core / "correction.py").write_text(CORRECTION)
@@ -50,7 +51,7 @@ class Package:
     def run(self, **environment: str) -> str:
         """Return what a process of its own computes, and how often it took what was compiled."""
         done = subprocess.run(
-            [sys.executable, "-c", "import core.correction"], cwd=self.folder, text=True,
+            [sys.executable, "-c", "import gapbridge.core.correction"], cwd=self.folder, text=True,
             env={**os.environ, "PYTHONPATH": str(self.folder), **environment},
             capture_output=True, timeout=120,
         )  # fmt: skip
@@ -85,7 +86,9 @@ def test_machine_code_from_before_a_module_was_renamed_is_not_read(package: Pack
     run = run.replace("correct(1.0)", "correct(Arm(1.0))")
     reference = (kernels / "reference.py").read_text()
     (kernels / "reference.py").write_text(arm + reference)
-    (package.core / "correction.py").write_text("from core.kernels.reference import Arm\n" + run)
+    (package.core / "correction.py").write_text(
+        "from gapbridge.core.kernels.reference import Arm\n" + run
+    )
     assert package.run() == "3.0 0"
     (kernels / "reference.py").unlink()
     (kernels / "renamed.py").write_text(arm + reference)
@@ -111,9 +114,9 @@ def test_compiled_functions_stand_only_where_they_are_looked_for() -> None:
 
 
 def test_each_compiled_function_of_ours_is_kept_so() -> None:
-    from bridge.loop import nominal_stream
-    from core import interpolation, limits
-    from core.kernels import single
+    from gapbridge.bridge.loop import nominal_stream
+    from gapbridge.core import interpolation, limits
+    from gapbridge.core.kernels import single
 
     compiled = (single.correct, limits._limit, interpolation._follow, nominal_stream._followed)
     for function in compiled:

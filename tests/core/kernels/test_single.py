@@ -7,12 +7,12 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from core.arm import builtin_arm
-from core.compensation import Compensator
-from core.effects import Site, Term
-from core.kernels import single
-from core.loads import Loads
-from core.model import Model
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.compensation import Compensator
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.kernels import single
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 
 def bent() -> Model:

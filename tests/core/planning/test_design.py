@@ -16,17 +16,17 @@ from planned_cell import (
     small_space,
 )
 
-from core.calibration.observables import make_observable
-from core.calibration.parameters import Parameters
-from core.calibration.plan import Payload, Plan
-from core.errors import PlanError
-from core.model import Model
-from core.planning import design
-from core.planning.candidates import candidates_of
-from core.planning.design import reference_of
-from core.planning.exchange import Choice, exchanged, grown, shrunk
-from core.planning.information import blocks, gathered, inverse
-from core.planning.workspace import Place, Space
+from gapbridge.core.calibration.observables import make_observable
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.plan import Payload, Plan
+from gapbridge.core.errors import PlanError
+from gapbridge.core.model import Model
+from gapbridge.core.planning import design
+from gapbridge.core.planning.candidates import candidates_of
+from gapbridge.core.planning.design import reference_of
+from gapbridge.core.planning.exchange import Choice, exchanged, grown, shrunk
+from gapbridge.core.planning.information import blocks, gathered, inverse
+from gapbridge.core.planning.workspace import Place, Space
 
 
 def plan(*given, **wishes) -> Plan:

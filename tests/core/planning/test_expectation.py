@@ -9,11 +9,11 @@ import pytest
 from planned_cell import LOADS, POSITION, SIGMA, readings_of, small_model, small_space
 
 from benchmarks.calibration.repeated import repeated_sessions
-from core.calibration.observables import Nuisance
-from core.calibration.parameters import Parameters
-from core.loads import Loads
-from core.planning.design import plan
-from core.planning.expectation import expectation
+from gapbridge.core.calibration.observables import Nuisance
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.loads import Loads
+from gapbridge.core.planning.design import plan
+from gapbridge.core.planning.expectation import expectation
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from core.arm import builtin_arm
-from core.errors import PlanError
-from core.model import Model
-from core.planning.capsules import Box, segment_distance
-from core.planning.workspace import Place, Space
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.errors import PlanError
+from gapbridge.core.model import Model
+from gapbridge.core.planning.capsules import Box, segment_distance
+from gapbridge.core.planning.workspace import Place, Space
 
 UP = np.array([[0.0, -np.pi / 2, 0.0, -np.pi / 2, 0.0, 0.0]])  # a UR stretched upwards
 OUT = np.zeros((1, 6))  # a UR stretched out along -x

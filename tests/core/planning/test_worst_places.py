@@ -7,11 +7,11 @@ import pytest
 from numpy.typing import NDArray
 from planned_cell import LOADS, POSITION, SIGMA, small_model, small_parameters, small_space
 
-from core.planning.candidates import candidates_of
-from core.planning.design import reference_of
-from core.planning.information import Reference, blocks, gathered, inverse
-from core.planning.refinement import Refined, Refiner
-from core.planning.worst_places import ROUNDS, evened, leaning
+from gapbridge.core.planning.candidates import candidates_of
+from gapbridge.core.planning.design import reference_of
+from gapbridge.core.planning.information import Reference, blocks, gathered, inverse
+from gapbridge.core.planning.refinement import Refined, Refiner
+from gapbridge.core.planning.worst_places import ROUNDS, evened, leaning
 
 Array = NDArray[np.float64]
 

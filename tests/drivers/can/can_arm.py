@@ -12,18 +12,18 @@ from typing import NamedTuple
 import can
 import numpy as np
 
-from core.arm import builtin_arm
-from core.errors import InvalidStateError
-from core.model import Model
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.can.driver import CanDriver
-from drivers.can.settings import CanSettings
-from drivers.simulated.can.nodes import CanNodes
-from drivers.simulated.can.server import make_servers
-from drivers.simulated.peer.peer import Peer, make_peer
-from drivers.simulated.peer.peer_server import PeerThread
-from drivers.simulated.ur.settings import simulated_arm
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.errors import InvalidStateError
+from gapbridge.core.model import Model
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.can.driver import CanDriver
+from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.simulated.can.nodes import CanNodes
+from gapbridge.drivers.simulated.can.server import make_servers
+from gapbridge.drivers.simulated.peer.peer import Peer, make_peer
+from gapbridge.drivers.simulated.peer.peer_server import PeerThread
+from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 _channels = itertools.count()
 UNIT = math.radians(0.001)

@@ -6,10 +6,10 @@ import can
 import pytest
 from pydantic import ValidationError
 
-from core.errors import LinkError
-from drivers.can_bus.bus import BusSettings, close_bus, open_bus
-from drivers.simulated.can.frame import Frame
-from drivers.simulated.can.hub import Hub
+from gapbridge.core.errors import LinkError
+from gapbridge.drivers.can_bus.bus import BusSettings, close_bus, open_bus
+from gapbridge.drivers.simulated.can.frame import Frame
+from gapbridge.drivers.simulated.can.hub import Hub
 
 
 @pytest.fixture

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from can_arm import next_state
 
-from bridge.cell import load_cell
-from bridge.cell.simulation import simulated_peer
-from core.errors import LinkError
-from drivers import make_driver
-from drivers.simulated.peer.peer_server import PeerThread
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cell.simulation import simulated_peer
+from gapbridge.core.errors import LinkError
+from gapbridge.drivers import make_driver
+from gapbridge.drivers.simulated.peer.peer_server import PeerThread
 
 CONFIG = Path(__file__).parents[3] / "config"
 PORTS = itertools.count(29581)  # another one where a busy machine asks for a second try

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bridge.cell import load_cell
+from gapbridge.bridge.cell import load_cell
 
 CONFIG = Path(__file__).parents[3] / "config"
 HOST, BENCH = "127.0.0.78", 30178
@@ -23,7 +23,7 @@ compliance: &soft
 
 @contextmanager
 def gapbridge(*words):
-    code = [sys.executable, "-m", "bridge.cli", *map(str, words)]
+    code = [sys.executable, "-m", "gapbridge", *map(str, words)]
     with subprocess.Popen(code, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:
         try:
             yield process

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from can_arm import MODEL, UNIT, next_state, other_bus, served_arm, setpoint_of
 
-from core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
-from drivers.can.driver import CanDriver
-from drivers.can.settings import CanSettings
+from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
+from gapbridge.drivers.can.driver import CanDriver
+from gapbridge.drivers.can.settings import CanSettings
 
 
 @pytest.fixture

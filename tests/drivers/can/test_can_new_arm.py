@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from can_arm import MODEL, next_state, setpoint_of
 
-from drivers.can.driver import CanDriver
-from drivers.can.settings import CanSettings
+from gapbridge.drivers.can.driver import CanDriver
+from gapbridge.drivers.can.settings import CanSettings
 
 INVENTED = Path(__file__).with_name("invented.yaml")
 COUNT = math.radians(0.0005)

@@ -12,14 +12,14 @@ from can_arm import next_state
 from piper_sdk import C_PiperInterface_V2
 from piper_sdk.kinematics.piper_fk import C_PiperForwardKinematics
 
-from bridge.cell import load_cell
-from drivers.can.driver import CanDriver
-from drivers.can.settings import CanSettings
-from drivers.simulated.can.server import make_servers
-from drivers.simulated.peer.peer import make_peer
-from drivers.simulated.peer.peer_server import PeerThread
-from drivers.simulated.plant.plant_arm import plant_arm
-from drivers.simulated.ur.settings import simulated_arm
+from gapbridge.bridge.cell import load_cell
+from gapbridge.drivers.can.driver import CanDriver
+from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.simulated.can.server import make_servers
+from gapbridge.drivers.simulated.peer.peer import make_peer
+from gapbridge.drivers.simulated.peer.peer_server import PeerThread
+from gapbridge.drivers.simulated.plant.plant_arm import plant_arm
+from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 CONFIG = Path(__file__).parents[3] / "config"
 CELL = CONFIG / "piper_can_simulated.yaml"
@@ -99,7 +99,7 @@ def test_simulate_serves_the_cell_to_another_process(tmp_path):
     text = text.replace("state_timeout: 0.1", "state_timeout: 1.0")
     cell.write_text(text)
     (tmp_path / "p.urdf").write_text((CONFIG / "piper.urdf").read_text())
-    code = [sys.executable, "-m", "bridge.cli", "simulate", str(cell)]
+    code = [sys.executable, "-m", "gapbridge", "simulate", str(cell)]
     with subprocess.Popen(code, stdout=subprocess.PIPE, text=True) as server:
         try:
             assert server.stdout is not None

@@ -9,8 +9,8 @@ from cantools.database.conversion import BaseConversion
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from drivers.can.codec import Reading, Writing, fill, place_of
-from drivers.can.loading import load_profile
+from gapbridge.drivers.can.codec import Reading, Writing, fill, place_of
+from gapbridge.drivers.can.loading import load_profile
 
 INVENTED = Path(__file__).with_name("invented.yaml")
 PROFILES = {name: load_profile(name) for name in ("piper", "openarm", "odrive", str(INVENTED))}

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from can_arm import MODEL, next_state, setpoint_of
 
-from drivers.can.driver import CanDriver
-from drivers.can.settings import CanSettings
-from drivers.driver import DriverSettings
-from drivers.simulated.can.server import make_servers
-from drivers.simulated.peer.peer import make_peer
-from drivers.simulated.peer.peer_server import PeerThread
-from drivers.simulated.ur.settings import simulated_arm
+from gapbridge.drivers.can.driver import CanDriver
+from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.driver import DriverSettings
+from gapbridge.drivers.simulated.can.server import make_servers
+from gapbridge.drivers.simulated.peer.peer import make_peer
+from gapbridge.drivers.simulated.peer.peer_server import PeerThread
+from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 PAGE = Path(__file__).parents[3] / "docs" / "porting.md"
 HALF = np.radians(0.005)

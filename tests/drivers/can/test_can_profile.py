@@ -4,8 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.can.loading import load_profile, read_profile, shipped_profiles
-from drivers.profile_file import ProfileError
+from gapbridge.drivers.can.loading import load_profile, read_profile, shipped_profiles
+from gapbridge.drivers.profile_file import ProfileError
 
 HERE = Path(__file__).parent
 Q = np.array([0.1, -0.2, 0.3, -0.4, 0.5, -0.6])

@@ -8,11 +8,11 @@ from can_arm import UNIT, joints_frame
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from core.arm import builtin_arm
-from core.errors import InvalidStateError
-from drivers.can.assembler import Assembler
-from drivers.can.loading import load_profile
-from drivers.can.state import StateBuilder
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.errors import InvalidStateError
+from gapbridge.drivers.can.assembler import Assembler
+from gapbridge.drivers.can.loading import load_profile
+from gapbridge.drivers.can.state import StateBuilder
 
 PIPER = load_profile("piper")
 PERIOD = 0.005  # s

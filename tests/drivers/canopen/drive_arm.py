@@ -11,17 +11,17 @@ from typing import Any
 import can
 import numpy as np
 
-from core.arm import builtin_arm
-from core.errors import InvalidStateError, LinkError
-from core.model import Model
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.canopen.driver import CanopenDriver
-from drivers.canopen.settings import CanopenSettings
-from drivers.simulated.canopen.server import CanopenServer
-from drivers.simulated.peer.peer import Peer, make_peer
-from drivers.simulated.peer.peer_server import PeerThread
-from drivers.simulated.ur.settings import simulated_arm
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.errors import InvalidStateError, LinkError
+from gapbridge.core.model import Model
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.canopen.driver import CanopenDriver
+from gapbridge.drivers.canopen.settings import CanopenSettings
+from gapbridge.drivers.simulated.canopen.server import CanopenServer
+from gapbridge.drivers.simulated.peer.peer import Peer, make_peer
+from gapbridge.drivers.simulated.peer.peer_server import PeerThread
+from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 HOST = "127.0.0.1"
 _numbers = itertools.count()

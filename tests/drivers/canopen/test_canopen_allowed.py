@@ -3,10 +3,10 @@
 import pytest
 from drive_arm import served
 
-from core.errors import GapbridgeError, WriteError
-from drivers.canopen.allowed import AllowedFrames
-from drivers.canopen.objects import Address
-from drivers.canopen.profile import read_profile
+from gapbridge.core.errors import GapbridgeError, WriteError
+from gapbridge.drivers.canopen.allowed import AllowedFrames
+from gapbridge.drivers.canopen.objects import Address
+from gapbridge.drivers.canopen.profile import read_profile
 
 
 @pytest.fixture

@@ -11,9 +11,15 @@ import numpy as np
 import pytest
 from drive_arm import DriveArm, follow, read_on, served, setpoint, settled, wait_for
 
-from core.errors import InputError, InvalidStateError, LinkError, StaleStateError, WriteError
-from drivers.canopen.driver import CanopenDriver
-from drivers.simulated.canopen.machine import Phase
+from gapbridge.core.errors import (
+    InputError,
+    InvalidStateError,
+    LinkError,
+    StaleStateError,
+    WriteError,
+)
+from gapbridge.drivers.canopen.driver import CanopenDriver
+from gapbridge.drivers.simulated.canopen.machine import Phase
 
 
 @pytest.fixture(params=["cia402", "lwa4p"])

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from canopen import Network
 
-from core.arm import builtin_arm
-from core.errors import InvalidStateError
-from drivers.canopen.listening import BusListener, Life
-from drivers.canopen.profile import CanopenProfile, read_profile
-from drivers.canopen.settings import SHIPPED
-from drivers.canopen.state import StateBuilder
-from drivers.canopen.sync_set import SyncCollector
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.errors import InvalidStateError
+from gapbridge.drivers.canopen.listening import BusListener, Life
+from gapbridge.drivers.canopen.profile import CanopenProfile, read_profile
+from gapbridge.drivers.canopen.settings import SHIPPED
+from gapbridge.drivers.canopen.state import StateBuilder
+from gapbridge.drivers.canopen.sync_set import SyncCollector
 
 TOTAL = 1_000_000
 Q = np.array([0.3, -1.2, 1.1, -0.4, 1.5, -2.0])

@@ -12,7 +12,7 @@ import pytest
 from canopen.profiles.p402 import BaseNode402
 from drive_arm import DriveArm, served, wait_for
 
-from drivers.canopen.settings import SHIPPED
+from gapbridge.drivers.canopen.settings import SHIPPED
 
 EDS = str(SHIPPED / "cia402.eds")
 NODE = 3

@@ -15,10 +15,10 @@ import pytest
 import yaml
 from drive_arm import follow, served, settled
 
-from core.errors import InputError
-from core.log.mcap_reading import read_columns
-from drivers.canopen.profile import read_profile
-from drivers.canopen.settings import SHIPPED
+from gapbridge.core.errors import InputError
+from gapbridge.core.log.mcap_reading import read_columns
+from gapbridge.drivers.canopen.profile import read_profile
+from gapbridge.drivers.canopen.settings import SHIPPED
 
 ROOT = Path(__file__).parents[3]
 PORTING = (ROOT / "docs" / "porting.md").read_text(encoding="utf-8")
@@ -55,7 +55,7 @@ def test_a_mistake_in_the_pages_profile_is_told_with_its_line(profile: Path) -> 
 
 
 def test_the_keys_of_the_page_are_the_links(profile: Path) -> None:
-    from drivers.canopen.settings import CanopenSettings
+    from gapbridge.drivers.canopen.settings import CanopenSettings
 
     [text] = [block for block in BLOCKS if "driver: canopen" in block]
     keys = yaml.safe_load(text)["link"]
@@ -72,7 +72,7 @@ def test_a_simulated_cell_is_run_from_end_to_end(tmp_path: Path) -> None:
     cell["recording"] = {"folder": "."}
     (tmp_path / "cell.yaml").write_text(yaml.safe_dump(cell))
     shutil.copy(ROOT / "config" / "lwa4p_canopen.urdf", tmp_path)
-    command = [sys.executable, "-m", "bridge.cli"]
+    command = [sys.executable, "-m", "gapbridge"]
     served_cell = subprocess.Popen(
         [*command, "simulate", "cell.yaml"], cwd=tmp_path, stdout=subprocess.PIPE, text=True
     )

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.errors import InputError
-from drivers.canopen.configure import interpolation_period
-from drivers.canopen.profile import read_profile
-from drivers.canopen.settings import SHIPPED, CanopenSettings
+from gapbridge.core.errors import InputError
+from gapbridge.drivers.canopen.configure import interpolation_period
+from gapbridge.drivers.canopen.profile import read_profile
+from gapbridge.drivers.canopen.settings import SHIPPED, CanopenSettings
 
 NAMES = sorted(path.stem for path in SHIPPED.glob("*.yaml"))
 

@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from core.arm import builtin_arm
-from core.errors import InvalidStateError
-from drivers.canopen.objects import Address
-from drivers.canopen.pdo import Entry, PdoLayout
-from drivers.canopen.profile import read_profile
-from drivers.canopen.settings import SHIPPED
-from drivers.canopen.state import StateBuilder, positions
-from drivers.canopen.sync_set import SyncCollector, SyncSet
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.errors import InvalidStateError
+from gapbridge.drivers.canopen.objects import Address
+from gapbridge.drivers.canopen.pdo import Entry, PdoLayout
+from gapbridge.drivers.canopen.profile import read_profile
+from gapbridge.drivers.canopen.settings import SHIPPED
+from gapbridge.drivers.canopen.state import StateBuilder, positions
+from gapbridge.drivers.canopen.sync_set import SyncCollector, SyncSet
 
 PROFILE = read_profile(SHIPPED / "cia402.yaml")
 COB_IDS = [layout.cob_id(node) for node in PROFILE.nodes for layout in PROFILE.tpdo]

@@ -12,12 +12,12 @@ from pathlib import Path
 
 from contract_case import Case
 
-from drivers.can.driver import CanDriver
-from drivers.can.settings import CanSettings
-from drivers.driver import Driver
-from drivers.simulated.can.nodes import CanNodes
-from drivers.simulated.can.server import make_servers
-from drivers.simulated.peer.peer_server import PeerServer
+from gapbridge.drivers.can.driver import CanDriver
+from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.simulated.can.nodes import CanNodes
+from gapbridge.drivers.simulated.can.server import make_servers
+from gapbridge.drivers.simulated.peer.peer_server import PeerServer
 
 INVENTED = Path(__file__).parents[1] / "can" / "invented.yaml"
 _ports = itertools.count(29600)

@@ -9,11 +9,11 @@ from functools import partial
 
 from contract_case import Case
 
-from drivers.canopen.driver import CanopenDriver
-from drivers.canopen.settings import CanopenSettings
-from drivers.driver import Driver
-from drivers.simulated.canopen.server import CanopenServer, make_servers
-from drivers.simulated.peer.peer_server import PeerServer
+from gapbridge.drivers.canopen.driver import CanopenDriver
+from gapbridge.drivers.canopen.settings import CanopenSettings
+from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.simulated.canopen.server import CanopenServer, make_servers
+from gapbridge.drivers.simulated.peer.peer_server import PeerServer
 
 LATE = 0.012  # s that a torn sample's PDO is late: it comes after the next SYNC's slot
 _ports = itertools.count(29900)

@@ -11,13 +11,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from bridge.cell import load_cell
-from core.arm import builtin_arm
-from core.model import Model
-from drivers.driver import Driver
-from drivers.simulated.peer.peer import Peer, make_peer
-from drivers.simulated.peer.peer_server import PeerServer, PeerThread
-from drivers.simulated.ur.settings import simulated_arm
+from gapbridge.bridge.cell import load_cell
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.model import Model
+from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.simulated.peer.peer import Peer, make_peer
+from gapbridge.drivers.simulated.peer.peer_server import PeerServer, PeerThread
+from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 PERIOD = 0.004  # s
 CONFIG = Path(__file__).parents[3] / "config"

@@ -11,12 +11,18 @@ import numpy as np
 import pytest
 from contract_case import Case, wait_for
 
-from core.errors import GateError, InvalidStateError, LinkError, StaleStateError, WriteError
-from core.model import Model
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.driver import Driver
-from drivers.simulated.plant.kinematics import gap, tcp_in_base
+from gapbridge.core.errors import (
+    GateError,
+    InvalidStateError,
+    LinkError,
+    StaleStateError,
+    WriteError,
+)
+from gapbridge.core.model import Model
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.simulated.plant.kinematics import gap, tcp_in_base
 
 OFFSET = (4e-4, -3e-4, 5e-4, 1e-3, 0.0, -1e-3)  # m, rad: what a write of offsets moves the TCP by
 STEP = 0.02  # rad: what a write of joints moves each joint by

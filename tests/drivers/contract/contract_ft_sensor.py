@@ -13,8 +13,8 @@ sys.path.insert(0, FT_SENSOR)
 from contract_modbus import ModbusCase  # noqa: E402
 from sensor_wires import RESOLUTION, RPY, XYZ, felt_of, make_wire  # noqa: E402
 
-from drivers.driver import Driver  # noqa: E402
-from drivers.ft_sensor.joined import DriverWithSensor  # noqa: E402
+from gapbridge.drivers.driver import Driver  # noqa: E402
+from gapbridge.drivers.ft_sensor.joined import DriverWithSensor  # noqa: E402
 
 
 class SensorCase(ModbusCase):

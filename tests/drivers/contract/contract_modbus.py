@@ -10,14 +10,14 @@ from pathlib import Path
 
 from contract_case import Case
 
-from drivers.driver import Driver
-from drivers.modbus.driver import ModbusDriver
-from drivers.modbus.profile import read_profile
-from drivers.modbus.registers import UNITS
-from drivers.modbus.schema import Vector
-from drivers.modbus.settings import SHIPPED, ModbusSettings
-from drivers.simulated.modbus.server import ModbusServer, make_servers
-from drivers.simulated.peer.peer_server import PeerServer
+from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.modbus.driver import ModbusDriver
+from gapbridge.drivers.modbus.profile import read_profile
+from gapbridge.drivers.modbus.registers import UNITS
+from gapbridge.drivers.modbus.schema import Vector
+from gapbridge.drivers.modbus.settings import SHIPPED, ModbusSettings
+from gapbridge.drivers.simulated.modbus.server import ModbusServer, make_servers
+from gapbridge.drivers.simulated.peer.peer_server import PeerServer
 
 INVENTED = Path(__file__).parents[1] / "modbus" / "invented.yaml"
 _ports = itertools.count(15100)

@@ -24,8 +24,8 @@ from contract_checks import (
 )
 from contract_table import CASES
 
-from core.errors import WriteError
-from drivers.driver import Driver
+from gapbridge.core.errors import WriteError
+from gapbridge.drivers.driver import Driver
 
 
 @pytest.fixture(params=CASES)

@@ -13,19 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from core.arm import builtin_arm
-from core.rotation import rpy_matrix
-from drivers.can_bus.bus import BusSettings
-from drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
-from drivers.ft_sensor.settings import AnyFtSensor, FtSensorSettings
-from drivers.simulated.ft_sensor.ati_node import AtiNode
-from drivers.simulated.ft_sensor.ft300_device import Ft300Device
-from drivers.simulated.ft_sensor.mounting import felt_by
-from drivers.simulated.ft_sensor.node import SimulatedSensor
-from drivers.simulated.ft_sensor.robotous_node import RobotousNode
-from drivers.simulated.peer.peer import Peer, make_peer
-from drivers.simulated.plant.plant_arm import plant_arm
-from drivers.simulated.plant.plant_settings import draw_plant_settings
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.rotation import rpy_matrix
+from gapbridge.drivers.can_bus.bus import BusSettings
+from gapbridge.drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
+from gapbridge.drivers.ft_sensor.settings import AnyFtSensor, FtSensorSettings
+from gapbridge.drivers.simulated.ft_sensor.ati_node import AtiNode
+from gapbridge.drivers.simulated.ft_sensor.ft300_device import Ft300Device
+from gapbridge.drivers.simulated.ft_sensor.mounting import felt_by
+from gapbridge.drivers.simulated.ft_sensor.node import SimulatedSensor
+from gapbridge.drivers.simulated.ft_sensor.robotous_node import RobotousNode
+from gapbridge.drivers.simulated.peer.peer import Peer, make_peer
+from gapbridge.drivers.simulated.plant.plant_arm import plant_arm
+from gapbridge.drivers.simulated.plant.plant_settings import draw_plant_settings
 
 Array = NDArray[np.float64]
 KINDS = ("robotous_rft", "ati_netcanoem", "robotiq_ft300", "robotiq_ft300 registers")

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bridge.cell import load_cell
-from bridge.recording.export import export
-from core.errors import InputError
-from drivers.simulated.ur.settings import BENCH_PORT
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.recording.export import export
+from gapbridge.core.errors import InputError
+from gapbridge.drivers.simulated.ur.settings import BENCH_PORT
 
 ROOT = Path(__file__).resolve().parents[3]
 _numbers = itertools.count(2)
@@ -58,7 +58,7 @@ def environment() -> dict[str, str]:
 @contextmanager
 def simulated(cell: Path) -> Iterator[subprocess.Popen[str]]:
     process = subprocess.Popen(
-        [sys.executable, "-m", "bridge.cli", "simulate", str(cell)], env=environment(),
+        [sys.executable, "-m", "gapbridge", "simulate", str(cell)], env=environment(),
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
     )  # fmt: skip
     assert process.stdout is not None
@@ -105,9 +105,9 @@ def recorded(folder: Path) -> list[dict[str, str]]:
 READ_BOTH = """
     import json, os, sys
     import numpy as np
-    from bridge.cell import load_cell
-    from drivers import make_driver
-    from drivers.ft_sensor.joined import DriverWithSensor
+    from gapbridge.bridge.cell import load_cell
+    from gapbridge.drivers import make_driver
+    from gapbridge.drivers.ft_sensor.joined import DriverWithSensor
 
     cell = load_cell(sys.argv[1])
     arm = make_driver(cell.link, cell.model)
@@ -152,7 +152,7 @@ def test_run_observes_and_records_the_sensors_wrench(tmp_path: Path, kind: str) 
     with simulated(cell):
         truth = json.loads(bench(cell, "truth"))
         done = subprocess.run(
-            [sys.executable, "-m", "bridge.cli", "run", str(cell), "--observe", "--duration", "2"],
+            [sys.executable, "-m", "gapbridge", "run", str(cell), "--observe", "--duration", "2"],
             env=environment(), capture_output=True, text=True, timeout=60, check=False,
         )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
@@ -175,7 +175,7 @@ def test_arm_and_sensor_share_one_can_bus(tmp_path: Path) -> None:
     with simulated(cell):
         bias = np.array(json.loads(bench(cell, "truth"))["sensor_bias"])
         done = subprocess.run(
-            [sys.executable, "-m", "bridge.cli", "run", str(cell), "--observe", "--duration", "2"],
+            [sys.executable, "-m", "gapbridge", "run", str(cell), "--observe", "--duration", "2"],
             env=environment(), capture_output=True, text=True, timeout=60, check=False,
         )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
@@ -193,7 +193,7 @@ def test_a_run_without_the_sensor_says_which_and_ends(tmp_path: Path) -> None:
     elsewhere.write_text(text.replace("interface: socketcand", "interface: socketcand, port: 9"))
     with simulated(with_sensor):
         done = subprocess.run(
-            [sys.executable, "-m", "bridge.cli", "run", str(elsewhere), "--observe",
+            [sys.executable, "-m", "gapbridge", "run", str(elsewhere), "--observe",
              "--duration", "5"],
             env=environment(), capture_output=True, text=True, timeout=60, check=False,
         )  # fmt: skip
@@ -237,7 +237,7 @@ def test_a_sensor_that_no_other_process_can_reach_is_not_simulated(tmp_path: Pat
     text = cell.read_text(encoding="utf-8").replace("socketcand", "virtual")
     cell.write_text(text, encoding="utf-8")
     done = subprocess.run(
-        [sys.executable, "-m", "bridge.cli", "simulate", str(cell)], env=environment(),
+        [sys.executable, "-m", "gapbridge", "simulate", str(cell)], env=environment(),
         capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert done.returncode == 2

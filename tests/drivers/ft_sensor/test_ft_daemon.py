@@ -16,10 +16,10 @@ sys.path.insert(0, BRIDGE)
 from daemon_cell import Robot, Run, offsets, wait_for  # noqa: E402
 from sensor_wires import Felt  # noqa: E402
 
-from bridge.loop.supervisor import State  # noqa: E402
-from drivers.can_bus.bus import BusSettings  # noqa: E402
-from drivers.simulated.can.hub import Hub  # noqa: E402
-from drivers.simulated.ft_sensor.robotous_node import RobotousNode  # noqa: E402
+from gapbridge.bridge.loop.supervisor import State  # noqa: E402
+from gapbridge.drivers.can_bus.bus import BusSettings  # noqa: E402
+from gapbridge.drivers.simulated.can.hub import Hub  # noqa: E402
+from gapbridge.drivers.simulated.ft_sensor.robotous_node import RobotousNode  # noqa: E402
 
 WEIGHT = (0.0, 0.0, 49.0, 0.0, 0.0, 0.0)
 

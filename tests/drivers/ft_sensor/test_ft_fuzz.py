@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymodbus.framer import FramerRTU
 
-from drivers.ft_sensor.ati_netcanoem import AnswerDecoder, decode_gauges
-from drivers.ft_sensor.robotiq_ft300 import FRAME, HEAD, StreamDecoder
-from drivers.ft_sensor.robotous_rft import LAYOUT, START, PairDecoder
+from gapbridge.drivers.ft_sensor.ati_netcanoem import AnswerDecoder, decode_gauges
+from gapbridge.drivers.ft_sensor.robotiq_ft300 import FRAME, HEAD, StreamDecoder
+from gapbridge.drivers.ft_sensor.robotous_rft import LAYOUT, START, PairDecoder
 
 MILLION = 1_000_000
 PERIOD, APART = 0.005, 0.0003  # s between samples, between the frames of one

@@ -23,16 +23,16 @@ from sensor_wires import (
     resting_peer,
 )
 
-from core.arm import builtin_arm
-from core.effects import Site, Term
-from core.errors import InvalidStateError, LinkError, StaleStateError
-from core.model import Model
-from core.rotation import transform
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.driver import Driver
-from drivers.ft_sensor.joined import DriverWithSensor
-from drivers.simulated.peer.peer import Peer
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import transform
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.ft_sensor.joined import DriverWithSensor
+from gapbridge.drivers.simulated.peer.peer import Peer
 
 TURNED = (0.3, -1.2, 1.4, -1.1, -1.3, 0.8)  # rad
 MOUNTED = {"sensor_in_flange": {"xyz": XYZ, "rpy": RPY}}
@@ -209,7 +209,7 @@ def joined_started(wire: Wire, peer: Peer) -> DriverWithSensor:
 
 
 def test_a_cut_serial_line_is_told_and_opened_anew(tmp_path: Any) -> None:
-    from drivers.simulated.ft_sensor.ft300_device import Ft300Device
+    from gapbridge.drivers.simulated.ft_sensor.ft300_device import Ft300Device
 
     peer, link = resting_peer(TURNED), tmp_path / "ft300"
     device = Ft300Device(felt_of(peer), link)

@@ -13,17 +13,17 @@ from contract_case import wait_for
 from contract_checks import OFFSET, next_state, setpoint_of, stream
 from contract_modbus import INVENTED, ModbusCase
 
-from bridge.cell import load_cell
-from core.errors import LinkError, WriteError
-from core.setpoint import Setpoint
-from core.state import RobotState
-from drivers.gate import GateBounds
-from drivers.modbus import encode
-from drivers.modbus.driver import ModbusDriver
-from drivers.modbus.settings import SHIPPED
-from drivers.simulated.modbus.programs import MailboxProgram
-from drivers.simulated.modbus.server import ModbusServer
-from drivers.simulated.peer.bench import BenchError
+from gapbridge.bridge.cell import load_cell
+from gapbridge.core.errors import LinkError, WriteError
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.gate import GateBounds
+from gapbridge.drivers.modbus import encode
+from gapbridge.drivers.modbus.driver import ModbusDriver
+from gapbridge.drivers.modbus.settings import SHIPPED
+from gapbridge.drivers.simulated.modbus.programs import MailboxProgram
+from gapbridge.drivers.simulated.modbus.server import ModbusServer
+from gapbridge.drivers.simulated.peer.bench import BenchError
 
 
 @pytest.fixture

@@ -13,14 +13,14 @@ from pymodbus.framer import FramerSocket
 from pymodbus.pdu import DecodePDU
 from pymodbus.pdu.register_message import ReadHoldingRegistersResponse
 
-from core.errors import InvalidStateError
-from drivers.modbus.decode import Decoder, check_step
-from drivers.modbus.map import compile_map
-from drivers.modbus.profile import read_profile
-from drivers.modbus.registers import wire_of
-from drivers.modbus.settings import SHIPPED
-from drivers.modbus.tcp_requests import TcpRequests, read_registers, read_request
-from drivers.simulated.modbus import image
+from gapbridge.core.errors import InvalidStateError
+from gapbridge.drivers.modbus.decode import Decoder, check_step
+from gapbridge.drivers.modbus.map import compile_map
+from gapbridge.drivers.modbus.profile import read_profile
+from gapbridge.drivers.modbus.registers import wire_of
+from gapbridge.drivers.modbus.settings import SHIPPED
+from gapbridge.drivers.modbus.tcp_requests import TcpRequests, read_registers, read_request
+from gapbridge.drivers.simulated.modbus import image
 
 Q = (0.3, -1.2, 1.1, -0.4, 2.8, -3.0)
 GAP = 0.02  # s between two samples

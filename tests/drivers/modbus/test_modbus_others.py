@@ -14,9 +14,9 @@ from contract_case import own_address
 from contract_checks import check_reads, next_state
 from contract_modbus import ModbusCase
 
-from drivers.modbus.driver import ModbusDriver
-from drivers.simulated.modbus import image
-from drivers.simulated.modbus.server import ModbusServer
+from gapbridge.drivers.modbus.driver import ModbusDriver
+from gapbridge.drivers.simulated.modbus import image
+from gapbridge.drivers.simulated.modbus.server import ModbusServer
 
 pyModbusTCP = pytest.importorskip("pyModbusTCP", reason="pyModbusTCP is not installed")
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.modbus.plan import TURN, BlockPlan
-from drivers.modbus.registers import CODES, Coding, wire_of
+from gapbridge.drivers.modbus.plan import TURN, BlockPlan
+from gapbridge.drivers.modbus.registers import CODES, Coding, wire_of
 
 word = st.integers(0, 0xFFFF)
 

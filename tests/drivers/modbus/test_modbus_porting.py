@@ -12,9 +12,9 @@ import pytest
 from contract_checks import check_angles, check_offset, check_reads
 from contract_modbus import ModbusCase
 
-from core.errors import InputError
-from drivers.modbus import encode
-from drivers.modbus.profile import read_profile
+from gapbridge.core.errors import InputError
+from gapbridge.drivers.modbus import encode
+from gapbridge.drivers.modbus.profile import read_profile
 
 PORTING = (Path(__file__).parents[3] / "docs" / "porting.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```yaml\n(.*?)```", PORTING, re.DOTALL)
@@ -68,7 +68,7 @@ def test_a_cell_with_a_map_of_the_users_is_served_and_run(profile: Path) -> None
         "8.0e-6, 8.0e-6, 8.0e-6]}\nrecording: {folder: null}\n"
         "link: {driver: modbus, profile: my_arm.yaml, host: 127.8.7.6, port: 15822}\n"
     )
-    command = [sys.executable, "-m", "bridge.cli"]
+    command = [sys.executable, "-m", "gapbridge"]
     served = subprocess.Popen([*command, "simulate", str(cell)], stdout=subprocess.PIPE, text=True)
     try:
         assert served.stdout is not None
@@ -110,7 +110,7 @@ def test_a_link_that_cannot_be_is_one_line(tmp_path: Path, link: str, words: str
     cell.write_text(f"robot: {{model: ur5e}}\nlink: {link}\n")
     for command in (["run", "--observe", "--duration", "1"], ["simulate"]):
         found = subprocess.run(
-            [sys.executable, "-m", "bridge.cli", command[0], str(cell), *command[1:]],
+            [sys.executable, "-m", "gapbridge", command[0], str(cell), *command[1:]],
             capture_output=True, text=True, check=False, timeout=60,
         )  # fmt: skip
         assert found.returncode == 2, (command, found.stdout, found.stderr)

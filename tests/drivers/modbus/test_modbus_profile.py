@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 from contract_modbus import INVENTED
 
-from core.errors import InputError, InvalidStateError
-from drivers.modbus.decode import check_identity
-from drivers.modbus.map import Block, compile_map
-from drivers.modbus.profile import read_profile
-from drivers.modbus.registers import wire_of
-from drivers.modbus.settings import SHIPPED
+from gapbridge.core.errors import InputError, InvalidStateError
+from gapbridge.drivers.modbus.decode import check_identity
+from gapbridge.drivers.modbus.map import Block, compile_map
+from gapbridge.drivers.modbus.profile import read_profile
+from gapbridge.drivers.modbus.registers import wire_of
+from gapbridge.drivers.modbus.settings import SHIPPED
 
 GOOD = """\
 name: an arm

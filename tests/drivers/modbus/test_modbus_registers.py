@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.modbus import encode
-from drivers.modbus.registers import CODES, Coding
+from gapbridge.drivers.modbus import encode
+from gapbridge.drivers.modbus.registers import CODES, Coding
 
 TYPES = sorted(CODES)
 

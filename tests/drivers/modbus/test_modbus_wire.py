@@ -19,11 +19,11 @@ from contract_checks import OFFSET, check_reads, next_state, read_on, setpoint_o
 from contract_modbus import ModbusCase
 from evil_proxy import EvilProxy, Ruin
 
-from core.errors import InvalidStateError, LinkError, StaleStateError
-from drivers.modbus.driver import ModbusDriver
-from drivers.modbus.settings import ModbusSettings
-from drivers.simulated.modbus.server import ModbusServer
-from drivers.simulated.peer.peer_server import PeerThread
+from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
+from gapbridge.drivers.modbus.driver import ModbusDriver
+from gapbridge.drivers.modbus.settings import ModbusSettings
+from gapbridge.drivers.simulated.modbus.server import ModbusServer
+from gapbridge.drivers.simulated.peer.peer_server import PeerThread
 
 QUICK = {"timeout": 0.05, "state_timeout": 0.4}
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 from simulated_cell import Bench, cell_settings
 
-from drivers.simulated.ur.process import SimulatedController
+from gapbridge.drivers.simulated.ur.process import SimulatedController
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import sys
 import textwrap
 from typing import Any
 
-from drivers.simulated.ur.settings import BENCH_PORT, ServerSettings, simulated_cell
+from gapbridge.drivers.simulated.ur.settings import BENCH_PORT, ServerSettings, simulated_cell
 
 _numbers = itertools.count(2)
 

@@ -8,12 +8,12 @@ import socket
 
 import pytest
 
-from core.arm import Arm, builtin_arm
-from core.errors import ArmError, LinkError
-from drivers.simulated.peer.bench import BenchError
-from drivers.simulated.peer.peer import Peer, make_peer
-from drivers.simulated.peer.peer_server import PeerServer, PeerThread
-from drivers.simulated.ur.settings import simulated_arm
+from gapbridge.core.arm import Arm, builtin_arm
+from gapbridge.core.errors import ArmError, LinkError
+from gapbridge.drivers.simulated.peer.bench import BenchError
+from gapbridge.drivers.simulated.peer.peer import Peer, make_peer
+from gapbridge.drivers.simulated.peer.peer_server import PeerServer, PeerThread
+from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 PERIOD = 0.004
 

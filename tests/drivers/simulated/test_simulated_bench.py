@@ -9,7 +9,7 @@ import pytest
 from rtde_client import RtdeClient
 from simulated_cell import Bench, cell_settings
 
-from drivers.simulated.ur.process import SimulatedController
+from gapbridge.drivers.simulated.ur.process import SimulatedController
 
 
 def reader(host: str, names: str) -> RtdeClient:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from simulated_cell import run_client
 
-from drivers.simulated.ur.process import SimulatedController
+from gapbridge.drivers.simulated.ur.process import SimulatedController
 
 CONTROL = """
 from rtde_receive import RTDEReceiveInterface

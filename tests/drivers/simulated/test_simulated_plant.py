@@ -6,15 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from core.arm import builtin_arm
-from core.errors import ArmError
-from core.loads import Loads
-from core.model import Model
-from drivers.simulated.plant import rotations as rot
-from drivers.simulated.plant.kinematics import frame_of, gap, pose_of, solve, tcp_in_base
-from drivers.simulated.plant.plant import Load, Plant
-from drivers.simulated.plant.plant_arm import plant_arm
-from drivers.simulated.plant.plant_settings import draw_plant_settings
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.errors import ArmError
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
+from gapbridge.drivers.simulated.plant import rotations as rot
+from gapbridge.drivers.simulated.plant.kinematics import frame_of, gap, pose_of, solve, tcp_in_base
+from gapbridge.drivers.simulated.plant.plant import Load, Plant
+from gapbridge.drivers.simulated.plant.plant_arm import plant_arm
+from gapbridge.drivers.simulated.plant.plant_settings import draw_plant_settings
 
 START = (0.3, -1.4, 1.2, -1.3, -1.5, 0.4)
 TCP = (0.02, -0.01, 0.18, 0.1, -0.2, 0.3)

@@ -14,9 +14,9 @@ import pytest
 from rtde_client import RtdeClient
 from simulated_cell import cell_settings, own_address
 
-from core.errors import LinkError
-from drivers.simulated.ur.process import SimulatedController
-from drivers.simulated.ur.settings import from_json, to_json
+from gapbridge.core.errors import LinkError
+from gapbridge.drivers.simulated.ur.process import SimulatedController
+from gapbridge.drivers.simulated.ur.settings import from_json, to_json
 
 ROOT = Path(__file__).parents[3]
 
@@ -25,7 +25,8 @@ ROOT = Path(__file__).parents[3]
 def test_the_command_serves_until_a_signal_and_exits_with_zero(number: signal.Signals) -> None:
     host = own_address()
     process = subprocess.Popen(
-        [sys.executable, "-m", "drivers.simulated", "--arm", "ur3e", "--host", host, "--seed", "4"],
+        [sys.executable, "-m", "gapbridge.drivers.simulated",
+         "--arm", "ur3e", "--host", host, "--seed", "4"],
         stdout=subprocess.PIPE, text=True, cwd=ROOT,
     )  # fmt: skip
     assert process.stdout is not None
@@ -38,7 +39,8 @@ def test_the_command_serves_until_a_signal_and_exits_with_zero(number: signal.Si
 
 def test_an_unknown_arm_is_bad_input_told_in_one_line() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "drivers.simulated", "--arm", "ur10f", "--host", own_address()],
+        [sys.executable, "-m", "gapbridge.drivers.simulated",
+         "--arm", "ur10f", "--host", own_address()],
         capture_output=True, text=True, cwd=ROOT, timeout=20, check=False,
     )  # fmt: skip
     assert done.returncode == 2
@@ -71,8 +73,8 @@ def test_the_server_ends_with_its_parent() -> None:
     settings = cell_settings()
     code = (
         "import json, sys, os\n"
-        "from drivers.simulated.ur.process import SimulatedController\n"
-        "from drivers.simulated.ur.settings import from_json\n"
+        "from gapbridge.drivers.simulated.ur.process import SimulatedController\n"
+        "from gapbridge.drivers.simulated.ur.settings import from_json\n"
         "c = SimulatedController(from_json(json.loads(sys.stdin.read())))\n"
         "c.start()\nprint(c.pid, flush=True)\nos.kill(os.getpid(), 9)\n"
     )

@@ -9,11 +9,11 @@ import pytest
 from rtde_client import RtdeClient
 from simulated_cell import cell_settings
 
-from drivers.simulated.peer.connection import listen
-from drivers.simulated.ur.process import SimulatedController
-from drivers.simulated.ur.rtde_names import INPUTS, OUTPUTS
-from drivers.simulated.ur.rtde_server import RtdeServer
-from drivers.simulated.ur.settings import make_controller
+from gapbridge.drivers.simulated.peer.connection import listen
+from gapbridge.drivers.simulated.ur.process import SimulatedController
+from gapbridge.drivers.simulated.ur.rtde_names import INPUTS, OUTPUTS
+from gapbridge.drivers.simulated.ur.rtde_server import RtdeServer
+from gapbridge.drivers.simulated.ur.settings import make_controller
 
 
 @pytest.mark.parametrize("version", [1, 2])

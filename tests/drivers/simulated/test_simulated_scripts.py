@@ -8,8 +8,13 @@ import pytest
 from rtde_client import RtdeClient
 from simulated_cell import Bench, cell_settings
 
-from drivers.simulated.ur.process import SimulatedController
-from drivers.simulated.ur.script_text import Pose, parse_assignment, parse_call, take_script
+from gapbridge.drivers.simulated.ur.process import SimulatedController
+from gapbridge.drivers.simulated.ur.script_text import (
+    Pose,
+    parse_assignment,
+    parse_call,
+    take_script,
+)
 
 FIELDS = (
     "actual_q,runtime_state,output_int_register_3,output_double_register_4,payload,tcp_offset,"

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import pytest
 from driver_runs import Bench, cell_settings, offset_program
 
-from drivers.simulated.ur.process import SimulatedController
-from drivers.simulated.ur.settings import SCRIPT_PORT
+from gapbridge.drivers.simulated.ur.process import SimulatedController
+from gapbridge.drivers.simulated.ur.settings import SCRIPT_PORT
 
 
 @pytest.fixture

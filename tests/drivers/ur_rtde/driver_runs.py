@@ -12,7 +12,7 @@ sys.path.insert(0, SIMULATED)
 
 from simulated_cell import Bench, cell_settings, run_client  # noqa: E402
 
-from drivers.ur_rtde.driver import OFFSET_SCRIPT  # noqa: E402
+from gapbridge.drivers.ur_rtde.driver import OFFSET_SCRIPT  # noqa: E402
 
 __all__ = ["Bench", "cell_settings", "run_driver"]
 
@@ -21,12 +21,12 @@ import sys
 sys.path.insert(0, {simulated!r})
 import numpy as np
 from simulated_cell import Bench
-from core.arm import builtin_arm
-from core.errors import *
-from core.model import Model
-from core.setpoint import Setpoint
-from drivers import make_driver
-from drivers.ur_rtde.settings import UrRtdeSettings
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.errors import *
+from gapbridge.core.model import Model
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.drivers import make_driver
+from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
 model = Model(builtin_arm("ur10e"))
 driver = make_driver(UrRtdeSettings(host=host, **{link!r}), model)

@@ -2,9 +2,9 @@
 
 import pytest
 
-from core.errors import WriteError
-from drivers.ur_rtde import registers
-from drivers.ur_rtde.allowed import CONTROL, AllowedControl, AllowedInputs
+from gapbridge.core.errors import WriteError
+from gapbridge.drivers.ur_rtde import registers
+from gapbridge.drivers.ur_rtde.allowed import CONTROL, AllowedControl, AllowedInputs
 
 
 class Library:

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from core.arm import builtin_arm
-from core.errors import InvalidStateError
-from core.model import Model
-from core.rotation import rotation_matrix, rotation_vector
-from drivers.offset_inverse import Nominal
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.errors import InvalidStateError
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rotation_matrix, rotation_vector
+from gapbridge.drivers.offset_inverse import Nominal
 
 REGULAR = np.array([0.1, -1.2, 1.3, -0.5, 1.5, 0.2])  # elbow bent, wrist far from singular
 MODEL = Model(builtin_arm("ur10e"))

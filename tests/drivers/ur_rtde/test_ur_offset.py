@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from driver_runs import Bench, offset_program, run_driver
 
-from drivers.simulated.ur.process import SimulatedController
-from drivers.ur_rtde import registers
+from gapbridge.drivers.simulated.ur.process import SimulatedController
+from gapbridge.drivers.ur_rtde import registers
 
 OFFSET = [1.0e-3, -5.0e-4, 2.0e-3, 1.0e-3, -4.0e-4, -2.0e-3]
 ARMED = """
@@ -115,7 +115,7 @@ def test_whoever_is_killed_is_withdrawn_at_the_rates_of_the_cell(
     out = run_driver(
         offset_robot.host,
         """
-        from drivers.gate import GateBounds
+        from gapbridge.drivers.gate import GateBounds
         driver.gate.hold_to(GateBounds(offset_rate=0.0005, offset_rotation_rate=0.001))
         driver.connect()
         driver.arm(read_for(20))
@@ -157,7 +157,7 @@ def test_a_program_that_takes_no_rates_is_refused_when_arming(
     out = run_driver(
         offset_robot.host,
         """
-        from drivers.ur_rtde import registers
+        from gapbridge.drivers.ur_rtde import registers
         right, registers.checksum = registers.checksum, lambda u, s, r: right(u, s, r + 1)
         driver.connect()
         out["error"] = error_of(driver.arm, read_for(20))
@@ -171,7 +171,7 @@ def test_a_wrong_checksum_moves_nothing_and_is_told(offset_robot: SimulatedContr
     out = run(
         offset_robot.host,
         f"""
-        from drivers.ur_rtde import registers
+        from gapbridge.drivers.ur_rtde import registers
         right, registers.checksum = registers.checksum, lambda *a: right(*a) + 1
         error, count = "", 0
         while not error and count < 400:
@@ -235,7 +235,7 @@ def test_another_tcp_in_the_controller_is_refused(offset_robot: SimulatedControl
 
 
 def test_the_checksum_is_what_both_sides_compute() -> None:
-    from drivers.simulated.ur.offset_program import checksum
+    from gapbridge.drivers.simulated.ur.offset_program import checksum
 
     for sequence in (1, 77, registers.LAST_SEQUENCE):
         units = registers.counts(OFFSET)

@@ -8,10 +8,10 @@ import time
 
 import pytest
 
-from core.errors import WriteError
-from drivers.simulated.ur.process import SimulatedController
-from drivers.ur_rtde import round_trip as module
-from drivers.ur_rtde.round_trip import round_trip
+from gapbridge.core.errors import WriteError
+from gapbridge.drivers.simulated.ur.process import SimulatedController
+from gapbridge.drivers.ur_rtde import round_trip as module
+from gapbridge.drivers.ur_rtde.round_trip import round_trip
 
 DELAY = 0.06  # s
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from driver_runs import Bench, run_driver
 
-from drivers.simulated.ur.process import SimulatedController
+from gapbridge.drivers.simulated.ur.process import SimulatedController
 
 ARMED = """
 driver.connect()
@@ -153,7 +153,7 @@ def test_writing_needs_arming_and_reading_first(controller: SimulatedController)
     out = run_driver(
         controller.host,
         """
-        from core.state import RobotState
+        from gapbridge.core.state import RobotState
         zero = np.zeros(6)
         blank = RobotState(0.0, 0.0, zero, zero, zero, zero)
         out["unread"] = error_of(driver.write_setpoint, setpoint(blank, zero, zero))

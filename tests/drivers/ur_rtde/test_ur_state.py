@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from driver_runs import run_driver
 
-from drivers.simulated.ur.process import SimulatedController
-from drivers.ur_rtde.settings import UrRtdeSettings
+from gapbridge.drivers.simulated.ur.process import SimulatedController
+from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
 
 def test_a_state_is_the_plants(controller: SimulatedController) -> None:
@@ -34,7 +34,7 @@ def test_a_state_is_the_plants(controller: SimulatedController) -> None:
             out["age"] = min(
                 -driver.read_state().received + time.monotonic() for _ in range(50)
             )
-            from core.rotation import rotation_vector
+            from gapbridge.core.rotation import rotation_vector
             pose = model.rigid_pose(s.actual_q[None])
             out["model"] = [*pose.position[0], *rotation_vector(pose.rotation[0])]
         """,
@@ -128,11 +128,11 @@ def _nobody() -> dict[str, str]:
     return run_client(
         "127.250.250.250",
         """
-        from core.arm import builtin_arm
-        from core.errors import LinkError
-        from core.model import Model
-        from drivers import make_driver
-        from drivers.ur_rtde.settings import UrRtdeSettings
+        from gapbridge.core.arm import builtin_arm
+        from gapbridge.core.errors import LinkError
+        from gapbridge.core.model import Model
+        from gapbridge.drivers import make_driver
+        from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
         driver = make_driver(UrRtdeSettings(host=host), Model(builtin_arm("ur10e")))
         for name, action in (("error", driver.connect), ("unread", driver.read_state)):
             try:

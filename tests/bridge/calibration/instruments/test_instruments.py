@@ -15,16 +15,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
-from bridge.calibration.instruments import INSTRUMENTS, make_instrument
-from bridge.calibration.instruments.instrument import (
+from gapbridge.bridge.calibration.instruments import INSTRUMENTS, make_instrument
+from gapbridge.bridge.calibration.instruments.instrument import (
     AnyInstrument,
     ReadingError,
     Surroundings,
     Where,
 )
-from bridge.calibration.instruments.numbers import numbers
-from bridge.cell.settings.instruments import InstrumentSettings
-from core.errors import InputError, LinkError
+from gapbridge.bridge.calibration.instruments.numbers import numbers
+from gapbridge.bridge.cell.settings.instruments import InstrumentSettings
+from gapbridge.core.errors import InputError, LinkError
 
 SETTINGS: TypeAdapter[InstrumentSettings] = TypeAdapter(InstrumentSettings)
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from played import plan_in, play, write_cell
 
-from bridge.cell import load_cell
-from core.arm import builtin_arm
-from core.calibration.observables import Nuisance, fixed_at, make_observable
-from core.calibration.observables.foreseen import empty_readings
-from core.loads import Loads
-from core.model import Model
+from gapbridge.bridge.cell import load_cell
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.calibration.observables import Nuisance, fixed_at, make_observable
+from gapbridge.core.calibration.observables.foreseen import empty_readings
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 
 BEGIN = np.array([0.2, -1.4, 1.6, -1.8, -1.5, 0.3])
 

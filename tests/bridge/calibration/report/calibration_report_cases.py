@@ -9,20 +9,20 @@ from pathlib import Path
 
 import numpy as np
 
-from bridge.calibration.report import InstrumentFacts, SessionFacts
-from core.arm import builtin_arm
-from core.calibration.fit import calibrate
-from core.calibration.observables import make_observable
-from core.calibration.parameters import Parameters
-from core.calibration.plan import Expectation, Payload, Plan, PlannedPose
-from core.calibration.readings import Readings
-from core.calibration.result import Calibration
-from core.effects import Site, Term
-from core.estimation.registration import Registration
-from core.loads import Loads
-from core.metrology import Metrology
-from core.model import Model
-from core.rotation import rotation_matrix
+from gapbridge.bridge.calibration.report import InstrumentFacts, SessionFacts
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.calibration.fit import calibrate
+from gapbridge.core.calibration.observables import make_observable
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.calibration.result import Calibration
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.estimation.registration import Registration
+from gapbridge.core.loads import Loads
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rotation_matrix
 
 LOADS = (Payload(1.0, (0.0, 0.0, 0.03), "gripper alone"), Payload(8.0, (0.02, 0.0, 0.09), "8 kg"))
 SIGMA, REPEATABILITY, JOINT = 1.5e-5, 2.0e-5, 2.0e-5  # m, m, rad

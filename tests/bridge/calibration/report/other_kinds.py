@@ -7,16 +7,16 @@ from functools import cache
 
 import numpy as np
 
-from core.arm import builtin_arm
-from core.calibration.fit import calibrate
-from core.calibration.observables import make_observable
-from core.calibration.observables.foreseen import empty_readings, foreseen, somewhere
-from core.calibration.parameters import Parameters
-from core.calibration.result import Calibration
-from core.effects import Site, Term
-from core.loads import Loads
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.calibration.fit import calibrate
+from gapbridge.core.calibration.observables import make_observable
+from gapbridge.core.calibration.observables.foreseen import empty_readings, foreseen, somewhere
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.result import Calibration
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.loads import Loads
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 EFFECTS = ("joint_offset_2", "joint_offset_3", "joint_offset_4", "axial_compliance_2")
 TRUE = (Term("joint_offset", Site(2), (6e-4,)), Term("joint_offset", Site(3), (-4e-4,)),

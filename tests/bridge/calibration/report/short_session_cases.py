@@ -8,15 +8,15 @@ from functools import cache
 import numpy as np
 from calibration_report_cases import JOINT, SIGMA, calibration
 
-from core.arm import builtin_arm
-from core.calibration.payload_session import PayloadCalibration, calibrate_payload
-from core.calibration.promise import document_of
-from core.calibration.readings import Readings
-from core.calibration.tool_session import ToolCalibration, calibrate_tool
-from core.calibration.verify import Verification, verify
-from core.effects import Site, Term
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.calibration.payload_session import PayloadCalibration, calibrate_payload
+from gapbridge.core.calibration.promise import document_of
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.calibration.tool_session import ToolCalibration, calibrate_tool
+from gapbridge.core.calibration.verify import Verification, verify
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 
 @cache

@@ -7,10 +7,10 @@ import pytest
 from calibration_report_cases import calibration, plan, session
 from other_kinds import calibration_of
 
-from bridge.calibration.report import InstrumentFacts, write_report
-from bridge.calibration.report.figures import mm
-from bridge.calibration.report.sections import CALIBRATION
-from core.calibration.observables import OBSERVABLES
+from gapbridge.bridge.calibration.report import InstrumentFacts, write_report
+from gapbridge.bridge.calibration.report.figures import mm
+from gapbridge.bridge.calibration.report.sections import CALIBRATION
+from gapbridge.core.calibration.observables import OBSERVABLES
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import pytest
 from calibration_report_cases import calibration, plan, session
 from short_session_cases import payload, tool, verification
 
-from bridge.calibration.report import (
+from gapbridge.bridge.calibration.report import (
     write_payload,
     write_report,
     write_tool,

@@ -4,13 +4,19 @@ import math
 
 import pytest
 
-from bridge.calibration.report.figures import decimals_of, estimate_words, fixed, load_words, mm
-from bridge.calibration.report.names import parameter_words, sentence, spoken
-from core.arm import builtin_arm
-from core.calibration.parameters import Parameters
-from core.calibration.result import Estimate
-from core.effects import CATALOGUE
-from core.model import Model
+from gapbridge.bridge.calibration.report.figures import (
+    decimals_of,
+    estimate_words,
+    fixed,
+    load_words,
+    mm,
+)
+from gapbridge.bridge.calibration.report.names import parameter_words, sentence, spoken
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.result import Estimate
+from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.model import Model
 
 
 def test_every_parameter_that_a_session_can_find_has_words_of_its_own():

@@ -5,13 +5,13 @@ import pytest
 from calibration_report_cases import session
 from short_session_cases import payload, tool, verification
 
-from bridge.calibration.report import (
+from gapbridge.bridge.calibration.report import (
     InstrumentFacts,
     write_payload,
     write_tool,
     write_verification,
 )
-from bridge.calibration.report.figures import estimate_words, mm
+from gapbridge.bridge.calibration.report.figures import estimate_words, mm
 
 
 def read(paths):

@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bridge.calibration.session.reading_check import Foresight, Verdict
-from core.arm import builtin_arm
-from core.calibration.parameters import DEFAULT
-from core.calibration.plan import Payload
-from core.calibration.readings import Readings
-from core.effects import Site, Term
-from core.estimation.registration import Registration
-from core.loads import Loads
-from core.metrology import Metrology
-from core.model import Model
-from core.rotation import rotation_matrix
+from gapbridge.bridge.calibration.session.reading_check import Foresight, Verdict
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.calibration.parameters import DEFAULT
+from gapbridge.core.calibration.plan import Payload
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.estimation.registration import Registration
+from gapbridge.core.loads import Loads
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rotation_matrix
 
 LOADS = (Payload(1.5, (0.0, 0.0, 0.05), "reflector"), Payload(9.5, (0.0, 0.0, 0.09), "plate"))
 NOMINAL = Model(builtin_arm("ur10e"))

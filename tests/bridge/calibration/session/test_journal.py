@@ -14,12 +14,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bridge.calibration.session.journal import FILE, Journal, plain, read_entries
-from bridge.calibration.session.plan_document import plan_entry, plan_of
-from bridge.calibration.session.reading import Taken
-from bridge.calibration.session.session import Book
-from core.calibration.plan import Expectation, Payload, Plan, PlannedPose
-from core.errors import InputError
+from gapbridge.bridge.calibration.session.journal import FILE, Journal, plain, read_entries
+from gapbridge.bridge.calibration.session.plan_document import plan_entry, plan_of
+from gapbridge.bridge.calibration.session.reading import Taken
+from gapbridge.bridge.calibration.session.session import Book
+from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
+from gapbridge.core.errors import InputError
 
 
 def small_plan(stops: int = 4) -> Plan:

@@ -8,12 +8,12 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bridge.calibration.joints.move import PERIOD, write_move
-from bridge.calibration.session.route import all_free, route
-from core.arm import builtin_arm
-from core.model import Model
-from core.planning.capsules import Box
-from core.planning.workspace import Space
+from gapbridge.bridge.calibration.joints.move import PERIOD, write_move
+from gapbridge.bridge.calibration.session.route import all_free, route
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.model import Model
+from gapbridge.core.planning.capsules import Box
+from gapbridge.core.planning.workspace import Space
 
 BEGIN, END = np.array([-1.0, 0.0]), np.array([1.0, 0.0])
 ABOVE, LEFT, RIGHT = np.array([0.0, 2.0]), np.array([-1.0, 1.5]), np.array([1.0, 1.5])

@@ -7,11 +7,11 @@ import pytest
 from hand_made import hand_made
 from scipy.stats import t as student
 
-from core.calibration.budget.budget import Stated, budget
-from core.calibration.budget.sensitivity import sensitivities
-from core.calibration.result import Estimate
-from core.effects import Site, Term
-from core.loads import Loads
+from gapbridge.core.calibration.budget.budget import Stated, budget
+from gapbridge.core.calibration.budget.sensitivity import sensitivities
+from gapbridge.core.calibration.result import Estimate
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.loads import Loads
 
 UM = 1e-6
 HELD = [False] * 20 + [True] * 10

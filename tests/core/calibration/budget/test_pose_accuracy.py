@@ -8,9 +8,9 @@ from hand_made import hand_made
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from core.calibration.budget.pose_accuracy import pose_accuracies
-from core.estimation.registration import Registration
-from core.rotation import rotation_matrix, rotation_vector
+from gapbridge.core.calibration.budget.pose_accuracy import pose_accuracies
+from gapbridge.core.estimation.registration import Registration
+from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 MM = 1e-3
 

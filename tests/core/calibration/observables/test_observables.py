@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.arm import builtin_arm
-from core.calibration.observables import (
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.calibration.observables import (
     OBSERVABLES,
     Nuisance,
     Observable,
@@ -17,14 +17,14 @@ from core.calibration.observables import (
     make_observable,
     point_of,
 )
-from core.calibration.observables.foreseen import empty_readings, foreseen, somewhere
-from core.calibration.parameters import Parameters
-from core.calibration.readings import Readings
-from core.errors import ExcitationError, InputError
-from core.estimation.registration import Registration
-from core.loads import Loads
-from core.model import Model
-from core.rotation import rotation_matrix
+from gapbridge.core.calibration.observables.foreseen import empty_readings, foreseen, somewhere
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.errors import ExcitationError, InputError
+from gapbridge.core.estimation.registration import Registration
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rotation_matrix
 
 Array = NDArray[np.float64]
 OPTIONS = {"distance": [{}, {"zeroed": True}], "sphere": [{}, {"radius": 0.05}]}

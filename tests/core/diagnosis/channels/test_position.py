@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import small_arm as small
 
-from core.diagnosis.document import document
-from core.errors import LogError
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.core.diagnosis.document import document
+from gapbridge.core.errors import LogError
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 # what the arm has more than the model, by its names in cells
 TRUE = {

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import small_arm as small
 
-from core.diagnosis.channels.position import observe
-from core.diagnosis.channels.simulation import joined, predicted_by
-from core.diagnosis.diagnosis import diagnose
-from core.effects import Site, Term
-from core.errors import LogError
-from core.log.log import Log
-from core.metrology import Metrology
+from gapbridge.core.diagnosis.channels.position import observe
+from gapbridge.core.diagnosis.channels.simulation import joined, predicted_by
+from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.errors import LogError
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
 
 METROLOGY = Metrology(registered=True, sigma=small.SIGMA)
 SESSION = small.session_of(0)

@@ -8,11 +8,11 @@ import moving_truth as truth
 import numpy as np
 import pytest
 
-from core.diagnosis.channels.torque import observe
-from core.diagnosis.diagnosis import diagnose
-from core.diagnosis.observation import NotObservable, Observation, thinned
-from core.effects import Site, Term
-from core.metrology import Metrology
+from gapbridge.core.diagnosis.channels.torque import observe
+from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.observation import NotObservable, Observation, thinned
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.metrology import Metrology
 
 METROLOGY = Metrology()
 N = 6

@@ -6,13 +6,13 @@ import moving_truth as truth
 import numpy as np
 import pytest
 
-from core.arm import builtin_arm
-from core.diagnosis.channels.tracking import encoder_step, observe
-from core.diagnosis.diagnosis import diagnose
-from core.diagnosis.observation import NotObservable
-from core.effects import Site, Term
-from core.metrology import Metrology
-from core.model import Model
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.diagnosis.channels.tracking import encoder_step, observe
+from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.observation import NotObservable
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
 
 METROLOGY = Metrology()
 N = 6

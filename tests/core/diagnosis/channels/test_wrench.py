@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from core.diagnosis.channels.wrench import observe, torque_weight
-from core.diagnosis.observation import NotObservable
-from core.effects import Site, Term
-from core.metrology import Metrology
+from gapbridge.core.diagnosis.channels.wrench import observe, torque_weight
+from gapbridge.core.diagnosis.observation import NotObservable
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.metrology import Metrology
 
 METROLOGY = Metrology()
 N, ROWS = 7, 70

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from core.arm import arm_from_dh, builtin_arm, builtin_rows
-from core.diagnosis.log_checks.frames import frame_findings
-from core.diagnosis.log_checks.kinematics import dh_rows
-from core.log.log import Log
-from core.metrology import Metrology
-from core.model import Model
-from core.rotation import rpy_matrix, transform
+from gapbridge.core.arm import arm_from_dh, builtin_arm, builtin_rows
+from gapbridge.core.diagnosis.log_checks.frames import frame_findings
+from gapbridge.core.diagnosis.log_checks.kinematics import dh_rows
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.model import Model
+from gapbridge.core.rotation import rpy_matrix, transform
 
 # UR10e in Craig's convention: a and alpha of the link before, with some tool and joint zeros
 ROWS = [dict(row) for row in builtin_rows("ur10e")["dh"]]

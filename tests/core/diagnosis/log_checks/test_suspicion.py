@@ -10,10 +10,10 @@ import pytest
 import small_arm as small
 from scipy.spatial.transform import Rotation
 
-from core.diagnosis.log_checks.units_and_clocks import check_units, findings
-from core.errors import LogError
-from core.log.log import Log
-from core.metrology import Metrology
+from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units, findings
+from gapbridge.core.errors import LogError
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
 
 MODEL = small.model_of()
 SESSION = small.session_of()

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import small_arm as small
 
-from core.diagnosis.channels.position import observe
-from core.diagnosis.selection.noise import estimate_noise
-from core.metrology import Metrology
+from gapbridge.core.diagnosis.channels.position import observe
+from gapbridge.core.diagnosis.selection.noise import estimate_noise
+from gapbridge.core.metrology import Metrology
 
 SESSION = small.session_of(0, small.Plan(poses=120))
 SEEN = observe(

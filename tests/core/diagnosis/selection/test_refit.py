@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.blind.mechanics import RealArm, turn
-from core.diagnosis.channels.position import observe
-from core.diagnosis.observation import Observation
-from core.diagnosis.selection.candidate import named_candidates, named_columns
-from core.diagnosis.selection.noise import estimate_noise
-from core.diagnosis.selection.problem import fit
-from core.diagnosis.selection.refit import refit
-from core.diagnosis.selection.state import Work, sample_space
-from core.metrology import Metrology
+from gapbridge.core.diagnosis.channels.position import observe
+from gapbridge.core.diagnosis.observation import Observation
+from gapbridge.core.diagnosis.selection.candidate import named_candidates, named_columns
+from gapbridge.core.diagnosis.selection.noise import estimate_noise
+from gapbridge.core.diagnosis.selection.problem import fit
+from gapbridge.core.diagnosis.selection.refit import refit
+from gapbridge.core.diagnosis.selection.state import Work, sample_space
+from gapbridge.core.metrology import Metrology
 
 MODEL = small.model_of()
 SESSION = small.session_of(0)

@@ -8,10 +8,10 @@ import toy_space as toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from core.diagnosis.selection.forward import clash
-from core.diagnosis.selection.local_search import improve, pruned, rivals
-from core.diagnosis.selection.problem import fit
-from core.diagnosis.selection.search import part, screened, screened_search, search
+from gapbridge.core.diagnosis.selection.forward import clash
+from gapbridge.core.diagnosis.selection.local_search import improve, pruned, rivals
+from gapbridge.core.diagnosis.selection.problem import fit
+from gapbridge.core.diagnosis.selection.search import part, screened, screened_search, search
 
 FAMILIES = [
     *(toy.named("joint_offset", 1, j) for j in range(1, 7)),

@@ -10,8 +10,8 @@ import toy_space as toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from core.diagnosis.selection.forward import children, grow, projected
-from core.diagnosis.selection.problem import fit, gains, prices
+from gapbridge.core.diagnosis.selection.forward import children, grow, projected
+from gapbridge.core.diagnosis.selection.problem import fit, gains, prices
 
 FAMILIES = [toy.named("a", 1, 1), toy.named("a", 1, 2), toy.named("b", 3), toy.named("c", 2),
             toy.smooth("time", size=4)]  # fmt: skip

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import small_arm as small
 
-from core.diagnosis.diagnosis import diagnose
-from core.metrology import Metrology
+from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.metrology import Metrology
 
 REGISTERED = Metrology(registered=True, sigma=small.SIGMA)
 GLITCHES = {11: (3e-3, 1e-3, -2e-3), 40: (-6e-3, 2e-3, 4e-3)}  # row from 0: m

@@ -10,8 +10,8 @@ import pyarrow
 import pytest
 from pyarrow import parquet
 
-from core.errors import LogError
-from core.log.sources import SourceOptions, source_of
+from gapbridge.core.errors import LogError
+from gapbridge.core.log.sources import SourceOptions, source_of
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
 NAMES = ("gripper", *JOINTS[::-1])  # another order than the arm's

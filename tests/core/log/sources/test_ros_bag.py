@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from core.errors import LogError
-from core.log.sources import SourceOptions, source_of
-from core.log.sources.joint_order import UR_JOINTS, order_joints
+from gapbridge.core.errors import LogError
+from gapbridge.core.log.sources import SourceOptions, source_of
+from gapbridge.core.log.sources.joint_order import UR_JOINTS, order_joints
 
 rosbags = pytest.importorskip("rosbags")
 

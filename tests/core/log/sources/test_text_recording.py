@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.errors import LogError
-from core.log.sources import SourceOptions, source_of
+from gapbridge.core.errors import LogError
+from gapbridge.core.log.sources import SourceOptions, source_of
 
 
 def franka(path: Path, rows: int = 5) -> np.ndarray:
