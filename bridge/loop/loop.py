@@ -270,7 +270,7 @@ class Loop:
             self._acknowledged = False
             self._supervisor.take(Cause.ACKNOWLEDGED)
 
-    def _record(
+    def _record(  # noqa: PLR0913
         self,
         state: RobotState,
         missed: int,

@@ -39,7 +39,7 @@ PARTS_IN_A_ROW = 3  # setpoints that left in part only, after which the motion i
 class Writing:
     """Sends what the states of the supervisor allow, and nothing else."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         settings: SetpointSettings,
         driver: Driver,
