@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 from numpy import float64
 from numpy.typing import NDArray
 
 from gapbridge.bridge.ipc.counts import Count
-from gapbridge.bridge.ipc.shared_memory import Page
 from gapbridge.bridge.loop.frozen_watch import FrozenWatch
 from gapbridge.bridge.loop.link_monitor import hold_time
 from gapbridge.bridge.loop.overrun_watch import OverrunWatch
 from gapbridge.bridge.loop.readiness import RateCheck
+from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.saturation_watch import SaturationWatch
 from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
 from gapbridge.core.state import RobotState
@@ -38,12 +35,11 @@ class LoopChecks:
         self,
         rate: float,
         supervisor: Supervisor,
-        page: Page,
-        tell: Callable[[dict[str, Any]], None],
+        reports: Reports,
         stale_after: float = 0.0,
         moves_arm: bool = False,
     ) -> None:
-        self._supervisor, self._page, self._tell = supervisor, page, tell
+        self._supervisor, self._reports = supervisor, reports
         self._period = 1.0 / rate
         self._longest_gap = max(LONG_GAP / rate, hold_time(rate), stale_after)
         self._frozen, self._overrun = FrozenWatch(), OverrunWatch(rate)
@@ -56,25 +52,27 @@ class LoopChecks:
         self._last: float | None = None  # s, controller clock
         self.fine = False  # the robot can move
         self.robot = ""  # what is wrong with it
-        self.flags = 0  # of this cycle
 
     def forget(self) -> None:
         """Begin anew: the loop did something else meanwhile."""
         self._last = None
         self._overrun.forget()
 
-    def begin(self, state: RobotState, missed: int) -> bool:
-        """Check a state before it is used; returns whether what was before means nothing now."""
-        self.flags = (LATE if missed else 0) | (DEGRADED if state.sensor_lost else 0)
+    def begin(self, state: RobotState, missed: int) -> int:
+        """Check a state before it is used; returns the cycle's flags.
+
+        RESYNC among them: what was before means nothing now.
+        """
+        flags = (LATE if missed else 0) | (DEGRADED if state.sensor_lost else 0)
         if missed:
-            self._page.count(Count.LATE, missed)
+            self._reports.count(Count.LATE, missed)
         gap = 0.0 if self._last is None else state.timestamp - self._last
         self._last = state.timestamp
         resync = gap > self._longest_gap
         words = f"found a gap of {gap:.3f} s between two states: begun anew" if resync else None
         self._judge(Count.RESYNC, words, Cause.RESYNC)
         if resync:
-            self.flags |= RESYNC
+            flags |= RESYNC
             self._overrun.forget()
         else:
             self._judge(Count.OVERRUN, self._overrun.update(state.timestamp, missed), Cause.OVERRUN)
@@ -82,7 +80,7 @@ class LoopChecks:
         self.rate.take(state.timestamp)
         self._check_robot(state)
         self._check_following(state)
-        return resync
+        return flags
 
     def judge_loads(self, words: str | None) -> None:
         """Hold where a payload or a force is none that the arm can bear."""
@@ -146,13 +144,15 @@ class LoopChecks:
             if what in self._lasting:
                 self._lasting.discard(what)
                 if what == Count.SENSOR_LOST:
-                    self._tell({"kind": "degraded", "what": "", "detail": "the sensor is back"})
+                    self._reports.emit(
+                        {"kind": "degraded", "what": "", "detail": "the sensor is back"}
+                    )
             return
         changed = cause is not None and self._supervisor.take(cause, words)
         if what in self._lasting:
             return
         self._lasting.add(what)
-        self._page.count(what)
+        self._reports.count(what)
         if not changed and self._supervisor.state != State.FAULT:
             kind = "degraded" if what == Count.SENSOR_LOST else "warning"
-            self._tell({"kind": kind, "what": what.words, "detail": words})
+            self._reports.emit({"kind": kind, "what": what.words, "detail": words})

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from typing import Any
 
 from gapbridge.bridge.ipc.counts import Count
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.sample_check import SampleCheck
 from gapbridge.bridge.loop.supervisor import Cause, Supervisor
 from gapbridge.core.arm import Arm
@@ -33,7 +31,7 @@ def hold_time(rate: float) -> float:
 class StateWatch:
     """Takes states from a driver and tells the supervisor when they fail to come.
 
-    ``lose`` is called with the reason when the link must be given up.
+    ``lost`` says why the link must be given up, from then on.
     """
 
     def __init__(
@@ -41,13 +39,11 @@ class StateWatch:
         driver: Driver,
         arm: Arm,
         supervisor: Supervisor,
-        page: Page,
-        tell: Callable[[dict[str, Any]], None],
-        lose: Callable[[str], None],
+        reports: Reports,
         patience: float = 0.0,
     ) -> None:
-        self._driver, self._supervisor, self._page = driver, supervisor, page
-        self._tell, self._lose = tell, lose
+        self._driver, self._supervisor, self._reports = driver, supervisor, reports
+        self.lost: str | None = None
         self._hold = hold_time(driver.rate)
         self._patience = max(patience, self._hold)  # s that one reading takes at most
         self._check = SampleCheck(arm)
@@ -56,10 +52,14 @@ class StateWatch:
         self._stale = self._silent = False  # has been told since the last believable state
         self._told: dict[Count, float] = {}  # s, monotonic
         self._heard = time.monotonic()  # s, of the last believable state
-        self.has_written = False  # the library's writing half exists in this process
+        self._has_armed = False
 
-    def next(self) -> RobotState | None:
-        """Return the next state, or None where none came that can be used."""
+    def next(self, has_armed: bool = False) -> RobotState | None:
+        """Return the next state, or None where none came that can be used.
+
+        ``has_armed``: the writing half of the robot's library exists in this process.
+        """
+        self._has_armed = has_armed
         begun, self._left = time.monotonic(), self._left or time.monotonic()
         away = begun - self._left > self._hold
         try:
@@ -74,13 +74,13 @@ class StateWatch:
         except StaleStateError as error:
             if away or time.monotonic() - begun > self._patience + SUSPENDED:
                 self._heard = time.monotonic()  # it was this process that slept: ask once more
-                self._page.count(Count.LATE)
+                self._reports.count(Count.LATE)
             else:
                 self._stand_still(str(error))
         except InvalidStateError as error:
             self.doubt(str(error))
         except LinkError as error:
-            self._lose(str(error))
+            self.lost = str(error)
         else:
             doubt = self._check.doubt(state)
             if doubt is None:
@@ -101,7 +101,7 @@ class StateWatch:
             self._stand_still(f"states are {now - expiry + self._hold:.3f} s old as they come")
             return False
         if self._old:
-            self._page.count(Count.LATE)
+            self._reports.count(Count.LATE)
             return False
         self._heard = now
         self._stale = self._silent = False
@@ -115,23 +115,23 @@ class StateWatch:
     def _stand_still(self, detail: str) -> None:
         """Judge a clock that stands still: late at first, then stale, then silent."""
         if time.monotonic() - self._heard <= self._hold:
-            self._page.count(Count.LATE)
+            self._reports.count(Count.LATE)
             return
         if not self._stale:
             self._stale = True
-            self._page.count(Count.STALE)
+            self._reports.count(Count.STALE)
             if not self._supervisor.take(Cause.STALE, detail):
-                self._tell({"kind": "link", "what": "stale", "detail": detail})
+                self._reports.emit({"kind": "link", "what": "stale", "detail": detail})
         self._fall_silent(detail)
 
     def doubt(self, detail: str, reason: Count = Count.DROPPED_TORN) -> None:
         """Drop a state that cannot be believed; several in a row end the compensation."""
-        self._page.count(reason)
+        self._reports.count(reason)
         self._invalid += 1
         now = time.monotonic()
         if now - self._told.get(reason, -TELL_EVERY) >= TELL_EVERY:
             self._told[reason] = now
-            self._tell({"kind": "dropped", "what": reason.words, "detail": detail})
+            self._reports.emit({"kind": "dropped", "what": reason.words, "detail": detail})
         if self._invalid >= INVALID_IN_A_ROW:
             self._supervisor.take(Cause.IMPLAUSIBLE, detail)
             self._check.forget()  # the arm may well be there: judge what comes by itself
@@ -142,7 +142,7 @@ class StateWatch:
         if silent > SILENCE:
             if not self._silent:
                 self._silent = True
-                self._page.count(Count.SILENCE)
+                self._reports.count(Count.SILENCE)
             self._supervisor.take(Cause.SILENCE, detail)
-        if silent > (LOST_AFTER_WRITING if self.has_written else LOST):
-            self._lose(detail)
+        if silent > (LOST_AFTER_WRITING if self._has_armed else LOST):
+            self.lost = detail

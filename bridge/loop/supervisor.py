@@ -116,3 +116,10 @@ class Supervisor:
         self.state = after
         self._listener(before, after, cause, detail)
         return True
+
+    def follow(self, state: State, cause: Cause) -> bool:
+        """Be in the state that a recording was in; returns whether it is another."""
+        before, self.state = self.state, state
+        if state != before:
+            self._listener(before, state, cause, "")
+        return state != before
