@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 
 from gapbridge.bridge.ipc.counts import Count
 from gapbridge.bridge.loop.reports import Reports
-from gapbridge.bridge.loop.sample_check import SampleCheck
 from gapbridge.bridge.loop.supervisor import Cause, Supervisor
 from gapbridge.core.arm import Arm
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.state_check import FASTEST, LARGEST, JointCheck
 
+Vector = NDArray[np.float64]
+DRIFT = 5e-3  # s per s: how fast the bound follows a clock that drifts or stumbles
+HASTE = 1.5  # times its velocity limit: a joint that moved faster is a mistake
+_WRENCH = np.array([LARGEST["force"]] * 3 + [LARGEST["moment"]] * 3)
 INVALID_IN_A_ROW = 3  # states that cannot be believed, after which they count as silence
 OLD_IN_A_ROW = 2  # states too old to write by, after which they count as none
 SILENCE = 0.2  # s without a state: a fault
@@ -26,6 +34,112 @@ TELL_EVERY = 1.0  # s between two events of samples dropped for the same reason
 def hold_time(rate: float) -> float:
     """Return for how long the last offset may stay without a new state, s: 5 cycles or 40 ms."""
     return min(max(5.0 / rate, 0.04), SILENCE)
+
+
+class ControllerClock:
+    """Ties controller time to this machine's monotonic clock by the quickest sample seen.
+
+    The age of a state counts from when its sample could have been here at the earliest, so that
+    late packets, late wake-ups and long computing all count. The shortest way over the wire, which
+    one clock alone cannot tell, does not. ``hold``: s after which a state is too old to write by.
+    What a stalled link hands on at once is old for a moment only. Where all samples are older than
+    that for as long, either the controller's clock has stood still or the way has become longer,
+    which no clock tells: the two are tied anew only while nothing is written.
+    """
+
+    def __init__(self, rate: float, hold: float = 1.0) -> None:
+        self._rate, self._hold = rate, hold
+        self._lead: float | None = None  # s: monotonic minus controller time, quickest sample
+        self._last: float | None = None  # s, controller clock
+        self._old_since: float | None = None  # s, monotonic: all samples have been old since
+
+    def take(self, state: RobotState, writes: bool = False) -> int:
+        """Take a new sample; returns the cycles missed since the one before.
+
+        ``writes``: setpoints are made of the samples, so that old ones stay old.
+        """
+        lead, before = state.received - state.timestamp, self._last
+        self._last = state.timestamp
+        gap = 0.0 if before is None else state.timestamp - before
+        if self._lead is None or (self._stood_still(lead, state.received) and not writes):
+            self._lead, self._old_since = lead, None
+        else:
+            self._lead = min(lead, self._lead + DRIFT * gap)
+        return 0 if before is None else max(round(gap * self._rate) - 1, 0)
+
+    def _stood_still(self, lead: float, now: float) -> bool:
+        """Return whether samples have come too old for long enough."""
+        if self._lead is None or lead - self._lead <= self._hold:
+            self._old_since = None
+        elif self._old_since is None:
+            self._old_since = now
+        return self._old_since is not None and now - self._old_since > self._hold
+
+    def skip(self) -> None:
+        """Do not count what the loop does not see now as missed: it does something else."""
+        self._last = None
+
+    def age(self, state: RobotState) -> float:
+        """Return how old a state is now, s."""
+        return time.monotonic() - self._due(state)
+
+    def expiry(self, state: RobotState) -> float:
+        """Return when a state becomes too old for a setpoint to be made of it, s monotonic."""
+        return self._due(state) + self._hold
+
+    def _due(self, state: RobotState) -> float:
+        return state.timestamp + (self._lead or 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """Why a sample was not believed."""
+
+    count: Count
+    words: str
+
+
+class SampleCheck:
+    """Checks each sample against the last one that was believed."""
+
+    def __init__(self, arm: Arm) -> None:
+        speed = arm.limits.velocity
+        self._joints = JointCheck(arm, HASTE * np.where(np.isfinite(speed), speed, FASTEST))
+        self._q: Vector | None = None
+        self._timestamp = 0.0
+
+    def forget(self) -> None:
+        """Take the next sample without comparing it to the ones before."""
+        self._q = None
+
+    def doubt(self, state: RobotState) -> Doubt | None:
+        """Return why a sample cannot be believed; None: it can, and is remembered."""
+        q = state.actual_q
+        force = state.actual_TCP_force
+        sound = bool(np.isfinite(q).all() and np.isfinite(state.target_q).all())
+        sound = sound and bool(np.isfinite(state.actual_qd).all())
+        if not sound or not (state.sensor_lost or np.isfinite(force).all()):
+            return Doubt(Count.DROPPED_NOT_FINITE, "found a number that is not finite in the state")
+        outside = self._joints.outside(q)
+        if outside is not None:
+            return Doubt(Count.DROPPED_IMPLAUSIBLE, outside)
+        if (np.abs(force) > _WRENCH).any():
+            return Doubt(Count.DROPPED_IMPLAUSIBLE, f"found a force of {np.abs(force).max():.3g}")
+        return self._doubt_motion(state)
+
+    def _doubt_motion(self, state: RobotState) -> Doubt | None:
+        before, gap = self._q, state.timestamp - self._timestamp
+        if before is not None:
+            if gap <= 0.0:
+                return Doubt(
+                    Count.DROPPED_BACKWARDS,
+                    f"the controller's clock went back by {-gap:.4f} s",
+                )
+            jumped = self._joints.jumped(state.actual_q - before, gap)
+            if jumped is not None:
+                return Doubt(Count.DROPPED_STEP, jumped)
+        self._q, self._timestamp = state.actual_q, state.timestamp
+        return None
 
 
 class StateWatch:

@@ -20,8 +20,7 @@ from gapbridge.bridge.ipc.counts import Count
 from gapbridge.bridge.ipc.cycle_row import fill_row
 from gapbridge.bridge.ipc.shared_memory import Page, Phase
 from gapbridge.bridge.loop.checks import NOTHING, RAMPING_OUT, RESYNC, UNSOLVED, LoopChecks
-from gapbridge.bridge.loop.controller_clock import ControllerClock
-from gapbridge.bridge.loop.link_monitor import StateWatch, hold_time
+from gapbridge.bridge.loop.link_monitor import ControllerClock, StateWatch, hold_time
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
 from gapbridge.bridge.loop.readiness import ModelCheck

@@ -12,13 +12,17 @@ from hypothesis import strategies as st
 
 from gapbridge.bridge.ipc.counts import Count
 from gapbridge.bridge.ipc.shared_memory import Page
-from gapbridge.bridge.loop.checks import DEGRADED, LATE, RESYNC, LoopChecks
-from gapbridge.bridge.loop.frozen_watch import FrozenWatch
-from gapbridge.bridge.loop.link_monitor import StateWatch, hold_time
-from gapbridge.bridge.loop.overrun_watch import OverrunWatch
+from gapbridge.bridge.loop.checks import (
+    DEGRADED,
+    LATE,
+    RESYNC,
+    FrozenWatch,
+    LoopChecks,
+    OverrunWatch,
+    SaturationWatch,
+)
+from gapbridge.bridge.loop.link_monitor import SampleCheck, StateWatch, hold_time
 from gapbridge.bridge.loop.reports import Reports
-from gapbridge.bridge.loop.sample_check import SampleCheck
-from gapbridge.bridge.loop.saturation_watch import SaturationWatch
 from gapbridge.bridge.loop.supervisor import State, Supervisor
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import InvalidStateError, StaleStateError
