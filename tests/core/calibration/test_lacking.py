@@ -19,7 +19,7 @@ from benchmarks.calibration.laid_out import (
 )
 from gapbridge.core.calibration.fit import fit_session
 from gapbridge.core.calibration.observables import make_observable
-from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.parameters import DEFAULT, Parameters
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.result import Estimate
 from gapbridge.core.calibration.telling import unsupported
@@ -29,21 +29,25 @@ KIND = ARMS["cobot10"]
 EFFECTS = ("joint_offset", "axial_compliance")
 
 
-def session(poses: int, seed: int) -> tuple[Readings, Parameters]:
+def session(
+    poses: int, seed: int, effects: tuple[str, ...] = EFFECTS
+) -> tuple[Readings, Parameters]:
     """Return a small session of an arm that has nothing but what is fitted."""
     layout = Layout(poses=poses, held_out=8, repeated=0)
     model = model_of(real_arm(KIND))
-    parameters = Parameters.of(model, EFFECTS, observable=make_observable("position"))
+    parameters = Parameters.of(model, effects, observable=make_observable("position"))
     rng = np.random.default_rng(seed)
     truth = draw_values(KIND, parameters.names, rng)
     laid, instrument = lay_out(KIND, layout, rng), instrument_for(KIND, layout, rng)
     return readings_of(arm_with(KIND, truth), laid, instrument, rng), parameters
 
 
-@pytest.mark.parametrize("poses", [5, 8, 14])
-def test_an_arm_without_further_effects_is_offered_none(poses: int) -> None:
+@pytest.mark.parametrize(("poses", "effects"), [(4, DEFAULT), (8, EFFECTS), (14, EFFECTS)])
+def test_an_arm_without_further_effects_is_offered_none(
+    poses: int, effects: tuple[str, ...]
+) -> None:
     for seed in range(3):
-        readings, parameters = session(poses, seed)
+        readings, parameters = session(poses, seed, tuple(effects))
         assert fit_session(readings, parameters, Metrology(False, 2e-5)).lacks == ()
 
 
