@@ -33,6 +33,7 @@ from gapbridge.core.diagnosis.regions import parts
 from gapbridge.core.diagnosis.remainder import links_withstand, withstanding
 from gapbridge.core.diagnosis.residual_structure import dependence, structure_p_value
 from gapbridge.core.diagnosis.selection.bent import not_bent
+from gapbridge.core.diagnosis.selection.candidate import shows_alone
 from gapbridge.core.diagnosis.selection.local_search import rivals
 from gapbridge.core.diagnosis.selection.problem import Found, Space
 from gapbridge.core.diagnosis.selection.selection import Selection
@@ -74,6 +75,9 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
     ]  # fmt: skip
     stays, beside = withstanding(selection, believed)
     withdrawn |= {c: BESIDE for c in believed if c not in stays}
+    for c in _without_mass(selection, stays):
+        withdrawn[c] = "no load is declared, and none is accused"
+        stays.remove(c)
     fallen = bool(withdrawn)
     stays = [*stays, *selection.block]
     for c in _gainless(selection, stays, held):
@@ -127,6 +131,18 @@ def _no_value(selection: Selection) -> dict[int, str]:
         if value @ np.linalg.pinv(spread, hermitian=True) @ value < len(value) * OWN_SIGMAS**2:
             found[position] = "its value may as well be none"
     return found
+
+
+def _without_mass(selection: Selection, stays: Sequence[int]) -> list[int]:
+    """Return the candidates that show nothing without an effect that is not accused beside them."""
+    space = selection.space
+    families = {space.candidates[c].family for c in stays}
+    return [
+        c for c in stays
+        if (needed := space.candidates[c].effect.shown_by) is not None
+        and needed.effect not in families
+        and not shows_alone(selection.observation, space.candidates[c])
+    ]  # fmt: skip
 
 
 def _gainless(selection: Selection, stays: Sequence[int], held: HeldOut) -> list[int]:
