@@ -20,7 +20,6 @@ from gapbridge.core.diagnosis.criteria import (
     GAIN,
     HINT,
     INSTRUMENTS,
-    OWN_SIGMAS,
     REPEATED,
     STAND_IN_GAIN,
     STATED,
@@ -36,6 +35,7 @@ from gapbridge.core.diagnosis.selection.bent import not_bent
 from gapbridge.core.diagnosis.selection.candidate import shows_alone
 from gapbridge.core.diagnosis.selection.local_search import rivals
 from gapbridge.core.diagnosis.selection.problem import Found, Space
+from gapbridge.core.diagnosis.selection.refit import may_be_none
 from gapbridge.core.diagnosis.selection.selection import Selection
 
 Array = NDArray[np.float64]
@@ -127,8 +127,7 @@ def _no_value(selection: Selection) -> dict[int, str]:
             for p, v in zip(candidate.parameters, term.values, strict=False)
         ):
             found[position] = "its value stands on its bound"
-        value = np.array(term.values[: len(spread)])
-        if value @ np.linalg.pinv(spread, hermitian=True) @ value < len(value) * OWN_SIGMAS**2:
+        if may_be_none(term, spread):
             found[position] = "its value may as well be none"
     return found
 
