@@ -76,7 +76,7 @@ def _footer(text: str) -> Callable[[Canvas, BaseDocTemplate], None]:
     return draw
 
 
-class _Numbered(Canvas):  # type: ignore[misc]
+class _Numbered(Canvas):
     """A canvas whose pages say how many there are, which is known once all are drawn."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -86,7 +86,7 @@ class _Numbered(Canvas):  # type: ignore[misc]
     def showPage(self) -> None:
         """Keep the page until all are drawn."""
         self._pages.append(dict(self.__dict__))
-        self._startPage()
+        self._startPage()  # type: ignore[attr-defined]
 
     def save(self) -> None:
         """Draw the number of every page, and write the file."""
