@@ -120,7 +120,7 @@ class _Sides:
             if not is_ours:
                 pdo.subscribe()
         self._driver.rhythm._torn = False
-        self._driver.master.collector.stray = ""
+        self._driver.master.collector.forget_stray()
 
     def _wait(self) -> None:
         self._due = max(self._due + PACE, time.monotonic())

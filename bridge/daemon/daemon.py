@@ -19,14 +19,17 @@ from typing import IO, Any
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.run_settings import Configuration, configuration_for, settings_of
+from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
 from gapbridge.bridge.daemon.control import Control
-from gapbridge.bridge.daemon.opening import open_all
+from gapbridge.bridge.daemon.host import OwnerLock
 from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.daemon.reload import Reload
 from gapbridge.bridge.daemon.service_manager import ServiceManager
 from gapbridge.bridge.daemon.sides import Sides
 from gapbridge.bridge.daemon.status import DaemonStatus
+from gapbridge.bridge.daemon.status_document import SCHEMA
 from gapbridge.bridge.daemon.summary import RunSummary, Tally
+from gapbridge.bridge.document.output_file import private
 from gapbridge.bridge.ipc.command_page import Command, CommandPage
 from gapbridge.bridge.ipc.control_socket import ControlSocket
 from gapbridge.bridge.ipc.events import Event, EventBook
@@ -34,7 +37,9 @@ from gapbridge.bridge.ipc.shared_memory import Phase, RunPage
 from gapbridge.bridge.loop.loop import LONGEST_STOP, Exit
 from gapbridge.bridge.loop.setpoint_stream import longest_withdrawal
 from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.recording.folder import LOOP_LOG, new_session, require_folder
 from gapbridge.core.errors import InputError, LinkError
+from gapbridge.drivers.controller_address import address_of
 
 __all__ = ["Daemon", "Say", "settings_of"]
 
@@ -69,7 +74,7 @@ class Daemon:
         self._taken = 0
         self._request_lock = threading.RLock()
         self._reader = self.page.reader()
-        self.output: IO[bytes] | int = subprocess.DEVNULL  # of all processes of the run
+        self._output: IO[bytes] | int = subprocess.DEVNULL  # of all processes of the run
         self.sides = Sides()
         self.tally = Tally(n, settings.link.rate)
         listeners = [self._hear, self.sides.tell]
@@ -77,11 +82,10 @@ class Daemon:
         self._posted: queue.SimpleQueue[Event] = queue.SimpleQueue()  # by other threads
         self.manager = ServiceManager()
         self.session = ""
-        self._status = DaemonStatus(self)
+        self._status = DaemonStatus(self.page.slices)
         self._status_at = 0.0
-        self._reload = Reload(self)
+        self._reload = Reload(self.manager, self.book)
         self.control = Control(self)
-        self.socket: ControlSocket | None = None
         self.loop: LoopProcess | None = None
         self._failure: Event = {}
         self._faults: list[str] = []
@@ -143,17 +147,52 @@ class Daemon:
         return self.book.since(sequence)
 
     def status(self) -> dict[str, Any]:
-        """Return the status document."""
-        return self._status.document()
+        """Return the status document; may be called from any thread."""
+        status, tally, recording = self._status, self.tally, self.recording
+        counted = self.page.counts()
+        return {
+            "schema": SCHEMA,
+            "time": time.time(),
+            "pid": os.getpid(),
+            "started": status.started,
+            "session": self.session,
+            "cell": str(self.settings.cell),
+            "configuration_hash": self.configuration.hash,
+            "configured": status.configured,
+            "state": self.state.name.lower(),
+            **status.history(),
+            "may_write": self.may_write,
+            "armed_by": status.armed_by,
+            "latched": status.latched,
+            "correction": status.correction,
+            "loop": {
+                "pid": self.loop_pid,
+                "restarts": self.restarts,
+                "phase": self.phase.name.lower(),
+            },
+            "link": {
+                "driver": self.settings.link.driver,
+                **status.link(),
+                "cycles": tally.cycles,
+                "missed": tally.missed,
+                "late": tally.late,
+                "written": tally.written,
+                "dropped": {
+                    name.removeprefix("dropped_"): count
+                    for name, count in counted.items()
+                    if name.startswith("dropped_")
+                },
+            },
+            "counts": counted,
+            "events": dict(self.book.counts),
+            "sides": self.sides.status(),
+            "recording": None if recording is None else str(recording),
+            "lost_rows": self.lost_rows,
+        }
 
     def note(self, event: Event) -> None:
         """Have an event told by the daemon's own thread."""
         self._posted.put(event)
-
-    def close_memory(self) -> None:
-        """Let go of what is shared with the loop and who reads along."""
-        self.page.close()
-        self._commands.close()
 
     def stop(self) -> None:
         """Ramp out and end."""
@@ -181,10 +220,6 @@ class Daemon:
         """
         return self._request(Command.DISARM, by)
 
-    def ramp_out(self) -> None:
-        """Have the loop ramp out and observe, by nobody's wish; for the daemon's own thread."""
-        self._commands.ask(Command.RAMP_OUT)
-
     def _request(self, command: Command, by: str) -> int:
         with self._request_lock:
             number = self._commands.number()
@@ -210,16 +245,62 @@ class Daemon:
     def run(self, arm: bool = False, duration: float | None = None, by: str = "") -> RunSummary:
         """Run until stopped; ``by`` says who or what has asked for arming. See run_cell."""
         with ExitStack() as stack:
-            arm = open_all(self, stack, arm, by)
+            arm = self._open(stack, arm, by)
             while not self._stopping.is_set():
                 self._run_loop((by or PROGRAM) if arm else "", duration)
-                arm = self._reload.swap()  # else only a person starts the writing again
+                swap = self._reload.swap()
+                self.configuration = swap.configuration or self.configuration
+                arm = swap.rearms  # else only a person starts the writing again
                 by = "the cell file" if arm else ""
-                if not self._stopping.is_set() and not self._reload.swapped:
+                if not self._stopping.is_set() and not swap.in_order:
                     self._pause()
                     self.restarts += 1
             self._take()
             return self._summary()
+
+    def _open(self, stack: ExitStack, arm: bool, by: str) -> bool:
+        """Open locks, sockets and processes; ``stack`` closes them.
+
+        Returns whether the first loop may arm by itself. Raises InputError where the controller has
+        an owner already, or a folder cannot be used.
+        """
+        settings = self.settings
+        stack.callback(self._commands.close)
+        stack.callback(self.page.close)
+        lock = stack.enter_context(OwnerLock(address_of(settings.link), settings.cell))
+        folder = settings.recording.folder
+        if folder is not None:
+            require_folder(folder)
+        self.session = new_session(folder)
+        if folder is not None:
+            log = folder / f"{self.session}{LOOP_LOG}"
+            self._output = stack.enter_context(open(log, "ab", opener=private))  # noqa: SIM115
+        order = {
+            "settings": settings.model_dump(mode="json"), "n": self.configuration.n,
+            "session": self.session, "extra": {"text": self.configuration.text},
+        }  # fmt: skip
+        stack.callback(self.sides.close)
+        self.sides.start(settings, order, self.page, self._output)
+        stack.callback(lambda: self.book.add({"kind": "ended"}))
+        path = runtime_folder() / f"{cell_key(settings.cell)}.sock"
+        try:
+            stack.enter_context(ControlSocket(path, self.control.answer))
+        except OSError as error:
+            raise InputError(f"{path}: {error.strerror}, expected a socket to listen on") from None
+        if settings.web is not None:
+            self.book.add({"kind": "note", "detail": f"status page: {settings.web.url}"})
+        if settings.setpoints.source == "planner":
+            where = f"setpoints: a planner writes to {settings.setpoints.socket}"
+            self.book.add({"kind": "note", "detail": where})
+        # a person at the terminal may arm after a crash; a service that was started anew may not
+        if arm and lock.before and (by != "--arm" or self.manager.present):
+            words = (
+                f"the run before (process {lock.before.get('pid')}) did not end in order: "
+                "not arming by itself; gapbridge arm"
+            )
+            self.book.add({"kind": "refused", "detail": words})
+            return False
+        return arm
 
     def _pause(self) -> None:
         """Wait before the next process of the loop, and go on looking after the rest."""
@@ -263,7 +344,8 @@ class Daemon:
                 )
                 if over or (self.page.ended and duration is None):
                     self._stopping.set()
-                self._reload.step(self.state, self.phase)
+                if self._reload.step(self.state, self.phase, self.configuration):
+                    self._commands.ask(Command.RAMP_OUT)  # by nobody's wish
                 if (self._stopping.is_set() or self._reload.wants_end) and stop_by is None:
                     needed = LONGEST_STOP + longest_withdrawal(self.settings.limits)
                     stop_by = time.monotonic() + needed + STOP_MARGIN
@@ -300,7 +382,7 @@ class Daemon:
             self._request(Command.ARM, armed_by)
             self._pass_on()
         self._loops += 1
-        return LoopProcess(self.configuration, self.page, self._commands, order, self.output)
+        return LoopProcess(self.configuration, self.page, self._commands, order, self._output)
 
     def _take(self) -> None:
         """Take cycles and events over from the loop."""

@@ -285,6 +285,11 @@ class PageReader:
         self.next = last
         return rows
 
+    def take_lost(self) -> int:
+        """Return how many rows were lost since the last call."""
+        lost, self.lost = self.lost, 0
+        return lost
+
 
 def _read_only(fd: int) -> int:
     path = f"/proc/self/fd/{fd}"

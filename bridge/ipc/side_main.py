@@ -52,6 +52,11 @@ class EventLines:
         if not self.closed:
             select.select([self.fd], [], [], timeout)
 
+    def close(self) -> None:
+        """Close the pipe; nothing comes any more."""
+        os.close(self.fd)
+        self.closed = True
+
 
 class EventWriter:
     """Writes events into a pipe, one JSON object a line; never blocks and never tears a line."""
@@ -78,6 +83,11 @@ class EventWriter:
             return False
         self.sent += 1
         return True
+
+    def take_dropped(self) -> int:
+        """Return how many events were dropped, once."""
+        dropped, self.dropped = self.dropped, 0
+        return dropped
 
     def _flush(self) -> None:
         """Write what is left of an event that has left in part."""

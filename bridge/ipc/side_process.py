@@ -163,16 +163,14 @@ class SideProcess:
 
     def _close_down(self) -> None:
         if self._down_fd is not None:
-            self._dropped += self._down.dropped
-            self._down.dropped = 0
+            self._dropped += self._down.take_dropped()
             os.close(self._down_fd)
             self._down_fd = None
 
     def _let_go(self) -> None:
         self._process = None
         self._close_down()
-        os.close(self._up.fd)
-        self._up.closed = True
+        self._up.close()
         self._pages.close()
 
 

@@ -134,9 +134,7 @@ class Recorder:
             self._write_event(segment, event)
         segment.flush()
         self._events.clear()
-        if self._reader.lost:
-            self._tell_lost(self._reader.lost)
-            self._reader.lost = 0
+        self._tell_lost(self._reader.take_lost())
         self._next, self._flushed = self._reader.next, now
         room = self._room()
         if room < self._settings.keep_free:

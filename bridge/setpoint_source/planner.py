@@ -51,6 +51,14 @@ class Connection:
         self.admitted = False  # a token has been given, or none is asked for
         self.closed = False
 
+    def admit(self) -> None:
+        """Take note that a token has been given, or none is asked for."""
+        self.admitted = True
+
+    def note_line(self) -> None:
+        """Take note of a good line now."""
+        self.heard = time.monotonic()
+
     def lines(self) -> list[bytes]:
         """Return the lines that have arrived, some of them; closes where there is no end."""
         if b"\n" not in self._buffer:
@@ -151,7 +159,7 @@ class PlannerSource(Source):
 
     def _admit(self, connection: Connection, line: bytes) -> bool:
         """Return whether a first line admits a connection and is used up by that."""
-        connection.admitted = True
+        connection.admit()
         return False
 
     def close(self) -> None:
@@ -255,7 +263,7 @@ class PlannerSource(Source):
             if self._planner is not None:
                 self._planner.refuse("silent, and another planner has taken the feed")
             self._planner = connection
-        connection.heard = time.monotonic()
+        connection.note_line()
         self._glide.take(np.array(values))
         return True
 

@@ -66,7 +66,7 @@ class CanDriver(Driver):
     def connect(self) -> None:
         """Open the bus and wait until the arm has told everything once. Sends no command."""
         self.reader.open()
-        self.writer.bus = self.reader.bus
+        self.writer.use(self.reader.bus)
         self._listening = time.monotonic()
         end = time.monotonic() + min(FIRST_SAMPLE, self.settings.connect_timeout)
         found = False
@@ -281,5 +281,5 @@ class CanDriver(Driver):
         with contextlib.suppress(LinkError, InvalidStateError):
             self.release()
         self._armed_at = None
-        self.writer.bus = None
+        self.writer.use(None)
         self.reader.close()

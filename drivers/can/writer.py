@@ -24,11 +24,15 @@ class FrameWriter:
 
     def __init__(self, settings: CanSettings, profile: CanProfile) -> None:
         self._settings, self._profile = settings, profile
-        self.bus: Any = None
+        self._bus: Any = None
         self._plan = Writing(profile)
         self._last: Frames | None = None  # the setpoint that got out whole
         self.target: Vector | None = None  # rad, the same as joints
         self.mended = 0  # setpoints that had to be taken back
+
+    def use(self, bus: Any) -> None:
+        """Send over this bus from now on; None: there is none any more."""
+        self._bus = bus
 
     def forget(self) -> None:
         """Forget the last setpoint: it is no longer what the arm holds."""
@@ -132,11 +136,11 @@ class FrameWriter:
 
         if key not in self._profile.sends:
             raise WriteError(f"{self._profile.name}: {key[0]:#x} is not among the profile's sends")
-        if self.bus is None:
+        if self._bus is None:
             raise WriteError(f"{self._settings.where()}: found no bus, expected connect() first")
         frame = can.Message(arbitration_id=key[0], is_extended_id=key[1], data=data)
         try:
-            self.bus.send(frame, timeout=self._settings.send_timeout)
+            self._bus.send(frame, timeout=self._settings.send_timeout)
         except Exception as error:  # CanError, OSError, serial's
             raise WriteError(
                 f"{self._settings.where()}: frame {key[0]:#x} could not be sent: "

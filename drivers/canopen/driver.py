@@ -90,7 +90,7 @@ class CanopenDriver(Driver):
             check_units(master, self.profile, self._arm)
             assert master.life is not None
             master.life.started()
-            master.collector.stray = ""
+            master.collector.forget_stray()
             for node in self.profile.nodes:
                 master.command(node, "OPERATIONAL")
             self._first_sample()

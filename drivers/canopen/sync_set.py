@@ -38,6 +38,10 @@ class SyncCollector:
         self.dropped: Counter[str] = Counter()  # reason -> frames or sets
         self.stray = ""  # a TPDO that came to no SYNC since the last look; empty: none
 
+    def forget_stray(self) -> None:
+        """Take note that somebody has looked at ``stray``."""
+        self.stray = ""
+
     def begin(self, now: float) -> None:
         """Forget what was collected: a SYNC leaves at ``now`` (s, monotonic)."""
         with self._changed:

@@ -120,7 +120,7 @@ class Bench:
             state = self.state()
             if self.supervisor.state.writes:
                 self.writing.write(state, self.q, self.loads.update(state))
-                self.driver.gate.clock = lambda: self.at
+                self.driver.gate.count_by(lambda: self.at)
 
     def count(self, name: str) -> int:
         return self.page.counts()[name]
@@ -367,7 +367,7 @@ def test_a_clock_that_goes_back_withdraws_the_offset_step_by_step(bench: Bench) 
     assert np.linalg.norm(offset[0]) > 1e-4
     bench.supervisor.take(Cause.IMPLAUSIBLE)  # what the watch over states makes of it
     bench.at -= 5.0
-    bench.driver.gate.clock = time.monotonic
+    bench.driver.gate.count_by(time.monotonic)
     for _ in range(700):
         bench.cycles(1)
         offset.append(bench.stream.limiter.offset_in_base)

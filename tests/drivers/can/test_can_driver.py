@@ -125,7 +125,8 @@ def test_half_a_setpoint_is_taken_back(served, at):
             return True
         return False
 
-    served.driver.writer.bus = breaking = Breaking(served.driver.reader.bus, once)
+    breaking = Breaking(served.driver.reader.bus, once)
+    served.driver.writer.use(breaking)
     with pytest.raises(WriteError, match=rf"{at} of 4 frames out; the setpoint before was sent"):
         served.driver.write_setpoint(setpoint_of(q + 0.001))
     assert breaking.sent[at:] == [
@@ -143,7 +144,8 @@ def test_where_the_setpoint_before_does_not_go_out_either_the_arm_is_stopped(ser
     def only_the_stop(frame, sent):
         return sent >= 2 and frame.arbitration_id != 0x150
 
-    served.driver.writer.bus = breaking = Breaking(served.driver.reader.bus, only_the_stop)
+    breaking = Breaking(served.driver.reader.bus, only_the_stop)
+    served.driver.writer.use(breaking)
     with pytest.raises(WriteError, match="the stop sequence was sent"):
         served.driver.write_setpoint(setpoint_of(q + 0.001))
     assert breaking.sent[-1] == (0x150, b"\x01" + bytes(7))
@@ -153,7 +155,8 @@ def test_where_the_setpoint_before_does_not_go_out_either_the_arm_is_stopped(ser
 
 def test_a_first_frame_that_fails_leaves_nothing_to_take_back(served):
     q = armed(served).actual_q
-    served.driver.writer.bus = breaking = Breaking(served.driver.reader.bus, lambda *_: True)
+    breaking = Breaking(served.driver.reader.bus, lambda *_: True)
+    served.driver.writer.use(breaking)
     with pytest.raises(WriteError, match="0 of 4 frames out; nothing of it was sent"):
         served.driver.write_setpoint(setpoint_of(q))
     assert breaking.sent == []
@@ -162,7 +165,8 @@ def test_a_first_frame_that_fails_leaves_nothing_to_take_back(served):
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 7.0])
 def test_a_setpoint_that_no_frame_can_carry_sends_nothing(served, bad):
     q = armed(served).actual_q
-    served.driver.writer.bus = breaking = Breaking(served.driver.reader.bus, lambda *_: False)
+    breaking = Breaking(served.driver.reader.bus, lambda *_: False)
+    served.driver.writer.use(breaking)
     wrong = q.copy()
     wrong[5] = bad  # the last frame's: those before must not be out
     with pytest.raises(WriteError):

@@ -66,7 +66,7 @@ def test_a_frame_before_any_sync_or_after_the_set_is_a_stray() -> None:
     collector = SyncCollector(PROFILE)
     collector.take(COB_IDS[0], frame_of(COB_IDS[0], 0), 0.0)
     assert collector.stray == "TPDO1 of node 1"
-    collector.stray = ""
+    collector.forget_stray()
     collector.begin(0.0)
     for cob_id in COB_IDS:
         collector.take(cob_id, frame_of(cob_id, 0), 0.0)
