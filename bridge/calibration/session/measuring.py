@@ -2,27 +2,92 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.format import force, millimetres, point
 from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, ReadingError, Where
-from gapbridge.bridge.calibration.joints.joint_source import Stand, TypedJoints
-from gapbridge.bridge.calibration.session.capture import Captured, capture
+from gapbridge.bridge.calibration.joints.joint_source import JointSource, Stand, TypedJoints
 from gapbridge.bridge.calibration.session.pace import header
 from gapbridge.bridge.calibration.session.positioning import Bringing
 from gapbridge.bridge.calibration.session.prompt import Talk, Word
-from gapbridge.bridge.calibration.session.reading import Taken
 from gapbridge.bridge.calibration.session.reading_check import NOTHING, Foresight, Verdict
-from gapbridge.bridge.calibration.session.revisit import look_back
-from gapbridge.bridge.calibration.session.session import Book
+from gapbridge.bridge.calibration.session.session import Book, Taken
+from gapbridge.core.calibration.plan import PlannedPose
+from gapbridge.core.errors import LinkError
+from gapbridge.core.estimation.registration import register
+from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 Array = NDArray[np.float64]
 SHAKY = 10.0  # times the instrument's sigma: samples that scatter more are doubted
 SHAKIEST = 1e-4  # m: less than this is never doubted
+REVISITED = 3  # poses measured once more where the first of them has changed
+NOISES = 6.0  # of instrument and arm: two readings of a pose differ by less
+LEAST = 1.5e-4  # m
+REPEATABILITY = 5e-5  # m, 1 sigma of one coordinate
+PLAINER = 3.0  # times: what is left over by the other story
 SAME = 2e-4  # m: two readings this near to each other are the same
+
+
+@dataclass(frozen=True)
+class Captured:
+    """An averaged reading and where the arm stood meanwhile."""
+
+    stand: Stand
+    value: Array  # (k,) SI
+    scatter: float  # m, 1 sigma of one coordinate of the mean; nan: one sample tells none
+    spread: float  # m, 1 sigma of one coordinate of one sample; nan: as above
+    samples: int
+    source: str
+
+
+def capture(
+    instrument: AnyInstrument, joints: JointSource, pose: PlannedPose, stand: Stand | None,
+    where: Where,
+) -> Captured:  # fmt: skip
+    """Read the instrument. Raises ReadingError where it fails or the arm moved meanwhile.
+
+    ``stand`` None: the arm stands where it does once the instrument has been read.
+    """
+    found = instrument.read(where)
+    if stand is None:
+        stand = joints.stand(pose)
+    elif not joints.still(stand):
+        raise ReadingError("the arm moved while it was measured")
+    if instrument.needs_wrench and stand.raw_wrench is None:
+        raise LinkError("the controller tells no ft_raw_wrench, expected a force sensor's reading")
+    values = found.values
+    if not np.isfinite(values).all():
+        raise ReadingError("found a reading that is not finite")
+    spread = float("nan")
+    if len(values) > 1 and values.shape[1]:
+        lengths = values[:, :3] if values.shape[1] >= 3 else values
+        spread = float(np.sqrt(lengths.var(axis=0, ddof=1).mean()))
+    return Captured(
+        stand, mean(values), spread / np.sqrt(len(values)), spread, len(values), found.source
+    )
+
+
+def mean(values: Array) -> Array:
+    """Return the mean (k,) of samples (M, k); rotations as matrices, as near pi vectors flip."""
+    found: Array = np.asarray(values.mean(axis=0), dtype=float)
+    if values.shape[1] == 6:
+        U, _, Vt = np.linalg.svd(rotation_matrix(values[:, 3:]).mean(axis=0))
+        turn = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        found[3:] = rotation_vector(turn)
+    return found
+
+
+@dataclass(frozen=True)
+class Again:
+    """One pose, before and now."""
+
+    before: Taken
+    now: Taken
+    q: Array  # (n,)
+    shift: Array  # (3,) or (k,) m, how far the reading has gone, the arm's own motion taken off
 
 
 class Conversation:
@@ -188,7 +253,7 @@ class Conversation:
             self.book.add("skip", stop=stop)
             self.talk.say(f"  stop {stop + 1} is left out")
         elif word.word == "back":
-            look_back(self)
+            self._look_back()
         elif word.word in ("moved", "slipped"):
             self.mark_moved(word.word)
         else:
@@ -217,3 +282,99 @@ class Conversation:
         else:
             self.talk.say("  the target has a new place on the tool from here on; earlier readings "
                           "stay good")  # fmt: skip
+
+    # -- `back`: earlier poses measured once more ------------------------------------------------
+
+    def _look_back(self) -> None:
+        """Measure an earlier pose again, further ones where it has changed, and say what moved."""
+        talk, book = self.talk, self.book
+        earlier = self._earlier()
+        if self.foresight is None or not self.foresight.compares or not earlier:
+            talk.say("  no earlier pose to go back to with this load, place and instrument")
+            return
+        limit = max(NOISES * float(np.hypot(self.sigma, REPEATABILITY)), LEAST)
+        first = len(book.taken)
+        seen: list[Again] = []
+        for before in earlier[:REVISITED]:
+            talk.say(f"  back to stop {before.stop + 1}", "bold")
+            seen.append(self._once_more(before))
+            off = float(np.linalg.norm(seen[-1].shift))
+            if off < limit:
+                break
+            talk.warn(
+                f"stop {before.stop + 1} now reads {millimetres(off)} beside what it read before"
+            )
+        if float(np.linalg.norm(seen[-1].shift)) < limit:
+            talk.say(
+                f"  as before, within {millimetres(limit)}: instrument and target stand where they "
+                "stood; measure the doubtful pose again"
+            )
+            return
+        self._decide(seen, limit, first)
+
+    def _earlier(self) -> list[Taken]:
+        """Return good readings of different stops with what is mounted now, the newest first."""
+        book, found, stops = self.book, [], set()
+        for taken in reversed(book.taken):
+            same = taken.station == book.station and taken.load == book.mounted
+            if same and not taken.doubted and taken.stop not in stops:
+                stops.add(taken.stop)
+                found.append(taken)
+        return found
+
+    def _once_more(self, before: Taken) -> Again:
+        book = self.book
+        pose = book.stops[before.stop]
+        now, _ = self.measure(before.stop, self.bringing.bring(pose), again=True)
+        book.add("reading", **now.entry())
+        kind = self.instrument.kind
+        assert self.foresight is not None
+        shift = self.foresight.shift(
+            book.readings(kind, [before]), book.readings(kind, [now]),
+            book.readings(kind, [t for t in book.taken[:-1] if not t.doubted]),
+        )  # fmt: skip
+        return Again(before, now, before.q, shift)
+
+    def _decide(self, seen: list[Again], limit: float, first: int) -> None:
+        """Say what has moved, have the person agree, and begin a new place."""
+        talk = self.talk
+        stories = self._stories(seen)
+        answers = {"moved": "the instrument was knocked or moved: it has a new place from here on",
+                   "slipped": "the target slipped on the tool: it has a new place from here on",
+                   "keep": "neither: go on as if nothing had happened"}  # fmt: skip
+        likely = ""
+        if stories and min(stories.values()) * PLAINER < max(stories.values()):
+            likely = min(stories, key=lambda story: stories[story])
+            what = "the instrument has moved" if likely == "moved" else "the target has slipped"
+            talk.say(
+                f"  {what}: that leaves {millimetres(stories[likely])} unexplained, "
+                f"the other story {millimetres(max(stories.values()))}"
+            )
+        else:
+            talk.say(
+                "  these poses do not tell whether instrument or target has moved; you may know"
+            )
+        order = [likely, *(k for k in answers if k != likely)] if likely else list(answers)
+        chosen = talk.choose("  which", {k: answers[k] for k in order})
+        if chosen != "keep":
+            self.mark_moved(chosen, since=first)
+
+    def _stories(self, seen: list[Again]) -> dict[str, float]:
+        """Return the rms residual of each story, m: a rigid motion, or a shift in tool axes."""
+        if len(seen) < REVISITED or len(seen[0].shift) < 3:
+            return {}
+        assert self.foresight is not None
+        poses = self.foresight.poses(self.book.readings(
+            self.instrument.kind, [a.now for a in seen]
+        ))  # fmt: skip
+        shift = np.array([a.shift[:3] for a in seen])
+        there = poses.position
+        frame = register(there + shift, there)
+        rigid = there + shift - (there @ frame.rotation.T + frame.position)
+        in_tool = np.einsum("nji,nj->ni", poses.rotation, shift)
+        slip = in_tool - in_tool.mean(axis=0)
+        count = shift.size  # degrees of freedom: six are spent on a motion, three on a slip
+        return {
+            "moved": float(np.sqrt(np.sum(rigid**2) / (count - 6))),
+            "slipped": float(np.sqrt(np.sum(slip**2) / (count - 3))),
+        }

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,48 @@ from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.session.journal import Entry, Journal
 from gapbridge.bridge.calibration.session.plan_document import plan_entry, plan_of
-from gapbridge.bridge.calibration.session.reading import Taken
 from gapbridge.core.calibration.plan import Plan, PlannedPose
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.loads import Loads
 
 Array = NDArray[np.float64]
+_VECTORS = ("q", "value", "approach", "temperature", "wrench", "raw_wrench")
+
+
+@dataclass(frozen=True)
+class Taken:
+    """What was measured at one stop."""
+
+    stop: int  # number in the plan's poses, from 0
+    q: Array  # (n,) rad
+    value: Array  # (k,) SI, mean of the samples
+    scatter: float  # m, 1 sigma of one coordinate of the mean; nan: not known
+    samples: int  # averaged
+    load: int
+    station: int
+    target: int
+    approach: Array  # (n,) sign of each joint's last motion
+    time: float = 0.0  # s, time.time()
+    source: str = ""  # row or file of the instrument
+    temperature: Array | None = None  # (n,) °C
+    wrench: Array | None = None  # (6,) N, Nm: actual_TCP_force
+    raw_wrench: Array | None = None  # (6,) N, Nm: ft_raw_wrench
+    again: bool = False  # an earlier stop, measured once more
+    doubted: bool = False  # kept by the person though it did not fit
+
+    def entry(self) -> dict[str, Any]:
+        """Return it for the journal, which gives it its time."""
+        return {k: v for k, v in asdict(self).items() if v is not None and k != "time"}
+
+    @classmethod
+    def of(cls, entry: dict[str, Any]) -> Taken:
+        """Return what an entry of the journal tells."""
+        known = {k: v for k, v in entry.items() if k in cls.__dataclass_fields__}
+        for name in _VECTORS:
+            if name in known:
+                known[name] = np.array([float(v) for v in known[name]])
+        known["scatter"] = float(known["scatter"])
+        return cls(**known)
 
 
 @dataclass
@@ -51,9 +88,9 @@ class Book:
 
     def apply(self, entry: Entry) -> None:
         """Act on an entry of the journal; one of a kind that is not known means nothing here."""
-        action = getattr(self, f"_{entry['kind']}", None)
+        action = _ACTIONS.get(entry["kind"])
         if action is not None:
-            action(entry)
+            action(self, entry)
 
     # -- entries, by their kind -------------------------------------------------------------------
 
@@ -160,3 +197,18 @@ class Book:
     def keep_plan(self, plan: Plan) -> None:
         """Write the plan that the session follows."""
         self.add("plan", plan=plan_entry(plan))
+
+
+_ACTIONS: dict[str, Callable[[Book, Entry], None]] = {
+    "begun": Book._begun,
+    "plan": Book._plan,
+    "reading": Book._reading,
+    "rejected": Book._rejected,
+    "undo": Book._undo,
+    "skip": Book._skip,
+    "mounted": Book._mounted,
+    "moved": Book._moved,
+    "note": Book._note,
+    "ended": Book._ended,
+}
+"""Kind of an entry -> what it does to the session."""

@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 
 from gapbridge.bridge.calibration.session.journal import FILE, Journal, plain, read_entries
 from gapbridge.bridge.calibration.session.plan_document import plan_entry, plan_of
-from gapbridge.bridge.calibration.session.reading import Taken
-from gapbridge.bridge.calibration.session.session import Book
+from gapbridge.bridge.calibration.session.session import Book, Taken
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
 from gapbridge.core.errors import InputError
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gapbridge.bridge.calibration.joints.move import PERIOD, write_move
-from gapbridge.bridge.calibration.session.route import all_free, route
+from gapbridge.bridge.calibration.session.positioning import all_free, route
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.model import Model
 from gapbridge.core.planning.capsules import Box
