@@ -32,11 +32,12 @@ from gapbridge.bridge.daemon.summary import RunSummary, Tally
 from gapbridge.bridge.document.output_file import private
 from gapbridge.bridge.ipc.command_page import Command, CommandPage
 from gapbridge.bridge.ipc.control_socket import ControlSocket
+from gapbridge.bridge.ipc.counts import DROPPED
 from gapbridge.bridge.ipc.events import Event, EventBook
 from gapbridge.bridge.ipc.shared_memory import Phase, RunPage
 from gapbridge.bridge.loop.loop import LONGEST_STOP, Exit
 from gapbridge.bridge.loop.setpoint_stream import longest_withdrawal
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.loop.supervisor import Cause, State
 from gapbridge.bridge.recording.folder import LOOP_LOG, new_session, require_folder
 from gapbridge.core.errors import InputError, LinkError
 from gapbridge.drivers.controller_address import address_of
@@ -177,11 +178,7 @@ class Daemon:
                 "missed": tally.missed,
                 "late": tally.late,
                 "written": tally.written,
-                "dropped": {
-                    name.removeprefix("dropped_"): count
-                    for name, count in counted.items()
-                    if name.startswith("dropped_")
-                },
+                "dropped": {reason: counted[count.words] for count, reason in DROPPED.items()},
             },
             "counts": counted,
             "events": dict(self.book.counts),
@@ -412,7 +409,7 @@ class Daemon:
             tail = f": {detail}" if detail else ""
             text = f"{event['from'].lower()} -> {event['to'].lower()} ({event['cause']}){tail}"
             self._say(text)
-            self._refused |= event["cause"] == "start refused"
+            self._refused |= event["cause"] == Cause.START_REFUSED
             if detail:
                 self._faults.append(text)
         elif detail and kind not in ("granted", "summary", "request"):

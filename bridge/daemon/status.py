@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gapbridge.bridge.ipc.events import Event
 from gapbridge.bridge.loop.checks import NOTHING, UNSOLVED
-from gapbridge.bridge.loop.supervisor import HEALED_BY_RECONNECTING, State
+from gapbridge.bridge.loop.supervisor import HEALED_BY_RECONNECTING, Cause, State
 
 RATE_SPAN = 2.0  # s that the rate is taken over
 
@@ -74,7 +74,7 @@ class DaemonStatus:
         self._since = event["time"]
         self._why = f"{cause}: {detail}" if detail else cause
         if to == State.FAULT.name:
-            if cause != "fault latched":  # else it is the one that is known already
+            if cause != Cause.LATCHED:  # else it is the one that is known already
                 self.latched, self._heals = self._why, cause in HEALED_BY_RECONNECTING
         elif event["from"] == State.FAULT.name and to == State.OBSERVING.name:
             self.latched = ""

@@ -17,11 +17,11 @@ from prometheus_client.core import (
 )
 from prometheus_client.registry import Collector
 
+from gapbridge.bridge.ipc.counts import DROPPED
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.metrics.counts import Buckets, Counts
 
 AXES = ("x", "y", "z")
-DROPPED = "dropped_"  # what counts of samples that could not be believed begin with
 
 
 class Families(Collector):
@@ -148,12 +148,11 @@ class Families(Collector):
             transitions.add_metric([to, cause], float(times))
         yield transitions
         told = _numbers(counts.status.get("counts"))
-        dropped = {k.removeprefix(DROPPED): v for k, v in told.items() if k.startswith(DROPPED)}
-        others = {k: v for k, v in told.items() if not k.startswith(DROPPED)}
+        dropped = {r: told.pop(c.words) for c, r in DROPPED.items() if c.words in told}
         yield _counter(
             "gapbridge_dropped_samples", "Samples that could not be believed.", dropped, "reason"
         )
-        yield _counter("gapbridge_incidents", "What the loop met with, by kind.", others, "kind")
+        yield _counter("gapbridge_incidents", "What the loop met with, by kind.", told, "kind")
 
     def _processes(self) -> Iterator[Metric]:
         status = self._counts.status

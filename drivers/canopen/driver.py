@@ -28,6 +28,7 @@ from gapbridge.drivers.canopen.configure import (
 )
 from gapbridge.drivers.canopen.listening import OPERATIONAL, Emergency, Foreign
 from gapbridge.drivers.canopen.master import Master
+from gapbridge.drivers.canopen.objects import FAULTS
 from gapbridge.drivers.canopen.power import Power
 from gapbridge.drivers.canopen.profile import WINDOW, read_profile
 from gapbridge.drivers.canopen.rhythm import Rhythm
@@ -200,7 +201,7 @@ class CanopenDriver(Driver):
         try:
             found = self._quiet_sample()
             for joint, told in enumerate(states(found)):
-                if told.startswith("FAULT") and not self.settings.clear_faults:
+                if told in FAULTS and not self.settings.clear_faults:
                     node = self.profile.nodes[joint]
                     raise WriteError(
                         f"{self.master.where}: node {node}: found {told}"

@@ -10,6 +10,7 @@ State = Literal[
     "NOT READY TO SWITCH ON", "SWITCH ON DISABLED", "READY TO SWITCH ON", "SWITCHED ON",
     "OPERATION ENABLED", "QUICK STOP ACTIVE", "FAULT REACTION ACTIVE", "FAULT",
 ]  # fmt: skip
+FAULTS: tuple[State, ...] = ("FAULT REACTION ACTIVE", "FAULT")
 
 
 @dataclass(frozen=True, slots=True)
