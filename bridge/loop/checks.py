@@ -155,4 +155,4 @@ class LoopChecks:
         self._page.count(what)
         if not changed and self._supervisor.state != State.FAULT:
             kind = "degraded" if what == Count.SENSOR_LOST else "warning"
-            self._tell({"kind": kind, "what": what.words, "detail": words})
+            self._tell({"kind": kind, "what": what.label, "detail": words})

@@ -81,7 +81,7 @@ def test_the_residual_is_the_distance_that_is_really_left(n):
     np.testing.assert_allclose(found.residual, distance(model, found.q, q), atol=1e-10)
 
 
-def test_a_stretched_arm_cannot_reach_where_it_sags_from_and_says_how_much_is_left():
+def test_a_stretched_arm_cannot_reach_where_it_sags_from_and_reports_how_much_is_left():
     found = correct(SIX, np.zeros((1, 6)))
     assert 1e-4 < found.residual[0] < distance(SIX, np.zeros((1, 6)), np.zeros((1, 6)))[0]
 
@@ -175,7 +175,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("what", BAD)
-def test_what_cannot_be_solved_says_so_and_spoils_no_later_setpoint(what):
+def test_what_cannot_be_solved_reports_so_and_spoils_no_later_setpoint(what):
     live, good = Compensator(SIX), np.array([0.3, -1.2, 1.4, -0.5, 0.8, 0.2])
     before = live.correct(good)
     assert live.correct(*BAD[what]).residual == np.inf

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
-from rigs import Rigs, calm_link
+from rigs import Rigs, quiet_link
 
 from benchmarks.faults.injection import make_fault
 from benchmarks.faults.links import LINKS
@@ -44,7 +44,7 @@ CASES = [(name, row) for name in LINKS for row in rows_of(name)]
 @pytest.mark.parametrize(
     ("name", "row"), CASES, ids=[f"{name}-{row.key.replace(' ', '_')}" for name, row in CASES]
 )
-def test_a_fault_is_detected_and_answered_as_the_table_says(
+def test_a_fault_is_detected_and_answered_as_the_table_reports(
     rigs: Rigs, name: str, row: Row
 ) -> None:
     assert attempt(rigs, name, row).wrong == ()
@@ -56,10 +56,10 @@ APART = [(name, row) for name in LINKS for row in rows_of(name, shared=False)]
 @pytest.mark.parametrize(
     ("name", "row"), APART, ids=[f"{name}-{row.key.replace(' ', '_')}" for name, row in APART]
 )
-def test_a_fault_that_needs_a_daemon_of_its_own_is_answered_as_the_table_says(
+def test_a_fault_that_needs_a_daemon_of_its_own_is_answered_as_the_table_reports(
     tmp_path: Path, name: str, row: Row
 ) -> None:
-    assert run_alone(row, calm_link(name), tmp_path).wrong == ()
+    assert run_alone(row, quiet_link(name), tmp_path).wrong == ()
 
 
 def test_every_row_has_a_name_of_its_own_and_links_that_exist() -> None:

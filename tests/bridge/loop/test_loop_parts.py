@@ -33,7 +33,7 @@ def test_the_first_force_counts_at_once_and_later_ones_come_slowly() -> None:
     assert after == pytest.approx(10 / np.e)
 
 
-def test_force_is_left_out_where_the_cell_says_so() -> None:
+def test_force_is_left_out_where_the_cell_reports_so() -> None:
     loads = LiveLoads(3, use_force=False, time_constant=0.0)
     assert loads.update(state(1.0, actual_TCP_force=np.ones(6))).wrench is None
 
@@ -70,7 +70,7 @@ def test_a_first_payload_that_cannot_be_leaves_the_models_own() -> None:
     assert loads.update(state(1.0, payload=40.0, payload_cog=Q * 0)).payload_mass is None
 
 
-def test_a_force_that_does_not_count_is_not_doubted() -> None:
+def test_a_force_that_does_not_count_is_not_rejected() -> None:
     loads = LiveLoads(3, False, 0.0, LoadBounds(5.0))
     loads.update(state(1.0, actual_TCP_force=np.full(6, 9e3)))
     assert loads.doubt is None

@@ -96,9 +96,9 @@ class Bench:
         self.loads = LiveLoads(6, True, 0.0)
         settings = SetpointSettings()
         source = make_source(settings, 6, True, Path())
-        told: list[dict[str, Any]] = []
+        events: list[dict[str, Any]] = []
         self.writing = Writing(
-            settings, self.driver, source, self.stream, self.supervisor, page, told.append,
+            settings, self.driver, source, self.stream, self.supervisor, page, events.append,
             lambda: None, self.lost.append,
         )  # fmt: skip
         self.at, self.q = 1.0, Q
@@ -187,7 +187,7 @@ def test_nothing_leaves_that_is_made_of_an_old_state_and_the_next_step_is_no_lar
     assert bench.supervisor.state == State.COMPENSATING
 
 
-def test_what_takes_the_watchdog_too_long_to_hear_lets_nothing_old_leave(bench: Bench) -> None:
+def test_what_takes_the_watchdog_too_long_to_notice_lets_nothing_old_leave(bench: Bench) -> None:
     bench.driver.keep_alive = lambda: time.sleep(0.03)  # type: ignore[method-assign]
     state = bench.state()
     expiry = time.monotonic() + 0.02
@@ -218,7 +218,7 @@ def test_a_process_that_was_stopped_after_the_judgement_sends_nothing_old(bench:
     assert len(bench.driver.sent) == sent + 1
 
 
-def test_a_process_that_was_stopped_while_it_sent_says_so_and_ends_the_motion(
+def test_a_process_that_was_stopped_while_it_sent_reports_so_and_ends_the_motion(
     bench: Bench,
 ) -> None:
     bench.driver._send = lambda _: time.sleep(0.03)  # type: ignore[method-assign]
