@@ -28,6 +28,6 @@ NAMED = [
 
 
 @pytest.mark.parametrize("name", NAMED)
-def test_a_named_member_is_where_its_table_reports(name: str) -> None:
+def test_a_named_member_is_where_its_table_says(name: str) -> None:
     module, member = name.split(":")
     assert callable(getattr(importlib.import_module(module), member))

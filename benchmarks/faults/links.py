@@ -1,4 +1,4 @@
-"""The links on which faults are made: a cell for the daemon, one for its simulated controller, a tap."""
+"""The links on which faults are made: a cell for the daemon, one for the controller, a tap."""
 
 from __future__ import annotations
 

@@ -81,9 +81,7 @@ class Program:
             raise RuntimeError(f"no answer in {LIMIT:g} s") from None
         if done.returncode:
             output = (done.stderr.strip() or done.stdout.strip()).splitlines()
-            raise RuntimeError(
-                f"exit {done.returncode}: {output[-1] if output else 'silent'}"
-            )
+            raise RuntimeError(f"exit {done.returncode}: {output[-1] if output else 'silent'}")
 
     def diagnosis(self, log: Path, cell: Path, *arguments: object) -> dict[str, dict[str, Any]]:
         """Return the channels of a diagnosis by name."""

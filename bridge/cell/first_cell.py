@@ -103,9 +103,7 @@ def _payload(facts: ControllerFacts) -> Iterator[str]:
         f"payload: {{mass: {number_text(mass)}, cog: {_list(np.zeros(3) if cog is None else cog)}}}"
     )
     what = "kg, m in the flange frame; tool included"
-    yield f"{text}  # {what}" + (
-        "" if known else ": not said by the controller, put yours in"
-    )
+    yield f"{text}  # {what}" + ("" if known else ": not said by the controller, put yours in")
     yield ""
 
 

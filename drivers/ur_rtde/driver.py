@@ -104,9 +104,7 @@ class UrRtdeDriver(Driver):
         q, tcp = found
         wanted = wanted_pose(self._model, q[None])
         apart = float(np.linalg.norm(tcp[:3] - wanted.position[0]))
-        cosine = 0.5 * (
-            np.trace(one_rotation_matrix(tcp[3:]).T @ wanted.rotation[0]) - 1.0
-        )
+        cosine = 0.5 * (np.trace(one_rotation_matrix(tcp[3:]).T @ wanted.rotation[0]) - 1.0)
         turned = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
         most = self.settings.tcp_tolerance
         if apart <= most and turned <= TCP_TURNED:  # NaN is not

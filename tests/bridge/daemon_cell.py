@@ -162,9 +162,7 @@ class Run:
         while self.daemon.state != State.COMPENSATING:
             now = time.monotonic()
             assert self.error is None, self.error
-            assert now < until, (
-                f"{self.daemon.state} ({self.output}): not within {limit:g} s"
-            )
+            assert now < until, f"{self.daemon.state} ({self.output}): not within {limit:g} s"
             if self.daemon.state == State.OBSERVING and now - asked > 3.0:
                 self.daemon.arm()
                 asked = now

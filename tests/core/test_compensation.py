@@ -175,7 +175,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("what", BAD)
-def test_what_cannot_be_solved_reports_so_and_spoils_no_later_setpoint(what):
+def test_what_cannot_be_solved_says_so_and_spoils_no_later_setpoint(what):
     live, good = Compensator(SIX), np.array([0.3, -1.2, 1.4, -0.5, 0.8, 0.2])
     before = live.correct(good)
     assert live.correct(*BAD[what]).residual == np.inf

@@ -150,7 +150,7 @@ def test_what_no_session_shows_stays_at_the_nominal_and_is_reported() -> None:
     assert fit.scatter.mean[1] == pytest.approx(MEAN[1], rel=1e-6)
 
 
-def test_the_drifting_arm_alone_is_reported_to_drift() -> None:
+def test_the_drifting_arm_alone_is_found_to_drift() -> None:
     rng = np.random.default_rng(11)
     given, number = [], []
     for arm in range(20):

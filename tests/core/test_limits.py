@@ -165,7 +165,7 @@ def test_a_joint_correction_without_a_tcp_offset_is_bounded_too() -> None:
     assert limiter.counts[JOINT_OFFSET] == 200
 
 
-def test_the_offset_grows_at_its_rate_and_reports_so() -> None:
+def test_the_offset_grows_at_its_rate_and_says_so() -> None:
     q, offset = np.zeros(N), np.array([5e-3, 0, 0, 0, 0, 0])
     limiter = started(q)
     lengths = [run(limiter, q, np.full(N, 1e-3), offset)[1][0] for _ in range(60)]
@@ -264,9 +264,7 @@ def test_a_stream_cannot_start_where_the_arm_must_not_be(q: Array) -> None:
         ({"lower": np.full(N, 3.0)}, "lower joint limit"),
     ],
 )
-def test_limits_that_make_no_sense_are_refused(
-    changed: dict[str, Any], output: str
-) -> None:
+def test_limits_that_make_no_sense_are_refused(changed: dict[str, Any], output: str) -> None:
     with pytest.raises(LimitError, match=output):
         limits(**changed)
 

@@ -44,7 +44,7 @@ CASES = [(name, row) for name in LINKS for row in rows_of(name)]
 @pytest.mark.parametrize(
     ("name", "row"), CASES, ids=[f"{name}-{row.key.replace(' ', '_')}" for name, row in CASES]
 )
-def test_a_fault_is_detected_and_answered_as_the_table_reports(
+def test_a_fault_is_detected_and_answered_as_the_table_says(
     rigs: Rigs, name: str, row: Row
 ) -> None:
     assert attempt(rigs, name, row).wrong == ()
@@ -56,7 +56,7 @@ APART = [(name, row) for name in LINKS for row in rows_of(name, shared=False)]
 @pytest.mark.parametrize(
     ("name", "row"), APART, ids=[f"{name}-{row.key.replace(' ', '_')}" for name, row in APART]
 )
-def test_a_fault_that_needs_a_daemon_of_its_own_is_answered_as_the_table_reports(
+def test_a_fault_that_needs_a_daemon_of_its_own_is_answered_as_the_table_says(
     tmp_path: Path, name: str, row: Row
 ) -> None:
     assert run_alone(row, quiet_link(name), tmp_path).wrong == ()

@@ -205,7 +205,7 @@ class ServerThread:
         self.loop.open()
         self._ended.clear()
         self._thread = threading.Thread(
-            target=self.loop.run, args=(self._ended.is_set,), daemon=True, name="simulated controller"
+            target=self.loop.run, args=(self._ended.is_set,), daemon=True, name="controller"
         )
         self._thread.start()
 

@@ -67,7 +67,5 @@ def test_the_cell_that_comes_of_it_predicts_the_arm(ended: tuple[Path, Played]) 
     folder, _ = ended
     plan = plan_in(folder / "s")
     predicted = there(plan, load_cell(folder / "new.yaml").model)
-    off = np.linalg.norm(
-        register(there(plan), predicted).in_base(there(plan)) - predicted, axis=1
-    )
+    off = np.linalg.norm(register(there(plan), predicted).in_base(there(plan)) - predicted, axis=1)
     assert off.max() < 1e-4

@@ -53,7 +53,7 @@ def test_a_cell_that_is_wrong_ends_with_two_and_every_line(tmp_path: Path) -> No
     assert all(line.startswith(f"error: {path}, line ") for line in lines)
 
 
-def test_a_fit_cell_ends_with_zero_and_reports_so(tmp_path: Path) -> None:
+def test_a_fit_cell_ends_with_zero_and_says_so(tmp_path: Path) -> None:
     path = tmp_path / "cell.yaml"
     path.write_text("robot: {model: ur10e}\nmetrology: {sigma: 0.005}\n")
     answer = gapbridge("check", path)

@@ -55,7 +55,7 @@ def test_a_log_is_large_from_its_number_of_rows_on(tmp_path, rows, large):
     assert large_log.is_large(log) == large
 
 
-def test_a_recording_that_holds_no_measured_poses_reports_so(tmp_path):
+def test_a_recording_that_holds_no_measured_poses_says_so(tmp_path):
     from gapbridge.bridge.cell.settings.recording import RecordingSettings
     from gapbridge.bridge.ipc.shared_memory import Page
     from gapbridge.bridge.recording.recorder import Recorder

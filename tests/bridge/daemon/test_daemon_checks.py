@@ -93,7 +93,7 @@ def nothing_left(run: Run) -> None:
 
 
 @pytest.mark.parametrize("times", [1000.0, 0.0])
-def test_a_model_that_is_no_use_is_reported_so_and_does_not_arm(robot: Robot, times: float) -> None:
+def test_a_model_that_is_no_use_is_reported_and_does_not_arm(robot: Robot, times: float) -> None:
     cell = robot.cell(PATIENT)
     axial, radial = (
         [times * value for value in values]
@@ -141,9 +141,7 @@ def test_what_a_person_changes_in_the_controller_during_a_run_is_held_and_not_co
         run.compensate()
         time.sleep(0.8)
         script(robot, line)
-        wait_for(
-            lambda: cause in " ".join(run.output), 3.0, f"{cause} ({run.output})"
-        )
+        wait_for(lambda: cause in " ".join(run.output), 3.0, f"{cause} ({run.output})")
         run.wait(State.OBSERVING, 5.0)
         assert cause.split(": ")[-1] in refusal(run)
         run.end()

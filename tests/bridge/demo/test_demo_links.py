@@ -112,7 +112,7 @@ def test_the_bench_moves_the_arm_and_stamps_with_this_machines_clock(tmp_path: P
         bench.close()
 
 
-def test_a_load_that_no_controller_shows_goes_into_the_log(tmp_path: Path) -> None:
+def test_a_load_that_no_controller_reports_goes_into_the_log(tmp_path: Path) -> None:
     load = LINKS["can"].scene.calibration_loads[2]
     t, q = np.arange(0, 2, 0.01), np.full((200, 6), 0.4)
     recording = {"timestamp": t, "actual_q": q, "actual_qd": 0 * q}

@@ -33,7 +33,7 @@ def test_the_first_force_counts_at_once_and_later_ones_come_slowly() -> None:
     assert after == pytest.approx(10 / np.e)
 
 
-def test_force_is_left_out_where_the_cell_reports_so() -> None:
+def test_force_is_left_out_where_the_cell_says_so() -> None:
     loads = LiveLoads(3, use_force=False, time_constant=0.0)
     assert loads.update(state(1.0, actual_TCP_force=np.ones(6))).wrench is None
 

@@ -164,7 +164,7 @@ def test_moving_effects_become_the_joints_and_actuators_own(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("on_top", [False, True])
-def test_a_servo_gives_way_as_much_as_the_cell_reports(tmp_path: Path, on_top: bool) -> None:
+def test_a_servo_gives_way_as_much_as_the_cell_says(tmp_path: Path, on_top: bool) -> None:
     """Found against the simulator, the droop comes beside the simulator's own."""
     kp, droop = 1e4, 3e-5
     (tmp_path / "a.xml").write_text(given := mjcf(ARM, UR_JOINTS, kp=kp))
@@ -219,9 +219,7 @@ def test_another_arm_is_refused_by_the_joint_that_does_not_agree(tmp_path: Path)
         ("a.urdf", "<robot name='x'><link name='a'/></robot>", "joints: found"),
     ],
 )
-def test_what_is_no_model_is_one_line(
-    tmp_path: Path, name: str, text: str, output: str
-) -> None:
+def test_what_is_no_model_is_one_line(tmp_path: Path, name: str, text: str, output: str) -> None:
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError, match=output) as error:
         format_of(tmp_path / name).patch(tmp_path / name, changes_of(NOMINAL), PatchOptions(), [])

@@ -40,7 +40,7 @@ def test_the_log_holds_the_contracts_columns_bit_for_bit(
     assert set(beside) <= set(log.unknown)
 
 
-def test_states_stand_in_text(desk: Desk, tmp_path: Path) -> None:
+def test_states_are_written_as_text(desk: Desk, tmp_path: Path) -> None:
     desk.record(3)
     export(desk.stem, tmp_path / "log.csv")
     lines = (tmp_path / "log.csv").read_text().splitlines()

@@ -102,9 +102,7 @@ def post(port: int, body: bytes, limit: float = 2.0) -> bytes:
 def test_a_posted_body_is_no_plan(target: Target) -> None:
     for _ in range(3):
         reply = post(target.port, target.lines())
-        assert reply == b"" or reply.startswith(
-            b"error: "
-        )  # reset, or refused in one line
+        assert reply == b"" or reply.startswith(b"error: ")  # reset, or refused in one line
     time.sleep(0.3)
     target.assert_untouched()
 

@@ -176,7 +176,7 @@ def test_neither_side_can_write_what_is_the_others() -> None:
         os.close(again)
 
 
-def test_the_arm_goes_where_the_plc_reports_and_the_plc_hears_of_it(tmp_path: Path) -> None:
+def test_the_arm_goes_where_the_plc_says_and_the_plc_hears_of_it(tmp_path: Path) -> None:
     with Robot(tmp_path) as robot:
         start = np.array(robot.settings.start_q)
         cell = robot.cell(setpoints="{source: modbus, port: 15811, timeout: 0.5}")

@@ -393,7 +393,7 @@ def test_a_loopback_address_is_taken(host: str) -> None:
     assert SetpointSettings(source="modbus", host=host).host == host
 
 
-def test_a_cell_with_a_port_and_no_token_is_refused_and_reports_what_to_set(tmp_path: Path) -> None:
+def test_a_cell_with_a_port_and_no_token_is_refused_and_names_what_to_set(tmp_path: Path) -> None:
     path = tmp_path / "cell.yaml"
     path.write_text(
         "robot: {model: ur10e}\nlink: {host: 127.0.0.1}\nsetpoints: {source: tcp, port: 30310}\n"

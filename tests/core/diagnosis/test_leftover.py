@@ -28,7 +28,7 @@ def space(seed: int, planted=(), size: float = 1.0):
     return toy.random_space(seed, CANDIDATES, ROWS, planted, size)
 
 
-def test_noise_has_no_structure_as_often_as_the_probability_reports():
+def test_noise_has_no_structure_as_often_as_the_probability_says():
     wide = np.linalg.qr(np.random.default_rng(8).normal(size=(ROWS, 35)))[0]
     drawn = np.array([structure_p_value(space(s), wide, ()) for s in range(60)])
     for level in (0.05, 0.2, 0.5, 0.8):

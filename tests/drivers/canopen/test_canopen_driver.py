@@ -269,7 +269,7 @@ def test_an_emergency_is_a_fault_that_stops_writing_and_is_named(
     assert Phase.ENABLED not in phases(generic)
 
 
-def test_faults_are_reset_where_the_cell_reports_so(generic: DriveArm) -> None:
+def test_faults_are_reset_where_the_cell_says_so(generic: DriveArm) -> None:
     with generic.driver(clear_faults=True) as driver:
         generic.server.fail(node_of(generic, 2), 0x2310)
         wait_for(lambda: settled(driver).safety_mode == 9, 1.0, "safety_mode fault")

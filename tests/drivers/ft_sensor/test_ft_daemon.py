@@ -60,9 +60,7 @@ def test_a_silent_sensor_is_seen_and_its_return_is_observed(
         time.sleep(0.3)
         run.end()
         raw = np.stack([run.cycles()[f"ft_raw_wrench_{i}"] for i in range(6)], axis=1)
-    assert any("robotous_rft" in line and "max_age" in line for line in run.output), (
-        run.output
-    )
+    assert any("robotous_rft" in line and "max_age" in line for line in run.output), run.output
     assert np.abs(raw - WEIGHT).max() <= 0.02  # not one cycle with another wrench
 
 

@@ -276,7 +276,7 @@ def test_no_sensor_is_a_link_error_and_the_arm_is_let_go() -> None:
 
 
 @pytest.mark.parametrize("lead", [0.0, 1234.5, -800.0])
-def test_each_state_gets_the_wrench_of_its_own_moment_whatever_the_arms_clock_reports(
+def test_each_state_gets_the_wrench_of_its_own_moment_whatever_the_arms_clock_says(
     lead: float,
 ) -> None:
     """The load rises by 100 N/s: a wrench of another moment would show."""

@@ -19,7 +19,7 @@ word = st.integers(0, 0xFFFF)
     st.lists(word, min_size=32, max_size=32), st.permutations(range(32)),
     st.sampled_from((1.0, 1e-3, -0.25)), st.none() | st.sampled_from(("i16", "u16", "sm16")),
 )  # fmt: skip
-def test_a_block_reports_to_the_plan_what_its_codings_say(
+def test_a_block_gives_the_plan_what_its_codings_say(
     kind: str, order: str, registers: list[int], places: list[int], size: float, turns: str | None
 ) -> None:
     coding = Coding(kind, order)  # type: ignore[arg-type]

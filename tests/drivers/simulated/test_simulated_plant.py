@@ -157,7 +157,7 @@ def test_rotation_vectors_go_there_and_back(angle: float) -> None:
     assert whole == pytest.approx(np.eye(3))
 
 
-def test_inverse_kinematics_finds_the_joints_back_and_reports_so_where_there_are_none() -> None:
+def test_inverse_kinematics_finds_the_joints_back_and_says_so_where_there_are_none() -> None:
     arm, tool = plant_arm("ur5e"), frame_of(TCP)
     target = tcp_in_base(arm, START, tool)
     near = tuple(v + 0.2 for v in START)

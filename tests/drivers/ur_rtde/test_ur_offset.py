@@ -145,7 +145,7 @@ def test_whoever_is_killed_is_withdrawn_at_the_rates_of_the_cell(
     assert out["armed"][1] == 0.0
 
 
-def test_rates_that_are_too_small_to_be_reported_are_refused() -> None:
+def test_rates_that_are_too_small_to_be_sent_are_refused() -> None:
     assert registers.rates(0.05, 0.1) == 1250 << 16 | 1000
     with pytest.raises(ValueError, match="offset_rate: found 1e-05"):
         registers.rates(1e-5, 0.1)

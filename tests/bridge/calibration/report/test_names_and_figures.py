@@ -11,7 +11,7 @@ from gapbridge.bridge.calibration.report.figures import (
     load_words,
     mm,
 )
-from gapbridge.bridge.calibration.report.names import parameter_words, told, sentence
+from gapbridge.bridge.calibration.report.names import parameter_words, sentence, spoken
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.result import Estimate
@@ -19,15 +19,15 @@ from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.model import Model
 
 
-def test_every_parameter_that_a_session_can_find_has_text_of_its_own():
+def test_every_parameter_that_a_session_can_find_has_words_of_its_own():
     effects = [e for e, effect in CATALOGUE.items() if effect.calibratable]
     names = Parameters.every(Model(builtin_arm("ur10e")), effects).names
-    phrase = [parameter_words(name) for name in names]
-    assert len(set(phrase)) == len(names)
-    assert not [w for w in phrase if "_" in w or w.endswith((":", "("))]
+    words = [parameter_words(name) for name in names]
+    assert len(set(words)) == len(names)
+    assert not [w for w in words if "_" in w or w.endswith((":", "("))]
 
 
-def test_a_few_names_as_they_are_reported():
+def test_a_few_names_as_they_are_told():
     assert parameter_words("joint_offset_3") == "zero of joint 3"
     assert parameter_words("link_geometry_2_alpha") == "twist alpha of link 2"
     assert parameter_words("tool_frame_rx") == "tool turn about x"
@@ -35,9 +35,9 @@ def test_a_few_names_as_they_are_reported():
     assert parameter_words("made_up") == "made_up"
 
 
-def test_names_inside_texts_are_reported_in_text_and_common_text_stay():
+def test_names_inside_texts_are_told_in_words_and_common_words_stay():
     text = "joint_offset_1 and link_geometry_3_d: backlash and payload stay"
-    assert told(text) == "zero of joint 1 and offset d of link 3: backlash and payload stay"
+    assert spoken(text) == "zero of joint 1 and offset d of link 3: backlash and payload stay"
     assert sentence("the error falls") == "The error falls."
     assert sentence("Done!") == "Done!"
 
@@ -46,7 +46,7 @@ def test_names_inside_texts_are_reported_in_text_and_common_text_stay():
     (0.0, "0.000 mm"), (5.4e-6, "0.0054 mm"), (41.3e-6, "0.041 mm"), (1.5894e-3, "1.589 mm"),
     (0.0314159, "31.42 mm"), (-2e-5, "−0.020 mm"), (math.nan, "unknown"),
 ])  # fmt: skip
-def test_lengths_are_reported_to_the_micrometre(length, text):
+def test_lengths_are_told_to_the_micrometre(length, text):
     assert mm(length) == text
 
 
@@ -61,6 +61,6 @@ def test_nothing_is_never_minus_nothing():
     assert fixed(-0.0126, 2) == "−0.01"
 
 
-def test_a_loads_name_that_only_reports_its_mass_is_left_out():
+def test_a_loads_name_that_only_says_its_mass_is_left_out():
     assert load_words(8.0, "8 kg") == "8 kg"
     assert load_words(1.25, "gripper") == "1.25 kg (gripper)"

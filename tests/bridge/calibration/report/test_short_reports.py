@@ -21,7 +21,7 @@ def read(paths):
     return paths[0].read_text("utf-8"), phrase
 
 
-def test_a_calibration_that_holds_is_reported_so_and_accuses_nothing(tmp_path):
+def test_a_calibration_that_holds_says_so_and_accuses_nothing(tmp_path):
     found, readings = verification(moved=False)
     html, phrase = read(write_verification(found, session(), tmp_path, readings))
     for text in (html, phrase):

@@ -50,7 +50,7 @@ def test_only_what_the_simulator_does_not_know_is_a_cause():
     assert abs(reported.value - 9e-4) < 4 * reported.std
 
 
-def test_a_simulator_that_reports_what_the_model_reports_changes_nothing():
+def test_a_simulator_that_predicts_what_the_model_predicts_changes_nothing():
     named, found = causes_of(small.REAL["backlash"], small.NOMINAL)
     plain = small.diagnosed("backlash")
     assert named == ["backlash"]
