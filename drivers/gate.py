@@ -251,7 +251,7 @@ class Gate:
         where = f"gate: joint {joint + 1}: " if joint >= 0 else "gate: "
         lower, upper = self._joints[3, joint], self._joints[4, joint]
         bounds, takes = self.bounds, f"found a step that takes {1e3 * found:.1f} ms at the rates"
-        words = {
+        message = {
             NOT_FINITE: f"found {found}, expected a finite number",
             OUTSIDE: f"found {found:.4f} rad, expected {lower:.4f} to {upper:.4f}",
             FAR_OFFSET: f"found an offset of {found:.6f} m, expected at most {bounds.offset:g}",
@@ -263,4 +263,4 @@ class Gate:
             RATE: f"{takes}, more than has passed",
             AWAY: f"found a first setpoint {found:.4f} rad from the arm, expected at most {START}",
         }
-        return where + words[code]
+        return where + message[code]

@@ -53,7 +53,7 @@ def test_files_that_the_readme_names_exist() -> None:
 
 
 @pytest.mark.parametrize("target", ["demo", "test", "check", "coverage"])
-def test_make_has_the_targets_that_are_promised(target: str) -> None:
+def test_make_has_the_targets_that_are_stated(target: str) -> None:
     assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
 
 
@@ -141,7 +141,7 @@ def test_a_part_that_sets_attributes_of_another_is_noticed() -> None:
     assert not _attributes_set(ast.parse(code.format("self.x = 1")))
 
 
-def test_what_the_package_promises_is_there_and_nothing_else_is_imported_for_it() -> None:
+def test_what_the_package_states_is_there_and_nothing_else_is_imported_for_it() -> None:
     code = (
         "import sys, gapbridge; early = {m.split('.')[0] for m in sys.modules}\n"
         "for name in dir(gapbridge): getattr(gapbridge, name)\n"

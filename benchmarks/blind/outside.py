@@ -211,10 +211,10 @@ def tower_bending(bench: Bench, rng: Generator) -> Outside:
     axis = np.array([np.cos(angle), np.sin(angle), 0.0])
 
     def change(arm: RealArm, strength: float) -> RealArm:
-        def tilt(s: Session) -> Array:
+        def base_rotation(s: Session) -> Array:
             return np.asarray(strength * (s.temperature[:, :1] - arm.reference_temperature) * axis)
 
-        return replace(arm, base_tilts=(*arm.base_tilts, tilt))
+        return replace(arm, base_tilts=(*arm.base_tilts, base_rotation))
 
     # all joints warm up together: one temperature is as good as the other, and as time
     columns = tuple(f"joint_temperatures_{i}" for i in range(bench.kind.n))

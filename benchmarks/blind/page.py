@@ -71,8 +71,8 @@ def _criteria(scores: Sequence[CaseScore]) -> str:
         word = {True: "reached", False: "not reached", None: "not measured"}[c.reached]
         css = {True: "good", False: "bad", None: ""}[c.reached]
         sign = "≥" if c.at_least else "≤"
-        target = f"{sign} {c.told(c.target)}"
-        texts = (c.name, c.told(c.value), target, str(c.cases))
+        target = f"{sign} {c.shown(c.target)}"
+        texts = (c.name, c.shown(c.value), target, str(c.cases))
         rows.append([*(_td(t) for t in texts), _td(word, css)])
     return _table(("figure", "found", "target", "cases", ""), rows)
 

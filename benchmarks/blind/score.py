@@ -44,7 +44,7 @@ class CaseScore:
     label: Label | None = None
     known: int = 0  # effects put in beside a remainder
     known_named: int = 0
-    told_beyond: float | None = None  # what is told to remain in a region not fitted, unit
+    reported_beyond: float | None = None  # what is told to remain in a region not fitted, unit
     true_beyond: float | None = None  # what truly remains there
 
     @property
@@ -93,7 +93,7 @@ def score(label: Label, diagnosis: dict[str, Any], seconds: float | None = None)
             verdict = Verdict("right_tie")  # a drift that settles may be owned up to as another
     explained = group in EXPLAINED and verdict.outcome in ("right", "right_tie")
     held_out = own.get("remaining_rms_held_out") or own.get("remaining_rms")
-    told_beyond = own.get("remaining_rms_new_region") if label.facts.get("beyond") else None
+    reported_beyond = own.get("remaining_rms_new_region") if label.facts.get("beyond") else None
     exact = verdict.outcome == "right" and _same_joints(label, claims)
     exact = exact and not label.facts.get("settling_drift")
     return CaseScore(
@@ -116,8 +116,8 @@ def score(label: Label, diagnosis: dict[str, Any], seconds: float | None = None)
         label=label,
         known=len(label.effects) if mixed else 0,
         known_named=verdict.named if mixed else 0,
-        told_beyond=told_beyond,
-        true_beyond=None if told_beyond is None else true_beyond(label, causes),
+        reported_beyond=reported_beyond,
+        true_beyond=None if reported_beyond is None else true_beyond(label, causes),
     )
 
 
@@ -150,11 +150,11 @@ def _mixed(
                      for c, p in own)  # fmt: skip
         if rest and _same_data(_true_claims(label), rest, Hidden(label.kind, label.seed)):
             there, extra = set(label.effects), []
-    told = {str(c["effect"]): {str(e) for e in c.get("indistinguishable_from") or []}
+    reported = {str(c["effect"]): {str(e) for e in c.get("indistinguishable_from") or []}
             for c in causes}  # fmt: skip
     lost = label.effects - there
-    tied = {e for e in lost if any(e in told.get(p[0], ()) for p in extra)}
-    extra = [p for p in extra if not told.get(p[0], set()) & tied]
+    tied = {e for e in lost if any(e in reported.get(p[0], ()) for p in extra)}
+    extra = [p for p in extra if not reported.get(p[0], set()) & tied]
     false = tuple(sorted({p[0] for p in extra}))
     named = len(there | tied)
     if false:
@@ -195,8 +195,8 @@ def _known(label: Label, claims: tuple[Claim, ...], causes: list[dict[str, Any]]
         return Verdict("right", (), joints, _needless(truth, claims, causes, hidden))
     if named > label.effects or not _same_data(truth, claims, hidden):
         return Verdict("wrong", tuple(sorted(named - label.effects)), False)
-    told = {str(e) for c in causes for e in c.get("indistinguishable_from") or []}
-    outcome = "right_tie" if label.effects - named <= told else "tie_untold"
+    reported = {str(e) for c in causes for e in c.get("indistinguishable_from") or []}
+    outcome = "right_tie" if label.effects - named <= reported else "tie_untold"
     return Verdict(outcome, () if outcome == "right_tie" else tuple(sorted(named - label.effects)))
 
 
@@ -256,11 +256,11 @@ def _unknown(label: Label, claims: tuple[Claim, ...], structured: bool) -> Verdi
 
 
 def _depends(label: Label, unexplained: dict[str, Any]) -> bool | None:
-    told = [str(d["quantity"]) for d in unexplained.get("depends_on") or []][:3]
+    reported = [str(d["quantity"]) for d in unexplained.get("depends_on") or []][:3]
     true = label.depends_on
     if not true:
         true = _plain_columns(label) or Hidden(label.kind, label.seed).columns_that_matter()
-    return bool(set(told) & set(true)) if true else None
+    return bool(set(reported) & set(true)) if true else None
 
 
 def _plain_columns(label: Label) -> tuple[str, ...]:

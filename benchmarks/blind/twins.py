@@ -54,7 +54,7 @@ def _joint_probes(
     bench: Bench, effect: str, joint: int, orders: Iterable[float]
 ) -> list[Ingredient]:
     kind = bench.kind
-    soft, tilt = kind.axial[joint - 1] / 10, kind.radial[joint - 1] / 10
+    soft, base_rotation = kind.axial[joint - 1] / 10, kind.radial[joint - 1] / 10
     if effect == "joint_offset":
         return [put.joint_offset(joint, 1e-5)]
     if effect == "link_geometry":
@@ -70,7 +70,7 @@ def _joint_probes(
     if effect == "axial_compliance":
         return [put.axial_compliance(joint, soft, 1.0)]
     if effect == "radial_compliance":
-        return [put.radial_compliance(joint, tilt, 1.0)]
+        return [put.radial_compliance(joint, base_rotation, 1.0)]
     if effect == "link_flexibility":
         return [put.link_flexibility(joint, soft, 1.0)]
     if effect == "stiffness_nonlinearity":

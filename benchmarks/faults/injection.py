@@ -66,8 +66,10 @@ def _seen(rig: Rig, row: Row, moment: float, before: dict[str, int]) -> float | 
         return _left(rig, moment)
     if row.sign.startswith("event:"):
         kind, _, key = row.sign.removeprefix("event:").partition(" ")
-        told = (e for e in rig.run.since(moment) if e["kind"] == kind and (not key or e.get(key)))
-        return next((float(event["time"]) for event in told), None)
+        reported = (
+            e for e in rig.run.since(moment) if e["kind"] == kind and (not key or e.get(key))
+        )
+        return next((float(event["time"]) for event in reported), None)
     return _counted(rig, row, before)
 
 

@@ -51,9 +51,9 @@ class Kept(Workers):
         """Do the tasks."""
         return self.inner.run(tasks)
 
-    def words(self) -> str:
+    def message(self) -> str:
         """Return who they are."""
-        return self.inner.words()
+        return self.inner.message()
 
 
 def measure(folder: Path, sessions: int, chunk: int, seed: int, *, dask: bool) -> dict[str, Any]:

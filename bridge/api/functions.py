@@ -92,8 +92,8 @@ def diagnose(
         effect_named(name)
     metrology = replace(cell.metrology, remounted=remounted)
     found = diagnose_log(cell.model, log, metrology, withhold=withhold, simulated=simulated)
-    told = document(found) | {"provenance": _origin(cell, log)}
-    return Diagnosed(cell, found.model, str(found.verdict), told)
+    reported = document(found) | {"provenance": _origin(cell, log)}
+    return Diagnosed(cell, found.model, str(found.verdict), reported)
 
 
 def _origin(cell: Cell, log: Log) -> dict[str, object]:

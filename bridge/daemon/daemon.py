@@ -178,7 +178,7 @@ class Daemon:
                 "missed": tally.missed,
                 "late": tally.late,
                 "written": tally.written,
-                "dropped": {reason: counted[count.words] for count, reason in DROPPED.items()},
+                "dropped": {reason: counted[count.label] for count, reason in DROPPED.items()},
             },
             "counts": counted,
             "events": dict(self.book.counts),

@@ -42,7 +42,7 @@ class Sides:
     def tell(self, event: dict[str, Any]) -> None:
         """Pass an event on to each; never blocks."""
         for side in self._running.values():
-            side.tell(event)
+            side.emit(event)
 
     def check(self) -> list[dict[str, Any]]:
         """Look after all; returns what they have told and what became of them, as events."""

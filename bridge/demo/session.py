@@ -89,7 +89,7 @@ class Session:
         self._runs.append(summary)
         if summary.faults or summary.recording is None:
             raise RunError(summary.faults[0] if summary.faults else "nothing was recorded")
-        recording = read_columns(summary.recording, told_only=True)
+        recording = read_columns(summary.recording, reported_only=True)
         return rests(recording, tracker.readings(), poses, load, self._link.settling)
 
     @property

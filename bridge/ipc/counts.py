@@ -36,7 +36,7 @@ class Count(IntEnum):
     MISMATCH = 26  # the controller is set otherwise than the cell says
 
     @property
-    def words(self) -> str:
+    def label(self) -> str:
         """Return the name as people and metrics have it."""
         return self.name.lower()
 

@@ -183,7 +183,7 @@ class Page:
 
     def counts(self) -> dict[str, int]:
         """Return how often each Count has happened since the daemon's start."""
-        return {what.words: int(self._words[_COUNTS + what]) for what in Count}
+        return {what.label: int(self._words[_COUNTS + what]) for what in Count}
 
     def reader(self, first: int = 0) -> PageReader:
         """Return a reader of its own cursor that begins at row number ``first``."""

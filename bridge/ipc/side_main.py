@@ -68,7 +68,7 @@ class EventWriter:
         self.sent = 0
         self.dropped = 0  # events that found the pipe full
 
-    def tell(self, event: dict[str, Any]) -> bool:
+    def emit(self, event: dict[str, Any]) -> bool:
         """Write an event; returns False where the pipe is full or nobody reads it."""
         self._flush()
         if self._rest:
@@ -108,9 +108,9 @@ class Order:
     up: EventWriter
     extra: dict[str, Any]
 
-    def tell(self, event: dict[str, Any]) -> None:
+    def emit(self, event: dict[str, Any]) -> None:
         """Tell the daemon of an event (a dict with "kind"), who hands it to all; never blocks."""
-        self.up.tell({"time": time.time(), "monotonic": time.monotonic(), **event})
+        self.up.emit({"time": time.time(), "monotonic": time.monotonic(), **event})
 
 
 def take_order() -> Order:

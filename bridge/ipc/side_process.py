@@ -56,12 +56,12 @@ class SideProcess:
         """Return how many events it did not get because it did not read."""
         return self._dropped + self._down.dropped
 
-    def tell(self, event: dict[str, Any]) -> None:
+    def emit(self, event: dict[str, Any]) -> None:
         """Pass an event on; where its pipe is full the event is dropped and counted."""
         if self._down_fd is None:
             self._dropped += 1
         else:
-            self._down.tell(event)
+            self._down.emit(event)
 
     def show(self, page: Page) -> None:
         """Have it change over to another page; one that does not look gets it when it is anew."""

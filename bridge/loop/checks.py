@@ -277,4 +277,4 @@ class LoopChecks:
         self._reports.count(what)
         if not changed and self._supervisor.state != State.FAULT:
             kind = "degraded" if what == Count.SENSOR_LOST else "warning"
-            self._reports.emit({"kind": kind, "what": what.words, "detail": words})
+            self._reports.emit({"kind": kind, "what": what.label, "detail": words})

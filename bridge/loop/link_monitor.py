@@ -245,7 +245,7 @@ class StateWatch:
         now = time.monotonic()
         if now - self._told.get(reason, -TELL_EVERY) >= TELL_EVERY:
             self._told[reason] = now
-            self._reports.emit({"kind": "dropped", "what": reason.words, "detail": detail})
+            self._reports.emit({"kind": "dropped", "what": reason.label, "detail": detail})
         if self._invalid >= INVALID_IN_A_ROW:
             self._supervisor.take(Cause.IMPLAUSIBLE, detail)
             self._check.forget()  # the arm may well be there: judge what comes by itself

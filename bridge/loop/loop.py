@@ -28,7 +28,7 @@ from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream, longest_withdrawal
 from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
 from gapbridge.bridge.loop.writing import Writing
-from gapbridge.bridge.setpoint_source.source import Source, Told
+from gapbridge.bridge.setpoint_source.source import Source, SourceStatus
 from gapbridge.core.errors import InvalidStateError, LinkError
 from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.loads import Loads
@@ -332,4 +332,6 @@ class Loop:
         kind = UNSENT if setpoint is not None and not left else int(attempted)
         row[last : last + 4] = (kind, stream.ramp_time, self._driver.rate, self._number)
         page.publish()
-        self._source.tell(Told(self._supervisor.state, nominal, corrected, offset, left, clamped))
+        self._source.emit(
+            SourceStatus(self._supervisor.state, nominal, corrected, offset, left, clamped)
+        )

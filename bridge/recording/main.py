@@ -29,7 +29,7 @@ def main() -> None:
         signal.signal(number, signal.SIG_IGN)
     order = take_order()
     recorder = Recorder(
-        order.settings.recording, order.session, order.page, _configuration(order), order.tell
+        order.settings.recording, order.session, order.page, _configuration(order), order.emit
     )
     ended = _follow(order, recorder)
     if not ended:

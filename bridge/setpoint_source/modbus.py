@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.setpoint_source.glide import Glide
 from gapbridge.bridge.setpoint_source.modbus_page import MOST_JOINTS, PlcPage
-from gapbridge.bridge.setpoint_source.source import Source, Told
+from gapbridge.bridge.setpoint_source.source import Source, SourceStatus
 from gapbridge.core.errors import InputError, RunError
 
 Vector = NDArray[np.float64]
 WRITTEN, LIMITED = 1, 2  # flags
+
+SERVER = "gapbridge.bridge.setpoint_source.modbus_server"  # module that the PLC talks to
 
 
 class ModbusSource(Source):
@@ -45,7 +47,7 @@ class ModbusSource(Source):
         page = self._page = PlcPage(self.n)
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
         server = self._server = subprocess.Popen(
-            [sys.executable, "-m", "gapbridge.bridge.setpoint_source.modbus_server"],
+            [sys.executable, "-m", SERVER],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment,
             pass_fds=page.fds,
         )  # fmt: skip
@@ -54,14 +56,14 @@ class ModbusSource(Source):
         order = {"host": self.settings.host, "port": self.settings.port, "n": self.n}
         server.stdin.write(json.dumps({**order, "pages": page.fds}) + "\n")
         server.stdin.flush()
-        said = json.loads(server.stdout.readline() or '{"failure": "its server ended"}')
-        if "failure" in said:
+        reply = json.loads(server.stdout.readline() or '{"failure": "its server ended"}')
+        if "failure" in reply:
             self.close()
-            raise RunError(f"setpoints: {said['failure']}")
+            raise RunError(f"setpoints: {reply['failure']}")
         if not page.is_sealed:
             self.close()
             raise RunError("setpoints: its server did not seal what it writes to")
-        self.port = int(said["port"])
+        self.port = int(reply["port"])
 
     def close(self) -> None:
         """End the server."""
@@ -99,13 +101,13 @@ class ModbusSource(Source):
         self._glide.take(found[1])
         return True
 
-    def tell(self, told: Told) -> None:
+    def emit(self, reported: SourceStatus) -> None:
         """Hand state, corrected and nominal joints on to the PLC."""
         if self._page is None:
             return
         self._cycle += 1
-        flags = (WRITTEN if told.written else 0) | (LIMITED if told.clamped else 0)
+        flags = (WRITTEN if reported.written else 0) | (LIMITED if reported.clamped else 0)
         self._page.put_status(
-            (int(told.state), self._sequence or 0, self._cycle, flags),
-            np.concatenate([told.corrected_q, told.nominal_q, told.offset_in_base]),
+            (int(reported.state), self._sequence or 0, self._cycle, flags),
+            np.concatenate([reported.corrected_q, reported.nominal_q, reported.offset_in_base]),
         )

@@ -78,10 +78,10 @@ class PlcServer:
         found = [0] * INPUTS
         n = self._page.n
         found[0], found[1] = VERSION, n
-        told = self._page.status()
-        if told is None:
+        reported = self._page.status()
+        if reported is None:
             return found
-        (state, sequence, cycle, flags), values = told
+        (state, sequence, cycle, flags), values = reported
         found[2:6] = [state, sequence, cycle & 0xFFFF, flags]
         numbers = np.nan_to_num(values, nan=0.0, posinf=LIMIT, neginf=-LIMIT)
         words = CODING.encode((np.clip(numbers, -LIMIT, LIMIT) / UNIT).tolist())

@@ -88,10 +88,10 @@ class Connection:
             self.close()
         self._buffer += data
 
-    def refuse(self, words: str) -> None:
+    def refuse(self, message: str) -> None:
         """Say why, and close."""
         with contextlib.suppress(OSError):
-            self._link.send(f"error: {words}\n".encode())
+            self._link.send(f"error: {message}\n".encode())
         self.close()
 
     def close(self) -> None:
@@ -253,8 +253,8 @@ class PlannerSource(Source):
             self._end(connection, f'found {shown!r}, expected {{"q": [...]}}')
             return False
         if len(values) != self.n or not all(map(math.isfinite, values)):
-            words = f"found {len(values)} numbers, expected {self.n} finite ones, rad"
-            self._end(connection, words)
+            message = f"found {len(values)} numbers, expected {self.n} finite ones, rad"
+            self._end(connection, message)
             return False
         if connection is not self._planner:
             if self._is_held:
@@ -267,6 +267,6 @@ class PlannerSource(Source):
         self._glide.take(np.array(values))
         return True
 
-    def _end(self, connection: Connection, words: str) -> None:
+    def _end(self, connection: Connection, message: str) -> None:
         self.refused += 1
-        connection.refuse(words)
+        connection.refuse(message)

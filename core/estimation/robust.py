@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 ROUNDS = 60
-SETTLED = 1e-9  # change of the weights at which the fit has come to rest
-CALM = 2.2  # scaled length below which nothing is weighed down: clean data keep all they tell
-WILD = 4.5  # scaled length beyond which a reading counts for nothing
+CONVERGED = 1e-9  # change of the weights at which the fit has come to rest
+INLIER = 2.2  # scaled length below which nothing is weighed down: clean data keep all they tell
+OUTLIER = 4.5  # scaled length beyond which a reading counts for nothing
 TINY = 1e-12
 
 
@@ -30,7 +30,7 @@ class Weighed:
 
 def weights_of(length: Array) -> Array:
     """Return weights for scaled lengths: 1 up to CALM, falling to 0 at WILD."""
-    fall = np.clip((length - CALM) / (WILD - CALM), 0.0, 1.0)
+    fall = np.clip((length - INLIER) / (OUTLIER - INLIER), 0.0, 1.0)
     return np.asarray((1 - fall**2) ** 2)
 
 
@@ -65,7 +65,7 @@ def weighed(A: Array, b: Array, unit: Index, row: Index, rounds: int = ROUNDS) -
         root = np.sqrt(weights[row]) / noise[unit]
         values = np.asarray(np.linalg.lstsq(A * root[:, None], b * root, rcond=None)[0], float)
         noise, spare = _noise(A, b - A @ values, root, weights[row], unit, units)
-        if np.abs(weights - before).max() < SETTLED:
+        if np.abs(weights - before).max() < CONVERGED:
             break
     root = np.sqrt(weights[row]) / noise[unit]
     scaled = A * root[:, None]

@@ -85,15 +85,15 @@ class CanDriver(Driver):
 
     def _nothing_heard(self, complete: bool) -> LinkError:
         """Return what was missed, and close: a link that is not there is not half open."""
-        heard = self.reader.assembler.heard
-        missing = [i.name for key, i in self.profile.incoming.items() if key not in heard]
+        received_at = self.reader.assembler.received_at
+        missing = [i.name for key, i in self.profile.incoming.items() if key not in received_at]
         dropped = dict(self.reader.assembler.dropped)
-        words = f"never heard {', '.join(missing)}" if missing else "no complete sample"
+        message = f"never heard {', '.join(missing)}" if missing else "no complete sample"
         if not missing and complete:
-            words = f"{self.reader.silent_status()} has fallen silent"
+            message = f"{self.reader.silent_status()} has fallen silent"
         self.close()
-        told = f"; dropped: {dropped}" if dropped else ""
-        return LinkError(f"{self.settings.where()}: {self.profile.name}: {words}{told}")
+        detail = f"; dropped: {dropped}" if dropped else ""
+        return LinkError(f"{self.settings.where()}: {self.profile.name}: {message}{detail}")
 
     def _ask(self) -> None:
         with contextlib.suppress(WriteError):  # silence follows, and is told
@@ -132,9 +132,9 @@ class CanDriver(Driver):
         broken, self._broken = self._broken, self.reader.assembler.broken
         if self._broken > broken:
             self._kept = sample
-            told = ", ".join(f"{n} {why}" for why, n in self.reader.assembler.dropped.items())
+            detail = ", ".join(f"{n} {why}" for why, n in self.reader.assembler.dropped.items())
             raise InvalidStateError(
-                f"{self.profile.name}: frames that make no sample were dropped (so far {told})"
+                f"{self.profile.name}: frames that make no sample were dropped (so far {detail})"
             )
 
     def _asked(self) -> Sample:
@@ -161,9 +161,9 @@ class CanDriver(Driver):
     def _stale(self) -> StaleStateError:
         silent = f"for {time.monotonic() - self._given:.3f} s" if self._given > 0.0 else "yet"
         errors = self.reader.error_frames
-        told = f" ({errors} error frames so far)" if errors else ""
+        detail = f" ({errors} error frames so far)" if errors else ""
         return StaleStateError(
-            f"{self.settings.where()}: {self.profile.name}: no complete sample {silent}{told}"
+            f"{self.settings.where()}: {self.profile.name}: no complete sample {silent}{detail}"
         )
 
     def _check_frozen(self, sample: Sample) -> None:
@@ -202,9 +202,9 @@ class CanDriver(Driver):
         if foreign is not None and time.monotonic() - foreign.seen < quiet:
             raise self._commanded_by_another()
         self._kept = None
-        trouble, words = self.reader.trouble(writing=False)
+        trouble, message = self.reader.trouble(writing=False)
         if trouble:
-            raise WriteError(f"{self.profile.name}: {trouble}: {words}")
+            raise WriteError(f"{self.profile.name}: {trouble}: {message}")
         start = self._present()
         try:
             self.writer.run(self.profile.enable, self._present, self._listen, self._reached)
@@ -239,8 +239,8 @@ class CanDriver(Driver):
     def _reached(self, goal: str) -> bool:
         if goal == "disabled":
             return self.reader.disabled
-        told = not self.profile.enabled_values or self.reader.enabled
-        return told and (goal == "enabled" or not self.reader.trouble(writing=True)[0])
+        detail = not self.profile.enabled_values or self.reader.enabled
+        return detail and (goal == "enabled" or not self.reader.trouble(writing=True)[0])
 
     def _commanded_by_another(self) -> ForeignCommandError:
         foreign = self.reader.foreign

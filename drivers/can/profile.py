@@ -84,8 +84,8 @@ class Outgoing:
         try:
             return bytes(self.message.encode(values, strict=True))
         except Exception as error:  # cantools, bitstruct and struct each raise their own
-            words = " ".join(str(error).split())
-            raise ValueError(f"{self.name}: {words}") from None
+            text = " ".join(str(error).split())
+            raise ValueError(f"{self.name}: {text}") from None
 
 
 @dataclass(frozen=True, slots=True)

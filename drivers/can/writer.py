@@ -50,14 +50,14 @@ class FrameWriter:
                 self._send(key, data)
             except WriteError as error:
                 done = self._mend() if sent else "nothing of it was sent"
-                words = f"{error} ({sent} of {len(frames)} frames out; {done})"
-                raise PartialWriteError(words) from None
+                message = f"{error} ({sent} of {len(frames)} frames out; {done})"
+                raise PartialWriteError(message) from None
         self._last, self.target = frames, q.copy()
 
     def _mend(self) -> str:
         """Take back a setpoint of which a part is out; returns what was done."""
         self.mended += 1
-        for frames, words in (
+        for frames, message in (
             (self._last, "the setpoint before was sent again"),
             (self._stop_frames(), "the stop sequence was sent"),
         ):
@@ -68,7 +68,7 @@ class FrameWriter:
                     self._send(key, data)
             except WriteError:
                 continue
-            return words
+            return message
         return "neither the setpoint before nor a stop could be sent"
 
     def _stop_frames(self) -> Frames:

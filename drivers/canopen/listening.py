@@ -96,7 +96,7 @@ class Life:
 
     def __init__(self, network: Network, profile: CanopenProfile) -> None:
         self._profile = profile
-        self.heard: dict[int, float] = {}  # node -> s, monotonic
+        self.received_at: dict[int, float] = {}  # node -> s, monotonic
         self.nmt: dict[int, int] = {}  # node -> NMT state that it told last
         self.restarted: set[int] = set()
         self.active: dict[int, Emergency] = {}
@@ -108,7 +108,7 @@ class Life:
 
     def _heartbeat_of(self, node: int) -> Any:
         def note(state: int) -> None:
-            self.heard[node] = time.monotonic()
+            self.received_at[node] = time.monotonic()
             if state == 0:
                 self.restarted.add(node)
             self.nmt[node] = state
@@ -133,7 +133,7 @@ class Life:
         self.restarted.clear()
         self.nmt.clear()
         now = time.monotonic()
-        self.heard = dict.fromkeys(self._profile.nodes, now)
+        self.received_at = dict.fromkeys(self._profile.nodes, now)
 
     @property
     def all_operational(self) -> bool:
@@ -144,7 +144,7 @@ class Life:
         """Return a node whose heartbeats have ceased; None: none."""
         now = time.monotonic()
         for node in self._profile.nodes:
-            if now - self.heard.get(node, 0.0) > self._profile.heartbeat.lost_after:
+            if now - self.received_at.get(node, 0.0) > self._profile.heartbeat.lost_after:
                 return node
         return None
 

@@ -91,9 +91,9 @@ class SyncCollector:
         """Return whether TPDOs of a torn set may still come: they must not meet the next SYNC's."""
         return bool(self._owed)
 
-    def _refuse(self, reason: str, words: str) -> None:
+    def _refuse(self, reason: str, message: str) -> None:
         self.dropped[reason] += 1
-        self._trouble = self._trouble or words
+        self._trouble = self._trouble or message
         self._changed.notify_all()
 
     def wait(self, until: float) -> SyncSet | None:

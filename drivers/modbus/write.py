@@ -225,10 +225,10 @@ class MailboxWriter:
             raise IneffectiveWriteError(self._silence(number, says))
 
     def _silence(self, number: int, says: int) -> str:
-        said = {0: "absent", 1: "running", 2: "watchdog expired", 3: "checksum rejected"}
+        states = {0: "absent", 1: "running", 2: "watchdog expired", 3: "checksum rejected"}
         return (
             f"{self._transport.name}: offsets do not arrive: number {self._sequence} was sent, "
-            f"{number} came back last, the robot's program says {said.get(says, says)}"
+            f"{number} came back last, the robot's program says {states.get(says, says)}"
         )
 
     def pending(self) -> tuple[int, list[int]] | None:

@@ -112,8 +112,8 @@ class ServoWriter:
             send_at_once()
             return AllowedControl(settings.host, library)
         except Exception as error:
-            words = str(error).strip().splitlines() or [type(error).__name__]
-            raise WriteError(f"{settings.host}: {words[0].strip()}") from None
+            message = str(error).strip().splitlines() or [type(error).__name__]
+            raise WriteError(f"{settings.host}: {message[0].strip()}") from None
 
     def _wait_running(self) -> None:
         """Wait until an uploaded script runs: the library returns before it does."""
@@ -256,8 +256,8 @@ class OffsetWriter:
             io = AllowedInputs(host, RTDEIOInterface(host))
             send_at_once()
         except Exception as error:
-            words = str(error).strip().splitlines() or [type(error).__name__]
-            raise WriteError(f"{host}: {words[0].strip()}") from None
+            message = str(error).strip().splitlines() or [type(error).__name__]
+            raise WriteError(f"{host}: {message[0].strip()}") from None
         return io
 
     def _wait_bare(self, look: Callable[[], None]) -> None:

@@ -94,8 +94,10 @@ class StateReader:
                 self._receive = RTDEReceiveInterface(settings.host, settings.rate, names)
                 break
             except Exception as error:  # the library raises RuntimeError and boost's own
-                told = set(re.findall(r"\w+", str(error)))
-                optional = [m for m in names if m in told and (m == "payload" or _is_optional(m))]
+                reported = set(re.findall(r"\w+", str(error)))
+                optional = [
+                    m for m in names if m in reported and (m == "payload" or _is_optional(m))
+                ]
                 if not optional:
                     raise LinkError(f"{settings.host}: {_first_line(error)}") from None
                 names = [name for name in names if name not in optional]
@@ -242,8 +244,8 @@ class StateReader:
                 f"actual_q_{joint}: found a step of {way[joint]:.4f} rad in {gap:.4f} s"
             )
 
-    def _invalid(self, words: str) -> InvalidStateError:
-        return InvalidStateError(f"{self._settings.host}: {words}")
+    def _invalid(self, message: str) -> InvalidStateError:
+        return InvalidStateError(f"{self._settings.host}: {message}")
 
     def tcp_pose(self) -> Vector | None:
         """Return the controller's own TCP pose (6,) in base, m and rotation vector, or None."""

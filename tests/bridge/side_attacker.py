@@ -95,9 +95,9 @@ def main() -> None:
                     "loop": event["loop"]["pid"] in family(os.getppid()),
                 }
                 for event_ in FORGED:
-                    order.tell(event_)
+                    order.emit(event_)
                 for kind in ("recorder", "web", "metrics"):
-                    order.tell({"kind": kind, "attack": found})
+                    order.emit({"kind": kind, "attack": found})
         if time.monotonic() - begun > 120.0:
             return
 

@@ -81,7 +81,7 @@ def test_the_residual_is_the_distance_that_is_really_left(n):
     np.testing.assert_allclose(found.residual, distance(model, found.q, q), atol=1e-10)
 
 
-def test_a_stretched_arm_cannot_reach_where_it_sags_from_and_says_how_much_is_left():
+def test_a_stretched_arm_cannot_reach_where_it_sags_from_and_reports_how_much_is_left():
     found = correct(SIX, np.zeros((1, 6)))
     assert 1e-4 < found.residual[0] < distance(SIX, np.zeros((1, 6)), np.zeros((1, 6)))[0]
 

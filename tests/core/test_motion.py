@@ -47,7 +47,7 @@ def test_the_noise_of_a_smooth_signal_is_found():
     assert np.allclose(signal_noise(noisy), 1e-4, rtol=0.1)
 
 
-def test_the_window_follows_the_noise_and_its_error_is_told():
+def test_the_window_follows_the_noise_and_its_error_is_reported():
     t = np.arange(5000) / 500
     quiet = differentiate(COURSE.at(t), 1 / 500, 2)
     loud = differentiate(
@@ -89,7 +89,7 @@ def test_a_gap_in_time_ends_a_stretch():
     assert np.abs(motion.qd - COURSE.at(t[kept], 1))[motion.valid].max() < 0.01
 
 
-def test_time_that_runs_back_is_told_with_its_line_also_in_a_selection():
+def test_time_that_runs_back_is_reported_with_its_line_also_in_a_selection():
     t, log = recording()
     back = replace(log, columns=dict(log.columns) | {"timestamp": np.where(t == t[900], 0.0, t)})
     for part, line in ((back, 902), (back.select(slice(500, None)), 902)):
@@ -103,7 +103,7 @@ def test_uneven_timestamps_are_honoured():
     assert np.abs(motion.qd - COURSE.at(t, 1))[motion.valid].max() < 1e-3
 
 
-def test_cycles_recorded_twice_count_once_and_are_told():
+def test_cycles_recorded_twice_count_once_and_are_reported():
     _, log = recording()
     twice = log.select(np.repeat(np.arange(len(log)), 2))
     motion = motion_of(twice)

@@ -232,7 +232,7 @@ def test_a_motion_command_of_the_library_other_than_servoj_is_forbidden() -> Non
     assert found.kind == "forbidden"
 
 
-def test_the_kernel_says_when_bytes_arrived_however_late_they_are_read() -> None:
+def test_the_kernel_reports_when_bytes_arrived_however_late_they_are_read() -> None:
     with (
         socket.create_server(("127.0.0.1", 0)) as server,
         socket.create_connection(server.getsockname()) as client,

@@ -31,7 +31,7 @@ def test_states_are_complete_and_time_goes_on(cell: Cell, driver: Driver) -> Non
     check_reads(driver, cell.model, 50)
 
 
-def test_the_arm_at_rest_tells_the_same_joints_again(driver: Driver) -> None:
+def test_the_arm_at_rest_shows_the_same_joints_again(driver: Driver) -> None:
     states = [next_state(driver) for _ in range(50)]
     speed = np.abs([s.actual_qd for s in states]).max()
     if speed > 0.01:

@@ -41,5 +41,7 @@ def instrument_settings(cell: Cell, given: str | None) -> InstrumentSettings:
     except ValidationError as error:
         worst = error.errors()[0]
         name = ".".join(str(part) for part in worst["loc"][1:])
-        words = str(worst["msg"]).removeprefix("Value error, ")
-        raise InputError(f"--instrument {kind}: {name}: {words[:1].lower()}{words[1:]}") from None
+        message = str(worst["msg"]).removeprefix("Value error, ")
+        raise InputError(
+            f"--instrument {kind}: {name}: {message[:1].lower()}{message[1:]}"
+        ) from None

@@ -124,7 +124,7 @@ class LinkedJoints(JointSource):
             state = run.daemon.state
             begun |= state == State.COMPENSATING
             if begun and not state.writes:
-                raise RunError(f"the move broke off: {run.words() or state.name.lower()}")
+                raise RunError(f"the move broke off: {run.message() or state.name.lower()}")
             now = self.now()
             there = now is not None and np.abs(now - pose.q).max() < NEAR / 10
             if begun and there and run.daemon.page.ended and self._rests():

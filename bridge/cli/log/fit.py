@@ -63,7 +63,7 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     # frame and tool point that were estimated along stay out of the cell
     model = given.model.with_compliance(found.axial, found.radial)
     save_cell(given, out, model, {"provenance": origin})
-    tell(found)
+    print_identification(found)
     click.echo(f"{out}: written")
 
 
@@ -89,7 +89,7 @@ def _listed(ranges: Mapping[str, tuple[float, float]]) -> dict[str, list[float]]
     return {name: list(ends) for name, ends in ranges.items()}
 
 
-def tell(found: Identification) -> None:
+def print_identification(found: Identification) -> None:
     """Print flexibilities with their spread, how far they carry, and what stays unknown."""
     table = Table(title="joint flexibility, 1e-6 rad/Nm", title_justify="left")
     for column in ("joint", "axial", "±", "radial", "±"):

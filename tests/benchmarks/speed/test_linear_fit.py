@@ -45,7 +45,7 @@ def test_the_fit_is_that_of_the_stored_rows(factored):
     assert found.note == ""
 
 
-def test_rows_that_hardly_differ_are_factored_and_told():
+def test_rows_that_hardly_differ_are_factored_and_reported():
     q, loads, gap = rows_of(800, spread=2e-4)
     assert loads.wrench is not None
     loads = Loads(wrench=1e-3 * loads.wrench)
@@ -77,9 +77,9 @@ def test_memory_does_not_grow_with_the_rows():
 
 def test_links_that_bend_are_refused():
     q, loads, gap = rows_of(10)
-    bent = model_of().with_terms([Term("link_flexibility", Site(2), (1e-6,))])
+    deflected = model_of().with_terms([Term("link_flexibility", Site(2), (1e-6,))])
     with pytest.raises(InputError, match="link that bends itself"):
-        fit_linear(bent, q, loads, gap)
+        fit_linear(deflected, q, loads, gap)
 
 
 def test_first_order_is_the_linear_form_and_near_the_exact_correction():

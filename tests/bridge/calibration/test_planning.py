@@ -105,7 +105,7 @@ def test_a_tip_on_one_point_is_planned_and_needs_its_place(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("lines", "changed", "words"),
+    ("lines", "changed", "phrase"),
     [
         ([], {"instrument": "{kind: point}"}, "expected where the point is"),
         (["further_places: [[1, 2, 3]]"], {}, "found nothing beside further_places"),
@@ -127,13 +127,13 @@ def test_a_tip_on_one_point_is_planned_and_needs_its_place(tmp_path: Path) -> No
     ],
 )  # fmt: skip
 def test_what_cannot_be_meant_is_refused_in_one_line(
-    tmp_path: Path, lines: list[str], changed: dict[str, object], words: str
+    tmp_path: Path, lines: list[str], changed: dict[str, object], phrase: str
 ) -> None:
     played = play(
         cell_with(tmp_path, *lines, **changed), "--plan-only", "--session", tmp_path / "s"
     )
     assert played.code == 2
-    assert words in played.err
+    assert phrase in played.err
     assert played.err.count("\n") == 1
 
 

@@ -52,7 +52,7 @@ def test_payload_only_weighs_what_hangs_there(served: BenchHand, tmp_path: Path)
     cell = write_cell(tmp_path, "cell.yaml", served.hands.host, TRUE_TCP)
     new = tmp_path / "new.yaml"
     served.jog(BEGIN)
-    served.hands.hang(*LOAD, tell=False)  # the controller believes in nothing of the kind
+    served.hands.hang(*LOAD, emit=False)  # the controller believes in nothing of the kind
     with Terminal(cell, "--payload-only", "--session", tmp_path / "s", "--apply", new) as terminal:
         shown = lead(terminal, {
             "hangs there": "",

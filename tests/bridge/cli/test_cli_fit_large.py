@@ -62,7 +62,7 @@ def test_a_recording_that_holds_no_measured_poses_says_so(tmp_path):
 
     page = Page(6)
     settings = RecordingSettings(folder=tmp_path, keep_free=0.0)
-    recorder = Recorder(settings, "run-20260101-000000", page, {"joints": 6}, lambda told: None)
+    recorder = Recorder(settings, "run-20260101-000000", page, {"joints": 6}, lambda reported: None)
     for number in range(40):
         row = page.next_row()
         row[1:] = 0.1

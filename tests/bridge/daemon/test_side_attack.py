@@ -61,7 +61,7 @@ def test_a_side_process_cannot_arm(
             assert status["armed_by"] == ""
 
 
-def test_every_arming_stands_behind_the_event_that_says_who_asked(
+def test_every_arming_follows_the_event_that_names_who_asked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))

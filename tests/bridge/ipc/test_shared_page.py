@@ -70,7 +70,7 @@ def test_a_new_process_of_the_loop_goes_on_counting_and_nothing_else_stays(run: 
     put(loop, 1.0)
     assert reader.drain()[:, 1].tolist() == [0, 1]
     assert run.written == 2
-    assert run.counts()[Count.LATE.words] == 5
+    assert run.counts()[Count.LATE.label] == 5
     loop.close()
 
 

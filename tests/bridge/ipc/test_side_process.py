@@ -112,7 +112,7 @@ def test_it_gets_its_order_the_cycles_and_the_events_and_answers(
     page.next_row()[1:] = 5.0
     page.publish()
     assert hear(side, "rows")["timestamps"] == [5.0]
-    side.tell({"kind": "transition", "to": "armed"})
+    side.emit({"kind": "transition", "to": "armed"})
     assert hear(side, "heard")["of"] == {"kind": "transition", "to": "armed"}
     assert side.check() is None
     side.close()
@@ -131,7 +131,7 @@ def test_one_that_is_killed_comes_back_and_the_later_the_more_often(
         os.kill(side.pid, signal.SIGKILL)
         assert "ended with -9" in wait_for(side.check)
         gone = time.monotonic()
-        side.tell({"kind": "lost"})  # to nobody, and nobody waits
+        side.emit({"kind": "lost"})  # to nobody, and nobody waits
         wait_for(lambda: side.check() or side.pid)
         waits.append(time.monotonic() - gone)
     hear(side, "hello")
@@ -147,7 +147,7 @@ def test_one_that_does_not_read_loses_events_holds_up_nothing_and_is_ended(
     hear(side, "hello")
     begun = time.monotonic()
     for _ in range(2000):
-        side.tell({"kind": "status", "filling": "x" * 1000})
+        side.emit({"kind": "status", "filling": "x" * 1000})
     assert time.monotonic() - begun < 2.0
     assert side.dropped > 1000
     monkeypatch.setattr(side_process, "STALLED", 0.3)
@@ -165,14 +165,14 @@ def test_a_line_is_never_torn_though_the_pipe_was_full(
     assert side.pid is not None
     os.kill(side.pid, signal.SIGSTOP)
     for k in range(400):
-        side.tell({"kind": "status", "number": k, "filling": "x" * 3001})
+        side.emit({"kind": "status", "number": k, "filling": "x" * 3001})
     dropped = side.dropped
     assert dropped > 0
     os.kill(side.pid, signal.SIGCONT)
     heard: list[int] = []
 
     def all_of_them() -> bool:
-        side.tell({"kind": "poke", "number": -1})
+        side.emit({"kind": "poke", "number": -1})
         heard.extend(e["of"]["number"] for e in side.events() if e["kind"] == "heard")
         return len([k for k in heard if k >= 0]) == 400 - dropped
 

@@ -70,7 +70,7 @@ def test_a_first_payload_that_cannot_be_leaves_the_models_own() -> None:
     assert loads.update(state(1.0, payload=40.0, payload_cog=Q * 0)).payload_mass is None
 
 
-def test_a_force_that_does_not_count_is_not_doubted() -> None:
+def test_a_force_that_does_not_count_is_not_rejected() -> None:
     loads = LiveLoads(3, False, 0.0, LoadBounds(5.0))
     loads.update(state(1.0, actual_TCP_force=np.full(6, 9e3)))
     assert loads.doubt is None

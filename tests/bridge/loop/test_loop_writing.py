@@ -185,7 +185,7 @@ def test_nothing_leaves_that_is_made_of_an_old_state_and_the_next_step_is_no_lar
     assert bench.supervisor.state == State.COMPENSATING
 
 
-def test_what_takes_the_watchdog_too_long_to_hear_lets_nothing_old_leave(bench: Bench) -> None:
+def test_what_takes_the_watchdog_too_long_to_notice_lets_nothing_old_leave(bench: Bench) -> None:
     bench.driver.keep_alive = lambda: time.sleep(0.03)  # type: ignore[method-assign]
     state = bench.state()
     expiry = time.monotonic() + 0.02

@@ -92,15 +92,15 @@ def test_refused_and_half_sent_setpoints_gaps_and_lost_sensors_are_replayed(tmp_
     cell.write_text(CELL)
     model = load_cell(cell).model
     settings = DaemonSettings(cell=cell)
-    page, commands, told = Page(N), CommandPage(), []
+    page, commands, events = Page(N), CommandPage(), []
     source = TargetSource(SetpointSettings(), N, False, tmp_path, 20.0)
-    loop = Loop(settings, model, Scripted(1800, commands, model), source, page, told.append)
+    loop = Loop(settings, model, Scripted(1800, commands, model), source, page, events.append)
     _compile(settings, model)  # else the first cycles are late
     then = run(loop, page, commands, tmp_path, "then")
     flags = then["flags"].astype(int)
     assert {0.0, 1.0, 2.0} == set(then["attempted"])
     refused = (then["attempted"] == 1) & (then["written"] == 0)
-    assert refused.any(), told
+    assert refused.any(), events
     assert (flags & 1).any()  # sensor lost
     assert (flags & 4).any()  # gap
     assert (flags & 8).any()  # ramping out

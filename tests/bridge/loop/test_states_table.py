@@ -25,7 +25,7 @@ def test_the_page_has_the_table_as_it_is() -> None:
 
 @pytest.mark.parametrize("count", sorted(set(Count) - ELSEWHERE))
 def test_the_page_explains_every_counter(count: Count) -> None:
-    assert f"`{count.words}`" in PAGE
+    assert f"`{count.label}`" in PAGE
 
 
 @pytest.mark.parametrize("state", State)

@@ -42,11 +42,11 @@ class Desk:
     def __init__(self, folder: Path, **settings: Any) -> None:
         self.folder = folder
         self.page = Page(N)
-        self.told: list[dict[str, Any]] = []
+        self.events: list[dict[str, Any]] = []
         self.settings = RecordingSettings(folder=folder, **{"keep_free": 0.0, **settings})
 
     def recorder(self) -> Recorder:
-        return Recorder(self.settings, SESSION, self.page, CONFIGURATION, self.told.append)
+        return Recorder(self.settings, SESSION, self.page, CONFIGURATION, self.events.append)
 
     def record(self, *counts: int) -> Array:
         """Record so many cycles, a flush after each; returns the rows."""

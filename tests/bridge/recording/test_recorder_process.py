@@ -84,7 +84,7 @@ class Recording:
         return len(list(self.stem.parent.glob("*.mcap")))
 
     def end(self) -> None:
-        self.process.tell({"kind": "ended", "time": time.time()})
+        self.process.emit({"kind": "ended", "time": time.time()})
         self.process.close(10.0)
 
     def numbers(self) -> list[int]:
@@ -113,7 +113,7 @@ def test_it_ends_in_order_with_everything_and_without_secrets(
     recording: Recording, publisher: Publisher
 ) -> None:
     recording.wait_for_file()
-    recording.process.tell({"kind": "transition", "time": time.time(), "from": "DISCONNECTED",
+    recording.process.emit({"kind": "transition", "time": time.time(), "from": "DISCONNECTED",
                             "to": "OBSERVING", "cause": "connected", "detail": ""})  # fmt: skip
     time.sleep(0.5)
     count = publisher.end()

@@ -72,7 +72,7 @@ def test_a_payload_beside_flexibilities_is_found_and_does_not_run_away(
     assert found.held_out_before.rms > 20 * found.held_out_after.rms
 
 
-def test_what_one_load_cannot_tell_is_said_and_harms_no_prediction(
+def test_what_one_load_cannot_show_is_reported_and_harms_no_prediction(
     model: Model, parameters: Parameters
 ) -> None:
     readings = _session(parameters, 1.0)
@@ -93,7 +93,7 @@ def test_what_hangs_on_an_arm_weighs_nothing_or_more(parameters: Parameters) -> 
     assert bounds.lower[parameters.names.index("payload")] == pytest.approx(-lightest)
 
 
-def test_damping_shortens_what_two_parameters_hardly_tell_apart_most() -> None:
+def test_damping_shortens_what_two_parameters_hardly_separated_most() -> None:
     rng = np.random.default_rng(0)
     first, other = rng.normal(size=(2, 40))
     J = np.column_stack([first, first + 1e-3 * other])  # their difference is hardly told

@@ -122,7 +122,7 @@ def wild_frames(random, number):
 
 @pytest.mark.slow
 @pytest.mark.timeout(120)
-def test_a_million_wild_frames_raise_nothing_and_no_wrong_sample_is_taken_for_good():
+def test_a_million_outlier_frames_raise_nothing_and_no_wrong_sample_is_taken_for_good():
     """Wild frames among a true stream whose every cycle says its own number in all joints.
 
     A wild frame that stands in for a true one can only be told by what an arm can do between two
@@ -133,8 +133,8 @@ def test_a_million_wild_frames_raise_nothing_and_no_wrong_sample_is_taken_for_go
     stream = wild_frames(random, 1_000_000)
     good = wrong = refused = k = 0
     begun = time.monotonic()
-    wild = next(stream, None)
-    while wild is not None:
+    outlier = next(stream, None)
+    while outlier is not None:
         k += 1
         now = k * PERIOD
         number = abs((k + 500) % 1000 - 500)
@@ -142,10 +142,10 @@ def test_a_million_wild_frames_raise_nothing_and_no_wrong_sample_is_taken_for_go
         places = random.integers(0, 4, 4)
         frames = [((i, False), d) for i, d in true]
         for place in sorted(places.tolist(), reverse=True):
-            if wild is None:
+            if outlier is None:
                 break
-            frames.insert(place, wild)
-            wild = next(stream, None)
+            frames.insert(place, outlier)
+            outlier = next(stream, None)
         for n, (key, data) in enumerate(frames):
             sample = assembler.take(key, data, now + n * 1e-4, now + n * 1e-4)
             if sample is None:

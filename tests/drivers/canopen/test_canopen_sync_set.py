@@ -133,14 +133,14 @@ def test_speeds_are_the_drives_own_or_come_from_positions(name: str) -> None:
     profile = read_profile(SHIPPED / f"{name}.yaml")
     builder = StateBuilder(profile, builtin_arm("ur10e"))
     speed = np.array([0.5, -0.5, 0.2, 0.0, -0.3, 1.0])
-    told = np.rint(speed * profile.counts_per_radian)
+    reported = np.rint(speed * profile.counts_per_radian)
     for step in range(8):
         synced = 0.01 * step + (0.0005 if step % 2 else 0.0)  # a SYNC that is not punctual
         counts = profile.counts(speed * synced)
         rows = [
             {"Statusword": 0x0250, "Position actual value": int(q), "Velocity actual value": int(v),
              "Torque actual value": 0}
-            for q, v in zip(counts, told, strict=True)
+            for q, v in zip(counts, reported, strict=True)
         ]  # fmt: skip
         state = builder.build(SyncSet(tuple(rows), synced, synced + 0.001), None, False)
     assert state.actual_qd == pytest.approx(speed, abs=1e-3)

@@ -62,7 +62,7 @@ def written(tmp_path: Path, text: str) -> Path:
         ("joints: 6", "joints: [", 4, "broken YAML"),
     ],
 )  # fmt: skip
-def test_a_mistake_is_told_with_its_line(
+def test_a_mistake_is_reported_with_its_line(
     tmp_path: Path, old: str, new: str, line: int, words: str
 ) -> None:
     assert old in GOOD

@@ -68,7 +68,7 @@ def with_last(readings: Readings, value: list[float] | np.ndarray) -> Readings:
 
 
 @pytest.mark.parametrize("registered", [True, False])
-def test_good_readings_are_not_doubted(registered: bool) -> None:
+def test_good_readings_are_not_rejected(registered: bool) -> None:
     metrology = replace(METROLOGY, registered=registered)
     found = Foresight(NOMINAL, metrology, "position", 2e-5, DEFAULT, LOADS)
     seen = []
@@ -82,13 +82,13 @@ def test_good_readings_are_not_doubted(registered: bool) -> None:
 
 
 @pytest.mark.parametrize(
-    ("factor", "words"), [(1e3, "millimetres"), (1e-3, "metres"), (25.4, "25.4")]
+    ("factor", "phrase"), [(1e3, "millimetres"), (1e-3, "metres"), (25.4, "25.4")]
 )
-def test_a_wrong_unit_is_named_and_put_right(factor: float, words: str) -> None:
+def test_a_wrong_unit_is_named_and_put_right(factor: float, phrase: str) -> None:
     readings = session(10, 1)
     found = judged(with_last(readings, readings.value[-1] * factor))
     assert found.doubted
-    assert words in found.reasons[0]
+    assert phrase in found.reasons[0]
     np.testing.assert_allclose(found.instead, readings.value[-1])
 
 
@@ -137,5 +137,5 @@ def test_a_mistyped_joint_is_named() -> None:
     assert any("joint 3" in reason for reason in found.reasons)
 
 
-def test_the_first_readings_of_an_unregistered_instrument_tell_nothing_yet() -> None:
+def test_the_first_readings_of_an_unregistered_instrument_show_nothing_yet() -> None:
     assert not np.isfinite(judged(session(2, 0)).off)

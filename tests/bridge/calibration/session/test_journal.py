@@ -121,11 +121,11 @@ def test_two_terminals_do_not_share_a_session(tmp_path: Path) -> None:
         Journal(tmp_path).open()
 
 
-def _write_forever(folder: str, told: int) -> None:
+def _write_forever(folder: str, reported: int) -> None:
     with Journal(Path(folder)) as journal:
         for i in range(10**6):
             journal.add("note", number=i)
-            os.write(told, b".")  # the next step: only now may anybody rely on it
+            os.write(reported, b".")  # the next step: only now may anybody rely on it
 
 
 def test_what_was_acknowledged_before_a_kill_is_there_afterwards(tmp_path: Path) -> None:

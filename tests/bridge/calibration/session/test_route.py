@@ -40,7 +40,7 @@ def test_two_poses_are_gone_by_where_one_is_not_enough() -> None:
     np.testing.assert_array_equal(by, [LEFT, RIGHT])
 
 
-def test_where_no_pose_leads_round_no_way_is_told() -> None:
+def test_where_no_pose_leads_round_no_way_is_reported() -> None:
     assert route(wall, BEGIN, END, [LEFT]) is None
     assert route(wall, BEGIN, END, []) is None
 
