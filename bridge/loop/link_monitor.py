@@ -31,7 +31,7 @@ def hold_time(rate: float) -> float:
 
 
 class StateWatch:
-    """Takes states from a driver and tells the supervisor when they fail to come.
+    """Takes states from a driver and notifies the supervisor when they fail to come.
 
     ``lose`` is called with the reason when the link must be given up.
     """
@@ -53,7 +53,7 @@ class StateWatch:
         self._check = SampleCheck(arm)
         self._invalid = self._old = 0
         self._left = 0.0  # s, monotonic: when the last reading ended
-        self._stale = self._silent = False  # has been told since the last believable state
+        self._stale = self._silent = False  # has been reported since the last believable state
         self._told: dict[Count, float] = {}  # s, monotonic
         self._heard = time.monotonic()  # s, of the last believable state
         self.has_written = False  # the library's writing half exists in this process

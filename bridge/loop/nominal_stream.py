@@ -61,5 +61,5 @@ class NominalStream:
 
     @property
     def rests(self) -> bool:
-        """Return whether it has come to rest."""
+        """Return whether it has converged."""
         return not self._rate.any()

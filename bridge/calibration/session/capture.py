@@ -22,7 +22,7 @@ class Captured:
 
     stand: Stand
     value: Array  # (k,) SI
-    scatter: float  # m, 1 sigma of one coordinate of the mean; nan: one sample tells none
+    scatter: float  # m, 1 sigma of one coordinate of the mean; nan: one sample gives none
     spread: float  # m, 1 sigma of one coordinate of one sample; nan: as above
     samples: int
     source: str
@@ -42,7 +42,7 @@ def capture(
     elif not joints.still(stand):
         raise ReadingError("the arm moved while it was measured")
     if instrument.needs_wrench and stand.raw_wrench is None:
-        raise LinkError("the controller tells no ft_raw_wrench, expected a force sensor's reading")
+        raise LinkError("the controller sends no ft_raw_wrench, expected a force sensor's reading")
     values = found.values
     if not np.isfinite(values).all():
         raise ReadingError("found a reading that is not finite")

@@ -40,7 +40,7 @@ class FittedSoFar:
         cls, before: Readings, new: Readings, parameters: Parameters, observable: Observable,
         sigma: float,
     ) -> FittedSoFar:  # fmt: skip
-        """Fit to the readings ``before``, wild ones weighed down, to judge ``new`` (one row).
+        """Fit to the readings ``before``, outliers down-weighted, to judge ``new`` (one row).
 
         Derivatives by the parameters are taken once, at the nominal model: all are small.
         """

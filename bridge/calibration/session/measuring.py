@@ -155,7 +155,7 @@ class Conversation:
         self.talk.say(" · ".join(told), "green" if not taken.doubted else "yellow")
 
     def _doubt(self, verdict: Verdict, same: bool) -> str:
-        """Tell what looks wrong; returns ``""`` (measure again), ``take`` or ``keep``."""
+        """Report what looks wrong; returns ``""`` (measure again), ``take`` or ``keep``."""
         if verdict.off > verdict.allowed:
             self.talk.warn(
                 f"{millimetres(verdict.off)} from where it was expected; a good reading is within "
@@ -171,7 +171,7 @@ class Conversation:
         if same:
             self.talk.say(
                 "    the same as the time before, so it is no slip: `back` measures an earlier "
-                "pose again and tells what has moved", "yellow",
+                "pose again and reports what has moved", "yellow",
             )  # fmt: skip
         answers = {"": "measure this pose again"}
         if verdict.instead is not None:

@@ -39,7 +39,7 @@ class Taken:
 
     @classmethod
     def of(cls, entry: dict[str, Any]) -> Taken:
-        """Return what an entry of the journal tells."""
+        """Return what an entry of the journal holds."""
         known = {k: v for k, v in entry.items() if k in cls.__dataclass_fields__}
         for name in _VECTORS:
             if name in known:

@@ -33,7 +33,7 @@ UNITS = {
     25.4: "25.4 times too small: inches taken for millimetres?",
 }
 SPARE = {"distance": 4, "relative": 9}
-"""Numbers beyond the unknowns, by kind: with fewer the instrument may be told in a wrong place."""
+"""Numbers beyond the unknowns, by kind: with fewer the instrument may be found in a wrong place."""
 EXCHANGED = ((1, 0, 2), (2, 1, 0), (0, 2, 1), (1, 2, 0), (2, 0, 1))
 
 

@@ -1,4 +1,4 @@
-"""`back`: earlier poses measured once more tell whether the instrument or the target has moved."""
+"""`back`: earlier poses measured once more show whether the instrument or the target has moved."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ POSES = 3  # measured once more where the first of them has changed
 NOISES = 6.0  # of instrument and arm: two readings of a pose differ by less
 LEAST = 1.5e-4  # m
 REPEATABILITY = 5e-5  # m, 1 sigma of one coordinate
-PLAINER = 3.0  # times: what is left over by the other story
+PLAINER = 3.0  # times: the residual by the other story
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def _decide(talking: Conversation, seen: list[Again], limit: float, first: int) 
             f"{millimetres(max(stories.values()))}"
         )
     else:
-        talk.say("  these poses do not tell whether instrument or target has moved; you may know")
+        talk.say("  these poses do not show whether instrument or target has moved; you may know")
     order = [likely, *(k for k in answers if k != likely)] if likely else list(answers)
     chosen = talk.choose("  which", {k: answers[k] for k in order})
     if chosen != "keep":

@@ -17,7 +17,7 @@ def route(clear: Clear, begin: Array, end: Array, known: Sequence[Array]) -> lis
     """Return the joints (n,) to go by between ``begin`` and ``end``; None: no way is found.
 
     Straight where that is free, else by one or two of the ``known`` poses, the shortest such way.
-    ``clear`` tells for joints (N, n) whether they are free.
+    ``clear`` says for joints (N, n) whether they are free.
     """
     if all_free(clear, begin[None], end[None])[0]:
         return []

@@ -1,4 +1,4 @@
-"""Where a session stands: what its journal tells, entry by entry."""
+"""Where a session stands: what its journal holds, entry by entry."""
 
 from __future__ import annotations
 
