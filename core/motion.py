@@ -109,7 +109,7 @@ def motion_of(log: Log) -> Motion:
 
     Needs ``actual_q`` or ``target_q``; speeds come from ``actual_qd`` where the log has them.
     A cycle that was recorded twice counts once; timestamps rounded so far that they repeat are
-    replaced by an even clock if they fit one (``time_finding`` tells). Raises LogError naming the
+    replaced by an even clock if they fit one (``time_finding`` reports). Raises LogError naming the
     row where time runs backwards or repeats in any other way.
     """
     q = log.require("actual_q", "target_q")

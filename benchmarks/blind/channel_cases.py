@@ -89,7 +89,7 @@ class ChannelCase:
         return float(np.sqrt(np.mean(sigma**2)))
 
 
-DRAWS = 600  # a delay and a lag are hardly told apart in most slow motions
+DRAWS = 600  # a delay and a lag are hardly separable in most slow motions
 
 
 def draw_channel_case(channel: str, what: str, rng: Generator) -> ChannelCase:

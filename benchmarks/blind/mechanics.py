@@ -31,7 +31,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Session:
-    """What happened at each of N poses: what the log tells, as it truly was."""
+    """What happened at each of N poses: what the log holds, as it truly was."""
 
     time: Array  # (N,) s
     q: Array  # (N, n) rad, encoder angles

@@ -103,7 +103,7 @@ def _is_right(row: str, column: str) -> bool:
 
 
 def _kinds(scores: Sequence[CaseScore]) -> str:
-    heads = ("kind", "group", "cases", "right", "tie told", "accused falsely", "owned up",
+    heads = ("kind", "group", "cases", "right", "tie reported", "accused falsely", "owned up",
              "joints right", "depends right", "remainder", "|z| ≥ 3", "median s",
              "outcomes")  # fmt: skip
     rows = []

@@ -2,7 +2,7 @@
 
 Written from the physics, with shapes that no effect of the catalogue has. ``akin`` names what a
 diagnosis may accuse with the rest admitted (the remainder's first order); ``near`` also the places
-where no known effect can be told from it, so that a mixed case puts none there.
+where no known effect can be distinguished from it, so that a mixed case puts none there.
 """
 
 from __future__ import annotations

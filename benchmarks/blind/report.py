@@ -1,4 +1,4 @@
-"""Tells the outcome of the blind benchmark: tables for the terminal."""
+"""Reports the outcome of the blind benchmark: tables for the terminal."""
 
 from __future__ import annotations
 

@@ -128,7 +128,7 @@ def _at_most(seconds: float) -> Iterator[None]:
 
 
 def run_job(job: Job, diagnose: Diagnose, keep: Path | None = None) -> CaseScore:
-    """Run one case. Its folder's name tells nothing, and its label never leaves this process."""
+    """Run one case. Its folder's name gives nothing away; its label stays in this process."""
     with tempfile.TemporaryDirectory(prefix="case-") as scratch:
         folder = Path(scratch)
         label = make_case(job.kind, job.seed, folder)

@@ -16,7 +16,7 @@ from benchmarks.blind.label import Label
 
 NOWHERE = "not in the catalogue"
 EXPLAINED = ("clean", "known", "several", "many", "arm", "sessions", "laid_out")
-UNLIKE = 100.0  # chi-square from which on a tie told is no tie
+UNLIKE = 100.0  # chi-square from which on a tie reported is no tie
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,12 @@ class CaseScore:
     label: Label | None = None
     known: int = 0  # effects put in beside a remainder
     known_named: int = 0
-    reported_beyond: float | None = None  # what is told to remain in a region not fitted, unit
+    reported_beyond: float | None = None  # what is reported to remain in a region not fitted, unit
     true_beyond: float | None = None  # what truly remains there
 
     @property
     def ok(self) -> bool:
-        """Return whether the answer was right, or a tie told that holds the truth."""
+        """Return whether the answer was right, or a tie reported that holds the truth."""
         return self.outcome in ("right", "right_tie")
 
 
@@ -138,7 +138,7 @@ def _mixed(
     """Return the verdict of known effects beside a remainder.
 
     Right is: all known effects named where they are, nothing else but the remainder's first
-    order, and structure left over. What makes the data of the known effects as well is no error.
+    order, and residual structure. What makes the data of the known effects as well is no error.
     """
     truth = {p for c in _true_claims(label) for p in c.places}
     own = [(c, p) for c in claims for p in c.places if p not in label.akin]
@@ -212,7 +212,7 @@ def _joints_right(truth: tuple[Claim, ...], claims: tuple[Claim, ...], hidden: H
     by_effect = {c.effect: c.joints for c in claims}
 
     def agree(cause: Claim) -> bool:
-        # what all joints have alike may be told of the arm as a whole
+        # what all joints have alike may be reported of the arm as a whole
         return by_effect[cause.effect] in (cause.joints, ()) or not cause.joints
 
     if all(agree(c) for c in truth):
@@ -231,7 +231,7 @@ def _needless(
     truth: tuple[Claim, ...], claims: tuple[Claim, ...], causes: list[dict[str, Any]],
     hidden: Hidden,
 ) -> tuple[str, ...]:  # fmt: skip
-    """Return ties told that the data rule out: the other effect in no place makes the data."""
+    """Return ties reported that the data rule out: the other effect in no place makes the data."""
     out = []
     for cause in causes:
         rest = [c for c in truth if c.effect != cause["effect"]]
@@ -280,7 +280,7 @@ def _plain_columns(label: Label) -> tuple[str, ...]:
 
 
 def _z_scores(label: Label, causes: list[dict[str, Any]]) -> dict[str, float]:
-    """Return (estimate - truth) / std of every parameter that is told with a std."""
+    """Return (estimate - truth) / std of every parameter that is reported with a std."""
     true = {_key(n): v for c in label.causes for n, v in c.parameters.items()}
     out = {}
     for cause in causes:

@@ -43,7 +43,7 @@ SIGMA = 3e-5
 DRAWS = 101  # random choices of each number of poses
 TIMES = (1.0, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0)  # of the planned number
 POOL = 2000  # poses over which the best possible choice is bounded
-SHOWN = 3.0  # a parameter counts as told where the weak prior is this many times as wide
+SHOWN = 3.0  # a parameter counts as determined where the weak prior is this many times as wide
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ def summary_of(rows: list[Row]) -> dict[str, float]:
         ),
         "random poses equal to the plan, worst place, median": float(np.median(worst)),
         "random poses equal to the plan, worst place, least": float(worst.min()),
-        "parameters told": len(ratio),
+        "parameters reported": len(ratio),
         "scatter over expected, mean": float(ratio.mean()),
         "scatter over expected, share within 10 %": float(np.mean(np.abs(ratio - 1) < 0.1)),
         "scatter over expected, farthest from 1": float(np.abs(ratio - 1).max()),

@@ -2,7 +2,7 @@
 
 A session whose instrument is a file and whose joints are as planned, so that nothing waits for
 people. The command is killed at random moments after it has begun to measure; every reading that it
-had told of before ("kept") must stand in the journal, unchanged, and the same command must go on.
+had reported before ("kept") must stand in the journal, unchanged, and the same command must go on.
 
     python -m benchmarks.calibration.kills --kills 100
 
@@ -58,7 +58,7 @@ class Tally:
 
     kills: int = 0
     sessions: int = 1
-    acknowledged: int = 0  # readings told of before a kill
+    acknowledged: int = 0  # readings reported before a kill
     lost: int = 0  # of these, not in the journal
     torn: int = 0  # kills that tore the last line
     refused: int = 0  # starts that did not go on
@@ -180,7 +180,7 @@ def main() -> None:
     begun = time.monotonic()
     tally = run(given.kills, given.seed, whole=given.whole)
     print(f"\r{tally.kills} kills in {tally.sessions} sessions, {time.monotonic() - begun:.0f} s: "
-          f"{tally.acknowledged} readings told of, {tally.lost} lost, {tally.torn} torn lines, "
+          f"{tally.acknowledged} readings reported, {tally.lost} lost, {tally.torn} torn lines, "
           f"{tally.refused} starts refused")  # fmt: skip
 
 

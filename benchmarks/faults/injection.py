@@ -12,7 +12,7 @@ POLL = 0.001  # s
 AFTERWARDS = 0.25  # s for which the end state must stay
 RESTING, AT_REST = (State.OBSERVING, State.COMPENSATING, State.FAULT), 3.0  # s: stays for good
 END_LIMIT = 90.0  # s: a new process takes its time on a busy machine
-PATIENCE = 10.0  # s on top of what is allowed, to tell what is late from what never comes
+PATIENCE = 10.0  # s on top of what is allowed, to distinguish what is late from what never comes
 BUSY = (Cause.OVERRUN.value, Cause.RESYNC.value)
 
 

@@ -25,9 +25,9 @@ import ctypes, json, signal, sys
 from pathlib import Path
 from gapbridge.bridge.cli import main
 from gapbridge.bridge.daemon.run import run_cell
-def tell(event):
+def emit(event):
     print(json.dumps(event, default=str), file=sys.stderr, flush=True)
-sys.exit(run_cell(Path(sys.argv[1]), arm=True, log=tell))
+sys.exit(run_cell(Path(sys.argv[1]), arm=True, log=emit))
 """
 PAGE_LIMIT = 90.0  # s
 LOOK_EVERY = 0.02  # s between two looks for the page of a new loop

@@ -1,8 +1,8 @@
-"""A TCP proxy between the real client and its peer that does harm, and tells a tap of it all.
+"""A TCP proxy between client and server that injects faults and sends a tap a copy of all.
 
-One thread serves every port. Messages from the client are told before anything is done to them:
+One thread serves every port. Messages from the client are recorded before anything is done to them:
 that is what was written, with the time at which the kernel had it (arrival.py). Messages to the
-client are told as they have left: that is what it could know.
+client are recorded as they have left: that is what it could know.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Emit = Callable[[float, float, int, str, str, bytes], None]
 
 @dataclass
 class Port:
-    """One port of the peer: where it is, and how its messages are told apart."""
+    """One port of the server: where it is, and how its messages are delimited."""
 
     name: str
     port: int

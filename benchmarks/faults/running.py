@@ -19,7 +19,7 @@ Event = dict[str, Any]
 
 
 class SourceStatus:
-    """What a run has told: its events, with both clocks' times."""
+    """What a run has reported: its events, with both clocks' times."""
 
     events: list[Event]
 

@@ -25,7 +25,7 @@ from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.simulated.server.protocol_server import ServerThread
 
 HOST, PORT = "127.77.0.3", 29920
-PACE = 0.010  # s from one SYNC to the next, as the drives are told
+PACE = 0.010  # s from one SYNC to the next, as the drives are configured
 COMMON = (
     "profile: lwa4p, rate: 100, state_timeout: 0.5, listen: 0.05, foreign_quiet: 0.1,"
     " frozen_after: 10.0"

@@ -88,7 +88,7 @@ def _size(o: Outcome, value: float | None) -> str:
 
 def _table(outcomes: list[Outcome]) -> Table:
     table = Table(title="real logs: what is left of rows that the fit did not see")
-    for head in ("log", "channel", "half", "rows", "gap", "told held out", "judged",
+    for head in ("log", "channel", "half", "rows", "gap", "reported held out", "judged",
                  "least squares", "published", "ratio", "verdict", "accused", "absurd",
                  "s"):  # fmt: skip
         table.add_column(head, overflow="fold")

@@ -43,7 +43,7 @@ TIMED = 1 << 19  # setpoints at the most: 17 minutes
 def loop(seconds: float) -> dict[str, Any]:
     """Return the row of the daemon's loop: ``seconds`` of compensating, and as many once more.
 
-    In the first a bare timer on each processor tells what the machine takes from everybody. Those
+    In the first a bare timer on each processor shows what the machine takes from everybody. Those
     timers come between, a thousand times a second: single setpoints are timed in the second.
     """
     with tempfile.TemporaryDirectory(prefix="loop-") as folder:

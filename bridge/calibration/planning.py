@@ -25,7 +25,7 @@ from gapbridge.core.planning.capsules import Box
 from gapbridge.core.planning.design import Wish, far_end, plan
 from gapbridge.core.planning.workspace import Place, Reflector, Space
 
-REPEATABILITY = 5e-5  # m, 1 sigma of one coordinate, where the cell does not tell it
+REPEATABILITY = 5e-5  # m, 1 sigma of one coordinate, where the cell does not report it
 NEEDS_PLACE = {"distance": "fixed end", "sphere": "sphere", "point": "point"}
 """Kinds that are planned around something fixed in the cell, and what that is."""
 TOUCHED = ("sphere", "point")  # kinds without anything that looks at the tool

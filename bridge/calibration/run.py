@@ -91,7 +91,7 @@ def _lead(cell: Cell, order: Order, talk: Talk, book: Book) -> None:
         joints = make_joints(cell, order, around.ask, folder)
         instrument = None
         if not order.plan_only and (book.plan is None or book.next is not None):
-            instrument = job.instrument(around)  # before the plan: what is missing is told at once
+            instrument = job.instrument(around)  # before the plan: reports at once what is missing
             with talk.waiting("reaching the instrument"):
                 stack.enter_context(instrument)
         if job.from_here and (book.plan is None or book.next is not None):
@@ -145,7 +145,7 @@ def _make_plan(job: Job, joints: JointSource) -> None:
 
 
 def _tell_old_plan(job: Job) -> None:
-    """Tell the plan of an earlier call where it is asked for, and that it stays."""
+    """Report the plan of an earlier call where it is asked for, and that it stays."""
     if job.order.poses is not None:
         job.talk.warn("this session has its plan: --poses counts for a new one")
     if job.order.plan_only and job.book.plan is not None:

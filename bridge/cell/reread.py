@@ -1,4 +1,4 @@
-"""A side process takes a changed cell file, once the daemon tells that it has taken it."""
+"""A side process takes a changed cell file, once the daemon reports that it has taken it."""
 
 from __future__ import annotations
 

@@ -60,8 +60,8 @@ def serve_cell(
 ) -> None:
     """Serve the simulated controller of a cell until ``stop()`` is true.
 
-    ``say`` is told where it listens. Raises CellError where the cell cannot be simulated, LinkError
-    where a port is taken.
+    ``say`` is called with where it listens. Raises CellError where the cell cannot be simulated,
+    LinkError where a port is taken.
     """
     link = cell.link
     if link is not None and link.driver in SIMULATORS:

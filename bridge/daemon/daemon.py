@@ -188,7 +188,7 @@ class Daemon:
         }
 
     def note(self, event: Event) -> None:
-        """Have an event told by the daemon's own thread."""
+        """Emit an event from the daemon's own thread."""
         self._posted.put(event)
 
     def stop(self) -> None:
@@ -196,7 +196,7 @@ class Daemon:
         self._stopping.set()
 
     def reload(self) -> None:
-        """Read the cell file again; what is wrong is told, and the old one stays."""
+        """Read the cell file again; what is wrong is reported, and the old one stays."""
         self._reload.ask()
 
     @property
@@ -351,7 +351,7 @@ class Daemon:
                     loop.ask_to_stop()
                 if loop.hangs or (stop_by is not None and time.monotonic() > stop_by):
                     words = f"the loop stood still for {self.page.silence:.2f} s and was ended"
-                    loop.kill()  # told when it is over: nothing is written after that
+                    loop.kill()  # reported when it is over: nothing is written after that
                     self._fault("hang", words)
             self._take()
             self._after(loop)
@@ -396,7 +396,7 @@ class Daemon:
             self.book.add(event)
 
     def _hear(self, event: Event) -> None:
-        """Act on an event, and tell it to the person at the terminal."""
+        """Act on an event, and report it to the person at the terminal."""
         kind, detail = event["kind"], str(event.get("detail", ""))
         self._status.hear(event)
         if kind == "failure":

@@ -45,14 +45,14 @@ class Sides:
             side.emit(event)
 
     def check(self) -> list[dict[str, Any]]:
-        """Look after all; returns what they have told and what became of them, as events."""
+        """Look after all; returns what they have reported and what became of them, as events."""
         found = []
         for name, side in self._running.items():
             for event in side.events():
                 if event.get("kind") == name:
                     found.append(event)
-                else:  # states and requests are not a side process's to tell of
-                    words = f"{name} told of {str(event.get('kind'))[:40]!r}, not its to tell of"
+                else:  # states and requests are not a side process's to emit
+                    words = f"{name} emitted {str(event.get('kind'))[:40]!r}, which is not its own"
                     found.append({"kind": "side", "side": name, "detail": words})
             if (wrong := side.check()) is not None:
                 found.append({"kind": "side", "side": name, "detail": wrong})
@@ -69,7 +69,7 @@ class Sides:
         }  # fmt: skip
 
     def close(self) -> None:
-        """Tell all that the daemon ends, and wait for what they have to finish."""
+        """Notify all that the daemon ends, and wait for what they have to finish."""
         for side in self._running.values():
             side.begin_close()
         for name, side in self._running.items():

@@ -43,8 +43,8 @@ class Session:
         """Visit poses (M, n) with a load on the arm; returns what was measured at each.
 
         The daemon writes setpoints corrected by the cell's model: a cell without compliance is
-        one without compensation. A run that breaks off is told and repeated from home, at half the
-        rate where deadlines were missed. Raises RunError where that does not help.
+        one without compensation. A run that breaks off is reported and repeated from home, at half
+        the rate where deadlines were missed. Raises RunError where that does not help.
         """
         cell = self._link.declared(cell, load)
         longest = self._link.prepare(self._folder, poses)

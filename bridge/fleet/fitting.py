@@ -1,4 +1,4 @@
-"""The work on one session: what it tells of the arm's compliance."""
+"""The work on one session: what it says about the arm's compliance."""
 
 from __future__ import annotations
 

@@ -95,25 +95,25 @@ class Page:
     # -- the loop's side --------------------------------------------------------------------------
 
     def beat(self) -> None:
-        """Tell that the loop is alive."""
+        """Report that the loop is alive."""
         self._times[_BEAT_TIME] = time.monotonic()
         self._words[_BEATS] += 1
 
     def enter(self, phase: Phase) -> None:
-        """Tell what comes next."""
+        """Report what comes next."""
         self.beat()
         self._words[_PHASE] = phase
 
     def tell_state(self, state: int) -> None:
-        """Tell the supervisor's state."""
+        """Report the supervisor's state."""
         self._words[_STATE] = state
 
     def tell_ended(self) -> None:
-        """Tell that the source has come to its end."""
+        """Report that the source has come to its end."""
         self._words[_ENDED] = 1
 
     def tell_seen(self) -> None:
-        """Tell that a state has been read: the link works."""
+        """Report that a state has been read: the link works."""
         self._words[_SEEN] = 1
 
     def count(self, what: Count, times: int = 1) -> None:
@@ -133,7 +133,7 @@ class Page:
         self._words[_WRITTEN] = written + 1
 
     def tell_taken(self, number: int) -> None:
-        """Tell up to which number requests have been taken; see command_page.py."""
+        """Report up to which number requests have been taken; see command_page.py."""
         self._words[_TAKEN] = number
 
     # -- who reads --------------------------------------------------------------------------------

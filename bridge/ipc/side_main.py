@@ -98,7 +98,7 @@ class EventWriter:
 
 @dataclass(frozen=True)
 class Order:
-    """What the daemon tells a side process at its start."""
+    """What the daemon hands a side process at its start."""
 
     settings: DaemonSettings
     n: int  # joints
@@ -109,7 +109,7 @@ class Order:
     extra: dict[str, Any]
 
     def emit(self, event: dict[str, Any]) -> None:
-        """Tell the daemon of an event (a dict with "kind"), who hands it to all; never blocks."""
+        """Notify the daemon of an event (a dict with "kind"), who hands it to all; never blocks."""
         self.up.emit({"time": time.time(), "monotonic": time.monotonic(), **event})
 
 
@@ -143,7 +143,7 @@ def read_event(line: bytes) -> dict[str, Any] | None:
 def _end_after_daemon(fd: int) -> None:
     """End the process, hanging or not, some time after the daemon's end of the pipe closed."""
     watch = select.poll()
-    watch.register(fd, 0)  # hang-ups only, which are always told
+    watch.register(fd, 0)  # hang-ups only, which are always reported
     watch.poll()
     time.sleep(FAREWELL)
     os._exit(1)

@@ -1,4 +1,4 @@
-"""The daemon's half of a side process: start it, tell it of events, start it anew.
+"""The daemon's half of a side process: start it, send it events, restart it.
 
 Whatever a side process does - hang, die, stop reading - the daemon never waits for it.
 """
@@ -73,7 +73,7 @@ class SideProcess:
         os.close(fd)
 
     def events(self) -> list[dict[str, Any]]:
-        """Return the events that it has told."""
+        """Return the events that it has reported."""
         return self._up.poll()
 
     def check(self) -> str | None:
@@ -95,7 +95,7 @@ class SideProcess:
         return f"{self.module} ended with {code}"
 
     def close(self, patience: float = 3.0) -> None:
-        """Tell it that the daemon ends, give it ``patience`` s to finish, then end it."""
+        """Notify it that the daemon ends, give it ``patience`` s to finish, then end it."""
         self.begin_close()
         if self._process is not None:
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -105,7 +105,7 @@ class SideProcess:
             self._let_go()
 
     def begin_close(self) -> None:
-        """Tell it that the daemon ends, without waiting."""
+        """Notify it that the daemon ends, without waiting."""
         if self._process is not None:
             self._close_down()
 

@@ -41,10 +41,10 @@ class ControllerClock:
 
     The age of a state counts from when its sample could have been here at the earliest, so that
     late packets, late wake-ups and long computing all count. The shortest way over the wire, which
-    one clock alone cannot tell, does not. ``hold``: s after which a state is too old to write by.
+    one clock alone cannot show, does not. ``hold``: s after which a state is too old to write by.
     What a stalled link hands on at once is old for a moment only. Where all samples are older than
     that for as long, either the controller's clock has stood still or the way has become longer,
-    which no clock tells: the two are tied anew only while nothing is written.
+    which no clock shows: the two are tied anew only while nothing is written.
     """
 
     def __init__(self, rate: float, hold: float = 1.0) -> None:
@@ -143,7 +143,7 @@ class SampleCheck:
 
 
 class StateWatch:
-    """Takes states from a driver and tells the supervisor when they fail to come.
+    """Takes states from a driver and notifies the supervisor when they fail to come.
 
     ``lost`` says why the link must be given up, from then on.
     """
@@ -163,7 +163,7 @@ class StateWatch:
         self._check = SampleCheck(arm)
         self._invalid = self._old = 0
         self._left = 0.0  # s, monotonic: when the last reading ended
-        self._stale = self._silent = False  # has been told since the last believable state
+        self._stale = self._silent = False  # has been reported since the last believable state
         self._told: dict[Count, float] = {}  # s, monotonic
         self._heard = time.monotonic()  # s, of the last believable state
         self._has_armed = False

@@ -120,7 +120,7 @@ class Loop:
     # -- the frame --------------------------------------------------------------------------------
 
     def run(self, commands: Commands, may_write: bool, latched: str = "") -> Exit:
-        """Connect and loop until told to stop, or until the link is lost.
+        """Connect and loop until asked to stop, or until the link is lost.
 
         ``commands``: the daemon's, and the only way to arm. ``may_write`` False: nothing can arm.
         ``latched``: the fault of a loop before this one that nobody has acknowledged.

@@ -110,7 +110,7 @@ def _make_loop(
 
 
 def _teller(events: int) -> Callable[[dict[str, Any]], None]:
-    """Return a function that tells the daemon of an event and never blocks."""
+    """Return a function that notifies the daemon of an event and never blocks."""
 
     def tell(event: dict[str, Any]) -> None:
         if len(event.get("detail", "")) > LONGEST_WORDS:

@@ -1,4 +1,4 @@
-"""What is counted: from the cycles in the shared page, and from what the daemon tells."""
+"""What is counted: from the cycles in the shared page, and from what the daemon reports."""
 
 from __future__ import annotations
 

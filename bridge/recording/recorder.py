@@ -2,7 +2,7 @@
 
 What counts is the number of the last cycle that a whole flush has written. After a failure, or in a
 new process, reading goes on behind it as long as the ring still holds what comes next; what it no
-longer holds is counted and told.
+longer holds is counted and reported.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Emit = Callable[[dict[str, Any]], None]
 class Recorder:
     """Records one run. ``step`` is called some ten times a second; it never raises for the disk.
 
-    ``configuration`` is the document that every file begins with; ``tell`` takes events of the
+    ``configuration`` is the document that every file begins with; ``emit`` takes events of the
     recorder's own (kind "recorder").
     """
 

@@ -24,7 +24,7 @@ SERVER = "gapbridge.bridge.setpoint_source.modbus_server"  # module that the PLC
 
 
 class ModbusSource(Source):
-    """Listens, in a process of its own, for a PLC; tells it what became of its setpoints.
+    """Listens, in a process of its own, for a PLC; reports back what became of its setpoints.
 
     Raises InputError for an arm with more joints than the registers hold.
     """

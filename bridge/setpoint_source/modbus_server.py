@@ -92,7 +92,7 @@ class PlcServer:
 
 
 async def serve(page: PlcPage, host: str, port: int) -> None:
-    """Serve until the process ends; tells the port, or the reason, in a line on stdout."""
+    """Serve until the process ends; reports the port, or the reason, in a line on stdout."""
     server = ModbusTcpServer(PlcServer(page).device(), address=(host, port))
     try:
         await server.serve_forever(background=True)

@@ -112,7 +112,7 @@ def _no_value(selection: Selection) -> dict[int, str]:
     """Return positions of terms that only a bound holds, or whose value may as well be none."""
     found = dict.fromkeys(
         not_bent(selection.terms, selection.covariance),
-        "its curve cannot be told from a straight line",
+        "its curve cannot be distinguished from a straight line",
     )
     for position, (c, term) in enumerate(zip(selection.term_index, selection.terms, strict=True)):
         if c in selection.block:
@@ -212,7 +212,7 @@ def _too_much_left(selection: Selection) -> float:
 def pure_error(left: Array, groups: NDArray[np.int64]) -> tuple[float, int]:
     """Return the variance of one coordinate among repeats of a pose, and its degrees of freedom.
 
-    Repeats under other loads count too: the leftover of a good model does not depend on them.
+    Repeats under other loads count too: the residual of a good model does not depend on them.
     """
     total, freedom = 0.0, 0
     for group in np.unique(groups):

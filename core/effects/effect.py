@@ -181,7 +181,7 @@ class Effect(ABC):
         return ()
 
     def reported(self, arm: Arm, term: Term, covariance: Array | None) -> tuple[Reported, ...]:
-        """Return the term's parameters as they are told; ``covariance`` is (k, k) or None."""
+        """Return the term's parameters as they are reported; ``covariance`` is (k, k) or None."""
         lines = []
         for k, parameter in enumerate(self.parameters(arm, term.site)):
             std = None

@@ -18,7 +18,7 @@ from gapbridge.core.effects import flexibility_effects
 from gapbridge.core.estimation.compliance_fit import Linear, Mask, solve
 
 Array = NDArray[np.float64]
-VAGUE = 0.3  # of the prior's sigma: what is known no better is not shown
+VAGUE = 0.3  # of the prior's sigma: what is known no better counts as not identifiable
 VISIBLE = float(
     np.sqrt(VAGUE**-2 - 1)
 )  # length of a column, in units of noise, that is shown alone
@@ -32,7 +32,7 @@ class Shown:
 
     kept: Mask  # (2n,) fitted; the others stay at the model's value
     covariance: Array  # (2n, 2n): of the kept ones, the others held; prior's square for the others
-    reported: tuple[str, ...]  # what is not shown, or only together
+    reported: tuple[str, ...]  # what is not identifiable, or only in combination
 
 
 def choose(linear: Linear, prior: tuple[Array, float], nonnegative: bool) -> Mask:
@@ -109,10 +109,10 @@ def _held(i: int, columns: Array, kept: Mask) -> str:
         ]
         if members and left < VAGUE * size:
             return (
-                f"{this}: not shown alone by these data, it acts like {' '.join(members)}; what "
-                "they make together is written there, this one stays at the model's value"
+                f"{this}: not identifiable alone from these data, it acts like {' '.join(members)}"
+                "; what they make together is written there, this one stays at the model's value"
             )
-    return f"{this}: not shown by these data, stays at the model's value"
+    return f"{this}: not identifiable from these data, stays at the model's value"
 
 
 def _faint(columns: Array, kept: Mask) -> list[str]:
@@ -138,7 +138,7 @@ def _faint(columns: Array, kept: Mask) -> list[str]:
 
 
 def _alike(covariance: Array, kept: Mask) -> list[str]:
-    """Return the pairs of kept flexibilities that the data hardly tell apart."""
+    """Return the pairs of kept flexibilities that the data hardly separate."""
     reported, std, count = [], np.sqrt(np.diag(covariance)), len(kept)
     for i in np.flatnonzero(kept):
         for j in np.flatnonzero(kept):

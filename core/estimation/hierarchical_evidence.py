@@ -1,4 +1,4 @@
-"""What one session tells of the joint flexibilities, in as few numbers as it takes.
+"""What one session says about the joint flexibilities, in as few numbers as it takes.
 
 The session's poses, its instrument's frame and its tool point are folded into 2n equations for the
 2n flexibilities, so that a fleet's fit needs neither logs nor models (hierarchical.py).
@@ -44,7 +44,7 @@ class Evidence:
 
     matrix: Array  # (2n, 2n) m per rad/Nm
     right: Array  # (2n,) m
-    squares: float  # m2, left over by the best flexibilities
+    squares: float  # m2, remaining with the best flexibilities
     freedom: float  # coordinates, less what was fitted
     least: float  # m, 1 sigma of one coordinate: the instrument alone
     poses: int
@@ -52,7 +52,7 @@ class Evidence:
 
 
 def evidence(model: Model, log: Log, metrology: Metrology | None = None) -> Evidence:
-    """Return what a log tells of the flexibilities of an arm.
+    """Return what a log says about the flexibilities of an arm.
 
     The equations are taken at the shape that fits the log best, so that their linear form holds.
     A log that excites little is no error here: it says little, and weighs little. Raises LogError
@@ -100,7 +100,7 @@ def _folded(fit: Fit, data: Data, metrology: Metrology) -> Evidence:
     units = _units(gap)
     inlier = _inliers(gap * units, count + data.nuisances, metrology.sigma)
     if not inlier.any():
-        raise ExcitationError("found wild readings alone, expected measured poses")
+        raise ExcitationError("found outliers alone, expected measured poses")
     unit = units * np.ones((int(inlier.sum()), 1))
     form = fit.model.linear_form(data.q, data.loads).regressor[inlier, :width]
     A = (form * unit[..., None]).reshape(-1, count)
@@ -116,7 +116,7 @@ def _folded(fit: Fit, data: Data, metrology: Metrology) -> Evidence:
     R[: len(upper)] = upper
     U, size, _ = np.linalg.svd(R[:count, :count])
     U = U[:, size > RANK * size.max()]
-    # what no flexibility reaches is left over too
+    # what no flexibility reaches remains too
     right = U @ (U.T @ R[:count, count])
     squares = float(np.sum(R[:, count] ** 2) - right @ right)
     return Evidence(
@@ -127,7 +127,7 @@ def _folded(fit: Fit, data: Data, metrology: Metrology) -> Evidence:
 
 
 def _inliers(gap: Array, spent: int, least: float) -> NDArray[np.bool_]:
-    """Return the rows (N,) that are no wild readings.
+    """Return the rows (N,) that are no outliers.
 
     ``spent`` numbers were fitted to them; ``least`` (m) is the noise that there is in any case.
     """

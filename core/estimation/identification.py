@@ -47,18 +47,18 @@ UNSEEN = float("nan")
 class Identification:
     """Flexibilities found, what they rest on and how far they carry.
 
-    All four rms are of one coordinate over the same rows, wild readings left out; frame and tool
+    All four rms are of one coordinate over the same rows, outliers left out; frame and tool
     point are fitted before as well as after, and the degrees of freedom spent are counted for both.
     """
 
     model: Model  # with the flexibilities, and the tool point that ``tool_offset`` moves
     axial: Array  # (n,) rad/Nm
     radial: Array  # (n,) rad/Nm
-    std_axial: Array  # (n,) rad/Nm, 1 sigma; the prior's where not shown
-    std_radial: Array  # (n,) rad/Nm, 1 sigma; the prior's where not shown
+    std_axial: Array  # (n,) rad/Nm, 1 sigma; the prior's where not identifiable
+    std_radial: Array  # (n,) rad/Nm, 1 sigma; the prior's where not identifiable
     covariance: Array  # (2n, 2n), axial then radial, of those shown with the others held
     identifiable: Mask  # (2n,): shown by the data; the others stand at the model's value
-    combinations: tuple[str, ...]  # what the data cannot tell apart or do not show
+    combinations: tuple[str, ...]  # what the data cannot separate or do not show
     registration: Registration | Placements  # one frame, or one a session
     tool_offset: Array  # (3,) m, flange axes: found tool point minus the cell's; 0 if registered
     samples: int
@@ -66,7 +66,7 @@ class Identification:
     remaining_rms: float  # m, after
     gap_rms_held_out: float  # m, before, on poses that the fit did not see; nan: too few poses
     remaining_rms_held_out: float  # m, after, on the same poses
-    outliers: NDArray[np.int64]  # rows weighed down as wild
+    outliers: NDArray[np.int64]  # rows down-weighted as outlier
     notes: tuple[str, ...]
     remaining_rms_new_region: float = UNSEEN  # m, folds are regions of joint space
     remaining_rms_new_session: float = UNSEEN  # m, folds are sessions
@@ -218,7 +218,7 @@ def pose_groups(q: Array, tolerance: float = 1e-3) -> NDArray[np.int64]:
 
 
 def _held_out(model: Model, data: Data, task: _Task, inlier: Mask) -> tuple[float, float]:
-    """Return the rms before and after over calm rows of poses left out; nan: too few poses."""
+    """Return the rms before and after over inlier rows of poses left out; nan: too few poses."""
     groups = pose_groups(data.q[:2000]) if len(data.q) <= 2000 else np.arange(len(data.q))
     poses = int(groups.max()) + 1
     if poses < 2 * FOLDS:
@@ -236,7 +236,7 @@ def _held_out(model: Model, data: Data, task: _Task, inlier: Mask) -> tuple[floa
 
 
 def _in_new_regions(model: Model, data: Data, task: _Task, inlier: Mask) -> float:
-    """Return the rms over calm rows of regions of joint space left out; nan: too few poses."""
+    """Return the rms over inlier rows of regions of joint space left out; nan: too few poses."""
     if len(np.unique(np.round(data.q, 3), axis=0)) < 2 * FOLDS:
         return UNSEEN
     fold, left = joint_regions(data.q, FOLDS), []
@@ -258,7 +258,7 @@ def _placed_sessions(data: Data) -> list[int]:
 
 
 def _in_new_sessions(model: Model, data: Data, task: _Task, inlier: Mask) -> float:
-    """Return the rms over calm rows of sessions left out, each placed on itself; nan: only one."""
+    """Return the rms over inlier rows of sessions left out, each registered on itself; nan: one."""
     if data.session is None or data.sessions < 2:
         return UNSEEN
     left = []
@@ -297,10 +297,10 @@ def _result(
 
 
 def notes_of(fit: Fit, kept: Mask, outlier: int, nuisances: int) -> list[str]:
-    """Return in words what a fit was like: wild readings, bounds reached, what was not shown."""
+    """Return in words what a fit was like: outliers, bounds reached, what was not identifiable."""
     notes = []
     if outlier:
-        notes.append(f"{outlier} wild reading(s) weighed down")
+        notes.append(f"{outlier} outlier(s) down-weighted")
     at_zero = np.flatnonzero((fit.flexibility <= 0) & kept)
     if len(at_zero):
         names = ", ".join(base_parameters.name(i, len(kept)) for i in at_zero)

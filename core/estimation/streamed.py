@@ -1,7 +1,7 @@
 """Identification from logs of any length: rows pass by in pieces, memory does not grow with them.
 
 The same least squares, weights and choice as identification.py. Held-out figures leave out every
-fifth row by chance, not whole poses: among many thousands of rows, poses are not told apart.
+fifth row by chance, not whole poses: among many thousands of rows, poses are not separated.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 SAMPLE = 20_000  # rows kept at most, for the first guess and the look whether anything bends
 MANY_OUTLIERS = 100_000  # rows that are named at most
-INLIER = 1e-6  # weight below which a row counts as wild
+INLIER = 1e-6  # weight below which a row counts as an outlier
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ def fold_of(rows: Rows) -> Rows:
 
 
 def _held_out(model: Model, stream: Stream, task: _Task, after: FitState) -> tuple[float, float]:
-    """Return the rms before and after over calm rows that each fit did not see."""
+    """Return the rms before and after over inlier rows that each fit did not see."""
     sums, count = np.zeros(2), 0
     for k in range(FOLDS):
         seen = stream.part(lambda rows, k=k: fold_of(rows) != k, 1 - 1 / FOLDS)  # type: ignore[misc]

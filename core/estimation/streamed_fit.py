@@ -1,7 +1,8 @@
 """The least squares of core.estimation.compliance_fit over rows that pass by in pieces.
 
 Each step of Gauss and Newton passes twice over the rows: once for the gap, whose median says what
-is noise and what is wild, once for the R factor of all weighed columns, into which every block of
+is noise and what is an outlier, once for the R factor of all weighed columns, into which every
+block of
 rows is folded (core.kernels). What is kept does not grow with the rows; the gaps wait in a file.
 """
 

@@ -94,7 +94,7 @@ def read_configuration(path: Path) -> Document:
 def read_columns(path: Path, reported_only: bool = False) -> dict[str, Array]:
     """Return all cycles of a recording by field name, empty where there are none.
 
-    ``told_only``: without what the controller never told, which is NaN throughout.
+    ``reported_only``: without what the controller never reported, which is NaN throughout.
     """
     batches = [batch.columns for batch in read_batches(path) if len(batch)]
     names = list(batches[0]) if batches else []

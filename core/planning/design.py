@@ -1,4 +1,4 @@
-"""The plan of a calibration session: which poses and loads tell most of the parameters at hand."""
+"""The plan of a calibration session: the poses and loads most informative for its parameters."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def plan(
     wish: Wish,
     progress: Progress | None = None,
 ) -> Plan:
-    """Return the poses, loads and approaches that tell most, in the order of travel.
+    """Return the most informative poses, loads and approaches, in the order of travel.
 
     Chosen so that the TCP predicted by the calibrated model is known best over the whole reachable
     space and under all ``loads``, the worst places before the others.
@@ -70,7 +70,7 @@ def plan(
 
 
 def _silent(text: str, share: float) -> None:
-    """Tell nobody."""
+    """Report to nobody."""
 
 
 def _planned(
@@ -86,7 +86,7 @@ def _planned(
     space = replace(space, hung=(*space.hung, *(far_end(load) for load in loads)))
     found = candidates_of(parameters, observable, loads, space, wish.seed, wish.stops)
     _require_enough(parameters, observable, found, wish)
-    emit("working out what each pose tells", 0.1)
+    emit("working out what each pose contributes", 0.1)
     rows = blocks(parameters, observable, found.readings, found.nuisance, wish.sigma)
     reference = reference_of(parameters, loads, space, wish.seed)
     cost = _cost(parameters, found, wish)
@@ -98,7 +98,7 @@ def _planned(
     refiner = Refiner(parameters, observable, space, found, weight, wish.sigma)
     best, weight = evened(
         refiner, reference, Refined(found.readings[np.array(chosen)], rows[chosen]), share,
-        wish.seed, lambda share: emit("moving poses to where they tell more", 0.5 + 0.2 * share),
+        wish.seed, lambda share: emit("moving poses to more informative places", 0.5 + 0.2 * share),
     )  # fmt: skip
     choice, refiner = Choice.of(rows, weight, cost), replace(refiner, weight=weight)
     emit("working out what more or fewer poses buy", 0.7)
@@ -246,14 +246,14 @@ def _notes(
     notes = []
     vague = [n for n, s in zip(parameters.names, std, strict=True) if not np.isfinite(s)]
     if vague:
-        notes.append(f"not shown by these poses: {', '.join(vague)}")
+        notes.append(f"not identifiable from these poses: {', '.join(vague)}")
     idle = [f"{load.mass:g} kg" for i, load in enumerate(loads) if i not in hung]
     if idle:
-        notes.append(f"loads that tell nothing more and need not be hung: {', '.join(idle)}")
+        notes.append(f"loads that add nothing and need not be hung: {', '.join(idle)}")
     soft = [e for e in flexibility_effects().values() if parameters.joints(e)]
     if soft and len(loads) == 1:
         notes.append(
-            "one load alone: compliance is told from what the arm itself weighs; a second load "
-            "tells it better"
+            "one load alone: compliance is found from the arm's own weight; a second load "
+            "determines it better"
         )
     return notes

@@ -1,4 +1,4 @@
-"""What readings tell: the information matrix of parameters and nuisances, and what it foretells.
+"""What readings determine: the information matrix of parameters and nuisances.
 
 Everything is counted in usual sizes: a parameter in its weak prior's sigma, a nuisance in metres
 and radians. The nuisances stay in the matrix, so that its inverse has them projected out.
@@ -89,7 +89,7 @@ def inverse(information: Array) -> Array:
 
 
 def expectation_of(parameters: Parameters, rows: Array, reference: Reference) -> Expectation:
-    """Return what equations (N, k, p+m) will tell."""
+    """Return what equations (N, k, p+m) will determine."""
     covariance = inverse(information_of(rows))
     share = np.sqrt(np.diag(covariance))[: len(parameters)]
     std = np.where(share < UNSHOWN, share * parameters.prior, np.inf)

@@ -1,4 +1,4 @@
-"""Chosen poses moved a little, joint by joint, to where they tell more.
+"""Chosen poses moved a little, joint by joint, to where they are more informative.
 
 The candidates of a plan are a coarse sample of six or more joints; between them lie better poses.
 Each pose goes down the gradient of the criterion, as far as limits, obstacles and sight allow.

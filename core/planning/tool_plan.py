@@ -44,8 +44,8 @@ def plan_tool(
     """Return poses that keep the tip where it is at ``begin`` (n,) rad and turn the tool about it.
 
     Tilted by up to ``tilt`` (rad) and turned about its own axis, within the joint limits; chosen so
-    that the tip is told best (D-optimal). ``noise`` is 1 sigma (m) of one coordinate of a touch.
-    Raises ExcitationError where the arm reaches no orientations that tell the tip.
+    that the tip is determined best (D-optimal). ``noise`` is 1 sigma (m) of one coordinate of a
+    touch. Raises ExcitationError where the arm reaches no orientations that determine the tip.
     """
     begin = np.asarray(begin, dtype=float)
     reached = _candidates(model, begin, base_rotation, np.random.default_rng(seed))

@@ -40,7 +40,7 @@ def evened(
 ) -> tuple[Refined, Array]:  # fmt: skip
     """Return the poses after some bouts of moves, and the weight (P, P) of the last one.
 
-    ``share`` (M,) are the places' weights in the first; ``told`` gets the share that is done.
+    ``share`` (M,) are the places' weights in the first; ``report`` gets the share that is done.
     """
     now, size = begin, begin.rows.shape[2]
     for number in range(BOUTS):

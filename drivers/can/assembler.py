@@ -20,7 +20,7 @@ Vector = NDArray[np.float64]
 
 
 class Sample(NamedTuple):
-    """One complete sample, SI units; (n,) each, NaN where a joint has not told yet.
+    """One complete sample, SI units; (n,) each, NaN where a joint has not reported yet.
 
     All quantities are rows of ``table`` (q, n), the position first, then ``others`` in order. A
     tuple, because one is made in every cycle.
@@ -52,7 +52,7 @@ class Assembler:
         self.status: dict[tuple[Key, str], tuple[float, str, bool]] = {}
         self.enabled: dict[tuple[Key, str], bool] = {}
         self.received_at: dict[Key, float] = {}  # s, monotonic, of each message that we read
-        self.troubled: set[tuple[Key, str]] = set()  # members of ``status`` that tell of trouble
+        self.troubled: set[tuple[Key, str]] = set()  # members of ``status`` that report trouble
         self._seen: dict[Key, bytes] = {}  # last bytes of messages beside the sample
 
     @property

@@ -50,10 +50,10 @@ def _float_of(bits, length):  # type: ignore[no-untyped-def]
 
 @njit(**JIT)
 def fill(raw, received, places, factors, lines, found):  # type: ignore[no-untyped-def]
-    """Write all quantities (q n,) in SI units that the frames in ``raw`` (8 bytes a slot) tell.
+    """Write all quantities (q n,) in SI units that the frames in ``raw`` (8 bytes a slot) contain.
 
     ``factors`` (m, 2): scale and offset of each signal; ``lines`` (3, q n): wire values, where
-    those of slots not ``told`` stay as they are, then scale and zero of each.
+    those of slots not ``received`` stay as they are, then scale and zero of each.
     """
     for k in range(places.shape[0]):
         slot, start, length = places[k, 0], places[k, 1], places[k, 2]
@@ -123,7 +123,7 @@ class Reading:
         self._received[slot] = 1
 
     def table(self) -> Vector:
-        """Return all quantities (q, n) in SI units, in the order of ``names``; NaN: not told."""
+        """Return all quantities (q, n) in SI units, in order of ``names``; NaN: not received."""
         found = np.empty(len(self.names) * self._n)
         fill(*self._arguments, found)
         return found.reshape(-1, self._n)

@@ -27,13 +27,13 @@ from gapbridge.drivers.can.writer import FrameWriter
 from gapbridge.drivers.driver import Driver
 
 Vector = NDArray[np.float64]
-FIRST_SAMPLE = 2.0  # s in which an arm on the bus must have told everything once
+FIRST_SAMPLE = 2.0  # s in which an arm on the bus must have reported everything once
 SLICE = 0.02  # s, of one wait for a frame
 ANSWER = 0.02  # s after which an answer that is not there does not come
 
 
 class CanDriver(Driver):
-    """One arm whose joints are told and commanded in CAN frames, as a profile maps them.
+    """One arm whose joints are reported and commanded in CAN frames, as a profile maps them.
 
     Who else sends our control identifiers is another commander: then nothing is armed, and what is
     armed writes no more.
@@ -56,15 +56,15 @@ class CanDriver(Driver):
         self._slot = 0.0  # s, when an arm that must be asked is asked next
         self._changed = 0.0  # s, monotonic: when the joints last changed
         self._q: Vector | None = None
-        self._angles: list[float] = []  # the same, as they were told in the last sample
-        self._broken = 0  # samples dropped, as far as they were told
-        self._kept: Sample | None = None  # came before a dropped one was told
+        self._angles: list[float] = []  # the same, as they were reported in the last sample
+        self._broken = 0  # samples dropped, as far as they were reported
+        self._kept: Sample | None = None  # came before a dropped one was reported
         self._listening = 0.0  # s, monotonic: since when other commanders would be heard
 
     # -- reading ----------------------------------------------------------------------------------
 
     def connect(self) -> None:
-        """Open the bus and wait until the arm has told everything once. Sends no command."""
+        """Open the bus and wait until the arm has reported everything once. Sends no command."""
         self.reader.open()
         self.writer.use(self.reader.bus)
         self._listening = time.monotonic()
@@ -96,7 +96,7 @@ class CanDriver(Driver):
         return LinkError(f"{self.settings.where()}: {self.profile.name}: {message}{detail}")
 
     def _ask(self) -> None:
-        with contextlib.suppress(WriteError):  # silence follows, and is told
+        with contextlib.suppress(WriteError):  # silence follows, and is reported
             self.writer.request()
 
     def read_state(self) -> RobotState:
@@ -128,7 +128,7 @@ class CanDriver(Driver):
         return sample
 
     def _check_torn(self, sample: Sample | None) -> None:
-        """Tell, once, that frames have come which make no sample; a good one is kept."""
+        """Report, once, that frames have come which make no sample; a good one is kept."""
         broken, self._broken = self._broken, self.reader.assembler.broken
         if self._broken > broken:
             self._kept = sample
@@ -185,7 +185,7 @@ class CanDriver(Driver):
             )
 
     def _target(self) -> Vector | None:
-        """Return what the arm was last told, by us or by another commander."""
+        """Return what the arm was last commanded, by us or by another commander."""
         if self._armed_at is not None:
             return self.writer.target
         return self.reader.foreign_target(self.settings.foreign_quiet)

@@ -34,7 +34,7 @@ def shipped_profiles() -> tuple[str, ...]:
 
 
 def load_profile(name: str, folder: Path | None = None) -> CanProfile:
-    """Return a shipped profile by name, or one by its path seen from ``folder``.
+    """Return a shipped profile by name, or one by its path relative to ``folder``.
 
     Raises ProfileError in one line: file, line, key, found, expected.
     """

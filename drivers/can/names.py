@@ -1,4 +1,4 @@
-"""Names in a profile, looked up in its DBC; what is not there is told with its line."""
+"""Names in a profile, looked up in its DBC; what is not there is reported with its line."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """A signal that tells whether the arm is well."""
+    """A signal that reports whether the arm is well."""
 
     signal: str
     normal: frozenset[int]
@@ -146,7 +146,7 @@ class CanProfile:
 
     @property
     def quantities(self) -> frozenset[str]:
-        """Return what the feedback tells."""
+        """Return what the feedback reports."""
         return frozenset(self.joints.scale)
 
     @property

@@ -21,7 +21,7 @@ Vector = NDArray[np.float64]
 
 @njit(**JIT)
 def _looked_at(table, bounds, before, step):  # type: ignore[no-untyped-def]
-    """Return which rows (bits) of a sample every joint has told; -1: it cannot be believed.
+    """Return which rows (bits) of a sample every joint has reported; -1: it cannot be believed.
 
     ``table`` (q, n): position first; ``bounds`` (q + 1, n): least and most position, then the
     largest magnitude of each other row. ``before`` (n,): positions that are at most ``step`` rad
@@ -67,7 +67,7 @@ class StateBuilder:
     def build(self, sample: Sample, target: Vector | None, trouble: str, ready: bool) -> RobotState:
         """Return the state of a sample. Raises InvalidStateError.
 
-        ``target`` (n,) is what the arm was last told, where anyone told it.
+        ``target`` (n,) is what the arm was last commanded, where anyone commanded it.
         """
         q = sample.position
         before = self._before  # a refused sample does not replace it: the next is compared too
@@ -92,7 +92,7 @@ class StateBuilder:
         )
 
     def _values(self, sample: Sample, before: Sample | None) -> dict[str, Vector]:
-        """Return the quantities that every joint has told. Raises InvalidStateError."""
+        """Return the quantities that every joint has reported. Raises InvalidStateError."""
         table, step, earlier = sample.table, np.inf, sample.position
         if before is not None:
             step = FASTEST * (sample.received - before.received) + JITTER

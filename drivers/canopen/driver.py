@@ -123,7 +123,7 @@ class CanopenDriver(Driver):
     # -- reading ----------------------------------------------------------------------------------
 
     def read_state(self) -> RobotState:
-        """Send one SYNC and return what all drives told at it; see Driver.read_state.
+        """Send one SYNC and return what all drives reported at it; see Driver.read_state.
 
         Raises InvalidStateError where a set is torn, LinkError where a drive has restarted.
         """

@@ -73,7 +73,7 @@ class BusListener(MessageListener):
         super().on_message_received(msg)  # type: ignore[no-untyped-call]
 
     def on_error(self, exc: Exception) -> None:
-        """Keep the notifier's thread from a traceback; ``Network.check`` tells what ended the bus.
+        """Keep the notifier's thread from a traceback; ``Network.check`` says what ended the bus.
 
         The thread goes on until it is stopped, so that it must not spin.
         """
@@ -97,7 +97,7 @@ class Life:
     def __init__(self, network: Network, profile: CanopenProfile) -> None:
         self._profile = profile
         self.received_at: dict[int, float] = {}  # node -> s, monotonic
-        self.nmt: dict[int, int] = {}  # node -> NMT state that it told last
+        self.nmt: dict[int, int] = {}  # node -> NMT state that it reported last
         self.restarted: set[int] = set()
         self.active: dict[int, Emergency] = {}
         self.log: deque[Emergency] = deque(maxlen=KEPT)
@@ -137,7 +137,7 @@ class Life:
 
     @property
     def all_operational(self) -> bool:
-        """Return whether every node's heartbeat has told that it is OPERATIONAL."""
+        """Return whether every node's heartbeat has reported that it is OPERATIONAL."""
         return all(self.nmt.get(node) == OPERATIONAL for node in self._profile.nodes)
 
     def lost(self) -> int | None:

@@ -134,7 +134,7 @@ class Power:
     def disable(self) -> None:
         """Stop by quick stop, wait until the arm stands, and switch off. Raises LinkError.
 
-        Drives that answer no more are told so too; they have at least our last word.
+        Drives that answer no more get the message too; they have at least our last word.
         """
         profile, end = self._profile, time.monotonic() + STOPPING
         reported: list[State] = ["OPERATION ENABLED"] * profile.n
@@ -156,6 +156,6 @@ class Power:
                     return
             if time.monotonic() > end:
                 raise WriteError(
-                    f"{self._master.where}: not all drives have told that they are off "
+                    f"{self._master.where}: not all drives have reported that they are off "
                     f"{STOPPING:g} s after the quick stop"
                 )

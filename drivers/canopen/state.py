@@ -17,7 +17,7 @@ from gapbridge.drivers.robot_modes import modes_of
 from gapbridge.drivers.state_check import JointCheck
 
 Vector = NDArray[np.float64]
-SPAN, OLDEST = 5, 0.1  # samples, s: what a velocity is reckoned from where drives tell none
+SPAN, OLDEST = 5, 0.1  # samples, s: what a velocity is reckoned from where drives report none
 
 
 def states(found: SyncSet) -> list[State]:
@@ -61,8 +61,8 @@ class StateBuilder:
     def build(self, found: SyncSet, target: Vector | None, armed: bool) -> RobotState:
         """Return the state. Raises InvalidStateError.
 
-        ``target`` (n,) is what the drives were last told, rad. The time of the sample is that of
-        its SYNC, at which all drives latched their positions.
+        ``target`` (n,) is what the drives were last commanded, rad. The time of the sample is that
+        of its SYNC, at which all drives latched their positions.
         """
         q = positions(self._profile, found)
         wrong = self._joints.outside(q)
@@ -102,7 +102,7 @@ class StateBuilder:
     def _velocity(self, found: SyncSet, q: Vector) -> Vector:
         """Return (n,) rad/s: the drives' own where the profile knows its unit.
 
-        Else out of the last samples: one step alone would tell the SYNC's jitter.
+        Else out of the last samples: one step alone would show the SYNC's jitter.
         """
         scale = self._profile.file.velocity_scale
         reported = [counts.get("Velocity actual value") for counts in found.counts]

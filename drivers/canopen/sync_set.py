@@ -12,7 +12,7 @@ from gapbridge.drivers.canopen.profile import CanopenProfile
 
 
 class SyncSet(NamedTuple):
-    """What all drives told at one SYNC. A tuple, because one is made in every cycle."""
+    """What all drives reported at one SYNC. A tuple, because one is made in every cycle."""
 
     counts: tuple[dict[str, int], ...]  # per joint: object name -> counts
     synced: float  # s, time.monotonic() when the SYNC left

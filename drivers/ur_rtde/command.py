@@ -205,7 +205,7 @@ class OffsetWriter:
     """Offsets in RTDE input registers, applied by the robot's own program.
 
     One call sends one register, so an offset arrives in nine packets; the sequence number goes
-    last, and the checksum tells the program whether they belong together. ``rates`` (m/s, rad/s)
+    last, and the checksum shows the program whether they belong together. ``rates`` (m/s, rad/s)
     are the cell's: the program takes offsets in and out no faster, also when nobody sends any more.
     """
 
@@ -224,7 +224,7 @@ class OffsetWriter:
         self._echo, self._program, self._applied = echo, program, applied
 
     def arm(self, state: RobotState, look: Callable[[], None]) -> None:
-        """Open the registers and tell the rates. Raises WriteError where the program is not there.
+        """Open the registers and send the rates. Raises WriteError where the program is not there.
 
         Waits until the program has taken out what was left of an offset, and sends one of zero.
         """
@@ -239,7 +239,7 @@ class OffsetWriter:
         try:
             self._rates = registers.rates(*self._cell_rates())
         except ValueError as error:
-            raise WriteError(f"limits.{error}: what the robot's program can be told") from None
+            raise WriteError(f"limits.{error}: what the robot's program can be given") from None
         self._wait_bare(look)
         if self._io is None:
             self._io = self._open()
@@ -271,7 +271,7 @@ class OffsetWriter:
                 raise WriteError(
                     f"{self._settings.host}: the robot's program still applies an offset of "
                     f"{1e3 * length:.3f} mm or mrad, expected none before arming: it takes it out "
-                    "by itself, at the rates it was last told"
+                    "by itself, at the rates it was last given"
                 )
             look()
 
@@ -349,7 +349,7 @@ class OffsetWriter:
     def release(self) -> None:
         """Send nothing more: without a heartbeat the program takes out what is left of an offset.
 
-        At the rates it was told; a zero from here would be a step.
+        At the rates it was given; a zero from here would be a step.
         """
 
     def abandon(self) -> None:

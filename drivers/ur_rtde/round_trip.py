@@ -1,6 +1,6 @@
 """How long a question to an RTDE server and its answer take: what bounds the age of its samples.
 
-RTDE's samples come by themselves, so that nothing in them tells how long they were under way. A
+RTDE's samples come by themselves, so that nothing in them says how long they were under way. A
 connection of its own asks for the protocol version (RTDE guide, RTDE_REQUEST_PROTOCOL_VERSION).
 """
 

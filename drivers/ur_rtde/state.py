@@ -255,7 +255,7 @@ class StateReader:
     def joints_and_tcp(self) -> tuple[Vector, Vector] | None:
         """Return joints (6,) and the controller's own TCP pose (6,) of one sample, or None.
 
-        The pose is in base, m and rotation vector. None where the controller does not tell it, or
+        The pose is in base, m and rotation vector. None where the controller does not report it, or
         a new sample came between the two each time.
         """
         receive = self._receive

@@ -1,4 +1,4 @@
-"""What a machine takes from everybody is told apart from what a program misses by itself."""
+"""What a machine takes from everybody is separated from what a program misses by itself."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Runs in the place of a side process, with what such a process is given, and tries to arm.
 
 It tries every descriptor of its own and, through /proc, of every process of the run: memory is
-opened anew for writing and mapped, pipes are written to, forged events are told. What it managed
-is reported as events of each side's kind.
+opened anew for writing and mapped, pipes are written to, forged events are reported. What it
+managed is reported as events of each side's kind.
 """
 
 from __future__ import annotations

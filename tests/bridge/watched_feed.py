@@ -129,7 +129,7 @@ class Feed:
                   detail=detail)  # fmt: skip
 
     def change_cell(self, keys: str, ok: bool = True) -> None:
-        """Write the cell file anew and tell that it was taken, or not."""
+        """Write the cell file anew and report that it was taken, or not."""
         text = CELL + keys
         self.settings.cell.write_text(text)
         hashed = hashlib.sha256(text.encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""The corrected setpoint's predicted real pose is the wanted one; what cannot be met is told."""
+"""The corrected setpoint's predicted real pose is the wanted one; unreachable ones are reported."""
 
 from dataclasses import replace
 
@@ -206,7 +206,7 @@ def test_the_predicted_pose_of_a_reached_setpoint_is_the_wanted_one(n, seed):
     result = correct(model, q, loads)
     left = distance(model, result.q, q, loads)
     assert (left[result.residual < TOLERANCE] < 1e-8).all()
-    # honest: what is told is what is left, the rotation counted at a lever of half a metre
+    # honest: what is reported is what is left, the rotation counted at a lever of half a metre
     np.testing.assert_allclose(result.residual, left, atol=2e-9, rtol=1e-3)
     assert np.isfinite(result.q).all()
 

@@ -1,4 +1,4 @@
-"""The fleet's fit: what a session tells, what is borrowed, and whether intervals hold."""
+"""The fleet's fit: what a session determines, what is borrowed, and whether intervals hold."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_a_session_of_too_few_poses_reports_nothing() -> None:
 
 
 def reported(truth: Array, rng: Generator, rows: int = 6, gain: float = 1.0) -> Evidence:
-    """Return what a session of an arm tells, straight from the linear model."""
+    """Return what a session of an arm determines, straight from the linear model."""
     A = rng.normal(0, 1, (rows, 4)) * [40, 8, 25, 4] * gain * np.sqrt(8 / rows)  # m per rad/Nm
     y = A @ truth + rng.normal(0, NOISE, rows)
     R = np.linalg.qr(A, mode="r")
@@ -96,7 +96,7 @@ def fleet(arms: int, sessions: int, seed: int) -> tuple[TypeFit, Array, list[Evi
     rng = np.random.default_rng(seed)
     truths = np.array([scattered(MEAN, 0.25, rng) for _ in range(arms)])
     number = np.repeat(np.arange(arms), sessions)
-    # the only session of an arm is the arm: nobody can tell the two apart
+    # the only session of an arm is the arm: nobody can separate them
     within = 0.03 if sessions > 1 else 0.0
     given = [reported(scattered(truths[a], within, rng), rng) for a in number]
     return fit_type(given, list(number), np.zeros(4), USUAL), truths, given

@@ -243,7 +243,7 @@ def test_an_angle_that_is_not_finite_is_reported_with_its_row_not_as_degrees(tmp
     rows = joints()
     rows[1][3] = value
     log = read_log(write(tmp_path, table([f"{name}_{i}" for i in range(6)], rows)), 6)
-    if value == "nan":  # an empty cell is told where it is needed, and only there
+    if value == "nan":  # an empty cell is reported where it is needed, and only there
         check_units(Model(builtin_arm("ur5e")), log)
     with pytest.raises(LogError) as caught:
         log.require(name) if value == "nan" else check_units(Model(builtin_arm("ur5e")), log)

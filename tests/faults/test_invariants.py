@@ -95,7 +95,7 @@ def test_a_write_in_a_state_that_forbids_it_is_found(checker: Checker) -> None:
 
 
 def test_a_write_that_was_only_seen_late_is_judged_by_when_it_arrived(checker: Checker) -> None:
-    state(checker, 28, supervisor=5)  # the tap slept; what came before it is told after it
+    state(checker, 28, supervisor=5)  # the tap slept; what came before it is reported after it
     late = Write(20 * CYCLE, "offset", (21 * STEP, *[0.0] * 5), "registers", 5)
     checker.take([late])
     checker.settle([(0.0, 20 * CYCLE + 0.001)])

@@ -24,7 +24,7 @@ from gapbridge.drivers.driver import Driver
 SHIFT = 2e-4  # m, along base z
 TURN = np.radians(0.5)  # of the last joint
 PACE = np.radians(1.0)  # per s
-COARSE = 2e-3  # rad: joints at rest tell the same angle within this
+COARSE = 2e-3  # rad: joints at rest report the same angle within this
 
 
 def test_states_are_complete_and_time_goes_on(cell: Cell, driver: Driver) -> None:

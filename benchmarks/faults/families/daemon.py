@@ -1,4 +1,4 @@
-"""The daemon itself: told to end, killed, or given a cell that does not fit its controller."""
+"""The daemon itself: asked to end, killed, or given a cell that does not fit its controller."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ class WholeJob(Job):
     """Plan, measure, fit, verify, report, and a new cell."""
 
     def plan(self, begin: Array | None, tell: Callable[[str, float], None]) -> Plan:
-        """Return the poses that tell most."""
+        """Return the most informative poses."""
         return planned(self.cell, self.order, tell)
 
     def tell_plan(self, plan: Plan) -> None:
@@ -48,7 +48,7 @@ class WholeJob(Job):
         self._tell_places(plan)
         used = {p.load for p in plan.poses}
         for i, load in enumerate(plan.loads):
-            needless = "" if i in used else " (not needed: it would tell nothing more)"
+            needless = "" if i in used else " (not needed: it would add nothing)"
             talk.say(f"  load {i + 1}: {load_text(load)}{needless}")
         talk.say(
             f"expected: the predicted TCP known to {millimetres(plan.expected.tcp_std)} (1 sigma "
@@ -58,7 +58,7 @@ class WholeJob(Job):
         talk.say(f"  what n poses buy: {told}")
         weak = _hardly_told(plan)
         if weak:
-            talk.say(f"  these poses hardly tell: {', '.join(weak)}")
+            talk.say(f"  these poses hardly determine: {', '.join(weak)}")
         for note in plan.notes:
             talk.say(f"  note: {note}")
 
@@ -81,7 +81,7 @@ class WholeJob(Job):
     def _completed(self, found: Calibration) -> Calibration:
         """Return the fit with what the readings ask for as well, as long as a person wants it.
 
-        One that is worse on poses that no fit saw is told and not taken.
+        One that is worse on poses that no fit saw is reported and not taken.
         """
         asked: tuple[str, ...] = ()
         for _ in range(REFITS):
@@ -102,7 +102,7 @@ class WholeJob(Job):
         return found
 
     def finish(self) -> None:
-        """Fit, tell, report, and write the new cell once a person says yes."""
+        """Fit, show, report, and write the new cell once a person says yes."""
         talk, folder, order = self.talk, self.folder, self.order
         talk.say()
         found = fitted(self.cell, order, talk, self.book)

@@ -1,4 +1,4 @@
-"""What the report tells of a session beside its figures."""
+"""What the report says about a session beside its figures."""
 
 from __future__ import annotations
 

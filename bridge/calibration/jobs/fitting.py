@@ -1,4 +1,4 @@
-"""What a session's readings come to: the fit, and how it is told."""
+"""What a session's readings come to: the fit, and how it is reported."""
 
 from __future__ import annotations
 
@@ -54,17 +54,17 @@ def tell_calibration(talk: Talk, found: Calibration) -> None:
     if np.isfinite(found.repeatability):
         small = found.repeatability < LEAST_TOLD
         noise += ", the arm repeats " + (
-            "better than the instrument tells" if small
+            "better than the instrument reports" if small
             else f"to {millimetres(found.repeatability)}"
         )  # fmt: skip
     talk.say(noise)
     talk.console.print(_table(found))
     for row in found.outliers:
-        talk.say(f"  weighed down as wild: reading {int(row) + 1}")
+        talk.say(f"  down-weighted as outlier: reading {int(row) + 1}")
     for line in found.notes:
         talk.say(f"  note: {line}")
     if found.combinations:
-        talk.say(f"  {len(found.combinations)} parameters cannot be told from others; the report "
+        talk.say(f"  {len(found.combinations)} parameters cannot be separated; the report "
                  "names them")  # fmt: skip
 
 

@@ -48,7 +48,7 @@ class Job(ABC):
 
     @abstractmethod
     def tell_plan(self, plan: Plan) -> None:
-        """Say what is planned, and what it will tell."""
+        """Say what is planned, and what it will determine."""
 
     def instrument(self, around: Surroundings) -> AnyInstrument:
         """Return what measures, not yet open."""
@@ -64,7 +64,7 @@ class Job(ABC):
 
     @abstractmethod
     def finish(self) -> None:
-        """Work out what the readings tell, report it, and apply it where a person says so."""
+        """Work out what the readings determine, report it, and apply it where a person says so."""
 
     def hand_over(
         self, model: Model, what: str, sections: dict[str, Any] | None = None

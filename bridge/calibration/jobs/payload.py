@@ -52,7 +52,7 @@ class PayloadJob(Job):
         return bare_plan((load,), poses, expected=expected)
 
     def tell_plan(self, plan: Plan) -> None:
-        """Say how many orientations there are, and how well they will tell the load."""
+        """Say how many orientations there are, and how well they will determine the load."""
         rows = zip(plan.expected.names, plan.expected.units, plan.expected.std, strict=True)
         told = ", ".join(f"{n} ±{figure(s)} {u}" for n, u, s in list(rows)[:4])
         self.talk.say(f"plan: {len(plan.poses)} orientations; expected {told}")
@@ -66,7 +66,7 @@ class PayloadJob(Job):
         return None
 
     def finish(self) -> None:
-        """Tell mass, centre of gravity and bias, and write them into a new cell after a yes."""
+        """Report mass, centre of gravity and bias, and write them into a new cell after a yes."""
         talk, taken = self.talk, self.book.taken
         q = np.array([t.q for t in taken])
         wrench = np.array([t.raw_wrench for t in taken])

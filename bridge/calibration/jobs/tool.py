@@ -53,7 +53,7 @@ class ToolJob(Job):
         return bare_plan(loads_of(self.cell)[:1], poses, found.bought)
 
     def tell_plan(self, plan: Plan) -> None:
-        """Say how many touches there are, and how well they will tell the tip."""
+        """Say how many touches there are, and how well they will determine the tip."""
         told = f"; expected ±{millimetres(plan.bought[-1][1])}" if plan.bought else ""
         self.talk.say(f"plan: the tip onto one fixed point {len(plan.poses)} times{told}")
 
@@ -66,7 +66,7 @@ class ToolJob(Job):
         return None
 
     def finish(self) -> None:
-        """Tell where the tip is, and write it into a new cell after a yes."""
+        """Report where the tip is, and write it into a new cell after a yes."""
         talk, model = self.talk, self.cell.model
         readings = self.book.readings("point")
         found = calibrate_tool(model, readings.q, readings.loads)

@@ -1,4 +1,4 @@
-"""Months later: a few poses measured again tell whether the calibration still holds."""
+"""Months later: a few poses measured again show whether the calibration still holds."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Stand:
-    """The arm at rest; a field that nobody tells is None."""
+    """The arm at rest; a field that nobody reports is None."""
 
     q: Array  # (n,) rad
     temperature: Array | None = None  # (n,) °C
@@ -32,10 +32,10 @@ class Stand:
 
 
 class JointSource(ABC):
-    """Tells where the arm stands. The constructor opens nothing."""
+    """Reports where the arm stands. The constructor opens nothing."""
 
     drives = False  # whether ``drive`` works
-    watches = False  # whether ``arrived`` can tell of itself
+    watches = False  # whether ``arrived`` can decide by itself
 
     def open(self) -> None:
         """Get ready. Raises InputError or LinkError."""
@@ -93,7 +93,7 @@ class TypedJoints(JointSource):
     def stand(self, pose: PlannedPose) -> Stand:
         """Return what is typed; Enter alone: exactly as planned. Raises ReadingError.
 
-        Where the tool is ``seated`` by hand the joints are the reading, and Enter tells none.
+        Where the tool is ``seated`` by hand the joints are the reading, and Enter reports none.
         """
         n = len(pose.q)
         exactly = "" if self._seated else " (Enter: exactly as planned)"

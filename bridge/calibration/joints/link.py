@@ -106,7 +106,7 @@ class LinkedJoints(JointSource):
             return super().drive(pose, via)
         begin = self.now()
         if begin is None:
-            raise LinkError("the arm tells no joints, expected where it stands before a move")
+            raise LinkError("the arm reports no joints, expected where it stands before a move")
         file = self._folder / "move.csv"
         length = write_move(file, [begin, *via, pose.q], self._speed)
         moving = SetpointSettings(source="trajectory", file=file.resolve())
@@ -148,7 +148,7 @@ class LinkedJoints(JointSource):
             if run.daemon.phase == Phase.STARTING and time.monotonic() < begun + STARTING:
                 until = time.monotonic() + limit  # imports, on a busy machine
             if time.monotonic() > until:
-                raise LinkError("the arm tells nothing, expected its joints")
+                raise LinkError("the arm reports nothing, expected its joints")
             time.sleep(0.02)
         run.ready = True
 

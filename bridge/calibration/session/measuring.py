@@ -27,7 +27,7 @@ REVISITED = 3  # poses measured once more where the first of them has changed
 NOISES = 6.0  # of instrument and arm: two readings of a pose differ by less
 LEAST = 1.5e-4  # m
 REPEATABILITY = 5e-5  # m, 1 sigma of one coordinate
-PLAINER = 3.0  # times: what is left over by the other story
+PLAINER = 3.0  # times: the residual by the other story
 SAME = 2e-4  # m: two readings this near to each other are the same
 
 
@@ -37,7 +37,7 @@ class Captured:
 
     stand: Stand
     value: Array  # (k,) SI
-    scatter: float  # m, 1 sigma of one coordinate of the mean; nan: one sample tells none
+    scatter: float  # m, 1 sigma of one coordinate of the mean; nan: one sample gives none
     spread: float  # m, 1 sigma of one coordinate of one sample; nan: as above
     samples: int
     source: str
@@ -57,7 +57,7 @@ def capture(
     elif not joints.still(stand):
         raise ReadingError("the arm moved while it was measured")
     if instrument.needs_wrench and stand.raw_wrench is None:
-        raise LinkError("the controller tells no ft_raw_wrench, expected a force sensor's reading")
+        raise LinkError("the controller sends no ft_raw_wrench, expected a force sensor's reading")
     values = found.values
     if not np.isfinite(values).all():
         raise ReadingError("found a reading that is not finite")
@@ -220,7 +220,7 @@ class Conversation:
         self.talk.say(" · ".join(told), "green" if not taken.doubted else "yellow")
 
     def _doubt(self, verdict: Verdict, same: bool) -> str:
-        """Tell what looks wrong; returns ``""`` (measure again), ``take`` or ``keep``."""
+        """Report what looks wrong; returns ``""`` (measure again), ``take`` or ``keep``."""
         if verdict.off > verdict.allowed:
             self.talk.warn(
                 f"{millimetres(verdict.off)} from where it was expected; a good reading is within "
@@ -236,7 +236,7 @@ class Conversation:
         if same:
             self.talk.say(
                 "    the same as the time before, so it is no slip: `back` measures an earlier "
-                "pose again and tells what has moved", "yellow",
+                "pose again and reports what has moved", "yellow",
             )  # fmt: skip
         answers = {"": "measure this pose again"}
         if verdict.instead is not None:
@@ -352,7 +352,7 @@ class Conversation:
             )
         else:
             talk.say(
-                "  these poses do not tell whether instrument or target has moved; you may know"
+                "  these poses do not show whether instrument or target has moved; you may know"
             )
         order = [likely, *(k for k in answers if k != likely)] if likely else list(answers)
         chosen = talk.choose("  which", {k: answers[k] for k in order})

@@ -30,7 +30,7 @@ def route(clear: Clear, begin: Array, end: Array, known: Sequence[Array]) -> lis
     """Return the joints (n,) to go by between ``begin`` and ``end``; None: no way is found.
 
     Straight where that is free, else by one or two of the ``known`` poses, the shortest such way.
-    ``clear`` tells for joints (N, n) whether they are free.
+    ``clear`` says for joints (N, n) whether they are free.
     """
     if all_free(clear, begin[None], end[None])[0]:
         return []
@@ -73,7 +73,7 @@ def all_free(clear: Clear, begin: Array, end: Array) -> NDArray[np.bool_]:
 class Bringing:
     """Loads mounted by people; the arm jogged by them, or driven after their yes.
 
-    ``clear`` tells for joints (N, n) whether they are free of what the cell names.
+    ``clear`` says for joints (N, n) whether they are free of what the cell names.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class Bringing:
                 f"{self._speed:g} rad/s. Keep clear, a hand at the stop button. Drive it?"
             )
             if not self._driven:
-                self.talk.say("  not driven: jog it, as the stops are told")
+                self.talk.say("  not driven: jog it, as the stops are shown")
             self._asked = load
 
     def _hang(self, load: int) -> None:
@@ -121,7 +121,7 @@ class Bringing:
         if self._instrument.needs_wrench:
             self.talk.say("  it hangs on the flange, and nothing touches it?")
         else:
-            self.talk.say("  hang it on the flange, and tell the controller its mass and centre")
+            self.talk.say("  hang it on the flange, and enter its mass and centre")
         self.talk.ask("  Enter when it hangs there")
         self.book.add("mounted", load=load)
 
@@ -210,7 +210,7 @@ class Bringing:
         return self.joints.stand(pose)
 
     def _look_at_load(self, pose: PlannedPose, stand: Stand) -> None:
-        """Tell where the controller believes in another load, or feels a pull."""
+        """Report where the controller believes in another load, or feels a pull."""
         assert self.book.plan is not None
         meant = self.book.plan.loads[pose.load].mass
         told = stand.payload
@@ -220,7 +220,7 @@ class Bringing:
             self._warned.add(pose.load)
             self.talk.warn(
                 f"the controller believes that {told:g} kg hang on the flange, the plan {meant:g} "
-                "kg: is the right load mounted, and the controller told?"
+                "kg: is the right load mounted, and the controller informed?"
             )
             self.talk.ask("  Enter when it is put right")
         elif stand.wrench is not None and np.linalg.norm(stand.wrench[:3]) > PULL:

@@ -39,7 +39,7 @@ class InputEnded(Exception):  # noqa: N818
 
 
 class Talk:
-    """One terminal. ``note`` is told every note that a person writes."""
+    """One terminal. ``note`` gets every note that a person writes."""
 
     def __init__(self, note: Callable[[str], None] = lambda _: None) -> None:
         self.console = Console(highlight=False, soft_wrap=True)

@@ -36,7 +36,7 @@ UNITS = {
     25.4: "25.4 times too small: inches taken for millimetres?",
 }
 SPARE = {"distance": 4, "relative": 9}
-"""Numbers beyond the unknowns, by kind: with fewer the instrument may be told in a wrong place."""
+"""Numbers beyond the unknowns, by kind: with fewer the instrument may be found in a wrong place."""
 EXCHANGED = ((1, 0, 2), (2, 1, 0), (0, 2, 1), (1, 2, 0), (2, 0, 1))
 RARE = 1e-5  # chance with which a good reading is doubted
 USUAL = 3.0  # usual sizes: 1 sigma at which parameters are held
@@ -75,7 +75,7 @@ class FittedSoFar:
         cls, before: Readings, new: Readings, parameters: Parameters, observable: Observable,
         sigma: float,
     ) -> FittedSoFar:  # fmt: skip
-        """Fit to the readings ``before``, wild ones weighed down, to judge ``new`` (one row).
+        """Fit to the readings ``before``, outliers down-weighted, to judge ``new`` (one row).
 
         Derivatives by the parameters are taken once, at the nominal model: all are small.
         """

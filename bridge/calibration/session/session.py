@@ -1,4 +1,4 @@
-"""Where a session stands: what its journal tells, entry by entry."""
+"""Where a session stands: what its journal holds, entry by entry."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Taken:
 
     @classmethod
     def of(cls, entry: dict[str, Any]) -> Taken:
-        """Return what an entry of the journal tells."""
+        """Return what an entry of the journal holds."""
         known = {k: v for k, v in entry.items() if k in cls.__dataclass_fields__}
         for name in _VECTORS:
             if name in known:

@@ -43,7 +43,7 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     Least squares on measured TCP poses (measured_position, and measured_rotation where the log has
     it) under different payloads or pulls. Effects that are in the cell stay in it. Writes NEW_CELL:
     the same cell with the flexibilities found; what the log does not show stays as it is in the
-    cell, and is told. Where the metrology is not registered, its frame and the tool point are
+    cell, and is reported. Where the metrology is not registered, its frame and the tool point are
     estimated along, before as well as after, and not written. Declines, with the reason, where
     nothing in the log excites the compliance. A log of more than 20,000 rows is read in pieces,
     so that memory does not grow with it; so is a recording of the daemon (.mcap). Several logs (or

@@ -74,8 +74,8 @@ def diagnose(withhold: tuple[str, ...], **given: Any) -> None:
     """Diagnose every log: which effects recur, which arms drift, what stands out.
 
     Writes results.parquet (a row per session and parameter), sessions.parquet and report.html. A
-    log that cannot be used is told and skipped. Sessions are kept as they are done: a run that was
-    broken off goes on where it stood.
+    log that cannot be used is reported and skipped. Sessions are kept as they are done: a run that
+    was broken off goes on where it stood.
 
     Example: gapbridge fleet diagnose 'logs/*/2026-*.csv' --cell arms.csv --workers 8
     """

@@ -72,7 +72,7 @@ class Observable(ABC):
         )
 
     def targets_of(self, readings: Readings) -> int:
-        """Return how many targets the readings tell of."""
+        """Return how many targets the readings have."""
         return int(readings.target.max(initial=0)) + 1
 
     def predict(self, model: Model, readings: Readings, nuisance: Nuisance) -> Array:
@@ -140,7 +140,7 @@ class Observable(ABC):
         return F
 
     def start(self, model: Model, readings: Readings) -> Nuisance:
-        """Return the nuisance that fits best to the model as it stands, wild readings or not.
+        """Return the nuisance that fits best to the model as it stands, outliers or not.
 
         Raises ExcitationError where there are too few readings to know where the instrument is.
         """

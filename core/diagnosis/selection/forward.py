@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 BEAM = 6
 DEPTH = 9
 PATIENCE = 2  # depths without a better set before the beam stops
-SMOOTH_TERMS = 2  # more unnamed functions than that tell nothing more
+SMOOTH_TERMS = 2  # more unnamed functions than that add nothing
 LINES = 4  # periodic lines a joint may have: more are the Fourier series of something else
 DEPENDENT = 1e-5  # share of a block below which a direction counts as given by its others
 

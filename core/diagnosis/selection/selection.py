@@ -1,7 +1,7 @@
 """Selection: from an observation to the terms that explain it.
 
 Rounds of: columns at the model found so far, search, exact refit (Gauss-Newton on the whole
-prediction, frames and all), wild readings looked at again; until the set stays the same.
+prediction, frames and all), outliers looked at again; until the set stays the same.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Selection:
     terms: tuple[Term, ...]  # the named part, refitted exactly
     term_index: tuple[int, ...]  # candidate index of each term
     covariance: tuple[Array, ...]  # per term (d, d) of its fitted parameters
-    kept: NDArray[np.bool_]  # (N,) samples that are not wild
+    kept: NDArray[np.bool_]  # (N,) samples that are no outliers
     noise: Noise
     residual: Array  # (N, k) measured - predicted by the named terms, frame estimated along
     base: tuple[Term, ...]
@@ -312,7 +312,7 @@ def _has_what_it_needs(candidate: Candidate, observation: Observation) -> bool:
     return all(
         any(q == need or q.startswith(f"{need}_") for q in observation.quantities)
         for need in candidate.effect.needs
-        if need != "approach"  # without reversals play is an offset: a tie to be told
+        if need != "approach"  # without reversals play is an offset: a tie to be reported
     )
 
 

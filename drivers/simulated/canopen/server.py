@@ -43,7 +43,7 @@ class _Network(canopen.Network):
 
     def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:
         if not self.mute and can_id & 0x7F not in self.silent:
-            with contextlib.suppress(Exception):  # the bus has gone: the server's cycle tells
+            with contextlib.suppress(Exception):  # the bus has gone: the server's cycle notices
                 super().send_message(can_id, data, remote)
 
 
@@ -62,7 +62,7 @@ class _Listener(MessageListener):
             self._server.heard(int(msg.arbitration_id), bytes(msg.data))
 
     def on_error(self, exc: Exception) -> None:
-        time.sleep(PAUSE)  # the bus has gone: the server's cycle tells
+        time.sleep(PAUSE)  # the bus has gone: the server's cycle notices
 
 
 class CanopenServer(ProtocolServer):

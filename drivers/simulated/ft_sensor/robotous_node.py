@@ -13,7 +13,7 @@ from gapbridge.drivers.simulated.ft_sensor.node import SimulatedSensor
 
 
 class RobotousNode(SimulatedSensor):
-    """Streams two frames a sample once it has been told to (0x0B), until told to stop (0x0C)."""
+    """Streams two frames a sample once it has been asked to (0x0B), until asked to stop (0x0C)."""
 
     def __init__(
         self,

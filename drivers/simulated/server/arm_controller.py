@@ -215,7 +215,7 @@ def make_controller(
 ) -> ArmController:
     """Return a peer at rest at `start_q` (n, rad) that is cycled every `period` s.
 
-    With `declare` the controller is told the plant's true TCP and payload.
+    With `declare` the controller is given the plant's true TCP and payload.
     """
     declared = Declared()
     if declare:

@@ -111,7 +111,7 @@ class BenchServer:
                 connection.send(self.answer(line).encode() + b"\n")
 
     def answer(self, line: str) -> str:
-        """Return the reply to one command; a mistake is told as ``error: ...``."""
+        """Return the reply to one command; a mistake is reported as ``error: ...``."""
         name, *arguments = line[:LONGEST_LINE].split()
         try:
             if name not in self._commands:

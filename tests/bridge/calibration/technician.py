@@ -145,6 +145,6 @@ class Terminal:
 
 
 def last_pose(shown: str) -> Array:
-    """Return the joints (n,), rad, that were told last."""
+    """Return the joints (n,), rad, that were commanded last."""
     line = next(part for part in reversed(shown.splitlines()) if "J1 " in part)
     return np.radians([float(v) for v in JOINT.findall(line)])

@@ -1,4 +1,4 @@
-"""A session that ends with the fit that its readings ask for: told, asked, fitted, written."""
+"""A session that ends with the fit that its readings ask for: reported, asked, fitted, written."""
 
 from __future__ import annotations
 

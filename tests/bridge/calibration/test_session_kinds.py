@@ -162,7 +162,7 @@ def test_files_that_the_trackers_software_exports(tmp_path: Path) -> None:
 
 @pytest.fixture
 def feed() -> Iterator[tuple[int, list[np.ndarray]]]:
-    """Serve lines: a connection that asks is told the next of the readings, as often as it asks."""
+    """Serve lines: a connection that asks gets the next of the readings, as often as it asks."""
     values: list[np.ndarray] = []
     with socket.create_server(("127.0.0.1", 0)) as server:
         thread = threading.Thread(target=_serve, args=(server, values), daemon=True)

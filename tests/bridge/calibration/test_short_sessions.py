@@ -85,5 +85,5 @@ def test_tool_only_finds_the_tip_by_touching_one_point(served: BenchHand, tmp_pa
         })  # fmt: skip
         assert terminal.code == 0, shown[-2000:]
     found = load_cell(new).model.tool_in_flange[:3, 3]
-    np.testing.assert_allclose(found, TRUE_TCP, atol=2e-3)  # the arm bends, which is not told
+    np.testing.assert_allclose(found, TRUE_TCP, atol=2e-3)  # the arm bends, which no reading shows
     assert list((tmp_path / "s").glob("*.html"))

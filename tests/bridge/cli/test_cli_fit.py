@@ -94,7 +94,7 @@ def test_a_fit_writes_no_tool_point_no_frame_and_exact_zeros(tmp_path: Path) -> 
     np.testing.assert_array_equal(fitted.tool_in_flange, deflected.tool_in_flange)
     axial, radial = fitted.compliance()
     reported = re.findall(
-        r"note: axial_compliance_(\d): not shown by these data, stays", answer.out
+        r"note: axial_compliance_(\d): not identifiable from these data, stays", answer.out
     )
     assert all(axial[int(joint) - 1] == 0.0 for joint in reported)
     assert all(v == 0 or v > 1e-9 for v in (*axial, *radial))

@@ -1,4 +1,4 @@
-"""What the service manager is told, and the unit that it runs."""
+"""What the service manager is notified of, and the unit that it runs."""
 
 from __future__ import annotations
 

@@ -169,7 +169,7 @@ def test_the_demo_shows_on_every_link_what_it_states(name: str, shown: dict[str,
     error, repeats = summary["tcp_error_mm"], summary["repeatability_mm"]
     assert summary["link"] == name
     assert error["without"]["rms"] > 20 * error["with"]["rms"]
-    # both floors are the link's and the arm's own; a few visits tell repeatability to a third
+    # both floors are the link's and the arm's own; a few visits determine repeatability to a third
     floor = np.hypot(repeats, summary["resolution_mm"])
     assert error["with"]["rms"] < 2.0 * floor
     assert 0.01 < repeats < 0.1

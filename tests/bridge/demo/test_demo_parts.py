@@ -123,7 +123,7 @@ def test_rests_take_what_was_measured_after_settling_and_nothing_else() -> None:
     readings = np.zeros((len(t), 7))
     readings[:, 0] = t
     readings[:, 1:4] = given["actual_q"][::5, :3]
-    flips = np.where(np.arange(len(t)) % 2, 1, -1)[:, None]  # one rotation, near pi, told two ways
+    flips = np.where(np.arange(len(t)) % 2, 1, -1)[:, None]  # one rotation, written two ways
     readings[:, 4:] = flips * [np.pi - 1e-9, 0, 0]
     found = rests(given, readings, poses)
     np.testing.assert_allclose(found.actual_q, poses, atol=1e-7)

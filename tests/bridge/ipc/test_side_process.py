@@ -26,16 +26,16 @@ ECHO = """
 
     order = take_order()
     reader = order.page.reader()
-    order.tell({"kind": "hello", "session": order.session, "extra": order.extra,
+    order.emit({"kind": "hello", "session": order.session, "extra": order.extra,
                 "cell": str(order.settings.cell), "n": order.n})
     while not order.events.closed:
         order.events.wait(0.05)
         for event in order.events.poll():
             event.pop("filling", None)
-            order.tell({"kind": "heard", "of": event})
+            order.emit({"kind": "heard", "of": event})
         rows = reader.drain()
         if len(rows):
-            order.tell({"kind": "rows", "timestamps": rows[:, 1].tolist()})
+            order.emit({"kind": "rows", "timestamps": rows[:, 1].tolist()})
     open(order.extra["last"], "w").write("finished")
 """
 DEAF = """
@@ -44,7 +44,7 @@ DEAF = """
 
     order = take_order()
     order.events.poll()
-    order.tell({"kind": "hello"})
+    order.emit({"kind": "hello"})
     time.sleep(1000)
 """
 

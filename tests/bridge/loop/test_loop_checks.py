@@ -1,4 +1,4 @@
-"""The checks of every cycle: what is dropped, what holds, what is told, and each only once."""
+"""The checks of every cycle: what is dropped, what holds, what is reported, and each only once."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def test_an_offset_at_its_limit_for_a_second_is_saturated_and_a_ramp_is_not() ->
 
 
 class Bench:
-    """Checks with a supervisor in a state, and what they have told."""
+    """Checks with a supervisor in a state, and what they have reported."""
 
     def __init__(self, page: Page, at: State) -> None:
         self.events: list[dict[str, Any]] = []
@@ -201,7 +201,7 @@ def test_while_only_observing_a_finding_is_reported_and_changes_nothing(page: Pa
 
 
 class Scripted(Driver):
-    """A driver that does what it is told to; no wire could be so exact about three in a row."""
+    """A driver that does what it is asked to; no wire could be so exact about three in a row."""
 
     def __init__(self) -> None:
         super().__init__(500.0, Model(ARM))

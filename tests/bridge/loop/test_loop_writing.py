@@ -43,7 +43,7 @@ MODEL = Model(builtin_arm("ur10e")).with_compliance([1e-6] * 6, [1e-6] * 6)
 
 
 class Failing(Driver):
-    """A driver whose writes fail as they are told to; no wire fails so exactly."""
+    """A driver whose writes fail as they are asked to; no wire fails so exactly."""
 
     def __init__(self) -> None:
         super().__init__(500.0, MODEL)

@@ -178,7 +178,7 @@ def test_a_daemon_that_is_gone_without_an_end_is_outlived_until_the_loop_has_sto
 ) -> None:
     recording.wait_for_file()
     assert recording.process.pid is not None
-    os.kill(recording.process.pid, signal.SIGTERM)  # as a service manager tells all at once
+    os.kill(recording.process.pid, signal.SIGTERM)  # as a service manager ends all at once
     recording.process.begin_close()  # as the system does when the daemon is killed
     time.sleep(1.0)
     count = publisher.end()

@@ -29,7 +29,7 @@ from gapbridge.core.model import Model
 
 KIND = ARMS["cobot5"]
 LAYOUT = Layout(poses=18, held_out=10, repeated=3)
-SEED = 6  # undamped steps came to rest 15 deviations away from it
+SEED = 6  # undamped steps converged 15 deviations away from it
 POSITION = make_observable("position")
 
 
@@ -96,7 +96,7 @@ def test_what_hangs_on_an_arm_weighs_nothing_or_more(parameters: Parameters) -> 
 def test_damping_shortens_what_two_parameters_hardly_separated_most() -> None:
     rng = np.random.default_rng(0)
     first, other = rng.normal(size=(2, 40))
-    J = np.column_stack([first, first + 1e-3 * other])  # their difference is hardly told
+    J = np.column_stack([first, first + 1e-3 * other])  # their difference is hardly determined
     system = System(J, np.zeros((40, 0)), J @ [3.0, -2.0])
     wide = Bounds(np.full(2, -np.inf), np.full(2, np.inf), np.full(2, 1e6), np.zeros(2))
     free = np.ones(2, dtype=bool)

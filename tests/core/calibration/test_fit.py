@@ -89,7 +89,7 @@ def test_an_instrument_that_moved_leaves_some_poses_to_verify_in_one_place_only(
     model: Model, parameters: Parameters, session: tuple[Readings, dict[str, float], Instrument],
     verified: str,
 ) -> None:  # fmt: skip
-    """Where it stands now is told by poses there, to verify or not; nothing breaks over it."""
+    """Where it stands now is found from poses there, to verify or not; nothing breaks over it."""
     readings = session[0]
     held, second = readings.held_out, np.zeros(len(readings), dtype=np.int64)
     second[np.flatnonzero(held if verified == "after it" else ~held)[-6:]] = 1

@@ -1,4 +1,4 @@
-"""The judgement: ties are told, weak accusations withdrawn, causes and losers accounted for."""
+"""The judgement: ties are reported, weak accusations withdrawn, causes and losers accounted for."""
 
 from __future__ import annotations
 

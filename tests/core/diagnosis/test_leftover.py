@@ -1,4 +1,4 @@
-"""The leftover: noise has no structure, structure is seen, and what it follows is named."""
+"""Residual structure: noise has none, structure is seen, and what it follows is named."""
 
 from __future__ import annotations
 

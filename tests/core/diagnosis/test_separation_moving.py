@@ -1,4 +1,4 @@
-"""What to record next: motions that tell apart what a slow recording leaves open."""
+"""What to record next: motions that separate what a slow recording leaves open."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Several sessions: frames and tool points of their own, effects shared, what changed is named.
 
-The truth comes from the blind benchmark's mechanics. What is told of a new session is compared with
-what the model leaves of further sessions, placed by code of this file.
+The truth comes from the blind benchmark's mechanics. What is reported of a new session is compared
+with what the model leaves of further sessions, placed by code of this file.
 """
 
 from __future__ import annotations

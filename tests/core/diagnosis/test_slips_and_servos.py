@@ -1,4 +1,4 @@
-"""Slips, droop and dead bands in a diagnosis: found, dated, told apart, and named where unseen."""
+"""Slips, droop and dead bands in a diagnosis: found, dated, separated, and named where unseen."""
 
 from __future__ import annotations
 

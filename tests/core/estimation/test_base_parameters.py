@@ -10,7 +10,7 @@ SIGMA = 1e-4  # rad/Nm, the prior's
 
 
 def problem(columns, values):
-    """Return a problem whose columns (M, 4) are told in units of the noise per prior sigma."""
+    """Return a problem whose columns (M, 4) are given in units of the noise per prior sigma."""
     columns = np.asarray(columns, dtype=float)
     return Linear(columns / SIGMA, columns / SIGMA @ (np.asarray(values) * SIGMA))
 
@@ -23,7 +23,7 @@ def chosen(linear, nonnegative=True):
 def test_what_has_columns_of_its_own_is_kept_and_the_empty_ones_are_held():
     kept, shown = chosen(problem(np.diag([50.0, 20.0, 0.0, 1.0]), [1, 1, 0, 0]))
     assert kept.tolist() == [True, True, False, False]
-    held = "not shown by these data, stays at the model's value"
+    held = "not identifiable from these data, stays at the model's value"
     assert shown.reported == (f"radial_compliance_1: {held}", f"radial_compliance_2: {held}")
     std = np.sqrt(np.diag(shown.covariance)) / SIGMA
     np.testing.assert_allclose(std[:2], [1 / 50, 1 / 20], rtol=2e-3)
@@ -37,7 +37,7 @@ def test_two_that_act_alike_are_carried_by_one_and_both_are_named():
     assert kept[[0, 2]].all()
     assert kept[1] != kept[3]
     assert len(shown.reported) == 1
-    assert "not shown alone by these data, it acts like +1.00 " in shown.reported[0]
+    assert "not identifiable alone from these data, it acts like +1.00 " in shown.reported[0]
     assert name(1, 4) in shown.reported[0]
     assert name(3, 4) in shown.reported[0]
 

@@ -1,4 +1,4 @@
-"""Flexibilities are found from poses and loads; intervals are honest, gaps in the data told."""
+"""Flexibilities are found from poses and loads; intervals are honest, gaps in the data reported."""
 
 import numpy as np
 import pytest
@@ -110,7 +110,7 @@ def test_outlier_readings_are_named_and_do_not_count():
     columns["measured_position"][outlier] += [0.003, -0.002, 0.004]
     found = identify_compliance(model_of(6), log_of(6, columns), KNOWN)
     assert found.outliers.tolist() == outlier
-    assert "3 wild reading(s) weighed down" in found.notes
+    assert "3 outlier(s) down-weighted" in found.notes
     assert found.remaining_rms < 1.2 * NOISE
     std = np.concatenate([found.std_axial, found.std_radial])
     assert (np.abs(np.concatenate([found.axial, found.radial]) - planted) < 5 * std).all()
@@ -131,7 +131,7 @@ def test_what_the_data_do_not_show_is_named():
     del columns["actual_TCP_force"]
     found = identify_compliance(model_of(6), log_of(6, columns), KNOWN)
     assert not found.identifiable[0]
-    reported = "axial_compliance_1: not shown by these data, stays at the model's value"
+    reported = "axial_compliance_1: not identifiable from these data, stays at the model's value"
     assert reported in found.combinations
     assert found.identifiable[1:3].all()
 
@@ -158,7 +158,7 @@ def test_what_the_data_do_not_show_stays_exactly_at_the_models_value(own):
 
 
 def test_of_a_sum_that_is_known_alone_one_member_carries_the_whole():
-    # as above, with an instrument too coarse to tell the shoulder's give from the base's tilt
+    # as above, with an instrument too coarse to separate the shoulder's give from the base's tilt
     planted, columns = truth(6, 40, 7, noise=2e-3, rotation=False, pull=0.0, still=(1, 2))
     found = identify_compliance(model_of(6), log_of(6, columns), KNOWN)
     both = found.identifiable[[1, 6]]
@@ -171,7 +171,7 @@ def test_of_a_sum_that_is_known_alone_one_member_carries_the_whole():
     assert abs(value - planted[1] - planted[6]) < 4 * std
     other = name(np.array([1, 6])[~both][0], 12)
     reported = next(line for line in found.combinations if line.startswith(other))
-    assert "not shown alone by these data, it acts like" in reported
+    assert "not identifiable alone from these data, it acts like" in reported
     assert name(carrier, 12) in reported
 
 
@@ -201,7 +201,7 @@ def test_a_tool_point_that_nobody_registered_is_found_along_and_costs_no_flexibi
 
 @pytest.mark.parametrize("metrology", [KNOWN, Metrology(sigma=NOISE)])
 def test_before_and_after_are_counted_alike(metrology):
-    # a model that is right already gains nothing, on seen and on unseen poses, wild ones left out
+    # a model that is right already gains nothing, on seen and on unseen poses, outliers left out
     planted, columns = truth(6, 60, 5, rotation=False)
     columns["measured_position"][[4, 33]] += [0.004, -0.003, 0.002]
     right = model_of(6).with_compliance(planted[:6], planted[6:])

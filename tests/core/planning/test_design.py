@@ -101,7 +101,7 @@ def test_more_poses_buy_less_uncertainty(planned: Plan) -> None:
     assert 12 in counts and len(counts) >= 4
     assert list(counts) == sorted(counts)
     assert list(std) == sorted(std, reverse=True)
-    # the second visits tell a little too
+    # the second visits determine a little too
     assert planned.expected.tcp_std < dict(planned.bought)[12]
 
 

@@ -52,7 +52,7 @@ class Listener:
 
 
 class Breaking:
-    """A bus whose sends fail when it is told so."""
+    """A bus whose sends fail when it is asked to."""
 
     def __init__(self, bus, fails):
         self._bus, self._fails = bus, fails

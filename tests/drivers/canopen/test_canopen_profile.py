@@ -1,4 +1,4 @@
-"""Profiles are data: the shipped ones are sound, and a wrong one is told with its line."""
+"""Profiles are data: the shipped ones are sound, and a wrong one is reported with its line."""
 
 from __future__ import annotations
 

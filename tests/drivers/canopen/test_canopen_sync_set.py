@@ -39,7 +39,7 @@ def test_a_set_is_given_only_when_each_pdo_came_once_and_whole(
     for cob_id, more in frames:
         collector.take(cob_id, bytes(LENGTHS.get(cob_id, 3) + more), 0.0)
     ours = [(cob_id, more) for cob_id, more in frames if cob_id in LENGTHS]
-    # what comes after the set was whole is told as a stray, not as a part of it
+    # what comes after the set was whole is reported as a stray, not as a part of it
     first = ours[: len(COB_IDS)]
     whole = sorted(cob_id for cob_id, _ in first) == sorted(COB_IDS) and not any(
         m for _, m in first

@@ -22,8 +22,8 @@ _ports = itertools.count(29900)
 class CanopenCase(Case):
     """Drives on a bus: their profile, their wire, half a count of the coarsest joint.
 
-    ``speed`` None: the drives tell none in a known unit, and positions of a plant that a busy
-    machine moves in bursts tell it badly.
+    ``speed`` None: the drives report none in a known unit, and positions of a plant that a busy
+    machine moves in bursts show it badly.
     """
 
     def __init__(

@@ -49,7 +49,8 @@ class Case(ABC):
     """A simulated controller served over its wire, and drivers for it.
 
     resolution: half a count of the joint angles, rad; speed_resolution the same, None where the
-    controller does not tell speeds; clocked: whether it tells a time of its own, so that a clock
+    controller does not report speeds; clocked: whether it reports a time of its own, so that a
+    clock
     that stands still can be noticed; force: half a count of the TCP force, N, None where there is
     none; writes: ``offset``, ``joints`` or None.
     """

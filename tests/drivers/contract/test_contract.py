@@ -81,7 +81,7 @@ def test_silence_is_stale_in_time(case: Case, driver: Driver) -> None:
 
 def test_a_clock_that_stands_still_is_stale(case: Case, driver: Driver) -> None:
     if not case.clocked:
-        assert not case.clocked, "nothing but arrival tells a sample's age here"
+        assert not case.clocked, "nothing but arrival shows a sample's age here"
         return
     check_frozen(case, driver)
 

@@ -17,7 +17,7 @@ PERIOD, APART = 0.005, 0.0003  # s between samples, between the frames of one
 
 
 def sample_of(k: int) -> tuple[int, ...]:
-    """Return six counts that tell which sample they are of, each of them."""
+    """Return six counts that identify which sample they are of, each of them."""
     k &= 0x7FFF
     return (k, -k, k ^ 0x2AAA, k, -k, k ^ 0x1555)
 

@@ -73,4 +73,4 @@ def test_a_outlier_reading_of_the_sensor_is_remarked(tmp_path):
     assert list(found.outliers) == [5]
     html, _ = read(write_payload(found, session(), tmp_path, nominal))
     assert "Found, see remarks" in html
-    assert "Weighed down as wild: reading 6." in html
+    assert "Down-weighted as outlier: reading 6." in html

@@ -20,7 +20,7 @@ ABOVE, LEFT, RIGHT = np.array([0.0, 2.0]), np.array([-1.0, 1.5]), np.array([1.0,
 
 
 def wall(q: np.ndarray) -> np.ndarray:
-    """Tell what is not in a wall between BEGIN and END, one unit high."""
+    """Report what is not in a wall between BEGIN and END, one unit high."""
     return np.asarray((np.abs(q[:, 0]) > 0.3) | (q[:, 1] > 1.0), dtype=float)
 
 

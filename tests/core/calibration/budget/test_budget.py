@@ -96,7 +96,7 @@ def test_one_blunder_is_named_and_no_uncertainty():
     error = np.vstack([good.after.vector, held])
     found = budget(hand_made(error, held_out=HELD), Stated())
     assert found.combined < 1e-4
-    assert "without wild ones (reading 25)" in named(found, "what the model").source
+    assert "without outliers (reading 25)" in named(found, "what the model").source
     assert found.looked_at == 27
 
 

@@ -1,4 +1,4 @@
-"""Wild readings: a tracker's glitch is set aside and told, and becomes no cause."""
+"""Outliers: a tracker's glitch is excluded and reported, and becomes no cause."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def test_glitches_become_no_cause_and_are_reported_with_their_rows(effect, regis
     assert [c.effect for c in channel.causes] == ([] if effect == "none" else [effect])
     assert not channel.structured
     assert set(np.flatnonzero(~channel.selection.kept)) == set(GLITCHES)
-    (reported,) = [f for f in found.findings if "wild" in f]
-    assert "2 wild reading(s) set aside (row 13, 42 of the file)" in reported
+    (reported,) = [f for f in found.findings if "outlier" in f]
+    assert "2 outlier(s) excluded (row 13, 42 of the file)" in reported
     assert channel.remaining_rms_held_out == pytest.approx(small.FLOOR, rel=0.2)
     assert channel.gap_max < 2e-3  # the glitches are no part of the gap
 
@@ -45,7 +45,7 @@ def test_parameters_are_those_without_the_glitches():
 
 
 def test_a_third_of_the_readings_is_no_bad_luck():
-    """What befalls every third pose is a gap, not wild readings."""
+    """What befalls every third pose is a gap, not outliers."""
     rows = np.arange(0, 60, 3)
     rng = np.random.default_rng(0)
     found = with_glitches("none", dict(zip(rows, rng.normal(0, 3e-3, (20, 3)), strict=True)))
