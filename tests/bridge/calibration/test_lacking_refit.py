@@ -55,8 +55,10 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Played]:
 def test_what_is_missing_is_offered_and_fitted_on_a_yes(ended: tuple[Path, Played]) -> None:
     folder, played = ended
     assert played.code == 0, played.err
-    assert "not complete: to be added" in played.out
-    assert "ask for transmission_error_2 as well. Fit again with it?" in played.out
+    assert "poses ask for transmission_error_2 as well. Fit again with it?" in played.out
+    offered, judged = played.out.index("Fit again"), played.out.index("poses to verify:")
+    assert offered < judged  # the held-out poses are looked at once, by what is written
+    assert played.out.count("poses to verify:") == 1
     found = [t for t in load_cell(folder / "new.yaml").model.terms if t.effect == WAVE.effect]
     second = next(t for t in found if t.site == WAVE.site)
     assert second.values == pytest.approx(WAVE.values, abs=1.2e-4)
