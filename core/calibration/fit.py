@@ -33,7 +33,7 @@ TELLING = 1.0  # usual sizes: a parameter that is known no better counts as not 
 TCP_STEP = 1e-3  # share of a parameter's scale, for derivatives of the predicted TCP
 
 
-def calibrate(
+def calibrate(  # noqa: PLR0913 (the public call: what is left out has its default)
     model: Model,
     readings: Readings,
     parameters: Parameters,

@@ -16,7 +16,12 @@ from gapbridge.drivers.simulated.plant.motion import Hold, Stop
 from gapbridge.drivers.simulated.plant.plant_settings import Vector6
 from gapbridge.drivers.simulated.server.arm_controller import BRAKING, HOLD, ArmController
 from gapbridge.drivers.simulated.server.bench import BenchError
-from gapbridge.drivers.simulated.ur.offset_program import NOTHING, SHIFT_STEP, TURN_STEP, approach
+from gapbridge.drivers.simulated.ur.programs.offset_program import (
+    NOTHING,
+    SHIFT_STEP,
+    TURN_STEP,
+    approach,
+)
 
 log = logging.getLogger("drivers.simulated")
 
@@ -100,8 +105,8 @@ class MailboxProgram:
         self._apply(controller)
 
     def _take(self, words: list[int], dt: float) -> None:
-        *body, checksum = words
-        if encode.checksum(body) != checksum:
+        *body, reported_value = words
+        if encode.checksum(body) != reported_value:
             self._state = encode.REJECTED if any(words) else encode.EXPIRED
             self._silent += dt
         else:
