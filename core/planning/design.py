@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from gapbridge.core.calibration.observables.nuisance import Layout
 from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.plan import Payload, Plan
@@ -82,6 +83,7 @@ def _planned(
     emit: Progress,
 ) -> Plan:
     loads = _in_order(parameters, loads)
+    _require_numbers(parameters, observable, wish)
     emit("looking for poses", 0.0)
     space = replace(space, hung=(*space.hung, *(far_end(load) for load in loads)))
     found = candidates_of(parameters, observable, loads, space, wish.seed, wish.stops)
@@ -140,16 +142,30 @@ def far_end(load: Payload) -> tuple[float, float, float]:
     return (2 * load.cog[0], 2 * load.cog[1], 2 * load.cog[2])
 
 
+def _require_numbers(parameters: Parameters, observable: Observable, wish: Wish) -> None:
+    """Raise PlanError where the poses give no more numbers than there are unknowns.
+
+    Arithmetic, before any pose is looked for: the instrument is counted as standing at one place.
+    """
+    frame = () if observable.registered and not observable.unknown else observable.frame
+    layout = Layout(1, 1, frame, observable.free_length, observable.first_target)
+    _require(len(parameters) + layout.size, observable, wish)
+
+
+def _require(unknown: int, observable: Observable, wish: Wish) -> None:
+    needed = unknown // observable.equations + 1
+    if wish.poses < needed:
+        raise PlanError(
+            f"too few poses: found {wish.poses}, expected at least {needed}: {unknown} unknowns, "
+            f"{observable.equations} number(s) a {observable.kind} reading; plan more poses or "
+            "ask for fewer effects"
+        )
+
+
 def _require_enough(
     parameters: Parameters, observable: Observable, found: Candidates, wish: Wish
 ) -> None:
-    unknown = len(parameters) + observable.layout(found.readings).size
-    needed = -(-unknown // observable.equations)
-    if wish.poses < needed:
-        raise PlanError(
-            f"poses: found {wish.poses}, expected at least {needed}: {unknown} unknowns, "
-            f"{observable.equations} number(s) a {observable.kind} reading"
-        )
+    _require(len(parameters) + observable.layout(found.readings).size, observable, wish)
     if len(found.readings) < wish.poses + wish.held_out:
         raise PlanError(
             f"poses: {len(found.readings)} can be reached and seen, expected at least "

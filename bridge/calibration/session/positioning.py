@@ -50,7 +50,7 @@ class Bringing:
             f"place {number + 1} · {self._instrument.stands} at about ({at}) m in base",
             "bold cyan",
         )
-        self.talk.ask("  Enter when it stands there")
+        self.talk.enter("  Enter when it stands there")
 
     def mount(self, load: int) -> None:
         """Have a load mounted, and ask whether the arm may be driven with it."""
@@ -76,7 +76,7 @@ class Bringing:
             self.talk.say("  it hangs on the flange, and nothing touches it?")
         else:
             self.talk.say("  hang it on the flange, and enter its mass and centre")
-        self.talk.ask("  Enter when it hangs there")
+        self.talk.enter("  Enter when it hangs there")
         self.book.add("mounted", load=load)
 
     def bring(self, pose: PlannedPose) -> Stand | None:
@@ -136,7 +136,7 @@ class Bringing:
             try:
                 if not self.joints.watches:
                     if isinstance(self.joints, PlannedJoints) and not self._instrument.waits:
-                        self.talk.ask("  Enter when it stands there")
+                        self.talk.enter("  Enter when it stands there")
                     return self.joints.stand(pose)
                 found = self.joints.arrived(pose)
                 if found is None:
@@ -152,6 +152,9 @@ class Bringing:
         heard = self.talk.ask_unless(question, lambda: self.joints.arrived(pose))
         if isinstance(heard, Stand):
             return heard
+        if heard:
+            self.talk.say(f"  found {heard!r}, expected Enter, or a word of the session (`?`)")
+            return None
         now = self.joints.now()
         if now is None:
             return None
@@ -176,11 +179,11 @@ class Bringing:
                 f"the controller believes that {told:g} kg hang on the flange, the plan {meant:g} "
                 "kg: is the right load mounted, and the controller informed?"
             )
-            self.talk.ask("  Enter when it is put right")
+            self.talk.enter("  Enter when it is put right")
         elif stand.wrench is not None and np.linalg.norm(stand.wrench[:3]) > PULL:
             self._warned.add(pose.load)
             self.talk.warn(
                 f"the controller feels {np.linalg.norm(stand.wrench[:3]):.0f} N at the tool: is "
                 "the right load mounted, and nothing touching it?"
             )
-            self.talk.ask("  Enter when it is put right")
+            self.talk.enter("  Enter when it is put right")

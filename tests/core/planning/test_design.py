@@ -252,3 +252,11 @@ def test_a_load_that_shows_nothing_is_named(parameters: Parameters, space: Space
     idle = [note for note in planned.notes if "need not be hung" in note]
     assert ("0.01 kg" in str(idle)) == (0.01 not in hung)
     assert 4.0 in hung
+
+
+def test_too_few_poses_are_said_before_any_is_looked_for(
+    parameters: Parameters, space: Space, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gapbridge.core.planning.design.candidates_of", None)
+    with pytest.raises(PlanError, match="too few poses: found 3, expected at least"):
+        plan(parameters, POSITION, LOADS, space, poses=3)

@@ -41,8 +41,10 @@ def _caption(material: Material) -> str:
     if material.wild:
         text += " The table counts outliers too."
     if len(material.axes) > 1:
-        noise = mm(material.calibration.noise)
-        text += f" Arm and instrument together scatter by {noise} along an axis (1 sigma)."
+        c = material.calibration
+        text += f" The fit leaves {mm(c.noise)} along an axis (1 sigma)"
+        known = np.isfinite(c.noise_floor)
+        text += f", arm and instrument alone {mm(c.noise_floor)}." if known else "."
     return text
 
 

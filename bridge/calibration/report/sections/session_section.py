@@ -64,13 +64,20 @@ def _front(facts: SessionFacts) -> list[tuple[str, str]]:
         low, high = facts.temperature
         temperature = f"{plain(low)} °C at the start, {plain(high)} °C at the end"
     given = [
-        ("customer", facts.customer), ("cell", facts.cell), ("arm", facts.arm),
+        ("report", facts.number), ("software", facts.version and f"Gapbridge {facts.version}"),
+        ("customer", facts.customer), ("cell", facts.cell),
+        ("SHA-256 of the cell file", _grouped(facts.cell_sha256)), ("arm", facts.arm),
         ("serial number", facts.serial), ("place", facts.place),
         ("measured", f"{start:%Y-%m-%d %H:%M} to {last} ({minutes} min)"),
         ("by", facts.operator), ("air", temperature), ("surroundings", facts.environment),
         ("data", str(facts.folder)),
     ]  # fmt: skip
     return [(name, text) for name, text in given if text]
+
+
+def _grouped(digest: str) -> str:
+    """Return a digest in groups, so that it can be read aloud and breaks over lines."""
+    return " ".join(digest[i : i + 8] for i in range(0, len(digest), 8))
 
 
 def _instrument(facts: SessionFacts, stations: int) -> list[tuple[str, str]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from gapbridge.bridge.calibration.report.figures import mm
 from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.calibration.report.names import sentence
@@ -18,6 +20,8 @@ from gapbridge.bridge.document.blocks import (
 )
 from gapbridge.bridge.document.section import Section
 from gapbridge.bridge.report.words import listed
+
+FEWEST_HELD_OUT = 8  # poses kept out of the fit by which an accuracy can be decided
 
 
 class Summary(Section[Material]):
@@ -52,7 +56,31 @@ class Summary(Section[Material]):
                 f" Among them {'is reading' if len(wild) == 1 else 'are readings'} {rows}, far "
                 "beyond all others: to be measured again. The uncertainty does not count it."
             )
-        return [Verdict(badge, sentence(c.verdict)), Tiles(tuple(tiles)), Paragraph(text, "note")]
+        asked = [] if material.session.accuracy is None else [_asked(material)]
+        return [
+            Verdict(badge, sentence(c.verdict)), *asked, Tiles(tuple(tiles)),
+            Paragraph(text, "note"),
+        ]  # fmt: skip
+
+
+def _asked(material: Material) -> Verdict:
+    """Return whether the accuracy asked for is met: by the farthest pose kept out of the fit."""
+    asked = material.session.accuracy or 0.0
+    after = material.calibration.held_out_after
+    poses = len(np.unique(material.calibration.readings.pose[after.rows]))
+    rule = f"Asked for: no pose kept out of the fit farther off than {mm(asked)}."
+    if poses < FEWEST_HELD_OUT or not material.shows_places:
+        found = (
+            f"{poses} such poses were measured, expected {FEWEST_HELD_OUT} or more"
+            if material.shows_places else "such readings show a part of where the tool is"
+        )  # fmt: skip
+        return Verdict(Badge("Not decided", DOUBTFUL), f"{rule} Not decided: {found}.")
+    met = after.max <= asked
+    word = Badge("Pass", GOOD) if met else Badge("Fail", BAD)
+    text = (
+        f"{rule} Found: at most {mm(after.max)} over {poses} poses, the instrument's noise in it."
+    )
+    return Verdict(word, text)
 
 
 def _times(before: float, after: float) -> str:
