@@ -18,12 +18,17 @@ from gapbridge.bridge.calibration.jobs.job import Job, write_document
 from gapbridge.bridge.calibration.jobs.log_of import write_log
 from gapbridge.bridge.calibration.planning import metrology_of, planned
 from gapbridge.bridge.calibration.session.pace import seconds_left
+from gapbridge.bridge.document.provenance import fitted as fitted_on
+from gapbridge.bridge.document.provenance import provenance
 from gapbridge.core.calibration.fit import SessionFit
 from gapbridge.core.calibration.lacking import Lack
 from gapbridge.core.calibration.plan import Plan
 from gapbridge.core.calibration.promise import document_of
 from gapbridge.core.calibration.result import Errors
+from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.calibration.telling import unsupported
+from gapbridge.core.log.log import read_log
+from gapbridge.core.ranges import range_of
 
 Array = NDArray[np.float64]
 REFITS = 3  # times at most that the readings may ask for more
@@ -147,7 +152,11 @@ class WholeJob(Job):
             self.book.add("ended", applied=None)
             talk.warn(why)
             return
-        target = self.hand_over(found.model, "the calibrated cell")
+        log = read_log(folder / "readings.csv", self.cell.arm.n)
+        spread = Spread(tuple(e.name for e in found.estimates), found.whole_covariance)
+        origin = provenance({"log": [folder / "readings.csv"], "cell": [self.cell.path]})
+        sections = {"provenance": fitted_on(origin, range_of(log), spread)}
+        target = self.hand_over(found.model, "the calibrated cell", sections)
         if target is not None:
             write_document(promise_beside(target), promise)
             talk.say(f"  months later: gapbridge calibrate {target} --verify")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from gapbridge.bridge.api.found_spread import spread_of
 from gapbridge.bridge.cell import Cell, save_cell
 from gapbridge.bridge.cell.opened_log import open_log
 from gapbridge.bridge.cli.log.answer import answer
@@ -30,6 +31,7 @@ from gapbridge.core.effects import effect_named
 from gapbridge.core.errors import InputError, LogError
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
+from gapbridge.core.ranges import range_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -120,7 +122,8 @@ def diagnose(
         write_text(json_file, text)
     if new_cell is not None:
         applied = found.with_stand_ins if stand_ins else found.model
-        save_cell(given, new_cell, applied, {"provenance": fitted(origin, rows)})
+        spread = spread_of(found).beside(given.spread)
+        save_cell(given, new_cell, applied, {"provenance": fitted(origin, range_of(rows), spread)})
     written = [] if out is None else _write_folder(out, text, found, given, rows)
     for file in (*written, json_file, new_cell):
         if file is not None:

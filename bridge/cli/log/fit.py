@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +22,8 @@ from gapbridge.bridge.cli.options import (
 )
 from gapbridge.bridge.cli.progress import progress, status
 from gapbridge.bridge.document.output_file import require_writable
-from gapbridge.bridge.document.provenance import provenance
+from gapbridge.bridge.document.provenance import fitted, provenance
+from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.estimation.identification import Identification, identify_compliance
 from gapbridge.core.estimation.streamed import identify_streamed
@@ -59,7 +60,8 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
         found, ranges = _identified(logs, given, metrology)
     except ExcitationError as error:
         raise ExcitationError(f"{', '.join(map(str, logs))}: {error}") from None
-    origin = provenance({"log": logs, "cell": [cell]}) | {"fitted": ranges}
+    spread = Spread.of_fit(found.identifiable, found.covariance).beside(given.spread)
+    origin = fitted(provenance({"log": logs, "cell": [cell]}), ranges, spread)
     # frame and tool point that were estimated along stay out of the cell
     model = given.model.with_compliance(found.axial, found.radial)
     save_cell(given, out, model, {"provenance": origin})
@@ -69,7 +71,7 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
 
 def _identified(
     paths: Sequence[Path], cell: Cell, metrology: Metrology
-) -> tuple[Identification, dict[str, list[float]]]:
+) -> tuple[Identification, dict[str, tuple[float, float]]]:
     """Return what the logs show, and the ranges fitted on; one of many rows passes in pieces."""
     if (
         len(paths) == 1
@@ -79,14 +81,10 @@ def _identified(
         log = LargeLog(paths[0], cell)
         with status("fitting") as tell_step:
             found = identify_streamed(cell.model, log, metrology, progress=tell_step)
-        return found, _listed(merged(range_of(piece) for piece in log))
+        return found, merged(range_of(piece) for piece in log)
     rows = open_logs(paths, cell)
     with progress("fitting"):
-        return identify_compliance(cell.model, rows, metrology), _listed(range_of(rows))
-
-
-def _listed(ranges: Mapping[str, tuple[float, float]]) -> dict[str, list[float]]:
-    return {name: list(ends) for name, ends in ranges.items()}
+        return identify_compliance(cell.model, rows, metrology), range_of(rows)
 
 
 def print_identification(found: Identification) -> None:

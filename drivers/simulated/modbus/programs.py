@@ -105,8 +105,8 @@ class MailboxProgram:
         self._apply(controller)
 
     def _take(self, words: list[int], dt: float) -> None:
-        *body, checksum = words
-        if encode.checksum(body) != checksum:
+        *body, reported_value = words
+        if encode.checksum(body) != reported_value:
             self._state = encode.REJECTED if any(words) else encode.EXPIRED
             self._silent += dt
         else:

@@ -71,3 +71,18 @@ def test_the_cell_that_comes_of_it_predicts_the_arm(ended: tuple[Path, Played]) 
     predicted = there(plan, load_cell(folder / "new.yaml").model)
     off = np.linalg.norm(register(there(plan), predicted).in_base(there(plan)) - predicted, axis=1)
     assert off.max() < 1e-4
+
+
+@pytest.mark.slow
+def test_the_cell_says_where_it_comes_from_and_how_well_it_is_known(
+    ended: tuple[Path, Played],
+) -> None:
+    folder, _ = ended
+    cell = load_cell(folder / "new.yaml")
+    origin = cell.file.provenance
+    assert origin is not None
+    assert origin.command == "calibrate"
+    assert {file.role for file in origin.files} == {"log", "cell"}
+    assert "transmission_error_2_order2_cos" in " ".join(cell.spread.names)
+    std = cell.spread.position_std(cell.model, np.array([p.q for p in plan_in(folder / "s").poses]))
+    assert 0 < std.max() < 2e-4

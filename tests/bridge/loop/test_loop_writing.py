@@ -216,7 +216,7 @@ def test_a_process_that_was_stopped_after_the_judgement_sends_nothing_old(bench:
     assert len(bench.driver.sent) == sent + 1
 
 
-def test_a_process_that_was_stopped_while_it_sent_says_so_and_ends_the_motion(
+def test_a_process_that_was_stopped_while_it_sent_reports_so_and_ends_the_motion(
     bench: Bench,
 ) -> None:
     bench.driver._send = lambda _: time.sleep(0.03)  # type: ignore[method-assign]

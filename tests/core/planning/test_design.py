@@ -258,5 +258,5 @@ def test_too_few_poses_are_said_before_any_is_looked_for(
     parameters: Parameters, space: Space, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gapbridge.core.planning.design.candidates_of", None)
-    with pytest.raises(PlanError, match="too few poses: found 6, expected at least"):
-        plan(parameters, POSITION, LOADS, space, poses=6)
+    with pytest.raises(PlanError, match="too few poses: found 3, expected at least"):
+        plan(parameters, POSITION, LOADS, space, poses=3)
