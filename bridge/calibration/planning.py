@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gapbridge.bridge.calibration.options import Order
+from gapbridge.bridge.calibration.options import SessionOptions
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.settings.calibration import (
     BoxEntry,
@@ -69,9 +69,9 @@ def loads_of(cell: Cell) -> tuple[Payload, ...]:
     return tuple(Payload(e.mass, _three(e.cog), e.name) for e in entries)
 
 
-def planned(cell: Cell, order: Order, tell: Callable[[str, float], None]) -> Plan:
+def planned(cell: Cell, options: SessionOptions, tell: Callable[[str, float], None]) -> Plan:
     """Return the plan of a whole session. Raises InputError where there can be none."""
-    given, instrument = cell.calibration, order.instrument
+    given, instrument = cell.calibration, options.instrument
     space = space_of(cell, instrument.measures)
     observable = observable_of(cell, instrument, max(len(space.places), 1))
     return plan(
@@ -80,10 +80,10 @@ def planned(cell: Cell, order: Order, tell: Callable[[str, float], None]) -> Pla
         loads_of(cell),
         space,
         Wish(
-            poses=order.poses or given.poses,
+            poses=options.poses or given.poses,
             held_out=given.held_out,
             repeats=given.repeats,
-            seed=order.seed,
+            seed=options.seed,
             sigma=float(np.hypot(instrument.sigma or cell.metrology.sigma,
                                  cell.metrology.repeatability or REPEATABILITY)),
         ),

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Stand:
+class JointSample:
     """The arm at rest; a field that nobody reports is None."""
 
     q: Array  # (n,) rad
@@ -43,7 +43,7 @@ class JointSource(ABC):
     def close(self) -> None:
         """Let go. Never raises."""
 
-    def arrived(self, pose: PlannedPose) -> Stand | None:
+    def arrived(self, pose: PlannedPose) -> JointSample | None:
         """Return where the arm rests, once it does so near the pose; None before."""
         return None
 
@@ -52,10 +52,10 @@ class JointSource(ABC):
         return None
 
     @abstractmethod
-    def stand(self, pose: PlannedPose) -> Stand:
+    def stand(self, pose: PlannedPose) -> JointSample:
         """Return where the arm stands, at rest. Raises ReadingError where it does not."""
 
-    def still(self, stand: Stand) -> bool:
+    def still(self, stand: JointSample) -> bool:
         """Return whether the arm has not moved since."""
         return True
 
@@ -79,9 +79,9 @@ class JointSource(ABC):
 class PlannedJoints(JointSource):
     """The arm's own program brings it exactly to the planned poses."""
 
-    def stand(self, pose: PlannedPose) -> Stand:
+    def stand(self, pose: PlannedPose) -> JointSample:
         """Return the planned joints."""
-        return Stand(pose.q)
+        return JointSample(pose.q)
 
 
 class TypedJoints(JointSource):
@@ -90,7 +90,7 @@ class TypedJoints(JointSource):
     def __init__(self, ask: Ask, seated: bool = False) -> None:
         self._ask, self._seated = ask, seated
 
-    def stand(self, pose: PlannedPose) -> Stand:
+    def stand(self, pose: PlannedPose) -> JointSample:
         """Return what is typed; Enter alone: exactly as planned. Raises ReadingError.
 
         Where the tool is ``seated`` by hand the joints are the reading, and Enter reports none.
@@ -101,10 +101,10 @@ class TypedJoints(JointSource):
         if not line and self._seated:
             raise ReadingError("found nothing, expected where the arm stands now, in degrees")
         if not line:
-            return Stand(pose.q)
+            return JointSample(pose.q)
         given = np.array(numbers(line, n, "deg"))
         if np.abs(given).max() > 720.0:
             raise ReadingError(f"found {np.abs(given).max():g} deg, expected at most two turns")
         if np.abs(given).max() < 2.0 * np.pi and np.abs(given - pose.q).max() < 0.1:
             raise ReadingError("found what look like radians, expected degrees")
-        return Stand(np.radians(given))
+        return JointSample(np.radians(given))

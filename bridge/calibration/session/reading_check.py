@@ -202,7 +202,7 @@ def _calm(left: Array) -> Array:
     return np.asarray(1 / np.sqrt(1 + (np.linalg.norm(left, axis=1) / CALM) ** 2))
 
 
-class Foresight:
+class ReadingCheck:
     """Judges readings of one session; cheap enough to be asked after each."""
 
     def __init__(

@@ -20,7 +20,7 @@ _VECTORS = ("q", "value", "approach", "temperature", "wrench", "raw_wrench")
 
 
 @dataclass(frozen=True)
-class Taken:
+class Reading:
     """What was measured at one stop."""
 
     stop: int  # number in the plan's poses, from 0
@@ -45,7 +45,7 @@ class Taken:
         return {k: v for k, v in asdict(self).items() if v is not None and k != "time"}
 
     @classmethod
-    def of(cls, entry: dict[str, Any]) -> Taken:
+    def of(cls, entry: dict[str, Any]) -> Reading:
         """Return what an entry of the journal holds."""
         known = {k: v for k, v in entry.items() if k in cls.__dataclass_fields__}
         for name in _VECTORS:
@@ -56,13 +56,13 @@ class Taken:
 
 
 @dataclass
-class Book:
+class Session:
     """A session in memory; everything that changes it goes through its journal first."""
 
     journal: Journal
     begun: Entry = field(default_factory=dict)  # the first entry
     plan: Plan | None = None
-    taken: list[Taken] = field(default_factory=list)
+    taken: list[Reading] = field(default_factory=list)
     undone: int = 0
     skipped: set[int] = field(default_factory=set)
     mounted: int | None = None  # load that hangs on the flange
@@ -75,12 +75,12 @@ class Book:
     seconds: list[float] = field(default_factory=list)  # between a reading and the one before
 
     @classmethod
-    def of(cls, journal: Journal) -> Book:
+    def of(cls, journal: Journal) -> Session:
         """Return where the session of an open journal stands."""
-        book = cls(journal)
+        session = cls(journal)
         for entry in journal.entries:
-            book.apply(entry)
-        return book
+            session.apply(entry)
+        return session
 
     def add(self, kind: str, **told: Any) -> None:
         """Write an entry, then act on it."""
@@ -101,7 +101,7 @@ class Book:
         self.plan = plan_of(entry["plan"])
 
     def _reading(self, entry: Entry) -> None:
-        found = Taken.of(entry)
+        found = Reading.of(entry)
         if self.taken and found.time - self.taken[-1].time > 0.0:
             self.seconds.append(found.time - self.taken[-1].time)
         self.taken.append(found)
@@ -166,7 +166,7 @@ class Book:
         found = self.readings(kind)
         return replace(found, station=np.unique(found.station, return_inverse=True)[1])
 
-    def readings(self, kind: str, taken: list[Taken] | None = None) -> Readings:
+    def readings(self, kind: str, taken: list[Reading] | None = None) -> Readings:
         """Return readings (default: all that stand) as the calibration takes them."""
         assert self.plan is not None
         rows = self.taken if taken is None else taken
@@ -199,16 +199,16 @@ class Book:
         self.add("plan", plan=plan_entry(plan))
 
 
-_ACTIONS: dict[str, Callable[[Book, Entry], None]] = {
-    "begun": Book._begun,
-    "plan": Book._plan,
-    "reading": Book._reading,
-    "rejected": Book._rejected,
-    "undo": Book._undo,
-    "skip": Book._skip,
-    "mounted": Book._mounted,
-    "moved": Book._moved,
-    "note": Book._note,
-    "ended": Book._ended,
+_ACTIONS: dict[str, Callable[[Session, Entry], None]] = {
+    "begun": Session._begun,
+    "plan": Session._plan,
+    "reading": Session._reading,
+    "rejected": Session._rejected,
+    "undo": Session._undo,
+    "skip": Session._skip,
+    "mounted": Session._mounted,
+    "moved": Session._moved,
+    "note": Session._note,
+    "ended": Session._ended,
 }
 """Kind of an entry -> what it does to the session."""

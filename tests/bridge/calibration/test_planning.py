@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from played import FRAME, plan_in, play, positions, typed, write_cell
 
-from gapbridge.bridge.calibration.options import Order
+from gapbridge.bridge.calibration.options import SessionOptions
 from gapbridge.bridge.calibration.planning import planned, space_of
 from gapbridge.bridge.calibration.session.journal import FILE, read_entries
 from gapbridge.bridge.cell import load_cell
@@ -27,8 +27,8 @@ def cell_with(folder: Path, *lines: str, **changed: object) -> Path:
 
 def plan_with(folder: Path, *lines: str, **changed: object) -> tuple[Plan, Model]:
     cell = load_cell(cell_with(folder, *lines, **changed))
-    order = Order("whole", None, cell.calibration.instrument)
-    return planned(cell, order, lambda text, share: None), cell.model
+    options = SessionOptions("whole", None, cell.calibration.instrument)
+    return planned(cell, options, lambda text, share: None), cell.model
 
 
 def test_poses_that_turn_the_reflector_away_are_not_planned(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gapbridge.bridge.calibration.session.first_readings import first_doubt
-from gapbridge.bridge.calibration.session.reading_check import Foresight, Verdict
+from gapbridge.bridge.calibration.session.reading_check import ReadingCheck, Verdict
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.calibration.parameters import DEFAULT
 from gapbridge.core.calibration.plan import Payload
@@ -57,7 +57,7 @@ def judged(
     readings: Readings, metrology: Metrology = METROLOGY, typed: bool = True, joints: bool = False
 ) -> Verdict:
     """Judge the last of some readings by those before it."""
-    found = Foresight(NOMINAL, metrology, "position", metrology.sigma, DEFAULT, LOADS)
+    found = ReadingCheck(NOMINAL, metrology, "position", metrology.sigma, DEFAULT, LOADS)
     last = np.arange(len(readings)) == len(readings) - 1
     return found.judge(readings[~last], readings[last], typed, joints)
 
@@ -71,7 +71,7 @@ def with_last(readings: Readings, value: list[float] | np.ndarray) -> Readings:
 @pytest.mark.parametrize("registered", [True, False])
 def test_good_readings_are_not_rejected(registered: bool) -> None:
     metrology = replace(METROLOGY, registered=registered)
-    found = Foresight(NOMINAL, metrology, "position", 2e-5, DEFAULT, LOADS)
+    found = ReadingCheck(NOMINAL, metrology, "position", 2e-5, DEFAULT, LOADS)
     seen = []
     for seed in range(3):
         readings = session(12, seed, registered)
