@@ -17,7 +17,7 @@ import psutil
 from benchmarks.faults.punctual import go_first
 from benchmarks.faults.running import Event, SourceStatus
 from gapbridge.bridge.cell import load_cell
-from gapbridge.bridge.ipc.shared_memory import NAME, Page
+from gapbridge.bridge.ipc.shared_memory import NAME, SharedMemory
 from gapbridge.bridge.loop.supervisor import State
 
 CODE = """
@@ -42,7 +42,7 @@ class ProcessRun(SourceStatus):
         self.events: list[Event] = []
         self.error: BaseException | None = None
         self.output = ""
-        self._page: Page | None = None
+        self._page: SharedMemory | None = None
         self._looked = 0.0  # s, monotonic: when the newest page was last looked for
         self._process: subprocess.Popen[str] | None = None
 
@@ -66,12 +66,12 @@ class ProcessRun(SourceStatus):
             except ValueError:
                 self.output += line
 
-    def _join(self, until: float) -> Page:
+    def _join(self, until: float) -> SharedMemory:
         """Return the newest page of the daemon; raises TimeoutError where there is none."""
         while time.monotonic() < until:
             found = self._newest()
             if found is not None:
-                return Page(self._n, found, writable=False)
+                return SharedMemory(self._n, found, writable=False)
             if not self.alive:
                 break
             time.sleep(0.02)
@@ -89,14 +89,14 @@ class ProcessRun(SourceStatus):
         return None
 
     @property
-    def page(self) -> Page:
+    def page(self) -> SharedMemory:
         """Return the shared page of the run's newest loop."""
         assert self._page is not None
         now = time.monotonic()
         if now - self._looked > LOOK_EVERY:
             self._looked = now
             if (fd := self._newest()) is not None:
-                self._page = Page(self._n, fd, writable=False)
+                self._page = SharedMemory(self._n, fd, writable=False)
         return self._page
 
     @property

@@ -23,7 +23,7 @@ class RereadSettings:
         self.settings = settings
         self._hash = None if text is None else hashlib.sha256(text.encode()).hexdigest()
 
-    def hear(self, event: dict[str, Any]) -> bool:
+    def on_event(self, event: dict[str, Any]) -> bool:
         """Take note of an event; returns whether the settings are others now."""
         if event.get("kind") == "configuration" and event.get("ok"):
             reported = event.get("hash")

@@ -33,7 +33,7 @@ from gapbridge.bridge.document.output_file import private
 from gapbridge.bridge.ipc.command_page import Command, CommandPage
 from gapbridge.bridge.ipc.control_socket import ControlSocket
 from gapbridge.bridge.ipc.counts import DROPPED
-from gapbridge.bridge.ipc.events import Event, EventBook
+from gapbridge.bridge.ipc.events import Event, EventLog
 from gapbridge.bridge.ipc.shared_memory import Phase, RunPage
 from gapbridge.bridge.loop.loop import LONGEST_STOP, Exit
 from gapbridge.bridge.loop.setpoint_stream import longest_withdrawal
@@ -78,14 +78,14 @@ class Daemon:
         self._output: IO[bytes] | int = subprocess.DEVNULL  # of all processes of the run
         self.sides = Sides()
         self.tally = Tally(n, settings.link.rate)
-        listeners = [self._hear, self.sides.tell]
-        self.book = EventBook(*listeners, *([log] if log else []))
+        listeners = [self._on_event, self.sides.tell]
+        self.event_log = EventLog(*listeners, *([log] if log else []))
         self._posted: queue.SimpleQueue[Event] = queue.SimpleQueue()  # by other threads
         self.manager = ServiceManager()
         self.session = ""
         self._status = DaemonStatus(self.page.slices)
         self._status_at = 0.0
-        self._reload = Reload(self.manager, self.book)
+        self._reload = Reload(self.manager, self.event_log)
         self.control = Control(self)
         self.loop: LoopProcess | None = None
         self._failure: Event = {}
@@ -124,7 +124,7 @@ class Daemon:
     @property
     def sequence(self) -> int:
         """Return the number of the last event."""
-        return self.book.sequence
+        return self.event_log.sequence
 
     @property
     def loop_pid(self) -> int | None:
@@ -145,7 +145,7 @@ class Daemon:
 
     def events_since(self, sequence: int) -> list[Event]:
         """Return the events after a number."""
-        return self.book.since(sequence)
+        return self.event_log.since(sequence)
 
     def status(self) -> dict[str, Any]:
         """Return the status document; may be called from any thread."""
@@ -181,7 +181,7 @@ class Daemon:
                 "dropped": {reason: counted[count.label] for count, reason in DROPPED.items()},
             },
             "counts": counted,
-            "events": dict(self.book.counts),
+            "events": dict(self.event_log.counts),
             "sides": self.sides.status(),
             "recording": None if recording is None else str(recording),
             "lost_rows": self.lost_rows,
@@ -231,7 +231,7 @@ class Daemon:
         while not self._requests.empty():
             number, command, by = self._requests.get()
             words = f"{command.name.lower()} asked for by {by}"
-            self.book.add(
+            self.event_log.add(
                 {"kind": "request", "command": command.name.lower(), "number": number, "by": by,
                  "detail": words}
             )  # fmt: skip
@@ -278,24 +278,24 @@ class Daemon:
         }  # fmt: skip
         stack.callback(self.sides.close)
         self.sides.start(settings, order, self.page, self._output)
-        stack.callback(lambda: self.book.add({"kind": "ended"}))
+        stack.callback(lambda: self.event_log.add({"kind": "ended"}))
         path = runtime_folder() / f"{cell_key(settings.cell)}.sock"
         try:
             stack.enter_context(ControlSocket(path, self.control.answer))
         except OSError as error:
             raise InputError(f"{path}: {error.strerror}, expected a socket to listen on") from None
         if settings.web is not None:
-            self.book.add({"kind": "note", "detail": f"status page: {settings.web.url}"})
+            self.event_log.add({"kind": "note", "detail": f"status page: {settings.web.url}"})
         if settings.setpoints.source == "planner":
             where = f"setpoints: a planner writes to {settings.setpoints.socket}"
-            self.book.add({"kind": "note", "detail": where})
+            self.event_log.add({"kind": "note", "detail": where})
         # a person at the terminal may arm after a crash; a service that was started anew may not
         if arm and lock.before and (by != "--arm" or self.manager.present):
             words = (
                 f"the run before (process {lock.before.get('pid')}) did not end in order: "
                 "not arming by itself; gapbridge arm"
             )
-            self.book.add({"kind": "refused", "detail": words})
+            self.event_log.add({"kind": "refused", "detail": words})
             return False
         return arm
 
@@ -313,9 +313,9 @@ class Daemon:
         if self.page.promote():
             self.sides.show(self.page)
         for event in self.sides.check():
-            self.book.add(event)
+            self.event_log.add(event)
         while not self._posted.empty():
-            self.book.add(self._posted.get())
+            self.event_log.add(self._posted.get())
         if time.monotonic() >= self._status_at:
             self._status_at = time.monotonic() + STATUS_EVERY
             self.sides.tell({"kind": "status", **self.status()})
@@ -393,12 +393,12 @@ class Daemon:
         self.tally.add(rows)
         self._status.take(rows)
         for event in events:
-            self.book.add(event)
+            self.event_log.add(event)
 
-    def _hear(self, event: Event) -> None:
+    def _on_event(self, event: Event) -> None:
         """Act on an event, and report it to the person at the terminal."""
         kind, detail = event["kind"], str(event.get("detail", ""))
-        self._status.hear(event)
+        self._status.on_event(event)
         if kind == "failure":
             self._failure = event
         if kind == "refused":
@@ -435,7 +435,7 @@ class Daemon:
 
     def _fault(self, cause: str, words: str) -> None:
         self._faults.append(words)
-        self.book.add({"kind": "fault", "cause": cause, "detail": words})
+        self.event_log.add({"kind": "fault", "cause": cause, "detail": words})
 
     def _summary(self) -> RunSummary:
         state = self._last_state
@@ -450,5 +450,5 @@ class Daemon:
             exit_code=1 if wrong else 0,
             recording=self.recording,
         )
-        self.book.add({"kind": "summary", "summary": summary.to_json()})
+        self.event_log.add({"kind": "summary", "summary": summary.to_json()})
         return summary

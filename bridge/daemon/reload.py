@@ -14,7 +14,7 @@ from typing import NamedTuple
 from gapbridge.bridge.cell.cell import complaints
 from gapbridge.bridge.cell.run_settings import Configuration, read_configuration
 from gapbridge.bridge.daemon.service_manager import ServiceManager
-from gapbridge.bridge.ipc.events import EventBook
+from gapbridge.bridge.ipc.events import EventLog
 from gapbridge.bridge.ipc.shared_memory import Phase
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.core.errors import GapbridgeError
@@ -35,8 +35,8 @@ class Swap(NamedTuple):
 class Reload:
     """One request to read the cell again, from asking to the new loop."""
 
-    def __init__(self, manager: ServiceManager, book: EventBook) -> None:
-        self._manager, self._book = manager, book
+    def __init__(self, manager: ServiceManager, event_log: EventLog) -> None:
+        self._manager, self._event_log = manager, event_log
         self._asked = threading.Event()
         self._next: Configuration | None = None
         self._rearm = False  # it was compensating, and the new cell arms by itself
@@ -92,7 +92,9 @@ class Reload:
         self._report(True, self._next, words)
 
     def _report(self, fine: bool, taken: Configuration, words: str) -> None:
-        self._book.add({"kind": "configuration", "ok": fine, "hash": taken.hash, "detail": words})
+        self._event_log.add(
+            {"kind": "configuration", "ok": fine, "hash": taken.hash, "detail": words}
+        )
 
 
 def _fitting(found: Configuration, running: Configuration) -> Configuration:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import IO, Any
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
 
 SIDES: dict[str, tuple[str, Callable[[DaemonSettings], bool]]] = {
@@ -27,14 +27,18 @@ class Sides:
         self._running: dict[str, SideProcess] = {}
 
     def start(
-        self, settings: DaemonSettings, order: dict[str, Any], page: Page, log: IO[Any] | int
+        self,
+        settings: DaemonSettings,
+        order: dict[str, Any],
+        page: SharedMemory,
+        log: IO[Any] | int,
     ) -> None:
         """Start those that the settings want."""
         for name, (module, wanted) in SIDES.items():
             if wanted(settings):
                 self._running[name] = SideProcess(module, order, page, log)
 
-    def show(self, page: Page) -> None:
+    def show(self, page: SharedMemory) -> None:
         """Have all change over to a page that the daemon shows."""
         for side in self._running.values():
             side.show(page)

@@ -62,7 +62,7 @@ class DaemonStatus:
         while self._batches and now - self._batches[0][0] > RATE_SPAN:
             self._batches.popleft()
 
-    def hear(self, event: Event) -> None:
+    def on_event(self, event: Event) -> None:
         """Take note of an event."""
         if event["kind"] == "configuration":
             self.configured = event

@@ -69,7 +69,7 @@ def slices_of(n: int) -> dict[str, slice]:
     return found
 
 
-class Page:
+class SharedMemory:
     """The shared memory, seen from any side.
 
     Without ``fd`` it is made; with one it is joined, for reading only unless ``writable``. Who
@@ -206,7 +206,7 @@ class Page:
         os.close(self.fd)
 
 
-class RunPage(Page):
+class RunPage(SharedMemory):
     """The daemon's view, for reading only: one page after the other, cycles and counts going on."""
 
     def __init__(self, n: int) -> None:
@@ -245,7 +245,7 @@ class RunPage(Page):
         os.close(self._shown)
 
 
-class FollowedPage(Page):
+class FollowedPage(SharedMemory):
     """A side process's view: it changes over to each page that the daemon sends it."""
 
     def __init__(self, n: int, fd: int, successors: socket.socket) -> None:
@@ -269,7 +269,7 @@ class FollowedPage(Page):
 class PageReader:
     """One reader of a page's cycles; any number of them read side by side."""
 
-    def __init__(self, page: Page, first: int) -> None:
+    def __init__(self, page: SharedMemory, first: int) -> None:
         self._page = page
         self.next = first  # number of the first row that it has not read
         self.lost = 0  # rows overwritten before they were read

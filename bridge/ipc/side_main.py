@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
-from gapbridge.bridge.ipc.shared_memory import FollowedPage, Page
+from gapbridge.bridge.ipc.shared_memory import FollowedPage, SharedMemory
 
 FAREWELL = 5.0  # s that a side process may take to end after the daemon
 NICENESS = 5  # the loop comes first
@@ -103,7 +103,7 @@ class Order:
     settings: DaemonSettings
     n: int  # joints
     session: str  # name of the daemon's run, run-YYYYmmdd-HHMMSS
-    page: Page  # for reading only
+    page: SharedMemory  # for reading only
     events: EventLines
     up: EventWriter
     extra: dict[str, Any]

@@ -16,7 +16,7 @@ import termios
 import time
 from typing import IO, Any
 
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_main import EventLines, EventWriter
 
 BACKOFF = (0.2, 10.0)  # s before a restart: first, most
@@ -34,7 +34,7 @@ class SideProcess:
     """
 
     def __init__(
-        self, module: str, order: dict[str, Any], page: Page, log: IO[Any] | int = -3
+        self, module: str, order: dict[str, Any], page: SharedMemory, log: IO[Any] | int = -3
     ) -> None:
         self.module, self.order = module, order
         self.restarts = 0
@@ -63,7 +63,7 @@ class SideProcess:
         else:
             self._down.emit(event)
 
-    def show(self, page: Page) -> None:
+    def show(self, page: SharedMemory) -> None:
         """Have it change over to another page; one that does not look gets it when it is anew."""
         if self._process is None:
             return

@@ -142,7 +142,7 @@ class SampleCheck:
         return None
 
 
-class StateWatch:
+class LinkMonitor:
     """Takes states from a driver and notifies the supervisor when they fail to come.
 
     ``lost`` says why the link must be given up, from then on.

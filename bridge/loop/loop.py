@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc.command_page import Command, Commands
 from gapbridge.bridge.ipc.counts import Count
-from gapbridge.bridge.ipc.cycle_row import fill_row
-from gapbridge.bridge.ipc.shared_memory import Page, Phase
+from gapbridge.bridge.ipc.cycle_row import write_cycle
+from gapbridge.bridge.ipc.shared_memory import Phase, SharedMemory
 from gapbridge.bridge.loop.checks import NOTHING, RAMPING_OUT, RESYNC, UNSOLVED, LoopChecks
-from gapbridge.bridge.loop.link_monitor import ControllerClock, StateWatch, hold_time
+from gapbridge.bridge.loop.link_monitor import ControllerClock, LinkMonitor, hold_time
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
 from gapbridge.bridge.loop.readiness import ModelCheck
@@ -75,7 +75,7 @@ class Loop:
         model: Model,
         driver: Driver,
         source: Source,
-        page: Page,
+        page: SharedMemory,
         tell: Tell,
         number: int = 0,
     ) -> None:
@@ -93,7 +93,7 @@ class Loop:
         reports = Reports(page, tell)
         self._supervisor = Supervisor(reports.transition)
         patience = settings.link.state_timeout
-        self._watch = StateWatch(driver, model.arm, self._supervisor, reports, patience)
+        self._watch = LinkMonitor(driver, model.arm, self._supervisor, reports, patience)
         self._checks = LoopChecks(
             driver.rate, self._supervisor, reports, patience, driver.moves_arm
         )
@@ -318,7 +318,7 @@ class Loop:
         clamped = stream.clamped if setpoint is not None else 0
         late = 0.0 if at is None else time.monotonic() - at  # arming: no part of the cycle
         row, slices = page.next_row(), page.slices
-        fill_row(row, slices, state, nominal, corrected, offset)
+        write_cycle(row, slices, state, nominal, corrected, offset)
         row[2] = self._supervisor.state
         row[3] = left
         row[4] = missed

@@ -18,7 +18,7 @@ from typing import Any
 
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
 from gapbridge.bridge.document.output_file import FOLDER_MODE
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.recording.event_text import LEVELS, level_of, text_of
 from gapbridge.bridge.recording.finishing import finish, unfinished
@@ -47,7 +47,7 @@ class Recorder:
         self,
         settings: RecordingSettings,
         session: str,
-        page: Page,
+        page: SharedMemory,
         configuration: Mapping[str, Any],
         emit: Emit,
     ) -> None:

@@ -219,7 +219,7 @@ class OffsetWriter:
         self._program = 0
         self._applied: Sequence[float] | np.ndarray = ()
 
-    def hear(self, echo: int, program: int, applied: Sequence[float] | np.ndarray) -> None:
+    def note_answer(self, echo: int, program: int, applied: Sequence[float] | np.ndarray) -> None:
         """Take what the robot's program says: last number accepted, its state, offset (6,)."""
         self._echo, self._program, self._applied = echo, program, applied
 

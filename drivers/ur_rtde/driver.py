@@ -55,7 +55,7 @@ class UrRtdeDriver(Driver):
         """Return the next sample; see Driver.read_state."""
         self._state = self.reader.read()
         if isinstance(self._writer, OffsetWriter):
-            self._writer.hear(self.reader.echo, self.reader.program, self.reader.applied)
+            self._writer.note_answer(self.reader.echo, self.reader.program, self.reader.applied)
         return self._state
 
     def _rates(self) -> tuple[float, float]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
-from gapbridge.bridge.ipc.shared_memory import Page, Phase
+from gapbridge.bridge.ipc.shared_memory import Phase, SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
 from gapbridge.bridge.loop.supervisor import State
 
@@ -59,7 +59,7 @@ class Feed:
         self.folder = folder
         scheme = "https" if keys.get("certificate") else "http"
         self.url = f"{scheme}://127.0.0.1:{self.port}/"
-        self.page = Page(N)
+        self.page = SharedMemory(N)
         self.state = State.OBSERVING
         self.restarts = 0
         self.counts: dict[str, int] = {"late": 1, "stale": 2, "overrun": 0}

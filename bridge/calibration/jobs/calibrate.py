@@ -17,7 +17,7 @@ from gapbridge.bridge.calibration.jobs.fitting import (
 from gapbridge.bridge.calibration.jobs.job import Job, write_document
 from gapbridge.bridge.calibration.jobs.log_of import write_log
 from gapbridge.bridge.calibration.planning import metrology_of, planned
-from gapbridge.bridge.calibration.session.pace import seconds_left
+from gapbridge.bridge.calibration.session.progress import seconds_left
 from gapbridge.bridge.document.provenance import fitted as fitted_on
 from gapbridge.bridge.document.provenance import provenance
 from gapbridge.core.calibration.fit import SessionFit

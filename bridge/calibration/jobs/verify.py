@@ -21,7 +21,7 @@ from gapbridge.bridge.calibration.planning import (
     space_of,
     with_loads,
 )
-from gapbridge.bridge.calibration.session.pace import seconds_left
+from gapbridge.bridge.calibration.session.progress import seconds_left
 from gapbridge.core.calibration.plan import Plan, PlannedPose
 from gapbridge.core.calibration.promise import promise_in
 from gapbridge.core.calibration.verify import Verification, verify

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from gapbridge.bridge.calibration.format import force, millimetres, point
 from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, ReadingError, Where
 from gapbridge.bridge.calibration.joints.joint_source import JointSample, JointSource, TypedJoints
-from gapbridge.bridge.calibration.session.pace import header
 from gapbridge.bridge.calibration.session.positioning import Positioning
+from gapbridge.bridge.calibration.session.progress import header
 from gapbridge.bridge.calibration.session.prompt import Prompt, SessionCommand
 from gapbridge.bridge.calibration.session.reading_check import NOTHING, ReadingCheck, Verdict
 from gapbridge.bridge.calibration.session.session import Reading, Session

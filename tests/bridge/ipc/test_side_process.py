@@ -17,7 +17,7 @@ import pytest
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc import side_process
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
 
 ECHO = """
@@ -58,8 +58,8 @@ def wait_for(what: Callable[[], Any], limit: float = 20.0) -> Any:
 
 
 @pytest.fixture
-def page() -> Iterator[Page]:
-    found = Page(2)
+def page() -> Iterator[SharedMemory]:
+    found = SharedMemory(2)
     yield found
     found.close()
 
@@ -75,7 +75,7 @@ def order(tmp_path: Path) -> dict[str, Any]:
 
 @pytest.fixture
 def start(
-    page: Page, order: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    page: SharedMemory, order: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Callable[[str], SideProcess]]:
     monkeypatch.syspath_prepend(str(tmp_path))
     started: list[SideProcess] = []
@@ -102,7 +102,7 @@ def hear(side: SideProcess, kind: str) -> dict[str, Any]:
 
 
 def test_it_gets_its_order_the_cycles_and_the_events_and_answers(
-    start: Callable[[str], SideProcess], page: Page, tmp_path: Path
+    start: Callable[[str], SideProcess], page: SharedMemory, tmp_path: Path
 ) -> None:
     side = start(ECHO)
     hello = hear(side, "hello")
@@ -190,9 +190,9 @@ def test_when_the_daemon_is_killed_they_end(
 import json, sys, time
 sys.path.insert(0, {str(tmp_path)!r})
 from gapbridge.bridge.ipc import side_main
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
-side = SideProcess("side_under_test", json.loads({json.dumps(order)!r}), Page(2))
+side = SideProcess("side_under_test", json.loads({json.dumps(order)!r}), SharedMemory(2))
 while not side.events():
     time.sleep(0.02)
 print(side.pid, flush=True)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gapbridge.bridge.ipc.counts import Count
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.loop.checks import (
     DEGRADED,
     LATE,
@@ -21,7 +21,7 @@ from gapbridge.bridge.loop.checks import (
     OverrunWatch,
     SaturationWatch,
 )
-from gapbridge.bridge.loop.link_monitor import SampleCheck, StateWatch, hold_time
+from gapbridge.bridge.loop.link_monitor import LinkMonitor, SampleCheck, hold_time
 from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.supervisor import State, Supervisor
 from gapbridge.core.arm import builtin_arm
@@ -138,7 +138,7 @@ def test_an_offset_at_its_limit_for_a_second_is_saturated_and_a_ramp_is_not() ->
 class Bench:
     """Checks with a supervisor in a state, and what they have reported."""
 
-    def __init__(self, page: Page, at: State) -> None:
+    def __init__(self, page: SharedMemory, at: State) -> None:
         self.events: list[dict[str, Any]] = []
         self.page = page
         self.supervisor = Supervisor(lambda *change: self.changes.append(change))
@@ -148,13 +148,13 @@ class Bench:
 
 
 @pytest.fixture
-def page() -> Iterator[Page]:
-    found = Page(6)
+def page() -> Iterator[SharedMemory]:
+    found = SharedMemory(6)
     yield found
     found.close()
 
 
-def test_a_stop_of_the_robot_is_a_fault_counted_and_reported_once(page: Page) -> None:
+def test_a_stop_of_the_robot_is_a_fault_counted_and_reported_once(page: SharedMemory) -> None:
     bench = Bench(page, State.COMPENSATING)
     bench.checks.begin(state(1.0), 0)
     for k in range(100):
@@ -168,7 +168,7 @@ def test_a_stop_of_the_robot_is_a_fault_counted_and_reported_once(page: Page) ->
     assert bench.checks.fine
 
 
-def test_a_gap_of_more_than_ten_cycles_and_the_hold_time_begins_anew(page: Page) -> None:
+def test_a_gap_of_more_than_ten_cycles_and_the_hold_time_begins_anew(page: SharedMemory) -> None:
     bench = Bench(page, State.COMPENSATING)
     assert bench.checks.begin(state(1.0), 0) == 0
     assert bench.checks.begin(state(1.03), 14) == LATE
@@ -180,7 +180,7 @@ def test_a_gap_of_more_than_ten_cycles_and_the_hold_time_begins_anew(page: Page)
     assert page.counts()["late"] == 48
 
 
-def test_a_lost_sensor_is_flagged_in_every_cycle_and_reported_twice(page: Page) -> None:
+def test_a_lost_sensor_is_flagged_in_every_cycle_and_reported_twice(page: SharedMemory) -> None:
     bench = Bench(page, State.COMPENSATING)
     for k in range(10):
         sample = state(1.0 + k * T, sensor_lost="silent" if 3 <= k < 7 else "")
@@ -191,7 +191,7 @@ def test_a_lost_sensor_is_flagged_in_every_cycle_and_reported_twice(page: Page) 
     assert page.counts()["sensor_lost"] == 1
 
 
-def test_while_only_observing_a_finding_is_reported_and_changes_nothing(page: Page) -> None:
+def test_while_only_observing_a_finding_is_reported_and_changes_nothing(page: SharedMemory) -> None:
     bench = Bench(page, State.OBSERVING)
     for k in range(2000):
         bench.checks.end(state(k * T), Q + 1e-5 * k, 0, 1e-4)
@@ -220,15 +220,15 @@ class Scripted(Driver):
     def close(self) -> None: ...
 
 
-def watched(page: Page) -> tuple[Scripted, Supervisor, StateWatch, list[dict[str, Any]]]:
+def watched(page: SharedMemory) -> tuple[Scripted, Supervisor, LinkMonitor, list[dict[str, Any]]]:
     events: list[dict[str, Any]] = []
     driver, supervisor = Scripted(), Supervisor(lambda *_: None)
     supervisor.state = State.COMPENSATING
-    watch = StateWatch(driver, ARM, supervisor, Reports(page, events.append))
+    watch = LinkMonitor(driver, ARM, supervisor, Reports(page, events.append))
     return driver, supervisor, watch, events
 
 
-def test_two_bad_samples_are_dropped_and_three_in_a_row_hold(page: Page) -> None:
+def test_two_bad_samples_are_dropped_and_three_in_a_row_hold(page: SharedMemory) -> None:
     driver, supervisor, watch, events = watched(page)
     good = driver.next
     for times, after in ((2, State.COMPENSATING), (3, State.HOLDING)):
@@ -244,7 +244,7 @@ def test_two_bad_samples_are_dropped_and_three_in_a_row_hold(page: Page) -> None
 
 
 def test_a_state_that_is_late_is_counted_and_only_a_stale_one_holds(
-    page: Page, monkeypatch: pytest.MonkeyPatch
+    page: SharedMemory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = [100.0]
     monkeypatch.setattr("gapbridge.bridge.loop.link_monitor.time.monotonic", lambda: clock[0])
@@ -272,7 +272,7 @@ def test_the_hold_time_is_five_cycles_or_forty_milliseconds(rate: float, hold: f
 
 
 @pytest.mark.parametrize("bits", [1 << bit for bit in range(2, 11)])
-def test_a_stop_in_the_safety_bits_alone_is_a_fault(page: Page, bits: int) -> None:
+def test_a_stop_in_the_safety_bits_alone_is_a_fault(page: SharedMemory, bits: int) -> None:
     bench = Bench(page, State.COMPENSATING)
     bench.checks.begin(state(1.0), 0)
     bench.checks.begin(state(1.0 + T, safety_status_bits=1 | bits), 0)
@@ -282,7 +282,7 @@ def test_a_stop_in_the_safety_bits_alone_is_a_fault(page: Page, bits: int) -> No
 
 
 @pytest.mark.parametrize("bits", [1, 2])
-def test_normal_and_reduced_mode_are_no_stop(page: Page, bits: int) -> None:
+def test_normal_and_reduced_mode_are_no_stop(page: SharedMemory, bits: int) -> None:
     bench = Bench(page, State.COMPENSATING)
     bench.checks.begin(state(1.0, safety_status_bits=bits), 0)
     assert bench.supervisor.state == State.COMPENSATING
@@ -301,7 +301,7 @@ def test_normal_and_reduced_mode_are_no_stop(page: Page, bits: int) -> None:
     ],
 )
 def test_a_robot_that_does_not_follow_for_the_hold_time_is_held(
-    page: Page, found: dict[str, Any], moves_arm: bool, holds: bool
+    page: SharedMemory, found: dict[str, Any], moves_arm: bool, holds: bool
 ) -> None:
     bench = Bench(page, State.COMPENSATING)
     bench.checks = LoopChecks(
@@ -316,7 +316,7 @@ def test_a_robot_that_does_not_follow_for_the_hold_time_is_held(
 
 
 def test_a_program_that_does_not_play_is_nobodys_fault_while_nothing_is_written(
-    page: Page,
+    page: SharedMemory,
 ) -> None:
     bench = Bench(page, State.OBSERVING)
     for k in range(100):
@@ -328,7 +328,7 @@ def test_a_program_that_does_not_play_is_nobodys_fault_while_nothing_is_written(
     assert bench.supervisor.state == State.COMPENSATING
 
 
-def test_a_load_that_cannot_be_holds_and_is_reported_with_its_reason(page: Page) -> None:
+def test_a_load_that_cannot_be_holds_and_is_reported_with_its_reason(page: SharedMemory) -> None:
     bench = Bench(page, State.COMPENSATING)
     for _ in range(3):
         bench.checks.judge_loads("payload: found 400 kg, expected 0 to 7.5 kg")
@@ -347,7 +347,7 @@ class Otherwise(Scripted):
         return self.phrase or None
 
 
-def test_the_controllers_settings_are_compared_every_second_while_armed(page: Page) -> None:
+def test_the_controllers_settings_are_compared_every_second_while_armed(page: SharedMemory) -> None:
     bench, driver = Bench(page, State.OBSERVING), Otherwise()
     for k in range(1000):
         bench.checks.judge_settings(state(1.0 + k * T), driver)
@@ -364,7 +364,7 @@ def test_the_controllers_settings_are_compared_every_second_while_armed(page: Pa
 
 
 def test_a_hiccup_while_observing_latches_no_fault(
-    page: Page, monkeypatch: pytest.MonkeyPatch
+    page: SharedMemory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = [100.0]
     monkeypatch.setattr("gapbridge.bridge.loop.link_monitor.time.monotonic", lambda: clock[0])

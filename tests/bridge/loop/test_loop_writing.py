@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from gapbridge.bridge.cell.sections import LimitSettings, SetpointSettings
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
 from gapbridge.bridge.loop.reports import Reports
@@ -88,7 +88,7 @@ class Stream(SetpointStream):
 class Bench:
     """A loop's writing half, compensating."""
 
-    def __init__(self, page: Page) -> None:
+    def __init__(self, page: SharedMemory) -> None:
         self.page, self.driver = page, Failing()
         self.changes: list[tuple[str, str]] = []  # cause and detail
         self.supervisor = Supervisor(lambda *change: self.changes.append(change[2:]))
@@ -128,7 +128,7 @@ class Bench:
 
 @pytest.fixture
 def bench() -> Iterator[Bench]:
-    page = Page(6)
+    page = SharedMemory(6)
     yield Bench(page)
     page.close()
 

@@ -15,7 +15,7 @@ from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
 from gapbridge.bridge.ipc.command_page import Command, CommandPage, Commands
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.loop.loop import Exit, Loop
 from gapbridge.bridge.loop.main import _compile
 from gapbridge.bridge.loop.replay import ReplayedLoop
@@ -79,7 +79,9 @@ class Scripted(Driver):
             raise PartialWriteError("half of it")
 
 
-def run(loop: Loop, page: Page, commands: CommandPage, folder: Path, name: str) -> dict[str, Any]:
+def run(
+    loop: Loop, page: SharedMemory, commands: CommandPage, folder: Path, name: str
+) -> dict[str, Any]:
     settings = RecordingSettings(folder=folder, keep_free=0.0)
     recorder = Recorder(settings, name, page, {}, lambda _: None)
     assert loop.run(Commands(commands.fd), True) in (Exit.LINK, Exit.DONE)
@@ -92,7 +94,7 @@ def test_refused_and_half_sent_setpoints_gaps_and_lost_sensors_are_replayed(tmp_
     cell.write_text(CELL)
     model = load_cell(cell).model
     settings = DaemonSettings(cell=cell)
-    page, commands, events = Page(N), CommandPage(), []
+    page, commands, events = SharedMemory(N), CommandPage(), []
     source = TargetSource(SetpointSettings(), N, False, tmp_path, 20.0)
     loop = Loop(settings, model, Scripted(1800, commands, model), source, page, events.append)
     _compile(settings, model)  # else the first cycles are late
@@ -106,7 +108,7 @@ def test_refused_and_half_sent_setpoints_gaps_and_lost_sensors_are_replayed(tmp_
     assert (flags & 8).any()  # ramping out
     assert then["written"].sum() > 500
 
-    page, commands = Page(N), CommandPage()
+    page, commands = SharedMemory(N), CommandPage()
     driver = ReplayDriver(ReplaySettings(file=tmp_path / "then", speed=100.0), model)
     again = ReplayedLoop(settings, model, driver, source, page, lambda _: None)
     assert_same_bits(run(again, page, commands, tmp_path, "again"), then, len(then["number"]))

@@ -16,7 +16,7 @@ from recorded import SESSION, N
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
 from gapbridge.bridge.ipc import side_process
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.core.log.mcap_reading import read_columns, read_configuration, read_documents
@@ -30,7 +30,7 @@ class Publisher:
     """A loop's half of a page, in a thread of the test: 500 cycles a second."""
 
     def __init__(self) -> None:
-        self.page = Page(N)
+        self.page = SharedMemory(N)
         self.stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()

@@ -13,7 +13,7 @@ WIDTH = 16  # characters of the whole bar
 
 
 def seconds_left(session: Session, minutes_per_load: float) -> float:
-    """Return s until the last stop, by the pace so far."""
+    """Return s until the last stop, by the readings so far."""
     paces = [s for s in session.seconds if s < PAUSE][-20:]
     done = {t.stop for t in session.taken} | session.skipped
     blocks = {(p.station, p.load) for i, p in enumerate(session.stops) if i not in done}
