@@ -81,6 +81,14 @@ def test_every_import_of_ours_goes_through_the_one_package() -> None:
                 assert not {name.split(".")[0] for name in names} & ours, (file, names)
 
 
+def test_no_folder_is_flatter_than_a_table_of_contents() -> None:
+    """About twenty modules at most; the effects are one family, one file a member."""
+    for top in ("core", "drivers", "bridge"):
+        for folder in [ROOT / top, *(ROOT / top).rglob("*/")]:
+            modules = [p.name for p in folder.glob("*.py") if p.name != "__init__.py"]
+            assert len(modules) <= 21 or folder == ROOT / "core" / "effects", (folder, len(modules))
+
+
 FOREIGN_ATTRIBUTES = {
     # what a library is set by, and by nothing else
     "drivers/canopen/master.py": {
