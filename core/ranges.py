@@ -57,6 +57,17 @@ def outside(log: Log, fitted: Range) -> list[str]:
     return told
 
 
+def outside_rows(log: Log, fitted: Range) -> NDArray[np.bool_]:
+    """Return which rows (N,) lie outside what was fitted, in any quantity."""
+    out = np.zeros(len(log), dtype=bool)
+    for name, values in _columns(log).items():
+        if name in fitted:
+            low, high = fitted[name]
+            margin = _margin(name, low, high)
+            out |= (values < low - margin) | (values > high + margin)
+    return out
+
+
 def outside_findings(log: Log) -> list[str]:
     """Return where many of a session's rows lie outside what the other sessions hold."""
     parts = sessions_in(log)

@@ -14,9 +14,12 @@ from gapbridge.bridge.api.records import Corrected, Diagnosed, Fitted, Predicted
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.cell.opened_log import open_log
 from gapbridge.bridge.document.provenance import fitted, provenance
+from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.compensation import correct
 from gapbridge.core.errors import InputError, LogError
 from gapbridge.core.log.log import Log
+from gapbridge.core.predicted_channels import predicted_channels
+from gapbridge.core.ranges import outside_rows, range_of
 from gapbridge.core.sessions import join_sessions
 
 __all__ = ["compensate", "diagnose", "fit", "load_cell", "predict", "read_log"]
@@ -28,11 +31,12 @@ def read_log(path: Path | str | Sequence[Path | str], cell: Cell) -> Log:
     return join_sessions([open_log(Path(one), cell) for one in paths], cell.model)
 
 
-def predict(cell: Cell, log: Log) -> Predicted:
+def predict(cell: Cell, log: Log, *, channels: bool = False) -> Predicted:
     """Return the TCP pose that the cell's model predicts for every row; ``gapbridge predict``.
 
     Joints are ``actual_q``; where there is none, ``target_q`` less what the servos are known to
-    give way.
+    give way. The standard deviation comes from the covariance of what was fitted, where the cell
+    has it. ``channels``: torque, wrench and tracking are predicted too.
     """
     q, loads = log.require("actual_q", "target_q"), log.loads()
     try:
@@ -43,7 +47,13 @@ def predict(cell: Cell, log: Log) -> Predicted:
         raise
     except InputError as error:
         raise InputError(f"{log.path}: data {error}") from None
-    return Predicted(poses.position, poses.rotation_vector)
+    further, lacking = predicted_channels(cell.model, log) if channels else ({}, {})
+    spread, ranges = cell.spread, cell.fitted_range
+    return Predicted(
+        poses.position, poses.rotation_vector,
+        spread.position_std(cell.model, q, loads) if spread.names else None,
+        outside_rows(log, ranges) if ranges else None, further, lacking,
+    )  # fmt: skip
 
 
 def compensate(cell: Cell, log: Log) -> Corrected:
@@ -71,7 +81,10 @@ def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
         std_radial=found.std_radial, shown=found.identifiable, samples=found.samples,
         gap_rms=found.gap_rms, remaining_rms=found.remaining_rms,
         remaining_rms_held_out=held_out if math.isfinite(held_out) else None,
-        notes=(*found.notes, *found.combinations), provenance=fitted(_origin(cell, log), log),
+        notes=(*found.notes, *found.combinations), provenance=fitted(
+            _origin(cell, log), range_of(log),
+            Spread.of_fit(found.identifiable, found.covariance).beside(cell.spread),
+        ),
     )  # fmt: skip
 
 
@@ -84,6 +97,7 @@ def diagnose(
     ``withhold`` names effects to take out of the catalogue; ``simulated`` is the log of another
     simulator, row by row, whose values are the prediction.
     """
+    from gapbridge.bridge.api.found_spread import spread_of
     from gapbridge.core.diagnosis.diagnosis import diagnose as diagnose_log
     from gapbridge.core.diagnosis.document import document
     from gapbridge.core.effects import effect_named
@@ -92,8 +106,10 @@ def diagnose(
         effect_named(name)
     metrology = replace(cell.metrology, remounted=remounted)
     found = diagnose_log(cell.model, log, metrology, withhold=withhold, simulated=simulated)
-    told = document(found) | {"provenance": _origin(cell, log)}
-    return Diagnosed(cell, found.model, str(found.verdict), told)
+    origin = _origin(cell, log)
+    told = document(found) | {"provenance": origin}
+    applied = fitted(origin, range_of(log), spread_of(found).beside(cell.spread))
+    return Diagnosed(cell, found.model, str(found.verdict), told, applied)
 
 
 def _origin(cell: Cell, log: Log) -> dict[str, object]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +22,27 @@ class Predicted:
 
     position: Array  # (N, 3) m
     rotation_vector: Array  # (N, 3) rad
+    position_std: Array | None = None  # (N, 3) m, 1 sigma in base axes; None: nothing was fitted
+    outside: NDArray[np.bool_] | None = None  # (N,) outside what was fitted; None: nothing was
+    channels: dict[str, Array] = field(default_factory=dict)  # (N, k) by name, where asked for
+    lacking: dict[str, str] = field(default_factory=dict)  # what a channel needs that is not there
+
+    @property
+    def columns(self) -> dict[str, Array]:
+        """Return all predictions by the command's names: (N, k), or (N,) without a number."""
+        found = {
+            "predicted_position": self.position, "predicted_rotation": self.rotation_vector,
+            "predicted_position_std": self.position_std,
+            "outside_fitted": None if self.outside is None else self.outside.astype(float),
+            **self.channels,
+        }  # fmt: skip
+        return {name: values for name, values in found.items() if values is not None}
 
     def to_json(self) -> dict[str, Any]:
-        """Return the poses as lists, by the names of the command's columns."""
+        """Return the predictions as lists, by the command's names; null where there is none."""
         return {
-            "predicted_position": self.position.tolist(),
-            "predicted_rotation": self.rotation_vector.tolist(),
+            name: np.where(np.isfinite(v), v.astype(object), [None]).tolist()
+            for name, v in self.columns.items()
         }
 
 
@@ -85,6 +100,7 @@ class Diagnosed:
     model: Model  # with the causes added
     verdict: str
     document: dict[str, Any]
+    provenance: dict[str, Any]  # of the cell that `save` writes
 
     @property
     def causes(self) -> tuple[str, ...]:
@@ -94,8 +110,7 @@ class Diagnosed:
 
     def save(self, path: Path | str) -> None:
         """Write the cell with the causes added, as ``--apply`` does."""
-        origin = {"provenance": self.document["provenance"]}
-        save_cell(self.cell, path, self.model, origin)
+        save_cell(self.cell, path, self.model, {"provenance": self.provenance})
 
     def to_json(self) -> dict[str, Any]:
         """Return the document, schema ``gapbridge.diagnosis/1``."""

@@ -24,6 +24,7 @@ from gapbridge.bridge.cell.settings.calibration import CalibrationSettings
 from gapbridge.bridge.cell.settings.metrics import MetricsSettings
 from gapbridge.bridge.cell.settings.web import WebSettings
 from gapbridge.core.arm import Arm
+from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.errors import ArmError, CellError, InputError
 from gapbridge.core.load_bounds import HEAVIEST
 from gapbridge.core.metrology import Metrology
@@ -122,6 +123,14 @@ class Cell:
         """Return the least and largest value of each log column that the model was fitted on."""
         origin = self.file.provenance
         return {} if origin is None else dict(origin.fitted)
+
+    @property
+    def spread(self) -> Spread:
+        """Return the covariance of what was fitted; of nothing where the cell has none."""
+        origin = self.file.provenance
+        if origin is None or not origin.parameters:
+            return Spread.none()
+        return Spread(tuple(origin.parameters), np.array(origin.covariance, dtype=float))
 
     @property
     def simulation(self) -> Simulation:

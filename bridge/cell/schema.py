@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from gapbridge.bridge.cell.sections import (
     LimitSettings,
@@ -151,6 +151,17 @@ class Provenance(Section):
     fitted: dict[str, tuple[Number, Number]] = Field(
         default={}, description="least and largest value of each column that was fitted on"
     )
+    parameters: list[str] = Field(default=[], description="that were fitted, by name")
+    covariance: list[list[Number]] = Field(
+        default=[], description="of those parameters, SI: one row and column each"
+    )
+
+    @model_validator(mode="after")
+    def _square(self) -> Provenance:
+        size = len(self.parameters)
+        if [len(row) for row in self.covariance] != [size] * size:
+            raise ValueError(f"expected {size} rows of {size} numbers, one for each of parameters")
+        return self
 
 
 class CellFile(Section):

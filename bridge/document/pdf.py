@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
+from typing import Any
 
 from reportlab.lib.colors import HexColor
 from reportlab.lib.pagesizes import A4
@@ -60,7 +61,7 @@ def pdf(document: Document) -> bytes:
     ]
     for part in document.parts:
         story += _part(part)
-    template.build(story)
+    template.build(story, canvasmaker=_Numbered)
     return file.getvalue()
 
 
@@ -70,12 +71,33 @@ def _footer(text: str) -> Callable[[Canvas, BaseDocTemplate], None]:
         line = Text(markup(text), STYLES["tile_label"])
         line.wrap(WIDTH - 60, 20)
         line.drawOn(canvas, SIDE, 9.3 * mm)
-        canvas.setFont(PLAIN, 7.5)
-        canvas.setFillColor(HexColor("#5b6770"))
-        canvas.drawRightString(A4[0] - SIDE, 10 * mm, f"page {canvas.getPageNumber()}")
         canvas.restoreState()
 
     return draw
+
+
+class _Numbered(Canvas):
+    """A canvas whose pages say how many there are, which is known once all are drawn."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._pages: list[dict[str, Any]] = []
+
+    def showPage(self) -> None:
+        """Keep the page until all are drawn."""
+        self._pages.append(dict(self.__dict__))
+        self._startPage()  # type: ignore[attr-defined]
+
+    def save(self) -> None:
+        """Draw the number of every page, and write the file."""
+        for number, page in enumerate(self._pages, start=1):
+            self.__dict__.update(page)
+            self.setFont(PLAIN, 7.5)
+            self.setFillColor(HexColor("#5b6770"))
+            text = f"page {number} of {len(self._pages)}"
+            self.drawRightString(A4[0] - SIDE, 10 * mm, text)
+            super().showPage()
+        super().save()
 
 
 def _part(part: Part) -> list[Flowable]:

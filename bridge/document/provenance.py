@@ -11,8 +11,7 @@ from typing import Any
 
 import click
 
-from gapbridge.core.log.log import Log
-from gapbridge.core.ranges import range_of
+from gapbridge.core.calibration.spread import Spread
 
 BLOCK = 1 << 20  # bytes read at a time
 
@@ -37,10 +36,15 @@ def provenance(files: Mapping[str, Sequence[Path]]) -> dict[str, Any]:
     }
 
 
-def fitted(origin: dict[str, Any], log: Log) -> dict[str, Any]:
-    """Return the provenance of a cell: with the ranges that its model was fitted on."""
-    ranges = {name: [low, high] for name, (low, high) in range_of(log).items()}
-    return {**origin, "fitted": ranges}
+def fitted(
+    origin: dict[str, Any], ranges: Mapping[str, tuple[float, float]], spread: Spread
+) -> dict[str, Any]:
+    """Return the provenance of a cell: with what its model was fitted on, and its covariance."""
+    listed = {name: [low, high] for name, (low, high) in ranges.items()}
+    told = {**origin, "fitted": listed}
+    if spread.names:
+        told |= {"parameters": list(spread.names), "covariance": spread.covariance.tolist()}
+    return told
 
 
 def installed_version() -> str:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from gapbridge.core.calibration.lacking import lacking
+from gapbridge.core.calibration.lacking import Lack, lacking
 from gapbridge.core.calibration.noise import Noise
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.observables.nuisance import Nuisance
@@ -22,7 +22,8 @@ from gapbridge.core.calibration.remainder import carried, diagnosed, repeatabili
 from gapbridge.core.calibration.rest import Rest, come_to_rest
 from gapbridge.core.calibration.result import Calibration, Errors, Estimate
 from gapbridge.core.calibration.staging import at_odds
-from gapbridge.core.calibration.telling import combinations, notes_of, verdict_of
+from gapbridge.core.calibration.telling import combinations, notes_of, remaining_of, verdict_of
+from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
@@ -33,7 +34,25 @@ TELLING = 1.0  # usual sizes: a parameter that is known no better is not shown
 TCP_STEP = 1e-3  # share of a parameter's scale, for derivatives of the predicted TCP
 
 
-def calibrate(
+@dataclass(frozen=True)
+class SessionFit:
+    """A converged fit that nobody has judged: the held-out readings have not been looked at."""
+
+    parameters: Parameters
+    observable: Observable
+    metrology: Metrology
+    readings: Readings  # all, those held out too
+    problem: Problem
+    rest: Rest
+    notes: tuple[str, ...]
+    lacks: tuple[Lack, ...]  # further effects that the fitted poses support
+
+    def estimates(self, expected: Expectation | None = None) -> tuple[Estimate, ...]:
+        """Return the parameters, beside what a plan ``expected`` of them."""
+        return estimates_of(self.parameters, self.rest, expected)
+
+
+def calibrate(  # noqa: PLR0913 (the public call: what is left out has its default)
     model: Model,
     readings: Readings,
     parameters: Parameters,
@@ -52,28 +71,72 @@ def calibrate(
     ``diagnose`` runs the diagnosis on what is left over (positions and poses), which takes seconds.
     Raises ExcitationError where the readings are too few, InputError where they do not fit the arm.
     """
+    fit = fit_session(
+        readings, parameters, metrology, observable=observable, progress=progress
+    )  # fmt: skip
+    return judged(model, fit, expected=expected, diagnose=diagnose, progress=progress)
+
+
+def fit_session(
+    readings: Readings,
+    parameters: Parameters,
+    metrology: Metrology | None = None,
+    *,
+    observable: Observable | None = None,
+    progress: Progress | None = None,
+) -> SessionFit:
+    """Return the fit of a session's readings, without a look at those held out.
+
+    What to fit is chosen on fits like this one; ``judged`` then looks at the held-out readings.
+    Raises ExcitationError where the readings are too few, InputError where they do not fit the arm.
+    """
     metrology = metrology or Metrology()
-    tell = progress or (lambda text: None)
     how = observable or make_observable(readings.kind, registered=metrology.registered)
-    to_fit = np.flatnonzero(~readings.held_out)
-    if not len(to_fit):
+    if readings.held_out.all():
         raise ExcitationError("found no readings to fit: all are held out, expected others")
     readings, lonely = _with_places(readings)
     to_fit = np.flatnonzero(~readings.held_out)
     with threadpool_limits(1, "blas"):  # matrices of this size gain nothing from threads
-        problem, rest = come_to_rest(parameters, how, readings[to_fit], metrology, tell)
+        problem, rest = come_to_rest(
+            parameters, how, readings[to_fit], metrology, progress or _silent
+        )
+        lacks = lacking(problem, rest)
+    return SessionFit(parameters, how, metrology, readings, problem, rest, lonely, lacks)
+
+
+def judged(
+    model: Model,
+    fit: SessionFit,
+    *,
+    declined: tuple[str, ...] = (),
+    expected: Expectation | None = None,
+    diagnose: bool = True,
+    progress: Progress | None = None,
+) -> Calibration:
+    """Return a fit judged on the held-out readings: the one look at them.
+
+    ``model`` is the arm as the cell had it; ``declined`` are further effects that were fitted and
+    not borne out.
+    """
+    tell = progress or _silent
+    parameters, readings = fit.parameters, fit.readings
+    problem, rest, how = fit.problem, fit.rest, fit.observable
+    to_fit = np.flatnonzero(~readings.held_out)
+    lacks = tuple(lack for lack in fit.lacks if lack.name not in declined)
+    with threadpool_limits(1, "blas"):
         tell("judging")
         found = parameters.model(rest.values)
-        remainder = carried(problem, rest, found, readings, metrology)
-        told = diagnosed(found, readings, rest, metrology, tell) if diagnose else None
-    estimates = estimates_of(parameters, rest, expected)
+        remainder = carried(problem, rest, found, readings, fit.metrology)
+        told = diagnosed(found, readings, rest, fit.metrology, tell) if diagnose else None
+    estimates = fit.estimates(expected)
     shown = np.array([e.shown for e in estimates], dtype=bool)
     errors = _errors(model, found, how, readings, rest.nuisance)
     odds = _stages_at_odds(problem, rest)
-    lacks = lacking(problem, rest)
     complete = rest.settled and remainder.calm and not lacks
     complete = complete and (told is None or told.verdict == "no_gap")
-    notes = (*lonely, *notes_of(problem, rest, remainder, odds, estimates))
+    remaining = remaining_of(remainder, told, complete, lacks, rest.settled)
+    floor = _floor(told)
+    notes = (*fit.notes, *notes_of(problem, rest, remainder, odds, estimates))
     return Calibration(
         model=found, nominal=model, readings=readings, estimates=estimates,
         covariance=rest.covariance[np.ix_(shown, shown)],
@@ -85,11 +148,23 @@ def calibrate(
         stations=rest.nuisance.stations,
         tcp_std=tcp_deviation(parameters, rest, readings[readings.held_out]),
         diagnosis=told, complete=complete,
-        verdict=verdict_of(errors, remainder, told, rest, complete, lacks), notes=notes,
+        verdict=verdict_of(errors, rest, floor, complete, remaining), notes=notes,
         instrument_noise=rest.noise.instrument, turn_noise=_turn_noise(how, rest.noise),
         joint_noise=rest.noise.joint, freedom=rest.freedom,
         whole_covariance=rest.covariance, lacking=tuple(lack.name for lack in lacks),
+        remaining=remaining, noise_floor=floor,
     )  # fmt: skip
+
+
+def _silent(text: str) -> None:
+    """Tell nobody."""
+
+
+def _floor(diagnosis: Diagnosis | None) -> float:
+    """Return the noise floor of the measured positions (m); nan where nobody measured it."""
+    channels = () if diagnosis is None else diagnosis.channels
+    floors = [c.noise_floor_rms for c in channels if c.channel == "position"]
+    return float("nan") if not floors or floors[0] is None else float(floors[0])
 
 
 def _with_places(readings: Readings) -> tuple[Readings, tuple[str, ...]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.calibration.parameters import Parameters
-from gapbridge.core.calibration.redundancy import Redundancy
 from gapbridge.core.calibration.result import Calibration
-from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.calibration.spread import parameters_named
 from gapbridge.core.errors import InputError
 from gapbridge.core.model import Model
 
@@ -37,25 +36,7 @@ class Promise:
 
     def parameters(self, model: Model) -> Parameters:
         """Return the same parameters, to be found beyond ``model`` (the calibrated one)."""
-        every = Parameters.every(model, effects_of(self.names))
-        at = {name: i for i, name in enumerate(every.names)}
-        missing = [name for name in self.names if name not in at]
-        if missing:
-            raise InputError(
-                f"calibration: found parameter {missing[0]!r}, expected one of this cell's arm"
-            )
-        return every.part(Redundancy([at[name] for name in self.names], ()))
-
-
-def effects_of(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the effects that parameters with these names belong to, each once."""
-    found = []
-    for name in names:
-        fitting = [e for e in CATALOGUE if name == e or name.startswith(f"{e}_")]
-        if not fitting:
-            raise InputError(f"calibration: found parameter {name!r}, expected one of an effect")
-        found.append(max(fitting, key=len))
-    return tuple(dict.fromkeys(found))
+        return parameters_named(model, self.names, "calibration")
 
 
 def document_of(calibration: Calibration, sigma: float = float("nan")) -> dict[str, Any]:

@@ -79,7 +79,7 @@ class Calibration:
     held_out_before: Errors  # held-out poses
     held_out_after: Errors
     outliers: NDArray[np.int64]  # rows of the readings that were weighed down as wild
-    noise: float  # m, 1 sigma of one coordinate: instrument and arm, estimated from the fit
+    noise: float  # m, 1 sigma of one coordinate that the fit leaves
     repeatability: float  # m, 1 sigma of one coordinate, from repeated poses; nan: none were
     stations: tuple[Registration, ...]  # frame of each place of the instrument
     tcp_std: Array  # (M,) m, 1 sigma (3D) of the predicted TCP at the held-out poses
@@ -91,5 +91,7 @@ class Calibration:
     turn_noise: float = float("nan")  # rad, 1 sigma of a measured rotation; nan: none were
     joint_noise: float = float("nan")  # rad, 1 sigma of one joint's repeatability
     freedom: float = float("inf")  # degrees of freedom that the fit left
-    lacking: tuple[str, ...] = ()  # effects to ask for next: the remainder speaks of them
+    lacking: tuple[str, ...] = ()  # effects to ask for next: the fit's own poses support them
+    remaining: str = ""  # in words: what is left, the same in every section of a report
+    noise_floor: float = float("nan")  # m, 1 sigma of one coordinate, without the fit; nan: unknown
     whole_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # of all estimates

@@ -16,6 +16,7 @@ from gapbridge.core.diagnosis.diagnosis import Diagnosis
 
 Array = NDArray[np.float64]
 CLOSE = 0.98  # correlation from which two parameters count as one combination
+SIGMAS = 3.0  # from zero, of its own, that a further effect must be to be fitted
 MEMBER = 0.35  # share of a combination from which a parameter is named in it
 
 
@@ -93,30 +94,58 @@ def notes_of(
 
 
 def verdict_of(
-    errors: tuple[Errors, ...], remainder: Remainder, diagnosis: Diagnosis | None, rest: Rest,
-    complete: bool, lacks: tuple[Lack, ...],
-) -> str:  # fmt: skip
+    errors: tuple[Errors, ...], rest: Rest, floor: float, complete: bool, remaining: str
+) -> str:
     """Return the calibration in one sentence."""
     held = len(errors[2].rows) > 0
     before, after = (errors[2], errors[3]) if held else (errors[0], errors[1])
     where = "on poses that the fit never saw" if held else "on the fitted poses (none held out)"
     text = (
         f"the error falls from {1e3 * before.rms:.3f} to {1e3 * after.rms:.3f} mm rms {where}; "
-        f"noise of instrument and arm is {1e3 * rest.noise.coordinate():.3f} mm a coordinate"
+        f"the fit leaves {1e3 * rest.noise.coordinate():.3f} mm a coordinate"
     )
+    if np.isfinite(floor):
+        text += f" (instrument and arm alone: {1e3 * floor:.3f} mm)"
+    return f"{text}; {'' if complete else 'not complete: '}{remaining}"
+
+
+def remaining_of(
+    remainder: Remainder, diagnosis: Diagnosis | None, complete: bool, lacks: tuple[Lack, ...],
+    settled: bool,
+) -> str:  # fmt: skip
+    """Return what is left: one statement, which every section of a report repeats."""
     if complete:
-        return f"{text}; nothing is left that a further effect could explain"
+        return "nothing is left that a further effect could explain"
+    if not settled:
+        return "the fit did not converge"
     if lacks:
         names = ", ".join(f"{lack.name} ({100 * lack.share:.0f} %)" for lack in lacks)
-        return f"{text}; not complete: to be added, with the share of what is left: {names}"
+        return (
+            "to be added, with the share that each takes off what is left on poses left out of its "
+            f"fit: {names}"
+        )
     left = [] if diagnosis is None else sorted(
         {cause.effect for c in diagnosis.channels for cause in c.causes}
     )  # fmt: skip
     if left:
-        return f"{text}; not complete: {', '.join(left)} is left to be added"
+        return f"{', '.join(left)} is left to be added"
     if diagnosis is not None and diagnosis.verdict != "no_gap":
-        return f"{text}; not complete: structure is left that no effect of the catalogue explains"
-    return (
-        f"{text}; not complete: held-out poses are {np.sqrt(remainder.ratio):.1f} times as far off "
-        "as promised"
+        return "structure is left that no effect of the catalogue explains"
+    return f"held-out poses are {np.sqrt(remainder.ratio):.1f} times as far off as promised"
+
+
+def unsupported(estimates: tuple[Estimate, ...], names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return those of the effects ``names`` that a fit does not bear out.
+
+    An effect is borne out where one of its numbers is more than three of its own sigmas from zero
+    and off its bounds.
+    """
+    return tuple(
+        name
+        for name in names
+        if not any(
+            abs(e.value) > SIGMAS * e.std and e.shown and not e.on_bound
+            for e in estimates
+            if e.name == name or e.name.startswith(f"{name}_")
+        )
     )

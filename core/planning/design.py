@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from gapbridge.core.calibration.observables.nuisance import Layout
 from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.plan import Payload, Plan
@@ -41,8 +42,8 @@ class Wish:
     repeats: int = 3  # visits to a pose a second time
     seed: int = 0
     sigma: float = 3e-5  # m, 1 sigma of one coordinate: instrument and arm together
-    travel_weight: float = 0.02  # a usual leg more at every pose is worth this share of the std
-    stops: int = STOPS  # candidates
+    travel_weight: float = 0.02  # share of the TCP's std that a usual leg more at every pose costs
+    stops: int = STOPS  # candidate poses that are looked at
 
 
 def plan(
@@ -50,25 +51,15 @@ def plan(
     observable: Observable,
     loads: Sequence[Payload],
     space: Space,
-    *,
-    poses: int = 30,
-    held_out: int = 8,
-    repeats: int = 3,
-    seed: int = 0,
-    sigma: float = 3e-5,
-    travel_weight: float = 0.02,
-    stops: int = STOPS,
+    wish: Wish,
     progress: Progress | None = None,
 ) -> Plan:
     """Return the poses, loads and approaches that tell most, in the order of travel.
 
     Chosen so that the TCP predicted by the calibrated model is known best over the whole reachable
-    space and under all ``loads``, the worst places before the others. ``sigma`` (m) is 1 sigma of
-    one coordinate of a reading; ``travel_weight`` the share of the TCP's deviation that a usual leg
-    more at every pose is worth; ``stops`` how many candidate poses are looked at.
+    space and under all ``loads``, the worst places before the others.
     Raises PlanError where no pose is reachable and seen, or where the poses cannot be enough.
     """
-    wish = Wish(poses, held_out, repeats, seed, sigma, travel_weight, stops)
     with threadpool_limits(1, "blas"):  # matrices of this size gain nothing from threads
         return _planned(parameters, observable, loads, space, wish, progress or _silent)
 
@@ -86,6 +77,7 @@ def _planned(
     tell: Progress,
 ) -> Plan:
     loads = _in_order(parameters, loads)
+    _require_numbers(parameters, observable, wish)
     tell("looking for poses", 0.0)
     space = replace(space, hung=(*space.hung, *(far_end(load) for load in loads)))
     found = candidates_of(parameters, observable, loads, space, wish.seed, wish.stops)
@@ -144,16 +136,30 @@ def far_end(load: Payload) -> tuple[float, float, float]:
     return (2 * load.cog[0], 2 * load.cog[1], 2 * load.cog[2])
 
 
+def _require_numbers(parameters: Parameters, observable: Observable, wish: Wish) -> None:
+    """Raise PlanError where the poses give no more numbers than there are unknowns.
+
+    Arithmetic, before any pose is looked for: the instrument is counted as standing at one place.
+    """
+    frame = () if observable.registered and not observable.unknown else observable.frame
+    layout = Layout(1, 1, frame, observable.free_length, observable.first_target)
+    _require(len(parameters) + layout.size, observable, wish)
+
+
+def _require(unknown: int, observable: Observable, wish: Wish) -> None:
+    needed = unknown // observable.equations + 1
+    if wish.poses < needed:
+        raise PlanError(
+            f"too few poses: found {wish.poses}, expected at least {needed}: {unknown} unknowns, "
+            f"{observable.equations} number(s) a {observable.kind} reading; plan more poses or "
+            "ask for fewer effects"
+        )
+
+
 def _require_enough(
     parameters: Parameters, observable: Observable, found: Candidates, wish: Wish
 ) -> None:
-    unknown = len(parameters) + observable.layout(found.readings).size
-    needed = -(-unknown // observable.equations)
-    if wish.poses < needed:
-        raise PlanError(
-            f"poses: found {wish.poses}, expected at least {needed}: {unknown} unknowns, "
-            f"{observable.equations} number(s) a {observable.kind} reading"
-        )
+    _require(len(parameters) + observable.layout(found.readings).size, observable, wish)
     if len(found.readings) < wish.poses + wish.held_out:
         raise PlanError(
             f"poses: {len(found.readings)} can be reached and seen, expected at least "

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from gapbridge.bridge.calibration.instruments.instrument import Instrument, Samples, Where
+from gapbridge.bridge.calibration.instruments.instrument import (
+    Instrument,
+    ReadingError,
+    Samples,
+    Where,
+)
 from gapbridge.bridge.cell.settings.instruments import SphereSettings
 
 
@@ -22,5 +27,6 @@ class Sphere(Instrument[SphereSettings]):
 
     def read(self, where: Where) -> Samples:
         """Return one sample without any number (1, 0), once the probe sits on the sphere."""
-        self.around.ask("probe seated on the sphere? Enter")
+        if answer := self.around.ask("probe seated on the sphere? Enter"):
+            raise ReadingError(f"found {answer!r}, expected Enter")
         return Samples(np.zeros((1, 0)))

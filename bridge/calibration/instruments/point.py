@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from gapbridge.bridge.calibration.instruments.instrument import Instrument, Samples, Where
+from gapbridge.bridge.calibration.instruments.instrument import (
+    Instrument,
+    ReadingError,
+    Samples,
+    Where,
+)
 from gapbridge.bridge.cell.settings.instruments import PointSettings
 
 
@@ -22,5 +27,6 @@ class TipOnPoint(Instrument[PointSettings]):
 
     def read(self, where: Where) -> Samples:
         """Return one sample without any number (1, 0), once the tip is on the point."""
-        self.around.ask("tip on the point? Enter")
+        if answer := self.around.ask("tip on the point? Enter"):
+            raise ReadingError(f"found {answer!r}, expected Enter")
         return Samples(np.zeros((1, 0)))

@@ -9,18 +9,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.format import duration, load_text, millimetres, parameter
-from gapbridge.bridge.calibration.jobs.fitting import fitted, tell_calibration
+from gapbridge.bridge.calibration.jobs.fitting import (
+    calibration_of,
+    fitted,
+    tell_calibration,
+)
 from gapbridge.bridge.calibration.jobs.job import Job, write_document
 from gapbridge.bridge.calibration.jobs.log_of import write_log
 from gapbridge.bridge.calibration.planning import metrology_of, planned
 from gapbridge.bridge.calibration.session.pace import seconds_left
+from gapbridge.bridge.document.provenance import fitted as fitted_on
+from gapbridge.bridge.document.provenance import provenance
+from gapbridge.core.calibration.fit import SessionFit
+from gapbridge.core.calibration.lacking import Lack
 from gapbridge.core.calibration.plan import Plan
 from gapbridge.core.calibration.promise import document_of
-from gapbridge.core.calibration.result import Calibration, Errors
+from gapbridge.core.calibration.result import Errors
+from gapbridge.core.calibration.spread import Spread
+from gapbridge.core.calibration.telling import unsupported
+from gapbridge.core.log.log import read_log
+from gapbridge.core.ranges import range_of
 
 Array = NDArray[np.float64]
 REFITS = 3  # times at most that the readings may ask for more
-WORSE = 1.1  # times the error on unseen poses above which a further fit is not taken
 
 
 def promise_beside(cell: Path) -> Path:
@@ -73,41 +84,56 @@ class WholeJob(Job):
             needless = "" if count else " (not needed: nothing more is seen from there)"
             self.talk.say(f"  place {i + 1}: ({place}) m in base, {count} stops{needless}")
 
-    def _wanted(self, lacking: tuple[str, ...]) -> bool:
-        """Return whether effects that the readings ask for are to be fitted as well."""
-        question = f"The readings ask for {', '.join(lacking)} as well. Fit again with it?"
+    def _wanted(self, lacks: tuple[Lack, ...]) -> bool:
+        """Return whether effects that the fitted poses support are to be fitted as well."""
+        shares = ", ".join(f"{lack.name} {100 * lack.share:.0f} %" for lack in lacks)
+        names = ", ".join(lack.name for lack in lacks)
+        self.talk.say(
+            f"on poses left out of its fit in turn, this takes off what is left: {shares}"
+        )
+        question = f"The fitted poses ask for {names} as well. Fit again with it?"
         return self.order.yes or self.talk.confirm(question)
 
-    def _completed(self, found: Calibration) -> Calibration:
-        """Return the fit with what the readings ask for as well, as long as a person wants it.
+    def _chosen(self, fit: SessionFit) -> tuple[SessionFit, tuple[str, ...]]:
+        """Return the fit with what the fitted poses support and a person wants; and what fell.
 
-        One that is worse on poses that no fit saw is told and not taken.
+        The held-out poses have no say in it. What is not borne out by its own value falls.
         """
         asked: tuple[str, ...] = ()
+        fallen: tuple[str, ...] = ()
         for _ in range(REFITS):
-            new = tuple(name for name in found.lacking if name not in asked)
+            new = tuple(lack for lack in fit.lacks if lack.name not in (*asked, *fallen))
             if not new or not self._wanted(new):
                 break
-            asked += new
-            further = fitted(self.cell, self.order, self.talk, self.book, asked)
-            tell_calibration(self.talk, further)
-            if further.held_out_after.rms > WORSE * found.held_out_after.rms:
-                self.talk.warn(
-                    f"with {', '.join(new)} unseen poses are "
-                    f"{further.held_out_after.rms / found.held_out_after.rms:.1f} times as far "
-                    "off: the fit without stays"
-                )
+            names = (*asked, *(lack.name for lack in new))
+            further = fitted(self.cell, self.order, self.talk, self.book, names)
+            while unfit := unsupported(further.estimates(), names):
+                for name in unfit:
+                    self._tell_fallen(name, further)
+                fallen += unfit
+                names = tuple(name for name in names if name not in fallen)
+                if names == asked:
+                    further = fit
+                    break
+                further = fitted(self.cell, self.order, self.talk, self.book, names)
+            if names == asked:
                 break
-            found = further
-        return found
+            fit, asked = further, names
+        return fit, fallen
+
+    def _tell_fallen(self, name: str, fit: SessionFit) -> None:
+        own = [e for e in fit.estimates() if e.name == name or e.name.startswith(f"{name}_")]
+        values = ", ".join(f"{e.name} = {parameter(e.value, e.unit)} ± {parameter(e.std, e.unit)}"
+                           for e in own)  # fmt: skip
+        self.talk.warn(f"not fitted: {values} is not three of its sigmas from zero")
 
     def finish(self) -> None:
         """Fit, tell, report, and write the new cell once a person says yes."""
         talk, folder, order = self.talk, self.folder, self.order
         talk.say()
-        found = fitted(self.cell, order, talk, self.book)
+        fit, fallen = self._chosen(fitted(self.cell, order, talk, self.book))
+        found = calibration_of(self.cell, order, talk, self.book, fit, fallen)
         tell_calibration(talk, found)
-        found = self._completed(found)
         metrology = metrology_of(self.cell, order.instrument, self.book.places)
         write_log(found.readings, metrology.registered, folder / "readings.csv")
         promise = document_of(found, sigma=metrology.sigma)
@@ -121,12 +147,16 @@ class WholeJob(Job):
         for file in write_report(found, self.book.plan, facts, folder):
             talk.say(f"{file}: written")
         if not found.complete:
-            talk.warn("something is left that these effects do not explain: see the report")
+            talk.warn(f"not complete: {found.remaining}")
         if (why := worse_than_before(found.held_out_before, found.held_out_after)) is not None:
             self.book.add("ended", applied=None)
             talk.warn(why)
             return
-        target = self.hand_over(found.model, "the calibrated cell")
+        log = read_log(folder / "readings.csv", self.cell.arm.n)
+        spread = Spread(tuple(e.name for e in found.estimates), found.whole_covariance)
+        origin = provenance({"log": [folder / "readings.csv"], "cell": [self.cell.path]})
+        sections = {"provenance": fitted_on(origin, range_of(log), spread)}
+        target = self.hand_over(found.model, "the calibrated cell", sections)
         if target is not None:
             write_document(promise_beside(target), promise)
             talk.say(f"  months later: gapbridge calibrate {target} --verify")

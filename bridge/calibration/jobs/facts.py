@@ -10,6 +10,7 @@ from gapbridge.bridge.calibration.options import Order
 from gapbridge.bridge.calibration.report import InstrumentFacts, SessionFacts
 from gapbridge.bridge.calibration.session.session import Book
 from gapbridge.bridge.cell import Cell
+from gapbridge.bridge.document.provenance import digest, installed_version
 
 NAMES = {
     "typed": "readings typed at the terminal",
@@ -36,24 +37,37 @@ def session_facts(
     times = [t.time for t in book.taken] or [float(book.begun["time"])]
     wide = {"position": 3, "pose": 3, "distance": 1}.get(kind, 0)  # the others look from nowhere
     distances = [np.linalg.norm(t.value[:wide]) for t in book.taken if wide]
+    started = datetime.fromtimestamp(float(book.begun["time"]))
     return SessionFacts(
         cell=cell.path.stem,
         arm=cell.arm.name,
         serial=given.serial,
         operator=given.operator,
+        customer=given.customer,
         environment=given.environment,
         instrument=InstrumentFacts(
             name=name, kind=kind, serial="" if what else instrument.serial,
+            certificate="" if what else instrument.certificate,
             sigma=instrument.sigma or cell.metrology.sigma,
             distance=float(np.median(distances)) if distances else 0.0,
         ),
         folder=book.journal.path.parent,
-        started=datetime.fromtimestamp(float(book.begun["time"])),
+        started=started,
         ended=datetime.fromtimestamp(max(times)),
         readings=len(book.taken),
         undone=book.undone,
+        number=_number(started, book),
+        version=installed_version(),
+        cell_sha256=digest(cell.path) or "",
+        accuracy=given.accuracy,
         remarks=tuple(_remarks(book)),
     )  # fmt: skip
+
+
+def _number(started: datetime, book: Book) -> str:
+    """Return the report's number: when the session began, and a digest of its journal so far."""
+    content = digest(book.journal.path) or ""
+    return f"GB-{started:%Y%m%d-%H%M}-{content[:8]}"
 
 
 def _remarks(book: Book) -> list[str]:

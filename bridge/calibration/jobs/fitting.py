@@ -12,7 +12,7 @@ from gapbridge.bridge.calibration.planning import effects_of, metrology_of, obse
 from gapbridge.bridge.calibration.session.prompt import Talk
 from gapbridge.bridge.calibration.session.session import Book
 from gapbridge.bridge.cell import Cell
-from gapbridge.core.calibration.fit import calibrate
+from gapbridge.core.calibration.fit import SessionFit, fit_session, judged
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.result import Calibration, Errors
 
@@ -22,21 +22,32 @@ DIAGNOSED = ("position", "pose")  # kinds whose remainder the diagnosis can judg
 
 def fitted(
     cell: Cell, order: Order, talk: Talk, book: Book, more: tuple[str, ...] = ()
-) -> Calibration:
+) -> SessionFit:
     """Return the fit of a session's readings, with ``more`` effects than the cell names.
 
-    Raises InputError where the readings are too few.
+    Nothing of the held-out poses is looked at. Raises InputError where the readings are too few.
     """
-    assert book.plan is not None
     kind, places = order.instrument.measures, book.places
     observable = observable_of(cell, order.instrument, places)
     metrology = metrology_of(cell, order.instrument, places)
     with talk.waiting("fitting") as tell:
         parameters = Parameters.of(cell.model, (*effects_of(cell), *more), observable=observable)
-        return calibrate(
-            cell.model, book.all_readings(kind), parameters, metrology, observable=observable,
-            expected=book.plan.expected, diagnose=kind in DIAGNOSED,
+        return fit_session(
+            book.all_readings(kind), parameters, metrology, observable=observable,
             progress=lambda text: tell(f"fitting: {text}"),
+        )  # fmt: skip
+
+
+def calibration_of(
+    cell: Cell, order: Order, talk: Talk, book: Book, fit: SessionFit, declined: tuple[str, ...]
+) -> Calibration:
+    """Return the fit judged on the held-out poses: the one look at them."""
+    assert book.plan is not None
+    with talk.waiting("verifying") as tell:
+        return judged(
+            cell.model, fit, declined=declined, expected=book.plan.expected,
+            diagnose=order.instrument.measures in DIAGNOSED,
+            progress=lambda text: tell(f"verifying: {text}"),
         )  # fmt: skip
 
 
@@ -50,7 +61,9 @@ def tell_calibration(talk: Talk, found: Calibration) -> None:
     for name, before, after in pairs:
         if len(after.vector):
             talk.say(f"  {name}: {_errors(before)} before, {_errors(after)} after")
-    noise = f"  noise {millimetres(found.noise)} a coordinate"
+    noise = f"  the fit leaves {millimetres(found.noise)} a coordinate"
+    if np.isfinite(found.noise_floor):
+        noise += f", instrument and arm alone {millimetres(found.noise_floor)}"
     if np.isfinite(found.repeatability):
         small = found.repeatability < LEAST_TOLD
         noise += ", the arm repeats " + (

@@ -21,6 +21,7 @@ from gapbridge.bridge.calibration.session.reading_check import Foresight
 from gapbridge.bridge.calibration.session.session import Book
 from gapbridge.bridge.cell import Cell, save_cell
 from gapbridge.bridge.document.output_file import require_writable, write_text
+from gapbridge.bridge.document.provenance import provenance
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
 from gapbridge.core.model import Model
 
@@ -81,7 +82,12 @@ class Job(ABC):
             talk.say(f"nothing is applied; fit and report stay in {self.folder}")
             return None
         require_writable(target, cell.path)
-        save_cell(cell, target, model, sections)
+        origin = provenance({"log": [self.book.journal.path], "cell": [cell.path]})
+        kept = cell.file.provenance
+        if kept is not None:  # what was fitted of the arm stays as it was
+            kept_keys = {"fitted", "parameters", "covariance"}
+            origin |= kept.model_dump(mode="json", include=kept_keys)
+        save_cell(cell, target, model, {"provenance": origin} | (sections or {}))
         self.book.add("ended", applied=str(target.resolve()))
         talk.say(f"{target}: written", "bold")
         return target

@@ -40,4 +40,8 @@ class SessionFacts:
     temperature: tuple[float, float] | None = None  # °C of the air, at the start and at the end
     payload_error: float | None = None  # kg, largest error of the loads' masses; None: not stated
     environment: str = ""  # anything else worth knowing, in words
+    number: str = ""  # of the report
+    version: str = ""  # of Gapbridge
+    cell_sha256: str = ""  # of the cell file that was calibrated
+    accuracy: float | None = None  # m, asked for; None: nobody has
     remarks: tuple[str, ...] = field(default=())  # what happened on the way, in words

@@ -8,10 +8,11 @@ from typing import TypeVar
 
 from gapbridge.bridge.calibration.report.facts import SessionFacts
 from gapbridge.bridge.calibration.report.material import Material
-from gapbridge.bridge.calibration.report.payload_sections import PAYLOAD, PayloadMaterial
-from gapbridge.bridge.calibration.report.sections import CALIBRATION
-from gapbridge.bridge.calibration.report.tool_sections import TOOL, ToolMaterial
-from gapbridge.bridge.calibration.report.verification_sections import (
+from gapbridge.bridge.calibration.report.sections.calibration_sections import CALIBRATION
+from gapbridge.bridge.calibration.report.sections.payload_sections import PAYLOAD, PayloadMaterial
+from gapbridge.bridge.calibration.report.sections.signature_section import signature
+from gapbridge.bridge.calibration.report.sections.tool_sections import TOOL, ToolMaterial
+from gapbridge.bridge.calibration.report.sections.verification_sections import (
     VERIFICATION,
     VerificationMaterial,
 )
@@ -81,11 +82,13 @@ def _document(
 ) -> Document:
     parts = [section.part(material) for section in sections]
     title = f"{what} of {session.cell}"
+    software = f"Gapbridge {session.version}".strip()
+    number = f"Report {session.number} · " if session.number else ""
     return Document(
         title,
-        f"Arm {session.arm}, {session.started:%d %B %Y} · Gapbridge",
-        tuple(part for part in parts if part is not None),
-        f"Gapbridge · {title[:1].lower()}{title[1:]} · {session.started:%Y-%m-%d}",
+        f"{number}Arm {session.arm}, {session.started:%d %B %Y} · {software}",
+        (*(part for part in parts if part is not None), signature(session)),
+        f"{number}{title[:1].lower()}{title[1:]} · {session.started:%Y-%m-%d} · {software}",
     )
 
 

@@ -101,7 +101,7 @@ class Conversation:
             except ReadingError as error:
                 self.talk.warn(str(error))
                 if not self.instrument.manual:
-                    self.talk.ask("  Enter to try again")
+                    self.talk.enter("  Enter to try again")
                     stand = self.bringing.bring(pose)
         at = found.stand
         before = self.book.taken[-1].q if self.book.taken else at.q

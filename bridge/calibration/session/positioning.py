@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from gapbridge.bridge.calibration.joints.joint_source import JointSource, Planne
 from gapbridge.bridge.calibration.session.prompt import Talk
 from gapbridge.bridge.calibration.session.route import route
 from gapbridge.bridge.calibration.session.session import Book
+from gapbridge.bridge.cell.settings.calibration import CalibrationSettings
 from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.errors import RunError
 
@@ -30,14 +31,13 @@ class Bringing:
     """
 
     def __init__(
-        self, talk: Talk, book: Book, joints: JointSource, clear: Callable[[Array], Array],
-        speed: float, minutes_per_load: float, instrument: AnyInstrument,
-        places: Sequence[Sequence[float]] = (),
+        self, talk: Talk, book: Book, joints: JointSource, instrument: AnyInstrument,
+        clear: Callable[[Array], Array], settings: CalibrationSettings,
     ) -> None:  # fmt: skip
         self.talk, self.book, self.joints = talk, book, joints
-        self.minutes_per_load = minutes_per_load
-        self._clear, self._speed = clear, speed
-        self._instrument, self._places = instrument, places
+        self.minutes_per_load = settings.minutes_per_load
+        self._instrument, self._clear, self._speed = instrument, clear, settings.speed
+        self._places = [settings.instrument_at or [], *settings.further_places]
         self._asked: int | None = None  # load for which driving was asked about
         self._driven = False
         self._warned: set[int] = set()
@@ -50,7 +50,7 @@ class Bringing:
             f"place {number + 1} · {self._instrument.stands} at about ({at}) m in base",
             "bold cyan",
         )
-        self.talk.ask("  Enter when it stands there")
+        self.talk.enter("  Enter when it stands there")
 
     def mount(self, load: int) -> None:
         """Have a load mounted, and ask whether the arm may be driven with it."""
@@ -76,7 +76,7 @@ class Bringing:
             self.talk.say("  it hangs on the flange, and nothing touches it?")
         else:
             self.talk.say("  hang it on the flange, and tell the controller its mass and centre")
-        self.talk.ask("  Enter when it hangs there")
+        self.talk.enter("  Enter when it hangs there")
         self.book.add("mounted", load=load)
 
     def bring(self, pose: PlannedPose) -> Stand | None:
@@ -136,7 +136,7 @@ class Bringing:
             try:
                 if not self.joints.watches:
                     if isinstance(self.joints, PlannedJoints) and not self._instrument.waits:
-                        self.talk.ask("  Enter when it stands there")
+                        self.talk.enter("  Enter when it stands there")
                     return self.joints.stand(pose)
                 found = self.joints.arrived(pose)
                 if found is None:
@@ -152,6 +152,9 @@ class Bringing:
         heard = self.talk.ask_unless(question, lambda: self.joints.arrived(pose))
         if isinstance(heard, Stand):
             return heard
+        if heard:
+            self.talk.say(f"  found {heard!r}, expected Enter, or a word of the session (`?`)")
+            return None
         now = self.joints.now()
         if now is None:
             return None
@@ -176,11 +179,11 @@ class Bringing:
                 f"the controller believes that {told:g} kg hang on the flange, the plan {meant:g} "
                 "kg: is the right load mounted, and the controller told?"
             )
-            self.talk.ask("  Enter when it is put right")
+            self.talk.enter("  Enter when it is put right")
         elif stand.wrench is not None and np.linalg.norm(stand.wrench[:3]) > PULL:
             self._warned.add(pose.load)
             self.talk.warn(
                 f"the controller feels {np.linalg.norm(stand.wrench[:3]):.0f} N at the tool: is "
                 "the right load mounted, and nothing touching it?"
             )
-            self.talk.ask("  Enter when it is put right")
+            self.talk.enter("  Enter when it is put right")

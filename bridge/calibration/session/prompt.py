@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import select
 import sys
+import termios
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
@@ -71,6 +72,11 @@ class Talk:
             if not self._is_help(heard):
                 return self._answer(heard)
 
+    def enter(self, question: str) -> None:
+        """Return on Enter alone; any other answer is asked again."""
+        while answer := self.ask(question):
+            self.say(f"found {answer!r}, expected Enter, or a word of the session (`?`)")
+
     def confirm(self, question: str) -> bool:
         """Return whether a person says yes; asks until it is yes or no."""
         while True:
@@ -102,13 +108,15 @@ class Talk:
             yield lambda text: shown.update(text)
 
     def _heard(self, question: str, look: Callable[[], T | None]) -> str | T:
+        if early := self._typed.flush():
+            self.say(f"  dropped what was typed before the question: {early}", "yellow")
         self.console.print(f"{question} > ", end="", markup=False, style="bold")
         self.console.file.flush()
         while True:
             line = self._typed.line(LOOK)
             if line is not None:
-                if self._typed.pasted or not sys.stdin.isatty():
-                    self.say(line)  # the terminal has shown it earlier, or never
+                if not sys.stdin.isatty():
+                    self.say(line)  # nothing has shown it yet
                 return line.strip()
             if self._typed.ended:
                 raise InputEnded
@@ -150,16 +158,30 @@ class _Lines:
     def __init__(self) -> None:
         self._rest = b""
         self.ended = False
-        self.pasted = False  # the last line came together with one before it
 
     @property
     def _ready(self) -> bool:
         return b"\n" in self._rest
 
+    def flush(self) -> str:
+        """Drop what was typed at a terminal so far, and return it; a file or pipe keeps its lines.
+
+        An answer typed before its question was meant for another one.
+        """
+        fd = sys.stdin.fileno()
+        if not os.isatty(fd):
+            return ""
+        while not self.ended and select.select([fd], [], [], 0.0)[0]:
+            data = os.read(fd, 4096)
+            self.ended = not data
+            self._rest += data
+        termios.tcflush(fd, termios.TCIFLUSH)  # a line that has not ended yet
+        early, self._rest = self._rest, b""
+        return " ⏎ ".join(early.decode("utf-8", "replace").splitlines())
+
     def line(self, wait: float) -> str | None:
         """Return the next line, None where none comes within ``wait`` s."""
         fd = sys.stdin.fileno()
-        self.pasted = self._ready
         if not self._ready and not self.ended and select.select([fd], [], [], wait)[0]:
             data = os.read(fd, 4096)
             self.ended = not data

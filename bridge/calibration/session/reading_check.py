@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.bridge.calibration.session.first_readings import first_doubt
 from gapbridge.bridge.calibration.session.fitted_so_far import AXES, FittedSoFar, here
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import Parameters
@@ -78,14 +79,32 @@ class Foresight:
         try:
             state = self._fitted(same, new)
         except GapbridgeError:
-            return NOTHING  # too few readings yet to know where the instrument stands
-        if state is None:
-            return NOTHING
+            state = None
+        if state is None:  # too few readings yet to know where the instrument stands
+            return self._first(same, new)
         off, allowed, doubted = state.compare(new)
         if not doubted:
             return Verdict(off, allowed, False)
         reasons, instead = self._reasons(state, new, typed, joints)
         return Verdict(off, allowed, True, tuple(reasons), instead)
+
+    def _first(self, before: Readings, new: Readings) -> Verdict:
+        """Return what reach, and the readings before it, say of one of the first readings."""
+        tip = np.concatenate([self.poses(before).position, self.poses(new).position])
+        doubt = first_doubt(before, new, tip)
+        if doubt is None:
+            return NOTHING
+        reasons = [doubt[2]]
+        instead: Array | None = None
+        for factor, words in UNITS.items():
+            value = new.value.copy()
+            value[:, :3] *= factor
+            if first_doubt(before, replace(new, value=value), tip) is None and len(before):
+                reasons.append(words)
+                instead = value[0]
+        if not len(before):
+            reasons.append("is the unit right?")
+        return Verdict(doubt[0], doubt[1], True, tuple(reasons), instead)
 
     def shift(self, old: Readings, new: Readings, before: Readings) -> Array:
         """Return how far a pose's reading has gone (k,), m, base axes where they are known.

@@ -106,6 +106,10 @@ class CalibrationSettings(_Section):
     )
     minutes_per_load: NotNegative = Field(default=5.0, description="min to change the load")
     folder: Path = Field(default=Path("calibration"), description="of the sessions")
+    accuracy: Positive | None = Field(
+        default=None, description="m, asked for: no pose kept out of the fit may be farther off"
+    )
+    customer: str = Field(default="", description="for whom, for the report")
     operator: str = Field(default="", description="who measures, for the report")
     serial: str = Field(default="", description="of the arm, for the report")
     environment: str = Field(default="", description="temperature, place, ..., for the report")

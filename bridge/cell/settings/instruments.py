@@ -27,6 +27,9 @@ class Base(BaseModel):
         default=None, description="m, 1 sigma of one coordinate; default: metrology.sigma"
     )
     serial: str = Field(default="", description="of the instrument, for the report")
+    certificate: str = Field(
+        default="", description="number and date of its own calibration, for the report"
+    )
 
     @property
     def measures(self) -> str:

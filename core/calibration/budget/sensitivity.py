@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.calibration.parameters import Parameters
-from gapbridge.core.calibration.promise import effects_of
 from gapbridge.core.calibration.result import Calibration
+from gapbridge.core.calibration.spread import effects_of
 from gapbridge.core.errors import InputError
 
 Array = NDArray[np.float64]

@@ -55,8 +55,10 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Played]:
 def test_what_is_lacking_is_offered_and_fitted_on_a_yes(ended: tuple[Path, Played]) -> None:
     folder, played = ended
     assert played.code == 0, played.err
-    assert "not complete: to be added" in played.out
-    assert "ask for transmission_error_2 as well. Fit again with it?" in played.out
+    assert "poses ask for transmission_error_2 as well. Fit again with it?" in played.out
+    offered, judged = played.out.index("Fit again"), played.out.index("poses to verify:")
+    assert offered < judged  # the held-out poses are looked at once, by what is written
+    assert played.out.count("poses to verify:") == 1
     found = [t for t in load_cell(folder / "new.yaml").model.terms if t.effect == WAVE.effect]
     second = next(t for t in found if t.site == WAVE.site)
     assert second.values == pytest.approx(WAVE.values, abs=1.2e-4)
@@ -69,3 +71,18 @@ def test_the_cell_that_comes_of_it_predicts_the_arm(ended: tuple[Path, Played]) 
     said = there(plan, load_cell(folder / "new.yaml").model)
     off = np.linalg.norm(register(there(plan), said).in_base(there(plan)) - said, axis=1)
     assert off.max() < 1e-4
+
+
+@pytest.mark.slow
+def test_the_cell_says_where_it_comes_from_and_how_well_it_is_known(
+    ended: tuple[Path, Played],
+) -> None:
+    folder, _ = ended
+    cell = load_cell(folder / "new.yaml")
+    origin = cell.file.provenance
+    assert origin is not None
+    assert origin.command == "calibrate"
+    assert {file.role for file in origin.files} == {"log", "cell"}
+    assert "transmission_error_2_order2_cos" in " ".join(cell.spread.names)
+    std = cell.spread.position_std(cell.model, np.array([p.q for p in plan_in(folder / "s").poses]))
+    assert 0 < std.max() < 2e-4

@@ -25,9 +25,10 @@ from benchmarks.calibration.laid_out import (
 from gapbridge.core.calibration.fit import calibrate
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import Parameters
-from gapbridge.core.calibration.promise import document_of, effects_of, promise_in
+from gapbridge.core.calibration.promise import document_of, promise_in
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.result import Calibration
+from gapbridge.core.calibration.spread import effects_of
 from gapbridge.core.calibration.verify import verify
 from gapbridge.core.errors import ExcitationError, InputError
 from gapbridge.core.metrology import Metrology

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gapbridge.bridge.calibration.session.first_readings import first_doubt
 from gapbridge.bridge.calibration.session.reading_check import Foresight, Verdict
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.calibration.parameters import DEFAULT
@@ -139,3 +140,35 @@ def test_a_mistyped_joint_is_named() -> None:
 
 def test_the_first_readings_of_an_unregistered_instrument_tell_nothing_yet() -> None:
     assert not np.isfinite(judged(session(2, 0)).off)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_the_first_three_readings_in_a_wrong_unit_are_doubted(count: int, factor: float) -> None:
+    readings = session(count, 1)
+    verdict = judged(with_last(readings, readings.value[-1] * factor))
+    assert verdict.doubted
+    if count > 1:
+        assert "millimetres" in " ".join(verdict.reasons)
+        assert verdict.instead == pytest.approx(readings.value[-1])
+
+
+def test_a_second_reading_of_another_stop_is_doubted_by_the_first() -> None:
+    readings = session(2, 1)
+    verdict = judged(with_last(readings, readings.value[0]))
+    assert verdict.doubted
+    assert "the joints put the two" in verdict.reasons[0]
+
+
+def test_two_balls_keep_their_distance_and_a_gauge_moves_no_farther_than_the_arm() -> None:
+    readings = session(2, 1)
+    tip = NOMINAL.predict(readings.q, readings.loads).position
+    balls = replace(readings, kind="relative", value=np.array([[0.2, 0, 0], [0, 0.21, 0]]))
+    one, two = balls[np.array([0])], balls[np.array([1])]
+    assert first_doubt(one, two, tip) is not None
+    assert first_doubt(one, replace(two, value=np.array([[0, 0.2002, 0]])), tip) is None
+    far = float(np.linalg.norm(tip[1] - tip[0]))
+    gauge = replace(readings, kind="distance", value=np.array([[1.0], [1.0 + 2 * far + 0.1]]))
+    assert first_doubt(gauge[np.array([0])], gauge[np.array([1])], tip) is not None
+    near = replace(gauge, value=np.array([[1.0], [1.0 + 0.5 * far]]))
+    assert first_doubt(near[np.array([0])], near[np.array([1])], tip) is None

@@ -1,0 +1,184 @@
+"""``gapbridge diagnose``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from gapbridge.bridge.api.found_spread import spread_of
+from gapbridge.bridge.cell import Cell, save_cell
+from gapbridge.bridge.cell.opened_log import open_log
+from gapbridge.bridge.cli.log.answer import answer
+from gapbridge.bridge.cli.options import (
+    cell_option,
+    logs_argument,
+    open_cell,
+    open_logs,
+    remounted_option,
+    warn_outside,
+)
+from gapbridge.bridge.cli.progress import status
+from gapbridge.bridge.document.output_file import FOLDER_MODE, require_writable, write_text
+from gapbridge.bridge.document.provenance import fitted, provenance
+from gapbridge.core.diagnosis.diagnosis import Diagnosis
+from gapbridge.core.diagnosis.diagnosis import diagnose as diagnose_log
+from gapbridge.core.diagnosis.document import document
+from gapbridge.core.effects import effect_named
+from gapbridge.core.errors import InputError, LogError
+from gapbridge.core.log.log import Log
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.ranges import range_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+@click.command()
+@logs_argument
+@cell_option
+@remounted_option
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Folder for diagnosis.json and report.html; made where it is missing.",
+)
+@click.option(
+    "--json",
+    "json_file",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write the diagnosis as JSON.",
+)
+@click.option(
+    "--apply",
+    "new_cell",
+    type=click.Path(path_type=Path),
+    metavar="NEW_CELL",
+    help="Write the cell with the found effects added.",
+)
+@click.option(
+    "--stand-ins",
+    is_flag=True,
+    help="With --apply: also what is not proved, but shrinks the gap in regions not fitted.",
+)
+@click.option(
+    "--withhold",
+    multiple=True,
+    metavar="EFFECT",
+    help="Take an effect out of the catalogue; may be given several times.",
+)
+@click.option(
+    "--sim",
+    type=click.Path(path_type=Path),
+    metavar="SIM_LOG",
+    help="Take the prediction, row by row, from a log of your own simulator.",
+)
+def diagnose(
+    logs: tuple[Path, ...],
+    cell: Path,
+    remounted: bool,
+    out: Path | None,
+    json_file: Path | None,
+    new_cell: Path | None,
+    stand_ins: bool,
+    withhold: tuple[str, ...],
+    sim: Path | None,
+) -> None:
+    """Diagnose the sim-to-real gap of a log, or of several sessions of one arm.
+
+    Says in plain sentences where it lies, what causes it and how far it shrinks. An effect is named
+    only where it shrinks the gap on poses that its fit did not see; what the catalogue does not
+    explain is said, with what it depends on. Several logs (or a column session in one) are sessions
+    that share the effects; each has a frame of its own, and with --remounted a tool point.
+
+    Example: gapbridge diagnose log.csv --cell cell.yaml --out out/diagnosis --apply better.yaml
+    """
+    if stand_ins and new_cell is None:
+        raise InputError("--stand-ins: found no --apply, expected the cell to write")
+    given = open_cell(cell)
+    rows = open_logs(logs, given)
+    warn_outside(rows, given)
+    _check_effects(withhold)
+    simulated = None if sim is None else _simulated(sim, given, rows)
+    inputs = [*logs, cell, *([sim] if sim else [])]
+    for file in (json_file, new_cell):
+        if file is not None:
+            require_writable(file, *inputs)
+    if out is not None:
+        _folder(out)
+    with status("diagnosing") as tell:
+        metrology = replace(given.metrology, remounted=remounted)
+        found = _diagnose(given, rows, metrology, withhold, simulated, tell)
+    click.echo(answer(found))
+    origin = provenance({"log": logs, "cell": [cell], "sim": [sim] if sim else []})
+    told = document(found) | {"provenance": origin}
+    text = json.dumps(told, indent=1, allow_nan=False) + "\n"
+    if json_file is not None:
+        write_text(json_file, text)
+    if new_cell is not None:
+        applied = found.with_stand_ins if stand_ins else found.model
+        spread = spread_of(found).beside(given.spread)
+        save_cell(given, new_cell, applied, {"provenance": fitted(origin, range_of(rows), spread)})
+    written = [] if out is None else _write_folder(out, text, found, given, rows)
+    for file in (*written, json_file, new_cell):
+        if file is not None:
+            click.echo(f"{file}: written")
+
+
+def _diagnose(
+    cell: Cell, log: Log, metrology: Metrology, withhold: tuple[str, ...], simulated: Log | None,
+    tell: Callable[[str], None],
+) -> Diagnosis:  # fmt: skip
+    extra: dict[str, Any] = {} if simulated is None else {"simulated": simulated}
+    try:
+        return diagnose_log(cell.model, log, metrology, withhold=withhold, progress=tell, **extra)
+    except InputError as error:
+        text = str(error)
+        raise type(error)(text if text.startswith(log.path) else f"{log.path}: {text}") from None
+
+
+def _check_effects(names: tuple[str, ...]) -> None:
+    for name in names:
+        try:
+            effect_named(name)
+        except InputError as error:
+            raise InputError(f"--withhold: {error}") from None
+
+
+def _simulated(path: Path, cell: Cell, log: Log) -> Log:
+    """Return the simulator's log; raises LogError where its rows are not those of the log."""
+    simulated = open_log(path, cell)
+    if len(simulated) != len(log):
+        raise LogError(
+            f"{path}: found {len(simulated)} rows, expected {len(log)}: one per row of {log.path}"
+        )
+    return simulated
+
+
+def _folder(path: Path) -> None:
+    """Make the folder of the results; its parent must exist."""
+    if path.exists() and not path.is_dir():
+        raise InputError(f"{path}: found a file, expected a folder for --out")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: found no folder {path.parent}, expected an existing one")
+    try:
+        path.mkdir(FOLDER_MODE, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: folder cannot be made: {error.strerror}") from None
+
+
+def _write_folder(folder: Path, text: str, found: Diagnosis, cell: Cell, log: Log) -> list[Path]:
+    """Write diagnosis.json and report.html; returns their paths."""
+    from gapbridge.bridge.report import (
+        write_report,  # plotly takes its time, and only --out needs it
+    )
+
+    written = [folder / "diagnosis.json"]
+    write_text(written[0], text)
+    written.append(write_report(found, str(cell.path), log, cell.model, folder))
+    return written

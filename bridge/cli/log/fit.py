@@ -1,0 +1,126 @@
+"""``gapbridge fit``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import click
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from gapbridge.bridge.cell import Cell, save_cell
+from gapbridge.bridge.cli.log.large_log import LargeLog, has_sessions, is_large
+from gapbridge.bridge.cli.options import (
+    cell_option,
+    logs_argument,
+    open_cell,
+    open_logs,
+    remounted_option,
+)
+from gapbridge.bridge.cli.progress import progress, status
+from gapbridge.bridge.document.output_file import require_writable
+from gapbridge.bridge.document.provenance import fitted, provenance
+from gapbridge.core.calibration.spread import Spread
+from gapbridge.core.errors import ExcitationError
+from gapbridge.core.estimation.identification import Identification, identify_compliance
+from gapbridge.core.estimation.streamed import identify_streamed
+from gapbridge.core.metrology import Metrology
+from gapbridge.core.ranges import merged, range_of
+
+
+@click.command()
+@logs_argument
+@cell_option
+@remounted_option
+@click.option(
+    "--out", required=True, type=click.Path(path_type=Path), help="The new cell file to write."
+)
+def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
+    """Identify the compliance of a cell from a log, or from several sessions of one arm.
+
+    Least squares on measured TCP poses (measured_position, and measured_rotation where the log has
+    it) under different payloads or pulls. Effects that are in the cell stay in it. Writes NEW_CELL:
+    the same cell with the flexibilities found; what the log does not show stays as it is in the
+    cell, and is told. Where the metrology is not registered, its frame and the tool point are
+    estimated along, before as well as after, and not written. Declines, with the reason, where
+    nothing in the log excites the compliance. A log of more than 20,000 rows is read in pieces,
+    so that memory does not grow with it; so is a recording of the daemon (.mcap). Several logs (or
+    a column session in one) are sessions: each has a frame of its own, and with --remounted a tool
+    point, and all share the flexibilities.
+
+    Example: gapbridge fit log.csv --cell cell.yaml --out calibrated.yaml
+    """
+    given = open_cell(cell)
+    require_writable(out, *logs, cell)
+    metrology = replace(given.metrology, remounted=remounted)
+    try:
+        found, ranges = _identified(logs, given, metrology)
+    except ExcitationError as error:
+        raise ExcitationError(f"{', '.join(map(str, logs))}: {error}") from None
+    spread = Spread.of_fit(found.identifiable, found.covariance).beside(given.spread)
+    origin = fitted(provenance({"log": logs, "cell": [cell]}), ranges, spread)
+    # frame and tool point that were estimated along stay out of the cell
+    model = given.model.with_compliance(found.axial, found.radial)
+    save_cell(given, out, model, {"provenance": origin})
+    tell(found)
+    click.echo(f"{out}: written")
+
+
+def _identified(
+    paths: Sequence[Path], cell: Cell, metrology: Metrology
+) -> tuple[Identification, dict[str, tuple[float, float]]]:
+    """Return what the logs show, and the ranges fitted on; one of many rows passes in pieces."""
+    if (
+        len(paths) == 1
+        and is_large(paths[0])
+        and not (has_sessions(paths[0]) or metrology.remounted)
+    ):
+        log = LargeLog(paths[0], cell)
+        with status("fitting") as tell_step:
+            found = identify_streamed(cell.model, log, metrology, progress=tell_step)
+        return found, merged(range_of(piece) for piece in log)
+    rows = open_logs(paths, cell)
+    with progress("fitting"):
+        return identify_compliance(cell.model, rows, metrology), range_of(rows)
+
+
+def tell(found: Identification) -> None:
+    """Print flexibilities with their spread, how far they carry, and what stays unknown."""
+    table = Table(title="joint flexibility, 1e-6 rad/Nm", title_justify="left")
+    for column in ("joint", "axial", "±", "radial", "±"):
+        table.add_column(column, justify="right")
+    n = len(found.axial)
+    for i in range(n):
+        table.add_row(
+            str(i + 1),
+            *_cells(found.axial[i], found.std_axial[i], bool(found.identifiable[i])),
+            *_cells(found.radial[i], found.std_radial[i], bool(found.identifiable[n + i])),
+        )
+    console = Console()
+    console.print(table)
+    click.echo(
+        f"gap per coordinate over {found.samples} poses, rms in mm: "
+        f"{_change(found.gap_rms, found.remaining_rms)}"
+    )
+    if np.isfinite(found.remaining_rms_held_out):
+        change = _change(found.gap_rms_held_out, found.remaining_rms_held_out)
+        click.echo(f"on poses left out of the fit: {change}")
+    for where, left in (
+        ("a new region of joint space", found.remaining_rms_new_region),
+        ("a new session", found.remaining_rms_new_session),
+    ):
+        if np.isfinite(left):
+            click.echo(f"to expect in {where}, rms in mm: {left * 1e3:.4f}")
+    for line in (*found.notes, *found.combinations):
+        click.echo(f"note: {line}")
+
+
+def _change(before: float, after: float) -> str:
+    return f"{before * 1e3:.4f} before, {after * 1e3:.4f} after"
+
+
+def _cells(value: float, std: float, shown: bool) -> tuple[str, str]:
+    return f"{value * 1e6:.4f}", f"{std * 1e6:.4f}" if shown else "not shown"

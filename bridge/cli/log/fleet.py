@@ -1,0 +1,161 @@
+"""``gapbridge fleet``: many arms, many sessions."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+from gapbridge.bridge.cli.progress import progress
+from gapbridge.bridge.fleet import diagnosing, fitting
+from gapbridge.bridge.fleet.cell_source import cell_source
+from gapbridge.bridge.fleet.folder import require_folder
+from gapbridge.bridge.fleet.journal import Journal
+from gapbridge.bridge.fleet.outcome_words import ending
+from gapbridge.bridge.fleet.runner import Done, run, tasks_of
+from gapbridge.bridge.fleet.session import Found, find_sessions
+from gapbridge.bridge.fleet.task import BAD, DONE, Outcome, Work
+from gapbridge.bridge.fleet.workers.dask_workers import DaskWorkers
+from gapbridge.bridge.fleet.workers.local_workers import LocalWorkers
+from gapbridge.bridge.fleet.workers.workers import Workers
+from gapbridge.core.effects import effect_named
+from gapbridge.core.errors import InputError, RunError
+
+OUT = Path("out/fleet")
+
+
+@click.group()
+def fleet() -> None:
+    """Diagnose or fit many arms over many sessions.
+
+    Example: gapbridge fleet diagnose logs --cell cell.yaml --out out/fleet
+    """
+
+
+def shared(command: Callable[..., None]) -> Callable[..., None]:
+    """Add what both commands take."""
+    for option in reversed((
+        click.argument("logs", nargs=-1, required=True, metavar="DIR_OR_GLOB..."),
+        click.option(
+            "--cell", required=True, metavar="CELL",
+            help="The cell of all logs; or a table (.csv) of columns arm and cell; or the word "
+            "'beside': the cell named like the log, or cell.yaml, in the log's folder or above.",
+        ),
+        click.option(
+            "--arm", "pattern", metavar="REGEX",
+            help="Finds the arm in a log's path below DIR. Default: the first folder, or the "
+            "file's name up to its first underscore.",
+        ),
+        click.option(
+            "--out", type=click.Path(path_type=Path), default=OUT, show_default=True,
+            metavar="DIR", help="Folder of the results; a run that was broken off goes on there.",
+        ),
+        click.option("--fresh", is_flag=True, help="Do all anew, whatever is in the folder."),
+        click.option(
+            "--workers", type=click.IntRange(1), metavar="N", default=None,
+            help="Local processes.  [default: one a processor]",
+        ),
+        click.option(
+            "--scheduler", metavar="ADDRESS",
+            help="Use the Dask cluster of this scheduler instead, such as tcp://10.0.0.5:8786.",
+        ),
+    )):  # fmt: skip
+        command = option(command)
+    return command
+
+
+@fleet.command()
+@shared
+@click.option("--withhold", multiple=True, metavar="EFFECT", help="Take an effect out.")
+def diagnose(withhold: tuple[str, ...], **given: Any) -> None:
+    """Diagnose every log: which effects recur, which arms drift, what stands out.
+
+    Writes results.parquet (a row per session and parameter), sessions.parquet and report.html. A
+    log that cannot be used is told and skipped. Sessions are kept as they are done: a run that was
+    broken off goes on where it stood.
+
+    Example: gapbridge fleet diagnose 'logs/*/2026-*.csv' --cell arms.csv --workers 8
+    """
+    for name in withhold:
+        effect_named(name)
+    done, found = _run("diagnose", diagnosing.work, {"withhold": list(withhold)}, **given)
+    from gapbridge.bridge.fleet.output import write_diagnosed
+
+    _told(done, found, *write_diagnosed(done, found, given["out"]))
+
+
+@fleet.command()
+@shared
+@click.option(
+    "--apply", "cells", type=click.Path(path_type=Path), metavar="DIR",
+    help="Write a new cell per arm there, and cells.csv, a table of them.",
+)  # fmt: skip
+def fit(cells: Path | None, **given: Any) -> None:
+    """Fit the compliance of all arms together: type, arm, session.
+
+    An arm with few poses borrows from the others of its type where its own data say little.
+    Writes results.parquet, sessions.parquet and report.html.
+
+    Example: gapbridge fleet fit logs --cell beside --out out/fit --apply out/cells
+    """
+    if cells is not None:
+        require_folder(cells, "--apply")
+    done, found = _run("fit", fitting.work, {}, **given)
+    from gapbridge.bridge.fleet.output import write_fitted
+
+    _told(done, found, *write_fitted(done, found, given["out"], cells))
+
+
+def _run(
+    name: str, work: Work, options: Mapping[str, Any], *, logs: tuple[str, ...], cell: str,
+    pattern: str | None, out: Path, fresh: bool, workers: int | None, scheduler: str | None,
+) -> tuple[Done, Found]:  # fmt: skip
+    if workers is not None and scheduler is not None:
+        raise InputError("--workers: found beside --scheduler, expected one of them")
+    found = find_sessions(logs, pattern, without=out)
+    cells = cell_source(cell, found.folder)
+    for warning in cells.warnings():
+        click.echo(f"warning: {warning}", err=True)
+    require_folder(out, "--out")
+    tasks, bad = tasks_of(found.sessions, cells, work, options)
+    count = min(workers or os.cpu_count() or 1, max(len(tasks), 1))
+    chosen: Workers = DaskWorkers(scheduler) if scheduler else LocalWorkers(count)
+    for outcome in bad:
+        _skipped(outcome)
+    with (
+        Journal(out / f"{name}.jsonl", fresh=fresh) as journal,
+        progress(f"{name}: sessions", len(tasks)) as advance,
+    ):
+
+        def tell(outcome: Outcome) -> None:
+            _skipped(outcome)
+            advance(1)
+
+        done = run(tasks, bad, chosen, journal, tell)
+    _require_usable(done)
+    return done, found
+
+
+def _skipped(outcome: Outcome) -> None:
+    if outcome.state != DONE:
+        click.echo(f"skipped: {outcome.error}", err=True)
+
+
+def _require_usable(done: Done) -> None:
+    if any(o.state == DONE for o in done.outcomes):
+        return
+    text = f"found no usable session among {len(done.outcomes)}, expected at least one"
+    first = done.outcomes[0].error
+    if all(o.state == BAD for o in done.outcomes):
+        raise InputError(f"{text}; the first: {first}")
+    raise RunError(f"{text}; the first: {first}")
+
+
+def _told(done: Done, found: Found, lines: list[str], files: list[Path]) -> None:
+    for line in (*ending(done, found), *lines):
+        click.echo(line)
+    for file in files:
+        click.echo(f"{file}: written")

@@ -1,0 +1,135 @@
+"""The standard deviation of predicted positions, from the covariance of fitted parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.redundancy import Redundancy
+from gapbridge.core.effects import CATALOGUE, Term
+from gapbridge.core.errors import InputError
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
+
+Array = NDArray[np.float64]
+STEP = 1e-3  # share of a parameter's usual size, for derivatives of the predicted TCP
+
+BLOCK = 20_000  # rows at a time, so that memory does not grow with them
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Names of fitted parameters (p), as calibrations have them, and their covariance (p, p), SI.
+
+    ``Spread.none()`` where nothing is known.
+    """
+
+    names: tuple[str, ...]
+    covariance: Array
+
+    @classmethod
+    def none(cls) -> Spread:
+        """Return no parameters."""
+        return cls((), np.zeros((0, 0)))
+
+    @classmethod
+    def of_fit(cls, shown: NDArray[np.bool_], covariance: Array) -> Spread:
+        """Return the flexibilities that a fit has ``shown`` (2n,), axial then radial."""
+        n = len(shown) // 2
+        names = [f"{kind}_compliance_{j + 1}" for kind in ("axial", "radial") for j in range(n)]
+        rows = np.flatnonzero(shown)
+        return cls(tuple(names[i] for i in rows), covariance[np.ix_(rows, rows)])
+
+    @classmethod
+    def of_terms(cls, model: Model, terms: Sequence[Term], covariance: Sequence[Array]) -> Spread:
+        """Return the numbers of terms, each with its own covariance (d, d).
+
+        Terms that a calibration does not fit (a slip, a torque) are left out.
+        """
+        names: list[str] = []
+        blocks: list[Array] = []
+        for term, own in zip(terms, covariance, strict=True):
+            if not CATALOGUE[term.effect].calibratable:
+                continue
+            every = Parameters.every(model, [term.effect])
+            at = {(every.terms[t].site, k): name for (t, k), name in
+                  zip(every.place, every.names, strict=True)}  # fmt: skip
+            known = [k for k in range(len(own)) if (term.site, k) in at]
+            names += [at[term.site, k] for k in known]
+            blocks.append(own[np.ix_(known, known)])
+        return cls(tuple(names), _blocks(blocks))
+
+    def beside(self, earlier: Spread) -> Spread:
+        """Return these parameters, and those of an earlier fit that this one left as they were."""
+        kept = [i for i, name in enumerate(earlier.names) if name not in self.names]
+        names = (*self.names, *(earlier.names[i] for i in kept))
+        return Spread(names, _blocks([self.covariance, earlier.covariance[np.ix_(kept, kept)]]))
+
+    def position_std(self, model: Model, q: Array, loads: Loads | None = None) -> Array:
+        """Return 1 sigma of the predicted TCP (N, 3), m, base axes: the parameters' part alone.
+
+        Raises InputError where a parameter is none of the model's arm.
+        """
+        q = np.atleast_2d(q)
+        if not self.names:
+            return np.full((len(q), 3), np.nan)
+        parameters = parameters_named(model, self.names, "provenance")
+        out = np.empty((len(q), 3))
+        for begin in range(0, len(q), BLOCK):
+            rows = slice(begin, begin + BLOCK)
+            here = None if loads is None else loads[rows]
+            J = _columns(parameters, model, q[rows], here)
+            square = np.einsum("nki,ij,nkj->nk", J, self.covariance, J, optimize=True)
+            out[rows] = np.sqrt(np.maximum(square, 0.0))
+        return out
+
+
+def _columns(parameters: Parameters, model: Model, q: Array, loads: Loads | None) -> Array:
+    """Return d TCP position / d parameters (N, 3, p), base axes."""
+    middle = model.predict(q, loads).position
+    J = np.empty((len(q), 3, len(parameters)))
+    for i, scale in enumerate(parameters.scales):
+        step = np.zeros(len(parameters))
+        step[i] = STEP * scale
+        J[:, :, i] = (parameters.model(step).predict(q, loads).position - middle) / step[i]
+    return J
+
+
+def parameters_named(model: Model, names: Sequence[str], where: str) -> Parameters:
+    """Return the parameters with these names, to be found beyond ``model``.
+
+    Raises InputError, beginning with ``where``, for a name that its arm does not have.
+    """
+    every = Parameters.every(model, effects_of(names))
+    at = {name: i for i, name in enumerate(every.names)}
+    missing = [name for name in names if name not in at]
+    if missing:
+        raise InputError(
+            f"{where}: found parameter {missing[0]!r}, expected one of this cell's arm"
+        )
+    return every.part(Redundancy([at[name] for name in names], ()))
+
+
+def effects_of(names: Sequence[str]) -> tuple[str, ...]:
+    """Return the effects that parameters with these names belong to, each once."""
+    found = []
+    for name in names:
+        fitting = [e for e in CATALOGUE if name == e or name.startswith(f"{e}_")]
+        if not fitting:
+            raise InputError(f"calibration: found parameter {name!r}, expected one of an effect")
+        found.append(max(fitting, key=len))
+    return tuple(dict.fromkeys(found))
+
+
+def _blocks(blocks: Sequence[Array]) -> Array:
+    size = sum(len(block) for block in blocks)
+    whole, begin = np.zeros((size, size)), 0
+    for block in blocks:
+        end = begin + len(block)
+        whole[begin:end, begin:end] = block
+        begin = end
+    return whole

@@ -1,0 +1,80 @@
+"""Any other program that a client uploads: straight lines of known calls, run one after the other.
+
+Not an interpreter of URScript: loops, branches and unknown calls are logged and passed over.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from gapbridge.drivers.simulated.plant.kinematics import frame_of
+from gapbridge.drivers.simulated.plant.motion import Stop
+from gapbridge.drivers.simulated.ur.controller import CYCLE, Controller, Steps
+from gapbridge.drivers.simulated.ur.programs.path_program import MOVES, make_move
+from gapbridge.drivers.simulated.ur.programs.script_text import Call, parse_assignment, parse_call
+
+log = logging.getLogger("drivers.simulated")
+
+
+def script_program(controller: Controller, name: str, lines: tuple[str, ...]) -> Steps:
+    """Run the lines of a program; it ends in the cycle of its last line, as clients expect."""
+    variables: dict[str, Any] = {"True": True, "False": False}
+    for raw in lines:
+        line = raw.split("#")[0].strip()
+        if not line:
+            continue
+        call = parse_call(line, variables)
+        if call is not None:
+            yield from _run(controller, name, call)
+            continue
+        assigned = parse_assignment(line, variables)
+        if assigned is not None:
+            variables[assigned[0]] = assigned[1]
+        else:
+            log.warning("program %s: line %r is not understood and passed over", name, line)
+
+
+def _run(controller: Controller, name: str, call: Call) -> Steps:
+    """Run one call, over as many cycles as it takes."""
+    if call.name in MOVES:
+        yield from controller.run_motion(make_move(controller, call, controller.target_q))
+    elif call.name in ("stopj", "stopl"):
+        rate = max(float(call.get(0, "a", 2.0)), 0.1)
+        yield from controller.run_motion(Stop(controller.target_qd, rate))
+    elif call.name == "sleep":
+        for _ in range(round(float(call.get(0, "t", 0.0)) / CYCLE)):
+            yield
+    elif call.name == "sync":
+        yield
+    elif not _set(controller, call):
+        log.warning("program %s: call of %s is not understood and passed over", name, call.name)
+
+
+def _set(controller: Controller, call: Call) -> bool:
+    """Run a call that takes no time; False for an unknown one."""
+    memory, declared = controller.memory, controller.declared
+    first = call.get(0, "n", None)
+    if call.name.startswith("write_output_"):
+        kind = {"integer": "int", "float": "double", "boolean": "bit"}[call.name.split("_")[2]]
+        memory[f"output_{kind}_register_{int(first)}"] = call.get(1, "value", 0)
+    elif call.name in ("set_payload", "set_target_payload"):
+        declared.payload_mass = float(call.get(0, "m", 0.0))
+        x, y, z = call.get(1, "cog", declared.payload_cog)
+        declared.payload_cog = (float(x), float(y), float(z))
+    elif call.name == "set_tcp":
+        a, b, c, d, e, f = controller.finite(call.get(0, "pose", ()), "set_tcp")
+        declared.set_tcp((a, b, c, d, e, f))
+        frame_of(declared.tcp)
+    elif call.name == "zero_ftsensor":
+        controller.sensors.zero()
+    elif call.name == "protective_stop":
+        controller.protective_stop()
+    elif call.name in ("set_standard_digital_out", "set_digital_out"):
+        bits, mask = memory["actual_digital_output_bits"], 1 << int(first)
+        memory["actual_digital_output_bits"] = bits | mask if call.get(1, "b", 0) else bits & ~mask
+    elif call.name == "textmsg":
+        log.info("textmsg: %s", call.arguments)
+    else:
+        return False
+    return True

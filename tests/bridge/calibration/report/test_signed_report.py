@@ -1,0 +1,76 @@
+"""A report that can be signed: number, version, hash, accuracy asked for, pages counted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pypdfium2
+import pytest
+from calibration_report_cases import calibration, plan, session
+
+from gapbridge.bridge.calibration.report import write_report
+from gapbridge.core.calibration.result import Errors
+
+FACTS = {"number": "GB-20261121-0912-1a2b3c4d", "version": "9.8.7", "cell_sha256": "ab" * 32}
+
+
+def page(folder: Path, accuracy: float | None, **changed: object) -> str:
+    found = replace(calibration(), **changed)
+    facts = session(**FACTS, accuracy=accuracy)
+    return write_report(found, plan(), facts, folder)[0].read_text(encoding="utf-8")
+
+
+def test_number_version_hash_certificate_and_room_to_sign_stand_in_it(tmp_path: Path) -> None:
+    text = page(tmp_path, None)
+    for found in (FACTS["number"], "Gapbridge 9.8.7", "abababab " * 7 + "abababab", "no. 88120"):
+        assert found in text
+    assert "released by" in text
+    assert "Asked for" not in text
+
+
+@pytest.mark.parametrize(("accuracy", "word"), [(1e-3, "Pass"), (1e-5, "Fail")])
+def test_the_accuracy_asked_for_is_met_or_not(tmp_path: Path, accuracy: float, word: str) -> None:
+    text = page(tmp_path, accuracy)
+    assert f">{word}</span>" in text
+    assert f"farther off than {accuracy * 1e3:.3f} mm" in text
+
+
+def test_fewer_than_eight_poses_decide_nothing(tmp_path: Path) -> None:
+    c = calibration()
+    few = np.isin(c.readings.pose[c.held_out_after.rows], np.arange(40, 47))
+
+    def part(errors: Errors) -> Errors:
+        return Errors(errors.vector[few], errors.rows[few])
+
+    text = page(
+        tmp_path, 1e-3, held_out_after=part(c.held_out_after),
+        held_out_before=part(c.held_out_before), tcp_std=c.tcp_std[few],
+    )  # fmt: skip
+    assert ">Not decided</span>" in text
+    assert "7 such poses were measured, expected 8 or more" in text
+
+
+def test_what_is_left_is_the_same_statement_in_every_section(tmp_path: Path) -> None:
+    c = calibration(True)
+    left = (
+        "to be added, with the share that each takes off what is left: transmission_error_2 (90 %)"
+    )
+    changed = {
+        "diagnosis": c.diagnosis, "complete": False, "lacking": ("transmission_error_2",),
+        "remaining": left, "verdict": f"the error falls; not complete: {left}",
+    }  # fmt: skip
+    text = page(tmp_path, None, **changed)
+    section = text[text.index('id="leftover"') : text.index('id="poses"')]
+    assert "To be added, with the share" in section
+    assert "90 %" in section
+    assert "no known effect" not in section.lower()
+    assert "no gap" not in section.lower()
+
+
+def test_every_page_says_how_many_there_are(tmp_path: Path) -> None:
+    _, paper = write_report(calibration(), plan(), session(**FACTS), tmp_path)
+    pages = pypdfium2.PdfDocument(str(paper))
+    ends = [p.get_textpage().get_text_bounded().strip().split("\n")[-1] for p in pages]
+    assert ends == [f"page {i} of {len(pages)}" for i in range(1, len(pages) + 1)]
