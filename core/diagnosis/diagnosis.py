@@ -48,7 +48,7 @@ CHANNELS: Mapping[str, Observe] = {
 
 
 # samples that a diagnosis looks at: more cost time and add hardly anything
-MOST = {"position": 1200, "wrench": 300, "tracking": 300, "torque": 900}
+MOST = {"position": 1200, "wrench": 300, "tracking": 300, "torque": 300}
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ class FtMisalignment(Effect):
     title = "force sensor is turned"
     order = 55
     scales_reading = True
+    shown_by = Term("payload", Site(), (1.0,))
     channels = ("wrench",)
     motion = "loads along at least two directions of the flange"
     instead = "turn the sensor's frame, or its readings"

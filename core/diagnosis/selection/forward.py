@@ -36,6 +36,8 @@ def clash(space: Space, chosen: Sequence[int], new: int) -> bool:
     lines = 0
     if not b.named and sum(not space.candidates[c].named for c in chosen) >= SMOOTH_TERMS:
         return True
+    if b.beside and b.beside not in {space.candidates[c].family for c in chosen}:
+        return True
     for c in chosen:
         a = space.candidates[c]
         if not (a.named and b.named) or a.site.joint != b.site.joint:
