@@ -167,8 +167,8 @@ class Loop:
         elif not_ready := self._not_ready():
             words = not_ready
         else:
-            self._supervisor.take(Cause.ARM)
-            self._skip()
+            if self._supervisor.take(Cause.ARM):
+                self._skip()
             return
         self._tell({"kind": "refused", "what": "arm", "detail": words})
 
