@@ -59,9 +59,9 @@ class MachineStalls:
         found: list[Span] = []
         allowed = True
         for watcher in self._watchers:
-            said, _ = watcher.communicate()  # its standard input ends: so does it
+            output, _ = watcher.communicate()  # its standard input ends: so does it
             allowed = allowed and watcher.returncode == 0
-            lines = [line.split() for line in said.splitlines()]
+            lines = [line.split() for line in output.splitlines()]
             found += [(float(due), float(come)) for due, come in lines]
         self.spans = sorted(found) if allowed else None
 

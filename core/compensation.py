@@ -127,8 +127,8 @@ def _moved(wanted, pose, offset, moved):  # type: ignore[no-untyped-def]
 def _rigid_pose(rigid, row, shape, q, pose):  # type: ignore[no-untyped-def]
     """Write the rigid TCP pose (12,) at q (n,), position first; nothing in ``shape`` bends."""
     row.q[0, :] = q
-    A, B, tilt = np.empty((3, 3)), np.empty((3, 3)), np.zeros(3)
-    kernel.place(rigid, row, 0, shape, tilt, A, B)
+    A, B, base_rotation = np.empty((3, 3)), np.empty((3, 3)), np.zeros(3)
+    kernel.place(rigid, row, 0, shape, base_rotation, A, B)
     pose[:3] = shape.tcp_position
     for i in range(3):
         pose[3 + 3 * i : 6 + 3 * i] = shape.tcp_rotation[i]

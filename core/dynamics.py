@@ -151,9 +151,9 @@ def _bent_flange(model: Model, motion: Motion, frames: Frames) -> Frames:
     chain = model.chain()
     if not (chain.compliance.any() or chain.flexibility.any() or chain.base_compliance.any()):
         return frames
-    bent = model.predict(motion.q, motion.loads).rotation @ chain.tool_rotation.T
+    deflected = model.predict(motion.q, motion.loads).rotation @ chain.tool_rotation.T
     rotation = frames.rotation.copy()
-    rotation[:, -1] = bent
+    rotation[:, -1] = deflected
     return replace(frames, rotation=rotation)
 
 

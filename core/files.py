@@ -24,8 +24,8 @@ def read_bytes(path: Path) -> bytes:
         for key in _keys(path):
             if key in _given:
                 return _given[key]
-        words = "not among the files of the configuration that runs"
-        raise FileNotFoundError(errno.ENOENT, words, str(path))
+        message = "not among the files of the configuration that runs"
+        raise FileNotFoundError(errno.ENOENT, message, str(path))
     found = path.read_bytes()
     if (recording := _recording.get()) is not None:
         recording.update(dict.fromkeys(_keys(path), found))

@@ -19,7 +19,7 @@ from gapbridge.core.rotation import rotation_vector
 
 Array = NDArray[np.float64]
 SETTLING = 10  # times that servos are looked at where they have given way
-SETTLED = 1e-10  # rad: less is no change
+CONVERGED = 1e-10  # rad: less is no change
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
 
 
@@ -169,7 +169,7 @@ class Model:
             held, before, q = self.held_torque(q, loads), q, commands
             for term in terms:
                 q = CATALOGUE[term.effect].settle(term, self.arm, q, held, loads.approach)
-            if np.abs(q - before).max(initial=0.0) < SETTLED:
+            if np.abs(q - before).max(initial=0.0) < CONVERGED:
                 break
         return q
 

@@ -109,7 +109,7 @@ def motion_of(log: Log) -> Motion:
 
     Needs ``actual_q`` or ``target_q``; speeds come from ``actual_qd`` where the log has them.
     A cycle that was recorded twice counts once; timestamps rounded so far that they repeat are
-    replaced by an even clock if they fit one (``time_finding`` tells). Raises LogError naming the
+    replaced by an even clock if they fit one (``time_finding`` reports). Raises LogError naming the
     row where time runs backwards or repeats in any other way.
     """
     q = log.require("actual_q", "target_q")
@@ -182,15 +182,15 @@ def _clock(log: Log, time: Array) -> tuple[Index, Array, str | None]:
         same &= (flat[repeats] == flat[repeats - 1]).all(axis=1)
     if same.mean() >= COPIES or len(repeats) < FEW_REPEATS * len(time):
         kept = np.delete(everything, repeats)
-        told = f"{len(repeats)} of {len(time)} rows repeat the timestamp before ({first})"
-        return kept, time[kept], f"{told}; the moving channels leave them out"
+        reported = f"{len(repeats)} of {len(time)} rows repeat the timestamp before ({first})"
+        return kept, time[kept], f"{reported}; the moving channels leave them out"
     even: Array = np.asarray(np.polyval(np.polyfit(everything, time, 1), everything), dtype=float)
     grain = float(np.diff(time)[np.diff(time) > 0].min())
     if np.abs(time - even).max() <= grain:
-        told = (
+        reported = (
             f"timestamps are rounded to {grain:.3g} s and repeat in {len(repeats)} rows ({first})"
         )
-        return everything, even, f"{told}; the rows were taken as evenly spaced"
+        return everything, even, f"{reported}; the rows were taken as evenly spaced"
     raise LogError(
         f"{log.path}: row {log.line(repeats[0])}, column timestamp: found "
         f"{time[repeats[0]]:g} again (as in {len(repeats)} of {len(time)} rows), expected a time "

@@ -40,7 +40,7 @@ def merged(ranges: Iterable[Range]) -> dict[str, tuple[float, float]]:
 
 def outside(log: Log, fitted: Range) -> list[str]:
     """Return one sentence for each quantity of a log that lies outside what was fitted."""
-    told = []
+    reported = []
     for name, values in _columns(log).items():
         if name not in fitted:
             continue
@@ -49,12 +49,12 @@ def outside(log: Log, fitted: Range) -> list[str]:
         beyond = np.flatnonzero((values < low - margin) | (values > high + margin))
         if len(beyond):
             worst = beyond[np.argmax(np.abs(values[beyond] - (low + high) / 2))]
-            told.append(
+            reported.append(
                 f"{name}: {len(beyond)} of {len(values)} rows lie outside what was fitted, "
                 f"{low:.4g} to {high:.4g} {UNITS[_stem(name)]} (row {log.line(worst)}: "
                 f"{values[worst]:.4g})"
             )
-    return told
+    return reported
 
 
 def outside_rows(log: Log, fitted: Range) -> NDArray[np.bool_]:

@@ -94,7 +94,7 @@ def join_sessions(logs: Sequence[Log], model: Model) -> Log:
 
 
 def _names(paths: Sequence[str]) -> tuple[str, ...]:
-    """Return the files' names, with as many folders as tell them apart."""
+    """Return the files' names, with as many folders as distinguish them."""
     parts = [Path(path).parts for path in paths]
     for count in range(1, max(len(p) for p in parts) + 1):
         names = ["/".join(p[-count:]) for p in parts]

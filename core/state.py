@@ -1,4 +1,4 @@
-"""What a controller tells: one sample, in RTDE's field names."""
+"""What a controller reports: one sample, in RTDE's field names."""
 
 from __future__ import annotations
 

@@ -144,8 +144,8 @@ def _arm(
         label = f"{path}: joint {joint.get('name')!r}: limit"
         free = joint.get("type") == "continuous"
         for key, default in (("lower", -np.inf), ("upper", np.inf)):
-            told = limit is not None and not free and limit.get(key) is not None
-            columns[key].append(_vector(limit, key, "0", label)[0] if told else default)
+            given = limit is not None and not free and limit.get(key) is not None
+            columns[key].append(_vector(limit, key, "0", label)[0] if given else default)
         for key in ("velocity", "effort"):
             value = _vector(limit, key, "0", label)[0]
             columns[key].append(value if value > 0 else np.inf)

@@ -25,7 +25,7 @@ DRIVERS: dict[str, str] = {
 def make_driver(settings: DriverSettings, model: Model, bounds: GateBounds | None = None) -> Driver:
     """Return the driver that the settings name, not yet connected.
 
-    ``model`` tells it the arm and the tool, ``bounds`` what its gate lets pass (left out: the
+    ``model`` gives it the arm and the tool, ``bounds`` what its gate lets pass (left out: the
     defaults of a cell file). Raises LinkError where the driver's library is missing.
     """
     name = str(getattr(settings, "driver", ""))

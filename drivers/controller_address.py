@@ -1,4 +1,4 @@
-"""What tells one controller from another."""
+"""What distinguishes one controller from another."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ OWN_PORTS = (502, 802, 30004)  # Modbus/TCP, Modbus/TCP Security, RTDE
 
 
 def address_of(link: DriverSettings) -> str:
-    """Return what tells one controller from another: the same for whatever driver reaches it.
+    """Return what distinguishes controllers: the same for whatever driver reaches one.
 
     A host is what its name resolves to, once for the whole run. A port is left out where it is the
     protocol's own: RTDE and Modbus of one robot are one controller, ports of a gateway are not.

@@ -105,12 +105,12 @@ def _tool(facts: ControllerFacts, model: Model, tolerance: float) -> Iterator[Di
     cosine = 0.5 * (float(np.trace(ours[:3, :3].T @ theirs[:3, :3])) - 1.0)
     turned = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
     if apart > 1e-5 or turned > 1e-4:
-        said = ", ".join(f"{v:.5g}" for v in theirs[:3, 3])
+        given_text = ", ".join(f"{v:.5g}" for v in theirs[:3, 3])
         # the flange of a URDF may have other axes than the controller's
         sure = (apart > tolerance or turned > TCP_TURNED) and not model.arm.joint_names
         yield Difference(
             ("tool", "tcp"), f"a TCP {1e3 * apart:.3g} mm and {turned:.2g} rad from the "
-            "controller's", f"the same TCP in both (controller: xyz [{said}])", sure=sure,
+            "controller's", f"the same TCP in both (controller: xyz [{given_text}])", sure=sure,
         )  # fmt: skip
 
 
@@ -122,17 +122,17 @@ def _load(facts: ControllerFacts, model: Model) -> Iterator[Difference]:
         )  # fmt: skip
     cog = facts.payload_cog
     if cog is not None and facts.payload and np.linalg.norm(cog - model.payload_cog) > COG:
-        said = ", ".join(f"{v:.4g}" for v in cog)
+        given_text = ", ".join(f"{v:.4g}" for v in cog)
         yield Difference(
             ("payload", "cog"), f"[{', '.join(f'{v:g}' for v in model.payload_cog)}]",
-            f"[{said}], as the controller has it", sure=False,
+            f"[{given_text}], as the controller has it", sure=False,
         )  # fmt: skip
     given = facts.gravity
     if given is not None and np.linalg.norm(given) > 1.0:
         apart = min(float(np.linalg.norm(sign * given - model.gravity)) for sign in (1.0, -1.0))
         if apart > TILTED:
-            said = ", ".join(f"{v:.4g}" for v in given)
+            given_text = ", ".join(f"{v:.4g}" for v in given)
             yield Difference(
                 ("gravity",), f"[{', '.join(f'{v:g}' for v in model.gravity)}]",
-                f"along [{said}], as the controller has it (either sign)",
+                f"along [{given_text}], as the controller has it (either sign)",
             )  # fmt: skip

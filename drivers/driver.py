@@ -47,7 +47,7 @@ class DriverSettings(BaseModel):
         return True
 
     def located(self, folder: Path) -> Self:
-        """Return the settings with relative paths, which are seen from ``folder``, made whole.
+        """Return the settings with paths relative to ``folder`` made absolute.
 
         Raises InputError where a file that they name cannot be used.
         """

@@ -177,10 +177,14 @@ class Gate:
         self._started: tuple[Vector, Vector] | None = None  # rad, where the arm was when armed
         self._open = False
         self._budget = self._at = self._travel = 0.0  # s
-        self.clock: Callable[[], float] = time.monotonic
+        self._clock: Callable[[], float] = time.monotonic
         self.bounds = GateBounds()
         self.hold_to(self.bounds)
         self._judged(0.0)  # compiled here: the first setpoint must not wait for a compiler
+
+    def count_by(self, clock: Callable[[], float]) -> None:
+        """Measure time by another clock (s) than this machine's monotonic one."""
+        self._clock = clock
 
     def hold_to(self, bounds: GateBounds) -> None:
         """Judge by these bounds from now on."""
@@ -198,7 +202,7 @@ class Gate:
         """Open for a stream that begins without an offset where the arm stands, (n,) rad each."""
         self._started = (stands[0].copy(), stands[-1].copy())
         self._offsets[:] = 0.0
-        self._open, self._budget, self._at = True, self._most, self.clock()
+        self._open, self._budget, self._at = True, self._most, self._clock()
 
     def end(self) -> None:
         """Let nothing pass until ``begin``."""
@@ -216,7 +220,7 @@ class Gate:
         offsets[0] = setpoint.offset_in_base
         if self._started is not None:
             self._check_start(joints[0])
-        budget = min(self._budget + DRIFT * max(self.clock() - self._at, 0.0), self._most)
+        budget = min(self._budget + DRIFT * max(self._clock() - self._at, 0.0), self._most)
         code, joint, found, self._travel = self._judged(budget)
         if code != FINE:
             raise GateError(self._reason(code, joint, found))
@@ -237,7 +241,7 @@ class Gate:
 
     def sent(self) -> None:
         """Take note that the setpoint that was checked has left."""
-        now = self.clock()
+        now = self._clock()
         self._budget = min(self._budget + DRIFT * max(now - self._at, 0.0), self._most)
         self._budget, self._at, self._travel = self._budget - self._travel, now, 0.0
         self._joints[2], self._offsets[1] = self._joints[0], self._offsets[0]
@@ -247,7 +251,7 @@ class Gate:
         where = f"gate: joint {joint + 1}: " if joint >= 0 else "gate: "
         lower, upper = self._joints[3, joint], self._joints[4, joint]
         bounds, takes = self.bounds, f"found a step that takes {1e3 * found:.1f} ms at the rates"
-        words = {
+        message = {
             NOT_FINITE: f"found {found}, expected a finite number",
             OUTSIDE: f"found {found:.4f} rad, expected {lower:.4f} to {upper:.4f}",
             FAR_OFFSET: f"found an offset of {found:.6f} m, expected at most {bounds.offset:g}",
@@ -259,4 +263,4 @@ class Gate:
             RATE: f"{takes}, more than has passed",
             AWAY: f"found a first setpoint {found:.4f} rad from the arm, expected at most {START}",
         }
-        return where + words[code]
+        return where + message[code]

@@ -61,10 +61,10 @@ class ProfileDocument:
             node = found
         return int(line)
 
-    def error(self, keys: Sequence[str | int], words: str) -> ProfileError:
+    def error(self, keys: Sequence[str | int], message: str) -> ProfileError:
         """Return the error that says ``words`` about a key path."""
         name = ".".join(str(key + 1) if isinstance(key, int) else key for key in keys)
-        return ProfileError(f"{self.path}, line {self.line(keys)}: {name}: {words}")
+        return ProfileError(f"{self.path}, line {self.line(keys)}: {name}: {message}")
 
 
 def read_profile_document(path: Path) -> ProfileDocument:

@@ -53,7 +53,7 @@ def test_files_that_the_readme_names_exist() -> None:
 
 
 @pytest.mark.parametrize("target", ["demo", "test", "check", "coverage"])
-def test_make_has_the_targets_that_are_promised(target: str) -> None:
+def test_make_has_the_targets_that_are_stated(target: str) -> None:
     assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
 
 
@@ -81,7 +81,75 @@ def test_every_import_of_ours_goes_through_the_one_package() -> None:
                 assert not {name.split(".")[0] for name in names} & ours, (file, names)
 
 
-def test_what_the_package_promises_is_there_and_nothing_else_is_imported_for_it() -> None:
+def test_no_folder_is_flatter_than_a_table_of_contents() -> None:
+    """About twenty modules at most; the effects are one family, one file a member."""
+    for top in ("core", "drivers", "bridge"):
+        for folder in [ROOT / top, *(ROOT / top).rglob("*/")]:
+            modules = [p.name for p in folder.glob("*.py") if p.name != "__init__.py"]
+            assert len(modules) <= 21 or folder == ROOT / "core" / "effects", (folder, len(modules))
+
+
+FOREIGN_ATTRIBUTES = {
+    # what a library is set by, and by nothing else
+    "drivers/canopen/master.py": {
+        "remote.sdo.RESPONSE_TIMEOUT", "self.network[node].nmt.state",
+        "_variable(remote, address).raw",
+    },
+    "bridge/served/server.py": {"server.should_exit"},
+}  # fmt: skip
+"""Attributes of other objects that are set all the same, by file."""
+SETTERS = ("setattr", "object.__setattr__")
+
+
+def _attributes_set(function: ast.AST) -> set[str]:
+    """Return the attributes that a function sets on objects it neither is nor has just made."""
+    made = {"self", "cls"}
+    found = set()
+    for node in ast.walk(function):
+        targets: list[ast.expr] = []
+        if isinstance(node, ast.Assign):
+            targets = [t for one in node.targets for t in getattr(one, "elts", [one])]
+            if isinstance(node.value, ast.Call):
+                made |= {t.id for t in targets if isinstance(t, ast.Name)}
+        elif isinstance(node, (ast.AugAssign, ast.AnnAssign)):
+            targets = [node.target]
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) in SETTERS:
+            targets = [ast.Attribute(node.args[0], "setattr")]
+        found |= {t for t in targets if isinstance(t, ast.Attribute)}
+    return {
+        ast.unparse(target)
+        for target in found
+        if not (isinstance(target.value, ast.Name) and target.value.id in made)
+    }
+
+
+@pytest.mark.parametrize(
+    "folder",
+    ["bridge/loop", "bridge/daemon", "bridge/ipc", "bridge/recording/recorder.py", "bridge/served",
+     "bridge/setpoint_source", "bridge/calibration", "bridge/web", "bridge/metrics", "bridge/cell",
+     *(str(p.relative_to(ROOT)) for p in (ROOT / "drivers").iterdir() if p.name != "simulated")],
+)  # fmt: skip
+def test_no_part_sets_attributes_of_another(folder: str) -> None:
+    path = ROOT / folder
+    for file in [path] if path.is_file() else path.rglob("*.py"):
+        if file.suffix != ".py":
+            continue
+        found: set[str] = set()
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+                found |= _attributes_set(node)
+        name = str(file.relative_to(ROOT))
+        assert found <= FOREIGN_ATTRIBUTES.get(name, set()), (name, found)
+
+
+def test_a_part_that_sets_attributes_of_another_is_noticed() -> None:
+    code = "def f(self, other):\n    own = Other()\n    own.x = self.y = 1\n    {}\n"
+    for line in ("other.x = 1", "self.other.x += 1", "setattr(other, 'x', 1)", "a, other.x = 1, 2"):
+        assert _attributes_set(ast.parse(code.format(line))), line
+    assert not _attributes_set(ast.parse(code.format("self.x = 1")))
+
+
+def test_what_the_package_states_is_there_and_nothing_else_is_imported_for_it() -> None:
     code = (
         "import sys, gapbridge; early = {m.split('.')[0] for m in sys.modules}\n"
         "for name in dir(gapbridge): getattr(gapbridge, name)\n"

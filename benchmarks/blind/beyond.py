@@ -1,7 +1,7 @@
 """What a diagnosis' model truly leaves in regions of joint space that its log did not show.
 
 The accusations are put into the benchmark's own arm, by their names and values; the frame is the
-one of the poses in the log. The figure holds the noise, as what is told does.
+one of the poses in the log. The figure holds the noise, as what is reported does.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ class Static:
     drawn: Drawn
     strange: Strange | None
     gap: Array  # whitened and noise-free, the frame not taken out
-    wild: bool
+    outliers: bool
 
 
 def generator_of(kind: str, seed: int) -> Generator:
@@ -93,10 +93,10 @@ def draw_case(kind: str, rng: Generator) -> Static | ChannelCase:
         return draw_channel_case(group, rest, rng)
     if group == "outside":
         strange = special_cases.draw_outside(rest, rng)
-        return Static(strange.drawn, strange, strange.gap, wild=False)
+        return Static(strange.drawn, strange, strange.gap, outliers=False)
     if group == "mixed":
         strange = _draw_mixed(rest, rng)
-        return Static(strange.drawn, strange, strange.gap, wild=False)
+        return Static(strange.drawn, strange, strange.gap, outliers=False)
     if group == "bad":
         drawn = special_cases.draw_bad(rest, rng)
     elif group in LAYOUTS:
@@ -111,7 +111,7 @@ def draw_case(kind: str, rng: Generator) -> Static | ChannelCase:
         drawn = draw_static(wish, rng)
     else:
         raise ValueError(f"kind: found {kind!r}, expected one of those that --list shows")
-    return Static(drawn, None, drawn.bench.whitened_gap(drawn.real), wild=group == "hard")
+    return Static(drawn, None, drawn.bench.whitened_gap(drawn.real), outliers=group == "hard")
 
 
 def _draw_mixed(what: str, rng: Generator) -> Strange:
@@ -134,7 +134,7 @@ def make_case(kind: str, seed: int, folder: Path) -> Label:
         write_channel_case(Path(folder), case, rng)
         return _channel_label(kind, seed, case)
     drawn, bench = case.drawn, case.drawn.bench
-    if case.wild:
+    if case.outliers:
         measured = special_cases.wild_readings(drawn, rng)
     else:
         misread = case.strange.misread if case.strange else None

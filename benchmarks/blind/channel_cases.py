@@ -89,7 +89,7 @@ class ChannelCase:
         return float(np.sqrt(np.mean(sigma**2)))
 
 
-DRAWS = 600  # a delay and a lag are hardly told apart in most slow motions
+DRAWS = 600  # a delay and a lag are hardly separable in most slow motions
 
 
 def draw_channel_case(channel: str, what: str, rng: Generator) -> ChannelCase:
@@ -142,7 +142,7 @@ def _draw_mixed(channel: str, rng: Generator) -> ChannelCase:
         size = np.sqrt(usual / np.mean((error / cell.truth.sigma) ** 2))
         error = error * size * rng.uniform(*SIZE)
         akin = _akin(name, columns)
-        if {p for p in values if p in akin} or not _told_apart(cell.truth, values, error):
+        if {p for p in values if p in akin} or not _separable(cell.truth, values, error):
             continue
         return ChannelCase(channel, cell, values, error, name, columns, akin)
     raise RuntimeError(f"no clear draw of {channel}:mixed in {DRAWS}")
@@ -155,7 +155,7 @@ def _akin(name: str, columns: tuple[str, ...]) -> tuple[Place, ...]:
     return tuple((effect, None if whole else joints[0]) for effect, whole in AKIN.get(name, ()))
 
 
-def _told_apart(truth: Parametric, values: Values, error: Array) -> bool:
+def _separable(truth: Parametric, values: Values, error: Array) -> bool:
     """Return whether each known place shows beside the remainder, and it beside any place more."""
     unknown = (error / truth.sigma).ravel()
     full = truth.gap(values)

@@ -160,7 +160,7 @@ def stiffness_nonlinearity(joint: int, soft: float, knee: float, limit: float) -
     """Return a joint that stiffens: theta = c M / sqrt(1 + (M / M0)^2)."""
 
     def change(arm: RealArm, v: Array) -> RealArm:
-        return replace(arm, bent={**arm.bent, joint - 1: (float(v[0]), float(v[1]))})
+        return replace(arm, deflected={**arm.deflected, joint - 1: (float(v[0]), float(v[1]))})
 
     stem = f"stiffness_nonlinearity_{joint}"
     return Ingredient("stiffness_nonlinearity", joint, (f"{stem}_compliance", f"{stem}_moment"),
@@ -182,8 +182,8 @@ def gravity_direction(x: float, y: float) -> Ingredient:
     """Return a base that is not level: gravity turned about x and y of base."""
 
     def change(arm: RealArm, v: Array) -> RealArm:
-        tilt = turn(np.array([[v[0], v[1], 0.0]]))[0]
-        return replace(arm, gravity=tilt @ arm.gravity)
+        base_rotation = turn(np.array([[v[0], v[1], 0.0]]))[0]
+        return replace(arm, gravity=base_rotation @ arm.gravity)
 
     return Ingredient("gravity_direction", None, ("gravity_direction_x", "gravity_direction_y"),
                       (x, y), (True, True), (0.2, 0.2), change)  # fmt: skip

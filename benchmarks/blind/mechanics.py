@@ -31,7 +31,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Session:
-    """What happened at each of N poses: what the log tells, as it truly was."""
+    """What happened at each of N poses: what the log holds, as it truly was."""
 
     time: Array  # (N,) s
     q: Array  # (N, n) rad, encoder angles
@@ -67,7 +67,7 @@ LOG_FIELDS = {
 AngleError = Callable[[Session], Array]  # -> (N, n) rad, true joint angle minus encoder angle
 ToolShift = Callable[[Session, Array], Array]  # (session, gravity in flange (N, 3)) -> (N, 3) m
 Pull = Callable[[Session, Array, Array], Array]  # (session, flange p, flange R) -> (N, 6) at flange
-BaseTilt = Callable[[Session], Array]  # -> (N, 3) rad, rotation vector of the base
+BaseRotation = Callable[[Session], Array]  # -> (N, 3) rad, rotation vector of the base
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class RealArm:
     axial: Array  # (n,) rad/Nm
     radial: Array  # (n,) rad/Nm
     gravity: Array  # (3,) m/s2
-    bent: dict[int, tuple[float, float]] = field(default_factory=dict)  # joint: (rad/Nm, Nm)
+    deflected: dict[int, tuple[float, float]] = field(default_factory=dict)  # joint: (rad/Nm, Nm)
     link_softness: Array | None = None  # (n,) 1/EI, 1/(N m2)
     base_softness: tuple[float, float] = (0.0, 0.0)  # rad/Nm about x and y of base
     more_payload: float = 0.0  # kg
@@ -90,7 +90,7 @@ class RealArm:
     angle_errors: tuple[AngleError, ...] = ()
     tool_shifts: tuple[ToolShift, ...] = ()
     pulls: tuple[Pull, ...] = ()
-    base_tilts: tuple[BaseTilt, ...] = ()
+    base_tilts: tuple[BaseRotation, ...] = ()
 
     @property
     def n(self) -> int:
@@ -101,7 +101,7 @@ class RealArm:
     def soft(self) -> bool:
         """Return whether anything gives way under load."""
         links = self.link_softness is not None and bool(np.any(self.link_softness))
-        joints = bool(np.any(self.axial)) or bool(np.any(self.radial)) or bool(self.bent)
+        joints = bool(np.any(self.axial)) or bool(np.any(self.radial)) or bool(self.deflected)
         return links or joints or bool(np.any(self.base_softness))
 
 
@@ -203,8 +203,8 @@ def stand(arm: RealArm, session: Session) -> Shape:
 def _place(arm: RealArm, session: Session, angle: Array, bend: _Bend) -> Shape:
     """Return the shape for given joint angles and deflections."""
     n, poses = arm.n, len(angle)
-    tilt = bend.base + sum((t(session) for t in arm.base_tilts), np.zeros((poses, 3)))
-    rotation, position = turn(tilt), np.zeros((poses, 3))
+    base_rotation = bend.base + sum((t(session) for t in arm.base_tilts), np.zeros((poses, 3)))
+    rotation, position = turn(base_rotation), np.zeros((poses, 3))
     origin, end, cog = (np.empty((n, poses, 3)) for _ in range(3))
     axes = np.empty((n, poses, 3, 3))
     soft = arm.soft
@@ -279,8 +279,8 @@ def _wanted_bend(arm: RealArm, session: Session, shape: Shape) -> _Bend:
         local = _back(shape.axes[i], loads.about(shape.origin[i], i))
         bend.joint[i, :, :2] = arm.radial[i] * local[:, :2]
         bend.joint[i, :, 2] = arm.axial[i] * local[:, 2]
-        if i in arm.bent:
-            soft, knee = arm.bent[i]
+        if i in arm.deflected:
+            soft, knee = arm.deflected[i]
             bend.joint[i, :, 2] += soft * local[:, 2] / np.hypot(1.0, local[:, 2] / knee)
         if arm.link_softness is not None and arm.link_softness[i]:
             bend.link_shift[i], bend.link_turn[i] = _cantilever(arm, loads, shape, i)

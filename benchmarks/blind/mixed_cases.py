@@ -53,7 +53,7 @@ def draw_mixed(count: int, name: str | None, rng: Generator) -> Strange:
 def _with_remainder(
     bench: Bench, parts: list[Ingredient], outside: Outside, rng: Generator
 ) -> Strange | None:
-    """Return the case, or None where something in it could not be told by any test."""
+    """Return the case, or None where something in it could not be found by any test."""
     places = {(p.effect, p.joint) for p in parts}
     if places & {*outside.near, *outside.akin}:
         return None

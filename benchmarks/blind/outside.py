@@ -1,6 +1,6 @@
 """Effects that stand in no catalogue: of one joint, the tool, the load, the instrument, the room.
 
-Each is told with the log columns that it truly depends on. ``strength`` is set afterwards by the
+Each is given with the log columns that it truly depends on. ``strength`` is set afterwards by the
 size of the gap, as for the known effects.
 """
 
@@ -31,7 +31,7 @@ class Outside:
     ratio: tuple[float, float] = (3.0, 10.0)
     first: float = 1e-4  # a strength to start sizing from
     akin: tuple[tuple[str, int | None], ...] = ()  # what may be accused with the rest admitted
-    near: tuple[tuple[str, int | None], ...] = ()  # where no known effect is told from it
+    near: tuple[tuple[str, int | None], ...] = ()  # where no known effect is distinguished from it
 
 
 def angle_of(joint: int, shape: Callable[[Session], Array]) -> Callable[[RealArm, float], RealArm]:
@@ -211,10 +211,10 @@ def tower_bending(bench: Bench, rng: Generator) -> Outside:
     axis = np.array([np.cos(angle), np.sin(angle), 0.0])
 
     def change(arm: RealArm, strength: float) -> RealArm:
-        def tilt(s: Session) -> Array:
+        def base_rotation(s: Session) -> Array:
             return np.asarray(strength * (s.temperature[:, :1] - arm.reference_temperature) * axis)
 
-        return replace(arm, base_tilts=(*arm.base_tilts, tilt))
+        return replace(arm, base_tilts=(*arm.base_tilts, base_rotation))
 
     # all joints warm up together: one temperature is as good as the other, and as time
     columns = tuple(f"joint_temperatures_{i}" for i in range(bench.kind.n))

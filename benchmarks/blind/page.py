@@ -71,8 +71,8 @@ def _criteria(scores: Sequence[CaseScore]) -> str:
         word = {True: "reached", False: "not reached", None: "not measured"}[c.reached]
         css = {True: "good", False: "bad", None: ""}[c.reached]
         sign = "≥" if c.at_least else "≤"
-        target = f"{sign} {c.told(c.target)}"
-        texts = (c.name, c.told(c.value), target, str(c.cases))
+        target = f"{sign} {c.shown(c.target)}"
+        texts = (c.name, c.shown(c.value), target, str(c.cases))
         rows.append([*(_td(t) for t in texts), _td(word, css)])
     return _table(("figure", "found", "target", "cases", ""), rows)
 
@@ -103,7 +103,7 @@ def _is_right(row: str, column: str) -> bool:
 
 
 def _kinds(scores: Sequence[CaseScore]) -> str:
-    heads = ("kind", "group", "cases", "right", "tie told", "accused falsely", "owned up",
+    heads = ("kind", "group", "cases", "right", "tie reported", "accused falsely", "owned up",
              "joints right", "depends right", "remainder", "|z| ≥ 3", "median s",
              "outcomes")  # fmt: skip
     rows = []

@@ -109,12 +109,12 @@ class Parametric:
         for effect in dict.fromkeys(p[0] for p in values):
             own = [p for p in values if p[0] == effect]
             joints = tuple(sorted(p[1] for p in own if p[1] is not None))
-            told = {
+            reported = {
                 n: float(x)
                 for p in own
                 for n, x in zip(self.candidates[p].names, values[p], strict=True)
             }
-            out.append(Cause(effect, joints, told))
+            out.append(Cause(effect, joints, reported))
         return tuple(out)
 
 

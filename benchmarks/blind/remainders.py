@@ -2,7 +2,7 @@
 
 Written from the physics, with shapes that no effect of the catalogue has. ``akin`` names what a
 diagnosis may accuse with the rest admitted (the remainder's first order); ``near`` also the places
-where no known effect can be told from it, so that a mixed case puts none there.
+where no known effect can be distinguished from it, so that a mixed case puts none there.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def load_play(bench: Bench, rng: Generator) -> Outside:
 
     columns = (f"approach_{j}", *_moment_columns(bench, j))
     made = Outside("load_play", columns, angle_of(j, shape))
-    return _told(made, j, ("backlash",))
+    return _reported(made, j, ("backlash",))
 
 
 def pose_stiffness(bench: Bench, rng: Generator) -> Outside:
@@ -48,7 +48,7 @@ def pose_stiffness(bench: Bench, rng: Generator) -> Outside:
 
     columns = (f"actual_q_{j}", *_moment_columns(bench, j))
     made = Outside("pose_stiffness", columns, angle_of(j, shape), first=1e-6)
-    return _told(made, j, ("axial_compliance",))
+    return _reported(made, j, ("axial_compliance",))
 
 
 def smooth_field(bench: Bench, rng: Generator) -> Outside:
@@ -63,7 +63,7 @@ def smooth_field(bench: Bench, rng: Generator) -> Outside:
         return np.asarray(np.cos(s.q[:, [j, k]] @ rate.T + phase) @ weight)
 
     made = Outside("smooth_field", (f"actual_q_{j}", f"actual_q_{k}"), angle_of(j, shape))
-    return _told(made, j, ("joint_offset",))
+    return _reported(made, j, ("joint_offset",))
 
 
 def bent_tool(bench: Bench, rng: Generator) -> Outside:
@@ -84,12 +84,12 @@ def bent_tool(bench: Bench, rng: Generator) -> Outside:
 
 def _bump(bench: Bench, rng: Generator) -> Outside:
     made = outside.chipped_tooth(bench, rng)
-    return _told(made, _joint_of(made), ())
+    return _reported(made, _joint_of(made), ())
 
 
 def _kink(bench: Bench, rng: Generator) -> Outside:
     made = outside.encoder_scale(bench, rng)
-    return _told(made, _joint_of(made), ("joint_offset",))
+    return _reported(made, _joint_of(made), ("joint_offset",))
 
 
 def _warm_base(bench: Bench, rng: Generator) -> Outside:
@@ -110,7 +110,7 @@ def _joint_of(made: Outside) -> int:
     return int(made.depends_on[0].rpartition("_")[2])
 
 
-def _told(made: Outside, joint: int, akin: tuple[str, ...]) -> Outside:
+def _reported(made: Outside, joint: int, akin: tuple[str, ...]) -> Outside:
     """Return a remainder in the angle of one joint (from 0) with its kin and its neighbourhood."""
     return replace(
         made,

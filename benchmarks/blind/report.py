@@ -1,4 +1,4 @@
-"""Tells the outcome of the blind benchmark: tables for the terminal."""
+"""Reports the outcome of the blind benchmark: tables for the terminal."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _criteria(scores: Sequence[CaseScore]) -> Table:
     for c in criteria(scores):
         sign = "≥" if c.at_least else "≤"
         word = {True: "[green]reached", False: "[red]not reached", None: "not measured"}[c.reached]
-        table.add_row(c.name, c.told(c.value), f"{sign} {c.told(c.target)}", str(c.cases), word)
+        table.add_row(c.name, c.shown(c.value), f"{sign} {c.shown(c.target)}", str(c.cases), word)
     return table
 
 

@@ -37,7 +37,7 @@ class DiagnosisError(RuntimeError):
 class Command:
     """A diagnosis by a program of its own: ``COMMAND LOG --cell CELL --json FILE``."""
 
-    words: tuple[str, ...] = ("gapbridge", "diagnose")
+    command: tuple[str, ...] = ("gapbridge", "diagnose")
     timeout: float = LIMIT
 
     @classmethod
@@ -55,20 +55,22 @@ class Command:
         """Return the diagnosis' JSON; raises DiagnosisError with what the program said."""
         with tempfile.TemporaryDirectory(prefix="gapbridge-") as folder:
             file = Path(folder) / "diagnosis.json"
-            words = [*self.words, str(log), "--cell", str(cell), "--json", str(file)]
+            command = [*self.command, str(log), "--cell", str(cell), "--json", str(file)]
             for effect in withhold:
-                words += ["--withhold", effect]
+                command += ["--withhold", effect]
             try:
                 done = subprocess.run(
-                    words, capture_output=True, text=True, timeout=self.timeout, check=False
+                    command, capture_output=True, text=True, timeout=self.timeout, check=False
                 )
             except subprocess.TimeoutExpired:
                 raise DiagnosisError(f"no answer in {self.timeout:g} s") from None
             except OSError as error:
-                raise DiagnosisError(f"{self.words[0]}: {error}") from None
+                raise DiagnosisError(f"{self.command[0]}: {error}") from None
             if done.returncode != 0 or not file.exists():
-                said = (done.stderr.strip() or done.stdout.strip()).splitlines()
-                raise DiagnosisError(f"exit {done.returncode}: {said[-1] if said else 'silent'}")
+                output = (done.stderr.strip() or done.stdout.strip()).splitlines()
+                raise DiagnosisError(
+                    f"exit {done.returncode}: {output[-1] if output else 'silent'}"
+                )
             answer: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
             return answer
 
@@ -126,7 +128,7 @@ def _at_most(seconds: float) -> Iterator[None]:
 
 
 def run_job(job: Job, diagnose: Diagnose, keep: Path | None = None) -> CaseScore:
-    """Run one case. Its folder's name tells nothing, and its label never leaves this process."""
+    """Run one case. Its folder's name gives nothing away; its label stays in this process."""
     with tempfile.TemporaryDirectory(prefix="case-") as scratch:
         folder = Path(scratch)
         label = make_case(job.kind, job.seed, folder)
@@ -135,8 +137,8 @@ def run_job(job: Job, diagnose: Diagnose, keep: Path | None = None) -> CaseScore
             with _at_most(LIMIT):
                 answer = diagnose(folder / "log.csv", folder / "cell.yaml", label.withhold)
         except Exception as error:
-            said = f"{type(error).__name__}: {error}"
-            return failed(label, said, time.perf_counter() - start)
+            output = f"{type(error).__name__}: {error}"
+            return failed(label, output, time.perf_counter() - start)
         seconds = time.perf_counter() - start
     if keep is not None:
         name = f"{job.kind.replace(':', '_')}-{job.seed}.json"

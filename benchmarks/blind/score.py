@@ -16,7 +16,7 @@ from benchmarks.blind.label import Label
 
 NOWHERE = "not in the catalogue"
 EXPLAINED = ("clean", "known", "several", "many", "arm", "sessions", "laid_out")
-UNLIKE = 100.0  # chi-square from which on a tie told is no tie
+UNLIKE = 100.0  # chi-square from which on a tie reported is no tie
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,12 @@ class CaseScore:
     label: Label | None = None
     known: int = 0  # effects put in beside a remainder
     known_named: int = 0
-    told_beyond: float | None = None  # what is told to remain in a region not fitted, unit
+    reported_beyond: float | None = None  # what is reported to remain in a region not fitted, unit
     true_beyond: float | None = None  # what truly remains there
 
     @property
     def ok(self) -> bool:
-        """Return whether the answer was right, or a tie told that holds the truth."""
+        """Return whether the answer was right, or a tie reported that holds the truth."""
         return self.outcome in ("right", "right_tie")
 
 
@@ -93,7 +93,7 @@ def score(label: Label, diagnosis: dict[str, Any], seconds: float | None = None)
             verdict = Verdict("right_tie")  # a drift that settles may be owned up to as another
     explained = group in EXPLAINED and verdict.outcome in ("right", "right_tie")
     held_out = own.get("remaining_rms_held_out") or own.get("remaining_rms")
-    told_beyond = own.get("remaining_rms_new_region") if label.facts.get("beyond") else None
+    reported_beyond = own.get("remaining_rms_new_region") if label.facts.get("beyond") else None
     exact = verdict.outcome == "right" and _same_joints(label, claims)
     exact = exact and not label.facts.get("settling_drift")
     return CaseScore(
@@ -116,8 +116,8 @@ def score(label: Label, diagnosis: dict[str, Any], seconds: float | None = None)
         label=label,
         known=len(label.effects) if mixed else 0,
         known_named=verdict.named if mixed else 0,
-        told_beyond=told_beyond,
-        true_beyond=None if told_beyond is None else true_beyond(label, causes),
+        reported_beyond=reported_beyond,
+        true_beyond=None if reported_beyond is None else true_beyond(label, causes),
     )
 
 
@@ -138,7 +138,7 @@ def _mixed(
     """Return the verdict of known effects beside a remainder.
 
     Right is: all known effects named where they are, nothing else but the remainder's first
-    order, and structure left over. What makes the data of the known effects as well is no error.
+    order, and residual structure. What makes the data of the known effects as well is no error.
     """
     truth = {p for c in _true_claims(label) for p in c.places}
     own = [(c, p) for c in claims for p in c.places if p not in label.akin]
@@ -150,11 +150,11 @@ def _mixed(
                      for c, p in own)  # fmt: skip
         if rest and _same_data(_true_claims(label), rest, Hidden(label.kind, label.seed)):
             there, extra = set(label.effects), []
-    told = {str(c["effect"]): {str(e) for e in c.get("indistinguishable_from") or []}
+    reported = {str(c["effect"]): {str(e) for e in c.get("indistinguishable_from") or []}
             for c in causes}  # fmt: skip
     lost = label.effects - there
-    tied = {e for e in lost if any(e in told.get(p[0], ()) for p in extra)}
-    extra = [p for p in extra if not told.get(p[0], set()) & tied]
+    tied = {e for e in lost if any(e in reported.get(p[0], ()) for p in extra)}
+    extra = [p for p in extra if not reported.get(p[0], set()) & tied]
     false = tuple(sorted({p[0] for p in extra}))
     named = len(there | tied)
     if false:
@@ -195,8 +195,8 @@ def _known(label: Label, claims: tuple[Claim, ...], causes: list[dict[str, Any]]
         return Verdict("right", (), joints, _needless(truth, claims, causes, hidden))
     if named > label.effects or not _same_data(truth, claims, hidden):
         return Verdict("wrong", tuple(sorted(named - label.effects)), False)
-    told = {str(e) for c in causes for e in c.get("indistinguishable_from") or []}
-    outcome = "right_tie" if label.effects - named <= told else "tie_untold"
+    reported = {str(e) for c in causes for e in c.get("indistinguishable_from") or []}
+    outcome = "right_tie" if label.effects - named <= reported else "tie_untold"
     return Verdict(outcome, () if outcome == "right_tie" else tuple(sorted(named - label.effects)))
 
 
@@ -212,7 +212,7 @@ def _joints_right(truth: tuple[Claim, ...], claims: tuple[Claim, ...], hidden: H
     by_effect = {c.effect: c.joints for c in claims}
 
     def agree(cause: Claim) -> bool:
-        # what all joints have alike may be told of the arm as a whole
+        # what all joints have alike may be reported of the arm as a whole
         return by_effect[cause.effect] in (cause.joints, ()) or not cause.joints
 
     if all(agree(c) for c in truth):
@@ -231,7 +231,7 @@ def _needless(
     truth: tuple[Claim, ...], claims: tuple[Claim, ...], causes: list[dict[str, Any]],
     hidden: Hidden,
 ) -> tuple[str, ...]:  # fmt: skip
-    """Return ties told that the data rule out: the other effect in no place makes the data."""
+    """Return ties reported that the data rule out: the other effect in no place makes the data."""
     out = []
     for cause in causes:
         rest = [c for c in truth if c.effect != cause["effect"]]
@@ -256,11 +256,11 @@ def _unknown(label: Label, claims: tuple[Claim, ...], structured: bool) -> Verdi
 
 
 def _depends(label: Label, unexplained: dict[str, Any]) -> bool | None:
-    told = [str(d["quantity"]) for d in unexplained.get("depends_on") or []][:3]
+    reported = [str(d["quantity"]) for d in unexplained.get("depends_on") or []][:3]
     true = label.depends_on
     if not true:
         true = _plain_columns(label) or Hidden(label.kind, label.seed).columns_that_matter()
-    return bool(set(told) & set(true)) if true else None
+    return bool(set(reported) & set(true)) if true else None
 
 
 def _plain_columns(label: Label) -> tuple[str, ...]:
@@ -280,7 +280,7 @@ def _plain_columns(label: Label) -> tuple[str, ...]:
 
 
 def _z_scores(label: Label, causes: list[dict[str, Any]]) -> dict[str, float]:
-    """Return (estimate - truth) / std of every parameter that is told with a std."""
+    """Return (estimate - truth) / std of every parameter that is reported with a std."""
     true = {_key(n): v for c in label.causes for n, v in c.parameters.items()}
     out = {}
     for cause in causes:

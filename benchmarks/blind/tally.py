@@ -31,7 +31,7 @@ class Criterion:
             return None
         return self.value >= self.target if self.at_least else self.value <= self.target
 
-    def told(self, value: float | None) -> str:
+    def shown(self, value: float | None) -> str:
         """Return a value in its own form."""
         if value is None:
             return "–"
@@ -54,7 +54,7 @@ def criteria(scores: Sequence[CaseScore]) -> list[Criterion]:
     known, several = _of(scores, "known"), _of(scores, "several")
     unknown, hard = _of(scores, "outside", "withheld"), _of(scores, "hard")
     out = [
-        _criterion("one known effect: named, or its twin with the tie told", 0.98, known),
+        _criterion("one known effect: named, or its twin with the tie reported", 0.98, known),
         Criterion("its joints right", *_at(0.96, _share(
             s.joints_right for s in known if s.ok and s.joints_right is not None))),
         _criterion("two or three effects: exactly those", 0.93, several),
@@ -62,7 +62,7 @@ def criteria(scores: Sequence[CaseScore]) -> list[Criterion]:
         _criterion("outside the catalogue or withheld: owned up, nobody accused", 0.95, unknown),
         Criterion("what it depends on, among the first three", *_at(0.85, _share(
             s.depends_right for s in unknown if s.depends_right is not None))),
-        _criterion("hard data: right, or a tie told", 0.90, hard),
+        _criterion("hard data: right, or a tie reported", 0.90, hard),
         Criterion("hard data: false accusations", *_at(0.01, _share(
             bool(s.false) for s in hard), at_least=False)),
     ]  # fmt: skip
@@ -80,12 +80,14 @@ def criteria(scores: Sequence[CaseScore]) -> list[Criterion]:
         Criterion("beside a remainder: false accusations", *_at(0.01, _share(
             bool(s.false) for s in mixed), at_least=False)),
     ]  # fmt: skip
-    told = [s.told_beyond / s.true_beyond for s in scores if s.told_beyond and s.true_beyond]
+    shown = [
+        s.reported_beyond / s.true_beyond for s in scores if s.reported_beyond and s.true_beyond
+    ]
     for at_least, target in ((True, 0.8), (False, 1.25)):
         word = "at least" if at_least else "at most"
-        out.append(Criterion(f"told remainder of a new region over the true one, median, {word}",
-                             float(np.median(told)) if told else None, target, at_least,
-                             len(told), "ratio"))  # fmt: skip
+        out.append(Criterion(f"reported remainder of a new region over the true one, {word}",
+                             float(np.median(shown)) if shown else None, target, at_least,
+                             len(shown), "ratio"))  # fmt: skip
     remainders = [s.remainder for s in scores if s.remainder is not None]
     out.append(_median("held-out remainder over the floor, median", 1.10, remainders, "ratio"))
     z = z_scores(scores)

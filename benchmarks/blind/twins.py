@@ -2,7 +2,7 @@
 
 Answered with the truth generator's own derivatives, never with the diagnosis: a hypothesis
 (effects and joints) is fitted to the noise-free gap, the unknown tracker frame along with it; what
-it leaves, in units of the noise, is the non-centrality that any test has for telling the two apart.
+it leaves, in units of the noise, is the non-centrality that any test has for separating the two.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from benchmarks.blind.ingredients import Ingredient
 from benchmarks.blind.measuring import axial_moments, without
 from benchmarks.blind.mechanics import Array, RealArm
 
-SAME = 20.0  # chi-square below which no fair test tells two hypotheses apart 98 times in 100
+SAME = 20.0  # chi-square below which no fair test separates two hypotheses 98 times in 100
 # effect, joint, orders of its lines; of a slip its moments, s
 Hypothesis = tuple[str, int | None, tuple[float, ...]]
 SLIPS = ("joint_slip", "target_slip")
@@ -54,7 +54,7 @@ def _joint_probes(
     bench: Bench, effect: str, joint: int, orders: Iterable[float]
 ) -> list[Ingredient]:
     kind = bench.kind
-    soft, tilt = kind.axial[joint - 1] / 10, kind.radial[joint - 1] / 10
+    soft, base_rotation = kind.axial[joint - 1] / 10, kind.radial[joint - 1] / 10
     if effect == "joint_offset":
         return [put.joint_offset(joint, 1e-5)]
     if effect == "link_geometry":
@@ -70,7 +70,7 @@ def _joint_probes(
     if effect == "axial_compliance":
         return [put.axial_compliance(joint, soft, 1.0)]
     if effect == "radial_compliance":
-        return [put.radial_compliance(joint, tilt, 1.0)]
+        return [put.radial_compliance(joint, base_rotation, 1.0)]
     if effect == "link_flexibility":
         return [put.link_flexibility(joint, soft, 1.0)]
     if effect == "stiffness_nonlinearity":

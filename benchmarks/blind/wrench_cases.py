@@ -77,8 +77,10 @@ def _reader(bench: Bench, saturating: bool) -> Callable[[Values], Array]:
     def read(values: Values) -> Array:
         shift = values.get(("payload_cog", None), zero)[:3]
         wrench = flange_wrench(bench, float(values.get(("payload", None), zero)[0]), shift)
-        tilt = values.get(("ft_misalignment", None), zero)[:3]
-        back = turn(tilt[None])[0]  # the sensor's axes in the flange: readings are seen from them
+        base_rotation = values.get(("ft_misalignment", None), zero)[:3]
+        back = turn(base_rotation[None])[
+            0
+        ]  # the sensor's axes in the flange: readings are seen from them
         wrench = np.column_stack([wrench[:, :3] @ back, wrench[:, 3:] @ back])
         wrench = wrench * (1 + values.get(("ft_gain", None), zero))
         rate = values.get(("ft_drift", None), zero)
@@ -105,8 +107,8 @@ def outside_error(cell: WrenchCell, name: str, rng: Generator) -> tuple[Array, t
         shape = np.cos(session.q[:, [j, k]] @ rate.T + phase) @ rng.normal(size=5)
         columns = (f"actual_q_{j}", f"actual_q_{k}")
     else:
-        bent = session.payload_mass / cell.bench.kind.rated
-        shape, columns = -(bent**3), ("payload",)
+        deflected = session.payload_mass / cell.bench.kind.rated
+        shape, columns = -(deflected**3), ("payload",)
     error = shape[:, None] * way
     centred = error - error.mean(axis=0)
     floors = float(np.sqrt(np.mean((centred / cell.truth.sigma) ** 2)))

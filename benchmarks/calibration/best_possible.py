@@ -1,7 +1,7 @@
 """How well any choice of poses could do: the bound that optimal design theory gives.
 
 A design that may measure each candidate pose any fraction of a time is at least as good as every
-plan of whole poses. It is found by the multiplicative algorithm, and the equivalence theorem tells
+plan of whole poses. It is found by the multiplicative algorithm, and the equivalence theorem says
 what is still missing: for the mean variance ``f`` of the prediction, convex in the weights ``w``,
 ``f(best) >= f(w) - (n max d - sum w d)`` with ``d = -df/dw``. Source: Silvey, Titterington,
 Torsney, Comm. Stat. A7 (1978); Atkinson, Donev, Tobias, Optimum Experimental Designs (2007),

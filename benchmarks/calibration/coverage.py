@@ -121,7 +121,7 @@ def summary(outcomes: list[Outcome]) -> dict[str, dict[str, float]]:
     for o in outcomes:
         groups.setdefault(o.arm, []).append(o)
         groups.setdefault(o.layout, []).append(o)
-    told = {
+    reported = {
         name: {
             "sessions": float(len(own)),
             "parameters": _share([held for o in own for _, held in o.parameters]),
@@ -135,7 +135,7 @@ def summary(outcomes: list[Outcome]) -> dict[str, dict[str, float]]:
     for o in outcomes:
         for name, held in o.parameters:
             effects.setdefault("_".join(name.split("_")[:2]), []).append(held)
-    return told | {name: {"parameters": _share(held)} for name, held in effects.items()}
+    return reported | {name: {"parameters": _share(held)} for name, held in effects.items()}
 
 
 def _share(held: list[bool]) -> float:
@@ -154,9 +154,9 @@ def main(sessions: int, seed: int, out: Path | None) -> None:
         outcomes.append(run(known[i % len(known)], seed + i))
         if out is not None and len(outcomes) % KEPT == 0:
             _write(out, outcomes)
-    told = summary(outcomes)
+    reported = summary(outcomes)
     table = Table("", "sessions", "parameters held", "predictions held", "rms z", "s a fit")
-    for name, row in told.items():
+    for name, row in reported.items():
         table.add_row(name, *(_cell(row.get(k), k) for k in COLUMNS))
     console.print(table)
     if out is not None:

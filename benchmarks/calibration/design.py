@@ -36,14 +36,14 @@ from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.loads import Loads
 from gapbridge.core.planning.candidates import candidates_of
 from gapbridge.core.planning.design import Wish, far_end, plan, reference_of
-from gapbridge.core.planning.information import Reference, blocks, gathered, inverse
+from gapbridge.core.planning.information import Reference, blocks, information_of, inverse
 
 Array = NDArray[np.float64]
 SIGMA = 3e-5
 DRAWS = 101  # random choices of each number of poses
 TIMES = (1.0, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0)  # of the planned number
 POOL = 2000  # poses over which the best possible choice is bounded
-SHOWN = 3.0  # a parameter counts as told where the weak prior is this many times as wide
+SHOWN = 3.0  # a parameter counts as determined where the weak prior is this many times as wide
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Row:
     equal_worst: float  # the same for the worst place
     possible: float  # rms that no choice of as many poses can come below
     equal_possible: float  # times as many random poses give that
-    told: int  # parameters that the plan shows
+    reported: int  # parameters that the plan shows
     scatter: list[float]  # scatter / expected of each of them
     scatter_tcp: float  # of the predicted TCP, rms
     travel: float  # s
@@ -135,7 +135,7 @@ def chosen_at_random(
         stds = []
         for _ in range(DRAWS):
             some = random.choice(len(rows), round(times * poses), replace=False)
-            stds.append(reference.std(inverse(gathered(rows[some]))))
+            stds.append(reference.std(inverse(information_of(rows[some]))))
         rms.append(float(np.median([np.sqrt(np.mean(std**2)) for std in stds])))
         worst.append(float(np.median([std.max() for std in stds])))
     return rms, worst
@@ -213,7 +213,7 @@ def summary_of(rows: list[Row]) -> dict[str, float]:
         ),
         "random poses equal to the plan, worst place, median": float(np.median(worst)),
         "random poses equal to the plan, worst place, least": float(worst.min()),
-        "parameters told": len(ratio),
+        "parameters reported": len(ratio),
         "scatter over expected, mean": float(ratio.mean()),
         "scatter over expected, share within 10 %": float(np.mean(np.abs(ratio - 1) < 0.1)),
         "scatter over expected, farthest from 1": float(np.abs(ratio - 1).max()),

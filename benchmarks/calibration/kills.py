@@ -2,7 +2,7 @@
 
 A session whose instrument is a file and whose joints are as planned, so that nothing waits for
 people. The command is killed at random moments after it has begun to measure; every reading that it
-had told of before ("kept") must stand in the journal, unchanged, and the same command must go on.
+had reported before ("kept") must stand in the journal, unchanged, and the same command must go on.
 
     python -m benchmarks.calibration.kills --kills 100
 
@@ -58,7 +58,7 @@ class Tally:
 
     kills: int = 0
     sessions: int = 1
-    acknowledged: int = 0  # readings told of before a kill
+    acknowledged: int = 0  # readings reported before a kill
     lost: int = 0  # of these, not in the journal
     torn: int = 0  # kills that tore the last line
     refused: int = 0  # starts that did not go on
@@ -128,22 +128,22 @@ def _killed_once(child: Child, session: Path, when: tuple[int, float], tally: Ta
     ``when``: after how many readings, and how long after the last of them, s.
     """
     before = [e for e in read_entries(session / FILE) if e["kind"] == "reading"]
-    told, kept, begun = b"", 0, False
+    reported, kept, begun = b"", 0, False
     count = min(when[0], _stops(session) - len(before))
     for line in child.shown:
-        told += line
+        reported += line
         begun |= line.startswith(b"instrument:")
         kept += line.startswith(b"  kept")
         if begun and kept >= count:
             break
     if not begun:
         tally.refused += 1
-        raise RuntimeError(f"the session did not go on: {told.decode()[-600:]}")
+        raise RuntimeError(f"the session did not go on: {reported.decode()[-600:]}")
     time.sleep(when[1])
     os.killpg(child.pid, signal.SIGKILL)
-    told += child.shown.read()
+    reported += child.shown.read()
     child.close()
-    _count(session, before, told, tally)
+    _count(session, before, reported, tally)
     done = sum(e["kind"] == "reading" for e in read_entries(session / FILE))
     return done >= _stops(session)
 
@@ -154,13 +154,13 @@ def _stops(session: Path) -> int:
     return len(entry["plan"]["poses"])
 
 
-def _count(session: Path, before: list[dict[str, object]], told: bytes, tally: Tally) -> None:
+def _count(session: Path, before: list[dict[str, object]], reported: bytes, tally: Tally) -> None:
     raw = (session / FILE).read_bytes()
     tally.kills += 1
     tally.torn += not raw.endswith(b"\n")
     whole = [json.loads(line) for line in raw.split(b"\n")[:-1]]
     after = [e for e in whole if e["kind"] == "reading"]
-    acknowledged = told.count(b"  kept  ")
+    acknowledged = reported.count(b"  kept  ")
     tally.acknowledged += acknowledged
     tally.lost += max(len(before) + acknowledged - len(after), 0)
     if after[: len(before)] != before:
@@ -180,7 +180,7 @@ def main() -> None:
     begun = time.monotonic()
     tally = run(given.kills, given.seed, whole=given.whole)
     print(f"\r{tally.kills} kills in {tally.sessions} sessions, {time.monotonic() - begun:.0f} s: "
-          f"{tally.acknowledged} readings told of, {tally.lost} lost, {tally.torn} torn lines, "
+          f"{tally.acknowledged} readings reported, {tally.lost} lost, {tally.torn} torn lines, "
           f"{tally.refused} starts refused")  # fmt: skip
 
 

@@ -55,8 +55,8 @@ def _value(kind: ArmKind, name: str, rng: Generator) -> float:
 
 def parts_of(name: str) -> tuple[str, int, str]:
     """Return effect, joint (0: none) and key of a parameter's name."""
-    words = name.split("_")
-    effect, rest = "_".join(words[:2]), words[2:]
+    parts = name.split("_")
+    effect, rest = "_".join(parts[:2]), parts[2:]
     joint = int(rest[0]) if rest and rest[0].isdigit() else 0
     return effect, joint, rest[-1] if rest and not rest[-1].isdigit() else ""
 

@@ -150,8 +150,8 @@ def by_figaroh(data: DataSet, python: str, patience: float) -> tuple[float, floa
     if not lines:
         last = (done.stderr or done.stdout).strip().splitlines()[-1:]
         return float("nan"), float("nan"), 0, f"failed: {' '.join(last)}"
-    told = json.loads(lines[-1][7:])
-    return told["held_out_rms"], told["seconds"], told["parameters"], ""
+    reported = json.loads(lines[-1][7:])
+    return reported["held_out_rms"], reported["seconds"], reported["parameters"], ""
 
 
 def _figaroh_files(data: DataSet, folder: Path) -> None:

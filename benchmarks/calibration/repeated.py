@@ -16,7 +16,7 @@ from gapbridge.core.calibration.readings import Readings
 
 Array = NDArray[np.float64]
 ROUNDS = 6
-SETTLED = 1e-3  # usual sizes: the next step would be of second order in this
+CONVERGED = 1e-3  # usual sizes: the next step would be of second order in this
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def repeated_sessions(
             step = solver @ np.concatenate([gap.ravel() * weight[:, 0], held])
             values = values + step[: len(values)]
             place = place.moved(step[len(values) :], layout)
-            if np.abs(step[: len(values)] / parameters.scales).max() < SETTLED:
+            if np.abs(step[: len(values)] / parameters.scales).max() < CONVERGED:
                 break
         found[s] = values
     return Scatter(found, truth)

@@ -107,13 +107,13 @@ def main(sessions: int, seed: int, out: Path | None) -> None:
         run(*settings[i % len(settings)], seed + i)
         for i in track(range(sessions), "sessions", console=console)
     ]
-    told = summary(outcomes)
-    table = Table("", *next(iter(told.values())))
-    for name, row in told.items():
+    reported = summary(outcomes)
+    table = Table("", *next(iter(reported.values())))
+    for name, row in reported.items():
         table.add_row(name, *(f"{value:.3g}" for value in row.values()))
     console.print(table)
     if out:
-        out.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+        out.write_text(json.dumps(reported, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

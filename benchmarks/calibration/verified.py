@@ -6,7 +6,7 @@ The figure is the held-out error of one coordinate over what no calibration can 
 instrument's noise and the arm's repeatability, as they truly were.
 
 With ``--asked`` nobody says what the arm has: the fit begins with the effects that every session
-looks for, and is made again with those that it says are lacking.
+looks for, and is made again with those that it says are missing.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ LIMIT = 1.2
 FITTED = 90
 SESSION = Plan(poses=FITTED + 200, blocks=3, pulled=0.25)  # many to verify: little left to chance
 TRIES = 60
-REFITS = 3  # times at most that what is lacking is added
+REFITS = 3  # times at most that what is missing is added
 TITLES = ("", "sessions", "before, mm", "after, mm", "floor, mm", "median", "mean", "largest")
 
 
@@ -90,7 +90,7 @@ def draw_case(arm: str, effect: str, rng: Generator) -> tuple[Bench, list[Ingred
 def run(arm: str, effect: str, seed: int, asked: bool = False) -> Outcome:
     """Return the outcome of one arm with one effect among others.
 
-    ``asked``: the fit is not told which, but made again with what it says is lacking.
+    ``asked``: the fit is not given which, but made again with what it says is lacking.
     """
     rng = np.random.default_rng([seed, 4711])
     bench, parts = draw_case(arm, effect, rng)
@@ -125,7 +125,7 @@ def run(arm: str, effect: str, seed: int, asked: bool = False) -> Outcome:
 
 
 def _named(effect: str, parts: list[Ingredient]) -> str:
-    """Return the effect as the fit is told of it: at its joint where it has one."""
+    """Return the effect as the fit is given it: at its joint where it has one."""
     joint = parts[0].joint
     return effect if joint is None else f"{effect}_{joint}"
 
@@ -168,7 +168,7 @@ def _floor(bench: Bench, real: RealArm, readings: Readings) -> float:
 @click.option("--seeds", default=2, show_default=True, help="Sessions of each arm and effect.")
 @click.option("--seed", default=0, show_default=True, help="First seed.")
 @click.option("--effects", default=",".join(("none", *POSITION_EFFECTS)), help="By commas.")
-@click.option("--asked", is_flag=True, help="Fit what the readings ask for, nothing else told.")
+@click.option("--asked", is_flag=True, help="Fit what the readings ask for, nothing else given.")
 @click.option("--json", "out", type=click.Path(path_type=Path), default=None, help="Write figures.")
 def main(seeds: int, seed: int, effects: str, asked: bool, out: Path | None) -> None:
     """Calibrate every arm with every effect, and check it on poses that the fit never saw."""

@@ -41,8 +41,8 @@ def bent_arms(count: int, rng: np.random.Generator) -> None:
         case = equilibrium.random_case(rng, dh, payload, softness)
         model, loads = model_of(case)
         rigid_arm = model.predict(case.q[None], loads).position[0]
-        bent = model.with_compliance(case.axial, case.radial)
-        pose = bent.predict(case.q[None], loads)
+        deflected = model.with_compliance(case.axial, case.radial)
+        pose = deflected.predict(case.q[None], loads)
         position, rotation = equilibrium.solve(case)
         shift.append(np.linalg.norm(pose.position[0] - position))
         turn.append(np.abs(pose.rotation[0] - rotation).max())
@@ -56,7 +56,7 @@ def bent_arms(count: int, rng: np.random.Generator) -> None:
             for exact, share in ((pose.position[0], 1.0), (halved, 0.5))
         ]
         ratios.append(errors[0] / errors[1])
-        left.append(correct(bent, case.q, loads).residual[0])
+        left.append(correct(deflected, case.q, loads).residual[0])
     percent = np.percentile(ratios, [5, 50, 95])
     reached = np.array(left) < TOLERANCE
     print(f"equilibrium, {count} cases ({', '.join(ARMS)}; deflections up to {max(moved):.3f} m):")

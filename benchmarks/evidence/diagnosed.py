@@ -26,7 +26,7 @@ LATER = (("tsinghua_ur5_grid", "tsinghua_ur5_random"), ("barrett_wam_grid", "bar
          ("ipa_ur10_a", "ipa_ur10_b"))  # fmt: skip
 
 
-def told(what: str, far: np.ndarray) -> None:
+def reported(what: str, far: np.ndarray) -> None:
     rms = float(np.sqrt(np.mean(far**2)))
     print(f"  {what:28s} mean {far.mean() * 1e3:8.4f}   rms {rms * 1e3:8.4f}", flush=True)
 
@@ -47,8 +47,8 @@ def report(name: str, cell_model: Model, learned: Log, checked: Log, metrology: 
     seconds = time.perf_counter() - start
     print(f"{name}: {len(learned)} rows diagnosed in {seconds:.0f} s, {len(checked)} checked")
     model = with_effects(found)
-    told("cell's model", distances(cell_model, checked, registered(cell_model, learned)))
-    told("with the found effects", distances(model, checked, registered(model, learned)))
+    reported("cell's model", distances(cell_model, checked, registered(cell_model, learned)))
+    reported("with the found effects", distances(model, checked, registered(model, learned)))
 
 
 def later(first: str, second: str) -> None:
@@ -58,8 +58,8 @@ def later(first: str, second: str) -> None:
     checked = read_log(DATA / second / "log.csv", cell.arm.n)
     model = diagnose(cell.model, learned, cell.metrology).model
     print(f"{first}, all {len(learned)} rows diagnosed; {second}, {len(checked)} rows checked")
-    told("cell's model", distances(cell.model, checked, registered(cell.model, checked)))
-    told("with the found effects", distances(model, checked, registered(model, checked)))
+    reported("cell's model", distances(cell.model, checked, registered(cell.model, checked)))
+    reported("with the found effects", distances(model, checked, registered(model, checked)))
 
 
 def main(names: list[str]) -> None:

@@ -57,20 +57,20 @@ def with_tool_point(model: Model, log: Log) -> Model:
     return model
 
 
-def told(what: str, far: np.ndarray) -> None:
+def reported(what: str, far: np.ndarray) -> None:
     print(f"  {what:40s} mean {far.mean() * 1e3:8.4f}   rms {np.sqrt(np.mean(far**2)) * 1e3:8.4f}")
 
 
 def compare(model: Model, fit: Log, held_out: Log, metrology: Metrology) -> None:
     """Print the held-out error before and after."""
     for start, what in ((model, "cell's tool"), (with_tool_point(model, fit), "fitted tool point")):
-        told(f"rigid, {what}", distances(start, held_out, registered(start, fit)))
+        reported(f"rigid, {what}", distances(start, held_out, registered(start, fit)))
         try:
             found = identify_compliance(start, fit, metrology)
         except InputError as error:
             print(f"  fit declines: {error}")
             continue
-        told(f"compliance fitted, {what}", distances(found.model, held_out, found.registration))
+        reported(f"compliance fitted, {what}", distances(found.model, held_out, found.registration))
         shown = ", ".join(
             f"{kind} {i + 1}: {max(value, 0) * 1e6:.1f}±{std * 1e6:.1f}"
             for kind, values, stds, first in (

@@ -95,15 +95,17 @@ def product_fit(case: Experiment) -> np.ndarray:
                "measured_position": rigid + true}  # fmt: skip
     log = Log("paper", {k: v[:FIT] for k, v in columns.items()}, case.model.arm.n)
     found = identify_compliance(model, log, Metrology(registered=True, sigma=1e-9))
-    bent = found.model.predict(q, Loads(wrench=SMALL * case.wrench)).position
-    return relative_error((bent - rigid) / SMALL, case.deflection[:, :3])
+    deflected = found.model.predict(q, Loads(wrench=SMALL * case.wrench)).position
+    return relative_error((deflected - rigid) / SMALL, case.deflection[:, :3])
 
 
 def second_order(case: Experiment, arm: FrameArm) -> float:
     """Return how far (m) equilibrium in the bent shape is from first-order theory, at most."""
     q = np.tile(case.q, (len(case.wrench), 1))
-    bent = case.model.with_compliance(arm.axial, arm.radial)
-    exact = bent.predict(q, Loads(wrench=case.wrench)).position - case.model.rigid_pose(q).position
+    deflected = case.model.with_compliance(arm.axial, arm.radial)
+    exact = (
+        deflected.predict(q, Loads(wrench=case.wrench)).position - case.model.rigid_pose(q).position
+    )
     return float(np.linalg.norm(exact - case.deflection[:, :3], axis=1).max())
 
 

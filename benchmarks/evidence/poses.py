@@ -48,7 +48,7 @@ def rms(gap: np.ndarray) -> float:
     return float(np.sqrt(np.mean(gap**2)))
 
 
-def tell(name: str, columns: dict[str, np.ndarray], seed: int, registered: bool) -> Identification:
+def emit(name: str, columns: dict[str, np.ndarray], seed: int, registered: bool) -> Identification:
     """Fit on the first half, print how the second is met, in um a coordinate."""
     rng = np.random.default_rng([seed, 1])
     true = columns["measured_position"]
@@ -86,7 +86,7 @@ def main() -> None:
                 rng = np.random.default_rng(seed)
                 columns = measured(frame_arm(name, rng, links), rng, name)
                 for registered in (True, False):
-                    tell(name, columns, seed, registered)
+                    emit(name, columns, seed, registered)
 
 
 if __name__ == "__main__":

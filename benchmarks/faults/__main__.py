@@ -54,7 +54,7 @@ def main(
         left = 60.0 * minutes - (time.monotonic() - begun)
         tally = run_sequences(chosen, sequences, seed, folder, rate, click.echo, left)
         wrong += tally.violated + tally.stuck
-        click.echo(tally.words())
+        click.echo(tally.message())
         if page:
             fill(PAGE, "sequences", tally.table())
     sys.exit(1 if wrong else 0)

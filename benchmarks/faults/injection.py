@@ -12,7 +12,7 @@ POLL = 0.001  # s
 AFTERWARDS = 0.25  # s for which the end state must stay
 RESTING, AT_REST = (State.OBSERVING, State.COMPENSATING, State.FAULT), 3.0  # s: stays for good
 END_LIMIT = 90.0  # s: a new process takes its time on a busy machine
-PATIENCE = 10.0  # s on top of what is allowed, to tell what is late from what never comes
+PATIENCE = 10.0  # s on top of what is allowed, to distinguish what is late from what never comes
 BUSY = (Cause.OVERRUN.value, Cause.RESYNC.value)
 
 
@@ -66,8 +66,10 @@ def _seen(rig: Rig, row: Row, moment: float, before: dict[str, int]) -> float | 
         return _left(rig, moment)
     if row.sign.startswith("event:"):
         kind, _, key = row.sign.removeprefix("event:").partition(" ")
-        told = (e for e in rig.run.since(moment) if e["kind"] == kind and (not key or e.get(key)))
-        return next((float(event["time"]) for event in told), None)
+        reported = (
+            e for e in rig.run.since(moment) if e["kind"] == kind and (not key or e.get(key))
+        )
+        return next((float(event["time"]) for event in reported), None)
     return _counted(rig, row, before)
 
 

@@ -68,12 +68,12 @@ class Found:
     violated: int = 0
     recent: deque[str] = field(default_factory=lambda: deque(maxlen=10))
 
-    def add(self, words: str) -> None:
+    def add(self, message: str) -> None:
         """Note a violation, the first few with what went over the wire just before."""
         self.violated += 1
         if len(self.violations) < LONGEST_LIST:
             before = "; ".join(self.recent) if self.violated < 5 else ""
-            self.violations.append(f"{words} [{before}]" if before else words)
+            self.violations.append(f"{message} [{before}]" if before else message)
 
 
 @dataclass
@@ -235,8 +235,8 @@ class Checker:
         self._unused -= 1.0
         self.found.oldest_state = max(self.found.oldest_state, age)
         if age > self.bounds.fresh:
-            told = f"write {age:.3f} s after the last fresh state"
-            self.found.add(f"{told}, {[round(v, 6) for v in write.values]}")
+            reported = f"write {age:.3f} s after the last fresh state"
+            self.found.add(f"{reported}, {[round(v, 6) for v in write.values]}")
         elif self._unused < 0.0:
             self._unused = 0.0
             self.found.add("more writes than states")

@@ -19,8 +19,8 @@ from pathlib import Path
 import click
 import psutil
 
+from benchmarks.faults.controller_process import ControllerProcess
 from benchmarks.faults.links import LIMITS, LINKS, own_address
-from benchmarks.faults.peer import Peer
 from benchmarks.faults.process_run import END_LIMIT, ProcessRun
 from benchmarks.faults.report import PAGE, fill
 from gapbridge.bridge.ipc.control_client import ask
@@ -66,16 +66,16 @@ class Scene:
                 ports.append(int(free.getsockname()[1]))
         more = LIMITS.replace("folder: null", "folder: recordings")
         more += f"web: {{port: {ports[0]}}}\nmetrics: {{port: {ports[1]}}}\n"
-        self.cell, peer_cell = self.link.write_cells(folder, self.host, self.host, more)
-        self.peer = Peer(peer_cell, self.host, 30100, folder / "peer.log")
-        self.peer.start()
+        self.cell, controller_cell = self.link.write_cells(folder, self.host, self.host, more)
+        self.controller = ControllerProcess(controller_cell, self.host, 30100, folder / "peer.log")
+        self.controller.start()
         self.folder = folder / "recordings"
         self.begin()
 
     def begin(self) -> float:
         """Start a run, armed; returns how long that took, s."""
         begun = time.monotonic()
-        self.link.prepare(self.peer, self.host)
+        self.link.prepare(self.controller, self.host)
         self.run = ProcessRun(self.cell)
         self.run.start()
         self.reach(State.COMPENSATING)
@@ -86,7 +86,7 @@ class Scene:
         until = time.monotonic() + LIMIT
         while self.run.state != state:
             if time.monotonic() > until or not self.run.alive:
-                raise TimeoutError(f"{self.run.last_words()}; {self.run.said[-300:]}")
+                raise TimeoutError(f"{self.run.last_words()}; {self.run.output[-300:]}")
             if self.run.state == State.FAULT:
                 ask(self.cell, "disarm")
             elif self.run.state == State.OBSERVING:
@@ -171,7 +171,7 @@ def run_kills(count: int, seed: int, folder: Path, link: str, limit: float) -> D
             (folder / "kills.json").write_text(json.dumps(asdict(found)), encoding="utf-8")
     finally:
         scene.run.stop()
-        scene.peer.stop()
+        scene.controller.stop()
     return found
 
 
@@ -186,8 +186,8 @@ def main(count: int, seed: int, link: str, minutes: float, page: bool) -> None:
     folder = Path(tempfile.mkdtemp(prefix="kills-"))
     found = run_kills(count, seed, folder, link, 60.0 * minutes)
     click.echo(found.table())
-    for words in found.wrong:
-        click.echo(f"NOT AS EXPECTED: {words}")
+    for message in found.wrong:
+        click.echo(f"NOT AS EXPECTED: {message}")
     if page:
         fill(PAGE, "kills", found.table())
     sys.exit(1 if found.wrong else 0)

@@ -1,4 +1,4 @@
-"""The links on which faults are made: a cell for the daemon, one for its simulated peer, a tap."""
+"""The links on which faults are made: a cell for the daemon, one for the controller, a tap."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import time
 from abc import ABC, abstractmethod
 from pathlib import Path
 
+from benchmarks.faults.controller_process import ControllerProcess
 from benchmarks.faults.invariants import Bounds
-from benchmarks.faults.peer import Peer
 from benchmarks.faults.proxy import Port
 from benchmarks.faults.splitting import ModbusFrames, Raw, RtdeFrames, SocketcandMessages
 from benchmarks.faults.wire.modbus import ModbusDecoder
@@ -104,7 +104,7 @@ class Link(ABC):
     def decoder(self) -> Decoder:
         """Return a decoder of what goes over the wire."""
 
-    def prepare(self, peer: Peer, host: str, writing: bool = False) -> None:
+    def prepare(self, controller: ControllerProcess, host: str, writing: bool = False) -> None:
         """Do what a person does at the robot before it can be armed (again).
 
         ``writing``: the daemon compensates, so that nothing needs to be done to programs.
@@ -164,14 +164,14 @@ class UrServo(Link):
         """See Link.decoder."""
         return RtdeDecoder(servoj=self.mode == "servoj")
 
-    def prepare(self, peer: Peer, host: str, writing: bool = False) -> None:
+    def prepare(self, controller: ControllerProcess, host: str, writing: bool = False) -> None:
         """Leave the robot without a program and ready to move."""
-        self._make_ready(peer, host, writing)
+        self._make_ready(controller, host, writing)
 
-    def _make_ready(self, peer: Peer, host: str, writing: bool) -> None:
-        peer.bench("thaw")
-        peer.bench("release")
-        peer.bench("unlock")
+    def _make_ready(self, controller: ControllerProcess, host: str, writing: bool) -> None:
+        controller.bench("thaw")
+        controller.bench("release")
+        controller.bench("unlock")
         if "RUNNING" not in dashboard(host, "robotmode"):
             dashboard(host, "power on")
             time.sleep(0.05)
@@ -188,9 +188,9 @@ class UrOffset(UrServo):
     grain, grain_rotation = 2e-8, 2e-8
     withdraws = 0.2  # gb_silence of gapbridge_offset.script
 
-    def prepare(self, peer: Peer, host: str, writing: bool = False) -> None:
+    def prepare(self, controller: ControllerProcess, host: str, writing: bool = False) -> None:
         """Have the robot's own program run."""
-        self._make_ready(peer, host, writing)
+        self._make_ready(controller, host, writing)
         if "true" not in dashboard(host, "running"):
             self.start_program(host)
 
@@ -227,10 +227,10 @@ class Modbus(Link):
         """See Link.decoder."""
         return ModbusDecoder()
 
-    def prepare(self, peer: Peer, host: str, writing: bool = False) -> None:
+    def prepare(self, controller: ControllerProcess, host: str, writing: bool = False) -> None:
         """Clear stops; have the mailbox program run."""
         for line in ("thaw", "release", "unlock", "program 1"):
-            peer.bench(line)
+            controller.bench(line)
 
 
 class CanPiper(Link):
@@ -257,10 +257,10 @@ class CanPiper(Link):
         """See Link.decoder."""
         return PiperDecoder()
 
-    def prepare(self, peer: Peer, host: str, writing: bool = False) -> None:
+    def prepare(self, controller: ControllerProcess, host: str, writing: bool = False) -> None:
         """Clear stops."""
         for line in ("thaw", "release", "unlock", "resume"):
-            peer.bench(line)
+            controller.bench(line)
 
 
 def dashboard(host: str, line: str) -> str:

@@ -123,5 +123,5 @@ def line(result: Result) -> str:
     step = f"largest step {1e6 * result.largest_step:.0f} um"
     if result.again:
         after += f", attempt {result.again + 1}"
-    words = f"{result.link:15} {result.row:24} {after:34} {step:24} end {result.end}"
-    return words + "".join(f"\n    NOT AS EXPECTED: {wrong}" for wrong in result.wrong)
+    message = f"{result.link:15} {result.row:24} {after:34} {step:24} end {result.end}"
+    return message + "".join(f"\n    NOT AS EXPECTED: {wrong}" for wrong in result.wrong)

@@ -15,9 +15,9 @@ from pathlib import Path
 import psutil
 
 from benchmarks.faults.punctual import go_first
-from benchmarks.faults.running import Event, Told
+from benchmarks.faults.running import Event, SourceStatus
 from gapbridge.bridge.cell import load_cell
-from gapbridge.bridge.ipc.shared_memory import NAME, Page
+from gapbridge.bridge.ipc.shared_memory import NAME, SharedMemory
 from gapbridge.bridge.loop.supervisor import State
 
 CODE = """
@@ -25,24 +25,24 @@ import ctypes, json, signal, sys
 from pathlib import Path
 from gapbridge.bridge.cli import main
 from gapbridge.bridge.daemon.run import run_cell
-def tell(event):
+def emit(event):
     print(json.dumps(event, default=str), file=sys.stderr, flush=True)
-sys.exit(run_cell(Path(sys.argv[1]), arm=True, log=tell))
+sys.exit(run_cell(Path(sys.argv[1]), arm=True, log=emit))
 """
 PAGE_LIMIT = 90.0  # s
 LOOK_EVERY = 0.02  # s between two looks for the page of a new loop
 END_LIMIT = 6.0  # s for every process of a run to be gone
 
 
-class ProcessRun(Told):
+class ProcessRun(SourceStatus):
     """``gapbridge run CELL --arm`` as the command runs it."""
 
     def __init__(self, cell: Path) -> None:
         self._cell, self._n = cell, load_cell(cell).arm.n
         self.events: list[Event] = []
         self.error: BaseException | None = None
-        self.said = ""
-        self._page: Page | None = None
+        self.output = ""
+        self._page: SharedMemory | None = None
         self._looked = 0.0  # s, monotonic: when the newest page was last looked for
         self._process: subprocess.Popen[str] | None = None
 
@@ -64,18 +64,18 @@ class ProcessRun(Told):
             try:
                 self.events.append(json.loads(line))
             except ValueError:
-                self.said += line
+                self.output += line
 
-    def _join(self, until: float) -> Page:
+    def _join(self, until: float) -> SharedMemory:
         """Return the newest page of the daemon; raises TimeoutError where there is none."""
         while time.monotonic() < until:
             found = self._newest()
             if found is not None:
-                return Page(self._n, found, writable=False)
+                return SharedMemory(self._n, found, writable=False)
             if not self.alive:
                 break
             time.sleep(0.02)
-        raise TimeoutError(f"the daemon did not start: {self.said[-300:]}")
+        raise TimeoutError(f"the daemon did not start: {self.output[-300:]}")
 
     def _newest(self) -> int | None:
         """Return a descriptor of the page of the newest loop: memory is numbered as it is made."""
@@ -89,14 +89,14 @@ class ProcessRun(Told):
         return None
 
     @property
-    def page(self) -> Page:
+    def page(self) -> SharedMemory:
         """Return the shared page of the run's newest loop."""
         assert self._page is not None
         now = time.monotonic()
         if now - self._looked > LOOK_EVERY:
             self._looked = now
             if (fd := self._newest()) is not None:
-                self._page = Page(self._n, fd, writable=False)
+                self._page = SharedMemory(self._n, fd, writable=False)
         return self._page
 
     @property
@@ -129,8 +129,8 @@ class ProcessRun(Told):
         found = {"daemon": psutil.Process(self.pid)}
         for child in found["daemon"].children(recursive=True):
             with contextlib.suppress(psutil.Error):
-                words = child.cmdline()
-                name = words[words.index("-m") + 1] if "-m" in words else "other"
+                arguments = child.cmdline()
+                name = arguments[arguments.index("-m") + 1] if "-m" in arguments else "other"
                 found[name.removeprefix("bridge.").removesuffix(".main")] = child
         return found
 

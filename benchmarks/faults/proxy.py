@@ -1,8 +1,8 @@
-"""A TCP proxy between the real client and its peer that does harm, and tells a tap of it all.
+"""A TCP proxy between client and server that injects faults and sends a tap a copy of all.
 
-One thread serves every port. Messages from the client are told before anything is done to them:
+One thread serves every port. Messages from the client are recorded before anything is done to them:
 that is what was written, with the time at which the kernel had it (arrival.py). Messages to the
-client are told as they have left: that is what it could know.
+client are recorded as they have left: that is what it could know.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from benchmarks.faults.splitting import Splitter
 
 UP, DOWN = "up", "down"  # from the client, to the client
 RESET = struct.pack("ii", 1, 0)  # SO_LINGER: closing sends RST
-Tell = Callable[[float, float, int, str, str, bytes], None]
+Emit = Callable[[float, float, int, str, str, bytes], None]
 """Between which times (s, monotonic), connection, name of the port, direction, message."""
 
 
 @dataclass
 class Port:
-    """One port of the peer: where it is, and how its messages are told apart."""
+    """One port of the server: where it is, and how its messages are delimited."""
 
     name: str
     port: int
@@ -60,8 +60,8 @@ class Proxy:
     to one connection. Methods may be called from any thread.
     """
 
-    def __init__(self, host: str, target: str, ports: Iterable[Port], tell: Tell) -> None:
-        self.host, self.target, self._tell = host, target, tell
+    def __init__(self, host: str, target: str, ports: Iterable[Port], emit: Emit) -> None:
+        self.host, self.target, self._emit = host, target, emit
         self._ports = list(ports)
         self._mischief: dict[tuple[str, str], Mischief] = {}
         self._selector = selectors.DefaultSelector()
@@ -226,7 +226,7 @@ class Proxy:
             if direction == UP:
                 # the kernel knows the time of the last one; the others came since the one before
                 earliest = arrived if i == len(messages) - 1 else connection.arrived
-                self._tell(earliest, arrived, connection.number, port, UP, message)
+                self._emit(earliest, arrived, connection.number, port, UP, message)
             mischief = self._mischief.get((port, direction), passing)
             for asked, made in mischief(message):
                 delay = max(asked, self._stalled_until - now)
@@ -254,7 +254,7 @@ class Proxy:
         if direction == DOWN:
             after = time.monotonic()
             for message in messages:
-                self._tell(before, after, connection.number, connection.port.name, DOWN, message)
+                self._emit(before, after, connection.number, connection.port.name, DOWN, message)
 
     def _push(self, connection: Connection, direction: str, message: bytes) -> None:
         end = connection.ends.get(DOWN if direction == UP else UP)

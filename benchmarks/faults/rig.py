@@ -9,9 +9,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from benchmarks.faults.controller_process import ControllerProcess
 from benchmarks.faults.invariants import Checker, Found
 from benchmarks.faults.links import Link, own_address
-from benchmarks.faults.peer import Peer
 from benchmarks.faults.proxy import Proxy
 from benchmarks.faults.punctual import be_punctual
 from benchmarks.faults.running import Running
@@ -21,8 +21,8 @@ from gapbridge.core.errors import LinkError
 
 SOME = 40  # messages decoded at a time
 STARTS = 3
-TOLD = 1.0  # s within which an event has come from the loop to here, on any machine
-SETTLED = 0.12  # s of compensating before a fault is made
+REPORTED = 1.0  # s within which an event has come from the loop to here, on any machine
+CONVERGED = 0.12  # s of compensating before a fault is made
 START_LIMIT, RECOVERY_LIMIT = 180.0, 120.0  # s: on a machine that has much else to do
 
 
@@ -32,13 +32,13 @@ class Rig:
     def __init__(self, link: Link, folder: Path, more: str = "", **changed: Any) -> None:
         self.link, self._changed = link, changed
         self.front, self.back = own_address(), own_address()
-        self.cell, peer_cell = link.write_cells(folder, self.front, self.back, more)
-        self.peer = Peer(peer_cell, self.back, 30100, folder / "peer.log")
+        self.cell, controller_cell = link.write_cells(folder, self.front, self.back, more)
+        self.controller = ControllerProcess(controller_cell, self.back, 30100, folder / "peer.log")
         self.checker = Checker(link.bounds(self.cell))
         self._runs: list[Running] = []
         self.decoder = link.decoder()
         self.tap = Tap(self.decoder, link.ports(), self._state_word)
-        self.proxy = Proxy(self.front, self.back, link.ports(), self.tap.tell)
+        self.proxy = Proxy(self.front, self.back, link.ports(), self.tap.emit)
 
     def _state_word(self) -> int:
         return self._runs[-1].state_word() if self._runs else -1
@@ -54,7 +54,7 @@ class Rig:
         while self.check():
             time.sleep(0.0005)  # the proxy goes first: who decodes must not slow the wire
         if self.checker.doubts:
-            time.sleep(TOLD)
+            time.sleep(REPORTED)
             self.checker.settle([span for run in self._runs for span in run.writing_spans()])
         return self.checker.found
 
@@ -68,12 +68,12 @@ class Rig:
         sys.setswitchinterval(1e-4)  # the proxy's thread must not wait for others
         be_punctual()  # nor for this one, which may hold the interpreter
         try:
-            self.peer.start()
-            self.link.prepare(self.peer, self.back)
+            self.controller.start()
+            self.link.prepare(self.controller, self.back)
             self.proxy.__enter__()
             self.start_daemon()
         except BaseException:
-            self.peer.stop()
+            self.controller.stop()
             raise
         return self
 
@@ -85,12 +85,12 @@ class Rig:
     ) -> None:
         try:
             if self.run.alive:
-                self.peer.go_on()
+                self.controller.go_on()
                 self.proxy.heal()
                 self.run.stop()
         finally:
             self.proxy.__exit__(None, None, None)
-            self.peer.stop()
+            self.controller.stop()
 
     def start_daemon(self) -> None:
         """Start a run, observing; again where a busy machine was too slow for the first words."""
@@ -132,10 +132,10 @@ class Rig:
     def heal(self) -> None:
         """Undo every fault that can be undone from here."""
         self.proxy.heal()
-        self.peer.go_on()
-        if not self.peer.runs:
-            self.peer.start()
-        self.link.prepare(self.peer, self.back, self.run.state.writes)
+        self.controller.go_on()
+        if not self.controller.runs:
+            self.controller.start()
+        self.link.prepare(self.controller, self.back, self.run.state.writes)
 
     def recover(self, limit: float = RECOVERY_LIMIT) -> None:
         """Heal, and acknowledge faults as a person does, until the daemon observes."""
@@ -159,7 +159,7 @@ class Rig:
                 self.run.daemon.arm()
             with contextlib.suppress(TimeoutError):
                 self.wait(State.COMPENSATING, 2.0)
-                self.pass_time(SETTLED)
+                self.pass_time(CONVERGED)
             if self.run.state == State.COMPENSATING:
                 return
             if time.monotonic() > until:

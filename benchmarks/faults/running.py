@@ -18,8 +18,8 @@ WRITES = tuple(state.name for state in State if state.writes)
 Event = dict[str, Any]
 
 
-class Told:
-    """What a run has told: its events, with both clocks' times."""
+class SourceStatus:
+    """What a run has reported: its events, with both clocks' times."""
 
     events: list[Event]
 
@@ -47,7 +47,7 @@ class Told:
         return "; ".join(f"{e.get('kind')} {words_of(e)}" for e in self.events[-4:])
 
 
-class Running(Told):
+class Running(SourceStatus):
     """One run of the daemon; every event is kept, with its wall clock's time."""
 
     def __init__(self, cell: Path, observe: bool = False, **changed: Any) -> None:

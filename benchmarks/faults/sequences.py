@@ -48,12 +48,12 @@ class Tally:
         for key in ("largest_step", "largest_offset"):
             mine, theirs = getattr(self, key), getattr(other, key)
             mine.update({name: max(mine.get(name, 0.0), most) for name, most in theirs.items()})
-        for name, words in other.violations.items():
-            self.violations[name] = [*self.violations.get(name, []), *words]
+        for name, message in other.violations.items():
+            self.violations[name] = [*self.violations.get(name, []), *message]
         self.violated += other.violated
         self.stuck += other.stuck
 
-    def words(self) -> str:
+    def message(self) -> str:
         """Return it in one line."""
         return (
             f"{sum(self.sequences.values())} sequences of {sum(self.faults.values())} faults, "
@@ -132,8 +132,8 @@ def _on_rig(
         if new or done % 25 == 0:
             keys = ", ".join(row.key for row, _ in chosen)
             say(f"{name}: {done} of {share}, {time.monotonic() - begun:.1f} s ({keys})")
-        for words in rig.checker.found.violations[-new:] if new else ():
-            say(f"    VIOLATION: {words}")
+        for message in rig.checker.found.violations[-new:] if new else ():
+            say(f"    VIOLATION: {message}")
     return done
 
 

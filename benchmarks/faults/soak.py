@@ -120,11 +120,11 @@ def soak(
 
 def missed_of(quiet: Quiet, stalls: MachineStalls, cycle: float) -> str:
     """Return in words how many cycles were missed, and how many of them the machine itself took."""
-    words = f"{quiet.share(quiet.missed):.3f} % missed"
+    message = f"{quiet.share(quiet.missed):.3f} % missed"
     if stalls.spans is None:
-        return words
+        return message
     own = quiet.share(stalls.not_among(quiet.missed, cycle))
-    return f"{words} ({own:.3f} % while a bare timer on each core was on time)"
+    return f"{message} ({own:.3f} % while a bare timer on each core was on time)"
 
 
 RECORDED = LIMITS.replace("folder: null", "folder: recordings")
@@ -161,8 +161,8 @@ def main(
     for name in sorted({name.split()[0] for name in memory.points} - {"loop"}):
         slope, size, span = memory.slope(name)
         click.echo(f"  {name}: {size:.0f} MB, {slope:+.2f} MB a minute over {span:.0f} s")
-    for words in found.violations[:20]:
-        click.echo(f"  VIOLATION: {words}")
+    for message in found.violations[:20]:
+        click.echo(f"  VIOLATION: {message}")
     if page:
         slope, size, span = memory.slope("loop")
         allowed = 1e6 * bounds.offset_rate * bounds.cycle

@@ -26,7 +26,7 @@ class Tap:
         self._kept: deque[tuple[float, float, int, str, bool, bytes, int]] = deque()
         self.messages = 0
 
-    def tell(
+    def emit(
         self, earliest: float, time: float, connection: int, port: str, direction: str,
         message: bytes,
     ) -> None:  # fmt: skip

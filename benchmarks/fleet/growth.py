@@ -1,7 +1,7 @@
 """How a fleet's cost grows with its sessions: bare loops, local processes, a Dask cluster.
 
 All run in turns over the same chunks of sessions, so that what else the machine does meets all of
-them alike; ratios are of a chunk's times, told as the median with the quartiles.
+them alike; ratios are of a chunk's times, reported as the median with the quartiles.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ class Kept(Workers):
         """Do the tasks."""
         return self.inner.run(tasks)
 
-    def words(self) -> str:
+    def message(self) -> str:
         """Return who they are."""
-        return self.inner.words()
+        return self.inner.message()
 
 
 def measure(folder: Path, sessions: int, chunk: int, seed: int, *, dask: bool) -> dict[str, Any]:

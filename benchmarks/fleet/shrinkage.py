@@ -57,8 +57,8 @@ def run_fleet(model: Model, metrology: Metrology, poses: list[int], seed: int) -
             "fleet": fit.arms[i].flexibility,
         }  # fmt: skip
         for name, values in flexibility.items():
-            bent = model.with_compliance(values[:n], values[n:])
-            ways[name].append(_gap(bent, seen[i], held[i], metrology))
+            deflected = model.with_compliance(values[:n], values[n:])
+            ways[name].append(_gap(deflected, seen[i], held[i], metrology))
     inside = np.array([
         np.abs(fit.arms[i].flexibility - truths[i]) <= 1.96 * fit.arms[i].std
         for i in range(len(poses))

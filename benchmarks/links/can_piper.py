@@ -20,10 +20,10 @@ from benchmarks.links.case import Cycles, LinkCase, OurCycle, Pause
 from benchmarks.links.serving import served_cell, written
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.cell import Cell
-from gapbridge.bridge.cell.simulation import simulated_peer
+from gapbridge.bridge.cell.simulation import served_controller
 from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
-from gapbridge.drivers.simulated.peer.peer_server import PeerThread
+from gapbridge.drivers.simulated.server.protocol_server import ServerThread
 
 HOST, PORT = "127.77.0.4", 29921
 BURST = 0.0015  # s in which all frames of one sample have come
@@ -55,9 +55,9 @@ class PiperVirtualCase(LinkCase):
         with written(VIRTUAL) as path:
             cell = load_cell(path)
             assert cell.link is not None
-            found = simulated_peer(cell, cell.link)
+            found = served_controller(cell, cell.link)
             with (
-                PeerThread(found.peer, found.servers, found.host),
+                ServerThread(found.controller, found.servers, found.host),
                 _armed(cell, time.sleep) as cycles,
             ):
                 yield cycles

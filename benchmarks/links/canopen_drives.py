@@ -19,13 +19,13 @@ from benchmarks.links.case import Cycles, LinkCase, OurCycle, Pause
 from benchmarks.links.serving import served_cell, written
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.cell import Cell
-from gapbridge.bridge.cell.simulation import simulated_peer
+from gapbridge.bridge.cell.simulation import served_controller
 from gapbridge.drivers.canopen.driver import CanopenDriver
 from gapbridge.drivers.canopen.settings import CanopenSettings
-from gapbridge.drivers.simulated.peer.peer_server import PeerThread
+from gapbridge.drivers.simulated.server.protocol_server import ServerThread
 
 HOST, PORT = "127.77.0.3", 29920
-PACE = 0.010  # s from one SYNC to the next, as the drives are told
+PACE = 0.010  # s from one SYNC to the next, as the drives are configured
 COMMON = (
     "profile: lwa4p, rate: 100, state_timeout: 0.5, listen: 0.05, foreign_quiet: 0.1,"
     " frozen_after: 10.0"
@@ -57,9 +57,9 @@ class DrivesVirtualCase(LinkCase):
         with written(VIRTUAL) as path:
             cell = load_cell(path)
             assert cell.link is not None
-            found = simulated_peer(cell, cell.link)
+            found = served_controller(cell, cell.link)
             with (
-                PeerThread(found.peer, found.servers, found.host),
+                ServerThread(found.controller, found.servers, found.host),
                 _armed(cell, time.sleep) as cycles,
             ):
                 yield cycles
@@ -120,7 +120,7 @@ class _Sides:
             if not is_ours:
                 pdo.subscribe()
         self._driver.rhythm._torn = False
-        self._driver.master.collector.stray = ""
+        self._driver.master.collector.forget_stray()
 
     def _wait(self) -> None:
         self._due = max(self._due + PACE, time.monotonic())

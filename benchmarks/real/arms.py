@@ -90,7 +90,7 @@ IRB120 = _links(
     (0, -H, 0),
     (0, 0, 0.072, pi),
 )
-# three axes in one point: every attitude of a flange, where a data set tells attitudes, no joints
+# three axes in one point: every attitude of a flange, where a data set gives attitudes, no joints
 WRIST = _links((0, -H, 0), (0, H, 0), (0, 0, 0))
 
 # Franka Emika Panda: origins of the joints and inertials as its public description gives them

@@ -23,7 +23,7 @@ from benchmarks.real.geometry import rough_tool
 
 Array = NDArray[np.float64]
 Columns = dict[str, Array]
-GAINS = np.array([14.87, 13.26, 11.13, 10.62, 11.03, 11.47])  # Nm/A of the UR10e's drives, as told
+GAINS = np.array([14.87, 13.26, 11.13, 10.62, 11.03, 11.47])  # Nm/A of the UR10e, as published
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ def _iiwa_log(raw: Array, mass: Array, about: dict[str, Any], more: Columns) -> 
 
 def _iiwa_month_before(folder: Path) -> Converted:
     raw = np.genfromtxt(folder / "20161118_run_1.csv", delimiter=",", skip_header=2)
-    return _iiwa_log(raw, np.zeros(len(raw)), {"payload": "not told, put as 0 kg"}, {})
+    return _iiwa_log(raw, np.zeros(len(raw)), {"payload": "not reported, put as 0 kg"}, {})
 
 
 # -- Motoman, IRB 120, UR10: laser trackers ----------------------------------------------------

@@ -37,8 +37,8 @@ class Outcome:
     split: str
     rows: int
     gap: float
-    told: float | None  # the diagnosis' own held-out figure
-    told_new_region: float | None
+    reported: float | None  # the diagnosis' own held-out figure
+    reported_new_region: float | None
     judged: float  # what its cell leaves of rows that it did not see
     rival: float | None  # what plain least squares leave of the same rows
     published: tuple[float, float, str] | None  # ours and theirs, mean length (m), and what
@@ -69,23 +69,24 @@ class Program:
         first, *others = shlex.split(command)
         self.words_of_apply = ("--stand-ins",) if stand_ins else ()
         own = Path(sys.executable).parent / first
-        self.words = (str(own) if own.is_file() and os.sep not in first else first, *others)
+        self.arguments = (str(own) if own.is_file() and os.sep not in first else first, *others)
 
-    def __call__(self, *words: object) -> None:
+    def __call__(self, *arguments: object) -> None:
         """Run one command."""
         try:
-            done = subprocess.run([*self.words, *map(str, words)], capture_output=True, text=True,
+            done = subprocess.run([*self.arguments, *map(str, arguments)], capture_output=True,
+                                  text=True,
                                   timeout=LIMIT, check=False)  # fmt: skip
         except subprocess.TimeoutExpired:
             raise RuntimeError(f"no answer in {LIMIT:g} s") from None
         if done.returncode:
-            said = (done.stderr.strip() or done.stdout.strip()).splitlines()
-            raise RuntimeError(f"exit {done.returncode}: {said[-1] if said else 'silent'}")
+            output = (done.stderr.strip() or done.stdout.strip()).splitlines()
+            raise RuntimeError(f"exit {done.returncode}: {output[-1] if output else 'silent'}")
 
-    def diagnosis(self, log: Path, cell: Path, *words: object) -> dict[str, dict[str, Any]]:
+    def diagnosis(self, log: Path, cell: Path, *arguments: object) -> dict[str, dict[str, Any]]:
         """Return the channels of a diagnosis by name."""
         file = log.with_suffix(".json")
-        self("diagnose", log, "--cell", cell, "--json", file, *words)
+        self("diagnose", log, "--cell", cell, "--json", file, *arguments)
         document = json.loads(file.read_text(encoding="utf-8"))
         return {c["channel"]: c for c in document["channels"]}
 
@@ -116,12 +117,12 @@ def _judge(
         train.write(place / "train.csv")
         test.write(place / "test.csv")
         better = place / "better.yaml"
-        words: list[object] = [*program.words_of_apply]
-        words += ["--remounted"] if name in REMOUNTED and _knows(program) else []
+        arguments: list[object] = [*program.words_of_apply]
+        arguments += ["--remounted"] if name in REMOUNTED and _knows(program) else []
         start = time.perf_counter()
-        told = program.diagnosis(place / "train.csv", nominal, "--apply", better, *words)
+        reported = program.diagnosis(place / "train.csv", nominal, "--apply", better, *arguments)
         seconds = time.perf_counter() - start
-        channels = [c for c in train.channels() if c in told]
+        channels = [c for c in train.channels() if c in reported]
         after: dict[str, dict[str, Any]] = {}
         if set(channels) - {"position"}:
             after = program.diagnosis(place / "test.csv", better)
@@ -129,14 +130,15 @@ def _judge(
         for channel in channels:
             left, published = _judged(name, channel, program, place, test, after)
             rival = _rival(channel, cell, cell_file.parent, train, test, place, program)
-            out.append(_outcome(name, told[channel], train, left, rival, published, seconds))
+            out.append(_outcome(name, reported[channel], train, left, rival, published, seconds))
     return out
 
 
 def _knows(program: Program) -> bool:
-    said = subprocess.run([*program.words, "diagnose", "--help"], capture_output=True, text=True,
+    output = subprocess.run([*program.arguments, "diagnose", "--help"], capture_output=True,
+                            text=True,
                           timeout=60, check=False).stdout  # fmt: skip
-    return "--remounted" in said
+    return "--remounted" in output
 
 
 def _judged(
@@ -173,7 +175,7 @@ def _rival(
 
 
 def _outcome(
-    name: str, told: dict[str, Any], train: Table, left: float, rival: float | None,
+    name: str, reported: dict[str, Any], train: Table, left: float, rival: float | None,
     published: tuple[float, float, str] | None, seconds: float,
 ) -> Outcome:  # fmt: skip
     mass = train.get("payload")
@@ -182,20 +184,20 @@ def _outcome(
     )
     return Outcome(
         log=name,
-        channel=told["channel"],
+        channel=reported["channel"],
         split=SPLIT.get(name.rpartition(" > ")[2], HELD_BACK),
         rows=len(train),
-        gap=float(told["gap_rms"]),
-        told=told.get("remaining_rms_held_out"),
-        told_new_region=told.get("remaining_rms_new_region"),
+        gap=float(reported["gap_rms"]),
+        reported=reported.get("remaining_rms_held_out"),
+        reported_new_region=reported.get("remaining_rms_new_region"),
         judged=left,
         rival=rival,
         published=published,
-        verdict=str(told["verdict"]),
-        accused=tuple(_accused(c) for c in told["causes"]),
-        absurd=tuple(absurdities(told["causes"], least, largest)),
+        verdict=str(reported["verdict"]),
+        accused=tuple(_accused(c) for c in reported["causes"]),
+        absurd=tuple(absurdities(reported["causes"], least, largest)),
         seconds=seconds,
-        unit=str(told["unit"]),
+        unit=str(reported["unit"]),
     )
 
 

@@ -13,7 +13,7 @@ TUNE, HELD_BACK = "tune", "held back"
 
 @dataclass(frozen=True)
 class Published:
-    """An outcome told by the authors of a set; m, mean length of the error vector."""
+    """An outcome reported by the authors of a set; m, mean length of the error vector."""
 
     mean_length: float
     what: str

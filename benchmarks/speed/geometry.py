@@ -22,7 +22,7 @@ from gapbridge.core.model import Model
 
 OURS, PEER = "ours", "least_squares, numerical derivatives"
 NOISE = 2e-5  # m
-SETTLED = 1e-9  # of the parameters' usual sizes
+CONVERGED = 1e-9  # of the parameters' usual sizes
 
 
 def linear(count: int, rounds: int) -> dict[str, Any]:
@@ -105,7 +105,7 @@ def _newton(parameters: Parameters, observable: Any, readings: Any, nuisance: An
         scaled = J * parameters.scales
         step = np.linalg.lstsq(scaled, gap, rcond=1e-12)[0]
         values = values + parameters.scales * step
-        if np.abs(step).max() < SETTLED:
+        if np.abs(step).max() < CONVERGED:
             break
     return np.asarray(values)
 

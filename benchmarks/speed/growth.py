@@ -43,7 +43,7 @@ def growth() -> dict[str, Any]:
 
 
 def _rows(count: int) -> dict[str, float]:
-    model, (q, loads) = task.bent(), task.rows(count)
+    model, (q, loads) = task.deflected(), task.rows(count)
     gap = np.random.default_rng(0).normal(0, 1e-4, (count, 3))
     return {
         "rows": count,

@@ -1,8 +1,8 @@
 """Flexibilities from rows that are never stored: the plain linear fit of the paper's eq. 35.
 
 Normal equations, their columns scaled to one length, add up block by block; where the scaled
-condition would cost digits, the R factor is taken instead, and that is told. What is needed besides
-the inputs does not grow with the rows. For logs with wild readings, unregistered instruments or
+condition would cost digits, the R factor is taken instead, and that is reported. What is needed
+besides the inputs does not grow with the rows. For logs with outliers, unregistered instruments or
 bounds there is core.estimation.identification.
 """
 
@@ -72,7 +72,7 @@ def fit_linear(
     found = unit * (Vt[shown].T @ ((U.T @ R[:, size])[:size][shown] / s[shown]))
     condition = float(s[0] / s[shown][-1]) if shown.any() else 1.0
     note = (
-        f"the rows hardly tell some flexibilities apart (condition {condition:.0f}): the normal "
+        f"the rows hardly separate some flexibilities (condition {condition:.0f}): the normal "
         "equations were left for the R factor"
     )
     return LinearFit(found, condition, int(shown.sum()), True, "" if factored else note)

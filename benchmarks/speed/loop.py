@@ -31,7 +31,7 @@ from gapbridge.drivers.simulated.ur.process import SimulatedController
 from gapbridge.drivers.simulated.ur.settings import simulated_cell
 
 HOST, RATE = "127.78.0.5", 500.0
-SETTLED = 5.0  # s of compensating before anything is counted
+CONVERGED = 5.0  # s of compensating before anything is counted
 PATIENCE = 240.0  # s until the daemon compensates
 PAYLOAD, COG = 5.0, (0.0, 0.0, 0.06)
 LOG = "daemon.log"
@@ -43,7 +43,7 @@ TIMED = 1 << 19  # setpoints at the most: 17 minutes
 def loop(seconds: float) -> dict[str, Any]:
     """Return the row of the daemon's loop: ``seconds`` of compensating, and as many once more.
 
-    In the first a bare timer on each processor tells what the machine takes from everybody. Those
+    In the first a bare timer on each processor shows what the machine takes from everybody. Those
     timers come between, a thousand times a second: single setpoints are timed in the second.
     """
     with tempfile.TemporaryDirectory(prefix="loop-") as folder:
@@ -54,7 +54,7 @@ def loop(seconds: float) -> dict[str, Any]:
                 with MachineStalls(cores) as stalls:
                     counted = _counted(web, metrics, seconds)
                 _compensating(web, cell)
-                time.sleep(SETTLED)
+                time.sleep(CONVERGED)
                 first = len(_timed(times))
                 time.sleep(seconds)
                 advance = _timed(times)[first:]
@@ -87,7 +87,7 @@ def loop(seconds: float) -> dict[str, Any]:
 
 def _counted(web: str, metrics: str, seconds: float) -> dict[str, Any]:
     """Return what the daemon counted over ``seconds``, scraped and looked at all the while."""
-    time.sleep(SETTLED)
+    time.sleep(CONVERGED)
     before, status = _counters(metrics), _status(web)
     process = psutil.Process(status["status"]["loop"]["pid"])
     busy, begin = _busy(process), time.monotonic()

@@ -35,7 +35,7 @@ BATCH = 100  # calls in one turn
 
 def sides() -> dict[str, Call]:
     """Return every way to compute one setpoint; all but the exact ones give the same numbers."""
-    model, (q, loads) = task.bent(), task.rows(1)
+    model, (q, loads) = task.deflected(), task.rows(1)
     chain, row = model.chain(), model.rows(q, loads)
     q1, wrench = q[0].copy(), row.wrench[0].copy()
     c = np.concatenate([task.AXIAL, task.RADIAL])
@@ -148,7 +148,7 @@ def _stream(rounds: int) -> dict[str, Any]:
     from gapbridge.bridge.loop.setpoint_stream import SetpointStream
     from gapbridge.core.state import RobotState
 
-    made = SetpointStream(task.bent(), LimitSettings(), 500.0)
+    made = SetpointStream(task.deflected(), LimitSettings(), 500.0)
     there, (_, loads) = task.path(500 * rounds), task.rows(1)
     made.start(there[0], 0.0, led=True)
     taken: dict[str, list[float]] = {"wall": [], "cpu": []}

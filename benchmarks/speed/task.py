@@ -22,7 +22,7 @@ def rigid() -> Model:
     return Model(builtin_arm("ur10e"), tool, 2.0, np.array([0.0, 0.02, 0.1]))
 
 
-def bent() -> Model:
+def deflected() -> Model:
     """Return the same with flexible joints."""
     return rigid().with_compliance(AXIAL, RADIAL)
 

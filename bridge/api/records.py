@@ -40,10 +40,7 @@ class Predicted:
 
     def to_json(self) -> dict[str, Any]:
         """Return the predictions as lists, by the command's names; null where there is none."""
-        return {
-            name: np.where(np.isfinite(v), v.astype(object), [None]).tolist()
-            for name, v in self.columns.items()
-        }
+        return {name: _plain(values) for name, values in self.columns.items()}
 
 
 @dataclass(frozen=True)
@@ -119,3 +116,10 @@ class Diagnosed:
 
 def _finite(values: Array) -> list[float | None]:
     return [float(v) if math.isfinite(v) else None for v in values]
+
+
+def _plain(values: Array) -> list[Any]:
+    """Return numbers as lists, None where there is none."""
+    plain = values.astype(object)
+    plain[~np.isfinite(values)] = None
+    return list(plain.tolist())

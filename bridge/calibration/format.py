@@ -1,4 +1,4 @@
-"""How poses, loads, lengths and times are told to a technician."""
+"""How poses, loads, lengths and times are worded for a technician."""
 
 from __future__ import annotations
 
@@ -67,6 +67,6 @@ def figure(value: float) -> str:
 
 
 def parameter(value: float, unit: str) -> str:
-    """Return a value as it is told, m as mm, rad as mrad."""
+    """Return a value as it is reported, m as mm, rad as mrad."""
     shown, factor = TOLD_IN.get(unit, (unit, 1.0))
     return f"{figure(value * factor)} {shown}"

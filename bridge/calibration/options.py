@@ -9,7 +9,7 @@ from gapbridge.bridge.cell.settings.instruments import InstrumentSettings
 
 
 @dataclass(frozen=True)
-class Order:
+class SessionOptions:
     """One call of the command."""
 
     kind: str  # whole, verify, payload or tool

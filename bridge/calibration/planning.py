@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gapbridge.bridge.calibration.options import Order
+from gapbridge.bridge.calibration.options import SessionOptions
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.settings.calibration import (
     BoxEntry,
@@ -25,7 +25,7 @@ from gapbridge.core.planning.capsules import Box
 from gapbridge.core.planning.design import Wish, far_end, plan
 from gapbridge.core.planning.workspace import Place, Reflector, Space
 
-REPEATABILITY = 5e-5  # m, 1 sigma of one coordinate, where the cell does not tell it
+REPEATABILITY = 5e-5  # m, 1 sigma of one coordinate, where the cell does not report it
 NEEDS_PLACE = {"distance": "fixed end", "sphere": "sphere", "point": "point"}
 """Kinds that are planned around something fixed in the cell, and what that is."""
 TOUCHED = ("sphere", "point")  # kinds without anything that looks at the tool
@@ -69,9 +69,9 @@ def loads_of(cell: Cell) -> tuple[Payload, ...]:
     return tuple(Payload(e.mass, _three(e.cog), e.name) for e in entries)
 
 
-def planned(cell: Cell, order: Order, tell: Callable[[str, float], None]) -> Plan:
+def planned(cell: Cell, options: SessionOptions, tell: Callable[[str, float], None]) -> Plan:
     """Return the plan of a whole session. Raises InputError where there can be none."""
-    given, instrument = cell.calibration, order.instrument
+    given, instrument = cell.calibration, options.instrument
     space = space_of(cell, instrument.measures)
     observable = observable_of(cell, instrument, max(len(space.places), 1))
     return plan(
@@ -80,10 +80,10 @@ def planned(cell: Cell, order: Order, tell: Callable[[str, float], None]) -> Pla
         loads_of(cell),
         space,
         Wish(
-            poses=order.poses or given.poses,
+            poses=options.poses or given.poses,
             held_out=given.held_out,
             repeats=given.repeats,
-            seed=order.seed,
+            seed=options.seed,
             sigma=float(np.hypot(instrument.sigma or cell.metrology.sigma,
                                  cell.metrology.repeatability or REPEATABILITY)),
         ),

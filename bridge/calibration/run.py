@@ -20,16 +20,16 @@ from gapbridge.bridge.calibration.instruments.instrument import (
 from gapbridge.bridge.calibration.jobs.job import Job
 from gapbridge.bridge.calibration.jobs.table import make_job
 from gapbridge.bridge.calibration.joints.joint_source import JointSource, PlannedJoints
-from gapbridge.bridge.calibration.options import Order
+from gapbridge.bridge.calibration.options import SessionOptions
 from gapbridge.bridge.calibration.planning import loads_of, metrology_of, space_of, with_loads
 from gapbridge.bridge.calibration.session.folders import begun_entry, check_begun, session_folder
 from gapbridge.bridge.calibration.session.joint_sources import make_joints
 from gapbridge.bridge.calibration.session.journal import Journal
-from gapbridge.bridge.calibration.session.measuring import Conversation
+from gapbridge.bridge.calibration.session.measuring import Measuring
 from gapbridge.bridge.calibration.session.plan_document import write_poses
-from gapbridge.bridge.calibration.session.positioning import Bringing
-from gapbridge.bridge.calibration.session.prompt import InputEnded, Talk, Word
-from gapbridge.bridge.calibration.session.session import Book
+from gapbridge.bridge.calibration.session.positioning import Positioning
+from gapbridge.bridge.calibration.session.prompt import InputEnded, Prompt, SessionCommand
+from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell
 from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.errors import CellError, LinkError
@@ -43,77 +43,77 @@ TITLES = {
 }
 
 
-def run_session(cell: Cell, order: Order) -> None:
+def run_session(cell: Cell, options: SessionOptions) -> None:
     """Do what a person has asked for. Raises InputError, RunError; click's Exit after Ctrl-C."""
-    folder = session_folder(cell, order)
+    folder = session_folder(cell, options)
     journal = Journal(folder)
-    talk = Talk()
+    prompt = Prompt()
     with journal:
-        book = Book.of(journal)
-        talk.note = lambda text: book.add("note", text=text)
+        session = Session.of(journal)
+        prompt.note = lambda text: session.add("note", text=text)
         try:
-            _lead(cell, order, talk, book)
-        except Word as word:
-            if word.word == "undo" and book.taken:  # at the last question
-                book.add("undo", stop=book.taken[-1].stop)
-                talk.say(
-                    f"took back the last reading; stop {(book.next or 0) + 1} is to be measured"
+            _lead(cell, options, prompt, session)
+        except SessionCommand as word:
+            if word.word == "undo" and session.taken:  # at the last question
+                session.add("undo", stop=session.taken[-1].stop)
+                prompt.say(
+                    f"took back the last reading; stop {(session.next or 0) + 1} is to be measured"
                 )
-            talk.say(_how_to_go_on(cell, order, book))
+            prompt.say(_how_to_go_on(cell, options, session))
         except InputEnded:
-            talk.say()
-            talk.say(f"the input ended; {_how_to_go_on(cell, order, book)}")
+            prompt.say()
+            prompt.say(f"the input ended; {_how_to_go_on(cell, options, session)}")
         except KeyboardInterrupt:
-            talk.say()
-            talk.say(f"interrupted; {_how_to_go_on(cell, order, book)}")
+            prompt.say()
+            prompt.say(f"interrupted; {_how_to_go_on(cell, options, session)}")
             raise click.exceptions.Exit(1) from None
         except LinkError:
-            talk.say(_how_to_go_on(cell, order, book))
+            prompt.say(_how_to_go_on(cell, options, session))
             raise
 
 
-def _lead(cell: Cell, order: Order, talk: Talk, book: Book) -> None:
-    folder = book.journal.path.parent
-    talk.say(f"{TITLES[order.kind]} {cell.path}: {cell.arm.name}", "bold")
-    job = make_job(cell, order, talk, book)
-    if book.begun:
-        check_begun(book.begun, cell, order, folder)
-        _tell_resumed(talk, book, folder)
+def _lead(cell: Cell, options: SessionOptions, prompt: Prompt, session: Session) -> None:
+    folder = session.journal.path.parent
+    prompt.say(f"{TITLES[options.kind]} {cell.path}: {cell.arm.name}", "bold")
+    job = make_job(cell, options, prompt, session)
+    if session.begun:
+        check_begun(session.begun, cell, options, folder)
+        _tell_resumed(prompt, session, folder)
     else:
-        book.add("begun", **begun_entry(cell, order))
-        talk.say(f"new session in {folder}")
+        session.add("begun", **begun_entry(cell, options))
+        prompt.say(f"new session in {folder}")
     around = Surroundings(
-        ask=lambda question: talk.ask(f"  {question}"),
+        ask=lambda question: prompt.ask(f"  {question}"),
         link_host=str(getattr(cell.link, "host", "") or ""),
-        since=float(book.begun["time"]),
+        since=float(session.begun["time"]),
     )
     with ExitStack() as stack:
-        joints = make_joints(cell, order, around.ask, folder)
+        joints = make_joints(cell, options, around.ask, folder)
         instrument = None
-        if not order.plan_only and (book.plan is None or book.next is not None):
-            instrument = job.instrument(around)  # before the plan: what is missing is told at once
-            with talk.waiting("reaching the instrument"):
+        if not options.plan_only and (session.plan is None or session.next is not None):
+            instrument = job.instrument(around)  # before the plan: reports at once what is missing
+            with prompt.waiting("reaching the instrument"):
                 stack.enter_context(instrument)
-        if job.from_here and (book.plan is None or book.next is not None):
-            _open(talk, stack, joints)
-        if book.plan is None:
+        if job.from_here and (session.plan is None or session.next is not None):
+            _open(prompt, stack, joints)
+        if session.plan is None:
             _make_plan(job, joints)
         else:
             _tell_old_plan(job)
-        if order.plan_only:
-            talk.say(f"every stop with its joints: {folder / 'poses.csv'}")
-            talk.say(f"go on with: {_command(cell, order, book)}")
+        if options.plan_only:
+            prompt.say(f"every stop with its joints: {folder / 'poses.csv'}")
+            prompt.say(f"go on with: {_command(cell, options, session)}")
             return
-        if book.next is not None:
+        if session.next is not None:
             assert instrument is not None
             if not job.from_here:
-                _open(talk, stack, joints)
+                _open(prompt, stack, joints)
             _measure(job, joints, instrument)
     job.finish()
 
 
-def _open(talk: Talk, stack: ExitStack, joints: JointSource) -> None:
-    with talk.waiting("reaching the arm"):
+def _open(prompt: Prompt, stack: ExitStack, joints: JointSource) -> None:
+    with prompt.waiting("reaching the arm"):
         stack.enter_context(joints)
 
 
@@ -125,62 +125,66 @@ def _begin(job: Job, joints: JointSource) -> Array:
         try:
             told = joints.stand(PlannedPose(0, np.full(n, np.nan), 0, np.zeros(n))).q
         except ReadingError as error:
-            job.talk.warn(str(error))
+            job.prompt.warn(str(error))
             continue
         if np.isfinite(told).all():
             here = told
         else:
-            job.talk.warn("found nothing, expected where the arm stands now: the plan begins there")
+            job.prompt.warn(
+                "found nothing, expected where the arm stands now: the plan begins there"
+            )
     return here
 
 
 def _make_plan(job: Job, joints: JointSource) -> None:
-    talk, book = job.talk, job.book
+    prompt, session = job.prompt, job.session
     begin = _begin(job, joints) if job.from_here else None
-    with talk.waiting("planning") as tell:
+    with prompt.waiting("planning") as tell:
         plan = job.plan(begin, lambda text, share: tell(f"planning: {text} ({share:.0%})"))
-    book.keep_plan(plan)
+    session.keep_plan(plan)
     write_poses(plan, job.folder / "poses.csv")
     job.tell_plan(plan)
 
 
 def _tell_old_plan(job: Job) -> None:
-    """Tell the plan of an earlier call where it is asked for, and that it stays."""
-    if job.order.poses is not None:
-        job.talk.warn("this session has its plan: --poses counts for a new one")
-    if job.order.plan_only and job.book.plan is not None:
-        job.tell_plan(job.book.plan)
+    """Report the plan of an earlier call where it is asked for, and that it stays."""
+    if job.options.poses is not None:
+        job.prompt.warn("this session has its plan: --poses counts for a new one")
+    if job.options.plan_only and job.session.plan is not None:
+        job.tell_plan(job.session.plan)
 
 
-def _tell_resumed(talk: Talk, book: Book, folder: Path) -> None:
-    count = len(book.stops)
-    done = count - book.left
-    talk.say(f"going on with the session in {folder}: {done} of {count} stops are measured")
-    if book.journal.torn:
-        talk.say("  the last line of its journal was torn by a break, before it counted")
-    if book.taken:
-        talk.say(f"  the last reading kept: stop {book.taken[-1].stop + 1}")
-    if book.mounted is not None and book.plan is not None and book.next is not None:
-        talk.say(f"  on the flange: {load_text(book.plan.loads[book.mounted])}")
+def _tell_resumed(prompt: Prompt, session: Session, folder: Path) -> None:
+    count = len(session.stops)
+    done = count - session.left
+    prompt.say(f"going on with the session in {folder}: {done} of {count} stops are measured")
+    if session.journal.torn:
+        prompt.say("  the last line of its journal was torn by a break, before it counted")
+    if session.taken:
+        prompt.say(f"  the last reading kept: stop {session.taken[-1].stop + 1}")
+    if session.mounted is not None and session.plan is not None and session.next is not None:
+        prompt.say(f"  on the flange: {load_text(session.plan.loads[session.mounted])}")
 
 
 def _measure(job: Job, joints: JointSource, instrument: AnyInstrument) -> None:
-    talk, given, order = job.talk, job.cell.calibration, job.order
-    if instrument.seats and order.move:
+    prompt, given, options = job.prompt, job.cell.calibration, job.options
+    if instrument.seats and options.move:
         raise CellError(
-            f"{job.cell.path}: calibration.instrument.kind: found {order.instrument.kind!r} with "
+            f"{job.cell.path}: calibration.instrument.kind: found {options.instrument.kind!r} with "
             "--move, expected another: the tool is brought onto something by hand"
         )
     if instrument.seats and isinstance(joints, PlannedJoints):
         raise CellError(
             f"{job.cell.path}: calibration.joints: found 'planned' with an instrument of kind "
-            f"{order.instrument.kind!r}, expected 'link' or 'typed': the joints are the reading"
+            f"{options.instrument.kind!r}, expected 'link' or 'typed': the joints are the reading"
         )
-    talk.say(f"instrument: {instrument.name}; joints: {_told(joints, order)}")
-    talk.say("at every question: Enter goes on, `undo`, `back`, `skip`, `quit`, `?`")
-    bringing = Bringing(talk, job.book, joints, instrument, _clear(job), given)
-    sigma = metrology_of(job.cell, order.instrument).sigma
-    Conversation(talk, job.book, bringing, instrument, job.foresight(), sigma, given.samples).lead()
+    prompt.say(f"instrument: {instrument.name}; joints: {_told(joints, options)}")
+    prompt.say("at every question: Enter goes on, `undo`, `back`, `skip`, `quit`, `?`")
+    positioning = Positioning(prompt, job.session, joints, instrument, _clear(job), given)
+    sigma = metrology_of(job.cell, options.instrument).sigma
+    Measuring(
+        prompt, job.session, positioning, instrument, job.reading_check(), sigma, given.samples
+    ).lead()
 
 
 def _clear(job: Job) -> Callable[[Array], Array]:
@@ -188,22 +192,28 @@ def _clear(job: Job) -> Callable[[Array], Array]:
     return lambda q: np.asarray(space.clear(q), dtype=float)
 
 
-def _told(joints: JointSource, order: Order) -> str:
+def _told(joints: JointSource, options: SessionOptions) -> str:
     if joints.watches:
-        return "from the controller" + (", which Gapbridge drives" if order.move else "")
+        return "from the controller" + (", which Gapbridge drives" if options.move else "")
     return "as planned" if isinstance(joints, PlannedJoints) else "typed in degrees"
 
 
-def _how_to_go_on(cell: Cell, order: Order, book: Book) -> str:
-    done = len(book.stops) - book.left
-    kept = f"{done} of {len(book.stops)} stops are measured and kept; " if book.stops else ""
-    return f"{kept}go on with: {_command(cell, order, book)}"
+def _how_to_go_on(cell: Cell, options: SessionOptions, session: Session) -> str:
+    done = len(session.stops) - session.left
+    kept = f"{done} of {len(session.stops)} stops are measured and kept; " if session.stops else ""
+    return f"{kept}go on with: {_command(cell, options, session)}"
 
 
-def _command(cell: Cell, order: Order, book: Book) -> str:
-    words = ["gapbridge", "calibrate", str(cell.path), "--session", str(book.journal.path.parent)]
+def _command(cell: Cell, options: SessionOptions, session: Session) -> str:
+    words = [
+        "gapbridge",
+        "calibrate",
+        str(cell.path),
+        "--session",
+        str(session.journal.path.parent),
+    ]
     flags = {"verify": "--verify", "payload": "--payload-only", "tool": "--tool-only"}
-    words += [flags[order.kind]] if order.kind in flags else []
-    words += ["--move"] if order.move else []
-    words += ["--apply", str(order.new_cell)] if order.new_cell else []
+    words += [flags[options.kind]] if options.kind in flags else []
+    words += ["--move"] if options.move else []
+    words += ["--apply", str(options.new_cell)] if options.new_cell else []
     return shlex.join(words)

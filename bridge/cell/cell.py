@@ -53,7 +53,7 @@ class Cell:
 
     @property
     def link(self) -> LinkSettings | None:
-        """Return section ``link``, its paths seen from here; None where the cell has none.
+        """Return section ``link``, its paths made absolute; None where the cell has none.
 
         Raises InputError where a file that it names cannot be used.
         """
@@ -78,7 +78,7 @@ class Cell:
 
     @property
     def setpoints(self) -> SetpointSettings:
-        """Return section ``setpoints``, its paths seen from here instead of the cell's folder."""
+        """Return section ``setpoints``, its paths made absolute."""
         given, folder = self.file.setpoints, self.path.parent
         return given.model_copy(
             update={
@@ -90,7 +90,7 @@ class Cell:
 
     @property
     def recording(self) -> RecordingSettings:
-        """Return section ``recording``, its folder seen from here instead of the cell's folder."""
+        """Return section ``recording``, its folder made absolute."""
         given = self.file.recording
         if given.folder is None:
             return given
@@ -98,19 +98,19 @@ class Cell:
 
     @property
     def web(self) -> WebSettings | None:
-        """Return section ``web``, its paths seen from here; None where the cell has none."""
+        """Return section ``web``, its paths made absolute; None where the cell has none."""
         given = self.file.web
         return None if given is None else given.located(self.path.parent)
 
     @property
     def metrics(self) -> MetricsSettings | None:
-        """Return section ``metrics``, its paths seen from here; None where the cell has none."""
+        """Return section ``metrics``, its paths made absolute; None where the cell has none."""
         given = self.file.metrics
         return None if given is None else given.located(self.path.parent)
 
     @property
     def calibration(self) -> CalibrationSettings:
-        """Return section ``calibration``, its paths seen from here."""
+        """Return section ``calibration``, its paths made absolute."""
         given, folder = self.file.calibration, self.path.parent
         return given.model_copy(
             update={

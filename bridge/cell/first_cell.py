@@ -97,13 +97,13 @@ def _tool(facts: ControllerFacts) -> Iterator[str]:
 
 
 def _payload(facts: ControllerFacts) -> Iterator[str]:
-    said = facts.payload is not None
-    mass, cog = facts.payload or 0.0, facts.payload_cog if said else None
+    known = facts.payload is not None
+    mass, cog = facts.payload or 0.0, facts.payload_cog if known else None
     text = (
         f"payload: {{mass: {number_text(mass)}, cog: {_list(np.zeros(3) if cog is None else cog)}}}"
     )
     what = "kg, m in the flange frame; tool included"
-    yield f"{text}  # {what}" + ("" if said else ": not said by the controller, put yours in")
+    yield f"{text}  # {what}" + ("" if known else ": not said by the controller, put yours in")
     yield ""
 
 

@@ -78,9 +78,9 @@ def _line(document: Document, schema: type[BaseModel], worst: ErrorDetails) -> s
     return f"{where}: {key_path(keys)}: found {found}, expected {expected}"
 
 
-def _chooser(told: str) -> str:
+def _chooser(reported: str) -> str:
     """Return the key that chooses between sections; pydantic quotes it, or names a function."""
-    key = told.strip("'")
+    key = reported.strip("'")
     return key if key.isidentifier() else "driver"
 
 

@@ -1,4 +1,4 @@
-"""A side process takes a changed cell file, once the daemon tells that it has taken it."""
+"""A side process takes a changed cell file, once the daemon reports that it has taken it."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ class RereadSettings:
         self.settings = settings
         self._hash = None if text is None else hashlib.sha256(text.encode()).hexdigest()
 
-    def hear(self, event: dict[str, Any]) -> bool:
+    def on_event(self, event: dict[str, Any]) -> bool:
         """Take note of an event; returns whether the settings are others now."""
         if event.get("kind") == "configuration" and event.get("ok"):
-            told = event.get("hash")
+            reported = event.get("hash")
         elif event.get("kind") == "status":
-            told = event.get("configuration_hash")
+            reported = event.get("configuration_hash")
         else:
             return False
-        if not told or told == self._hash:
+        if not reported or reported == self._hash:
             return False
-        first, self._hash = self._hash is None, str(told)
-        return not (first and event["kind"] == "status") and self._read(str(told))
+        first, self._hash = self._hash is None, str(reported)
+        return not (first and event["kind"] == "status") and self._read(str(reported))
 
-    def _read(self, told: str) -> bool:
+    def _read(self, reported: str) -> bool:
         """Read the file; one that has changed again meanwhile does not count."""
         try:
             found = read_configuration(self.settings.cell)
         except GapbridgeError:
             return False
-        if found.hash != told:
+        if found.hash != reported:
             return False
         kept = {name: getattr(self.settings, name) for name in KEPT}
         self.settings = found.settings.model_copy(update=kept)

@@ -18,7 +18,7 @@ DELTAS = ("delta_theta", "delta_a", "delta_d", "delta_alpha")
 
 
 def build_arm(robot: Robot, folder: Path) -> Arm:
-    """Return the arm that the robot section names; paths are seen from ``folder``.
+    """Return the arm that the robot section names; paths are relative to ``folder``.
 
     Raises CellError (or ArmError, naming the URDF) where the section or a file of it cannot be
     used; messages begin with the key.

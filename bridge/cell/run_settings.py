@@ -80,8 +80,8 @@ def settings_of(cell: Cell) -> DaemonSettings:
             web=cell.web, metrics=cell.metrics,
         )  # fmt: skip
     except ValidationError as error:
-        words = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
-        raise CellError(f"{cell.path}: {words}") from None
+        message = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
+        raise CellError(f"{cell.path}: {message}") from None
 
 
 def _setpoints_of(cell: Cell) -> SetpointSettings:

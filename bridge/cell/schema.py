@@ -53,7 +53,7 @@ class Robot(Section):
     """The arm: a built-in one, a URDF or DH rows."""
 
     model: str | None = Field(default=None, description="a built-in arm")
-    urdf: str | None = Field(default=None, description="a file, seen from the cell's folder")
+    urdf: str | None = Field(default=None, description="a file, relative to the cell's folder")
     dh: list[DhRow] | None = Field(default=None, description="standard DH rows")
     tip: str | None = Field(default=None, description="the URDF link that is the flange")
     rated_payload: Annotated[Number, Field(gt=0)] | None = Field(

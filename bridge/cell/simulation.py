@@ -1,6 +1,6 @@
 """The simulated controller of a cell: same arm and tool, hidden flexibilities of its own.
 
-A UR controller has a server of its own; every other protocol is a set of servers around a Peer.
+A UR controller has a server of its own; any other protocol: servers around an ArmController.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from gapbridge.core.rotation import rotation_vector
 from gapbridge.drivers.addresses import is_loopback
 from gapbridge.drivers.driver import DriverSettings
 from gapbridge.drivers.simulated.ft_sensor.serving import served_sensor
-from gapbridge.drivers.simulated.peer.peer import Peer, make_peer
-from gapbridge.drivers.simulated.peer.peer_server import PeerServer, serve_peer
+from gapbridge.drivers.simulated.server.arm_controller import ArmController, make_controller
+from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer, serve_controller
 from gapbridge.drivers.simulated.ur.server import serve
 from gapbridge.drivers.simulated.ur.settings import (
     BENCH_PORT,
@@ -32,21 +32,21 @@ from gapbridge.drivers.simulated.ur.settings import (
 
 HOST = "127.0.0.2"
 PORTS = ("rtde_port", "dashboard_port", "script_port", "bench_port", "primary_port")
-PERIOD = 0.004  # s, of a Peer's cycle
+PERIOD = 0.004  # s, of an ArmController's cycle
 
 SIMULATORS: dict[str, str] = {
     "can": "gapbridge.drivers.simulated.can.server:make_servers",
     "canopen": "gapbridge.drivers.simulated.canopen.server:make_servers",
     "modbus": "gapbridge.drivers.simulated.modbus.server:make_servers",
 }
-"""link.driver -> ``module:function(link, host, peer) -> list[PeerServer]``, imported on use."""
+"""link.driver -> ``module:function(link, host, controller)``, which returns its ProtocolServers."""
 
 
-class SimulatedPeer(NamedTuple):
+class ServedController(NamedTuple):
     """A cell's controller, not yet served."""
 
-    peer: Peer
-    servers: list[PeerServer]
+    controller: ArmController
+    servers: list[ProtocolServer]
     host: str
     bench_port: int
 
@@ -60,16 +60,16 @@ def serve_cell(
 ) -> None:
     """Serve the simulated controller of a cell until ``stop()`` is true.
 
-    ``say`` is told where it listens. Raises CellError where the cell cannot be simulated, LinkError
-    where a port is taken.
+    ``say`` is called with where it listens. Raises CellError where the cell cannot be simulated,
+    LinkError where a port is taken.
     """
     link = cell.link
     if link is not None and link.driver in SIMULATORS:
-        found = simulated_peer(cell, link, host, seed)
+        found = served_controller(cell, link, host, seed)
         names = ", ".join(server.name for server in found.servers)
         say(f"{cell.arm.name} at {found.host}: {names}, bench {found.bench_port}")
-        with served_sensor(cell.ft_sensor, lambda: found.peer.raw_wrench, link):
-            serve_peer(found.peer, found.servers, found.host, found.bench_port, stop)
+        with served_sensor(cell.ft_sensor, lambda: found.controller.raw_wrench, link):
+            serve_controller(found.controller, found.servers, found.host, found.bench_port, stop)
         return
     settings = server_settings(cell, host, seed)
     say(
@@ -80,9 +80,9 @@ def serve_cell(
     serve(settings, stop, lambda in_flange: served_sensor(cell.ft_sensor, in_flange))
 
 
-def simulated_peer(
+def served_controller(
     cell: Cell, link: DriverSettings, host: str | None = None, seed: int | None = None
-) -> SimulatedPeer:
+) -> ServedController:
     """Return the peer and the servers of a cell whose link is no UR controller's.
 
     Its plant is drawn as ``server_settings`` says. Raises CellError.
@@ -94,10 +94,10 @@ def simulated_peer(
         simulation.start_q,
         **_plant(cell),
     )
-    peer = make_peer(arm, plant, start, PERIOD)
+    controller = make_controller(arm, plant, start, PERIOD)
     module, function = SIMULATORS[str(getattr(link, "driver", ""))].split(":")
-    servers = getattr(importlib.import_module(module), function)(link, address, peer)
-    return SimulatedPeer(peer, servers, address, simulation.bench_port or BENCH_PORT)
+    servers = getattr(importlib.import_module(module), function)(link, address, controller)
+    return ServedController(controller, servers, address, simulation.bench_port or BENCH_PORT)
 
 
 def _address(cell: Cell, host: str | None) -> str:

@@ -37,7 +37,7 @@ class CommandTable(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Return the command that is meant; an unknown one is told with the nearest known."""
+        """Return the command that is meant; an unknown one is reported with the nearest known."""
         if args and args[0] not in COMMANDS and not args[0].startswith("-"):
             near = difflib.get_close_matches(args[0], COMMANDS, n=1)
             hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(COMMANDS)}"
@@ -121,7 +121,7 @@ def _fail(text: str, code: int) -> int:
 
 
 def _crash(error: Exception) -> int:
-    """Tell an unforeseen failure in one line; its traceback goes to a file."""
+    """Report an unforeseen failure in one line; its traceback goes to a file."""
     with tempfile.NamedTemporaryFile(
         "w", prefix="gapbridge-crash-", suffix=".txt", delete=False, encoding="utf-8"
     ) as file:

@@ -23,7 +23,7 @@ def progress(label: str, total: int | None = None) -> Iterator[Callable[[int], N
 
 @contextlib.contextmanager
 def status(label: str) -> Iterator[Callable[[str], None]]:
-    """Give a function that tells what is being done; silent where stderr is no terminal."""
+    """Give a function that reports what is being done; silent where stderr is no terminal."""
     if not sys.stderr.isatty():
         yield lambda text: None
         return

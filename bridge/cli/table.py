@@ -18,7 +18,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Serve the simulated controller of a cell.",
     ),
     "run": ("gapbridge.bridge.cli.robot.run:run", "Run the on-cell daemon."),
-    "status": ("gapbridge.bridge.cli.robot.status:status", "Tell what the daemon of a cell does."),
+    "status": (
+        "gapbridge.bridge.cli.robot.status:status",
+        "Report what the daemon of a cell does.",
+    ),
     "arm": ("gapbridge.bridge.cli.robot.arm:arm", "Have the daemon of a cell write setpoints."),
     "disarm": (
         "gapbridge.bridge.cli.robot.arm:disarm",

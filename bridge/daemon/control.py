@@ -14,7 +14,7 @@ from gapbridge.bridge.loop.supervisor import Cause, State
 LONGEST_ARMING = 25.0  # s: uploads a program to the robot
 LONGEST_RAMP = 20.0  # s
 LONGEST_TAKING = 20.0  # s: a new process of the loop may have to start first
-SOURCE_SILENT = 1.0  # s without a first setpoint after which arming is told to be waiting
+SOURCE_SILENT = 1.0  # s without a first setpoint after which arming is reported to be waiting
 LOOK = 0.02  # s
 
 
@@ -58,7 +58,7 @@ class Controlled(Protocol):
         """Ask this loop or the next one to ramp out, or acknowledge a fault; returns its number."""
 
     def note(self, event: Event) -> None:
-        """Have an event told."""
+        """Emit an event."""
 
 
 class Control:

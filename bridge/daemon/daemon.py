@@ -19,22 +19,28 @@ from typing import IO, Any
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.run_settings import Configuration, configuration_for, settings_of
+from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
 from gapbridge.bridge.daemon.control import Control
-from gapbridge.bridge.daemon.opening import open_all
+from gapbridge.bridge.daemon.host import OwnerLock
 from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.daemon.reload import Reload
 from gapbridge.bridge.daemon.service_manager import ServiceManager
 from gapbridge.bridge.daemon.sides import Sides
 from gapbridge.bridge.daemon.status import DaemonStatus
+from gapbridge.bridge.daemon.status_document import SCHEMA
 from gapbridge.bridge.daemon.summary import RunSummary, Tally
+from gapbridge.bridge.document.output_file import private
 from gapbridge.bridge.ipc.command_page import Command, CommandPage
 from gapbridge.bridge.ipc.control_socket import ControlSocket
-from gapbridge.bridge.ipc.events import Event, EventBook
+from gapbridge.bridge.ipc.counts import DROPPED
+from gapbridge.bridge.ipc.events import Event, EventLog
 from gapbridge.bridge.ipc.shared_memory import Phase, RunPage
 from gapbridge.bridge.loop.loop import LONGEST_STOP, Exit
 from gapbridge.bridge.loop.setpoint_stream import longest_withdrawal
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.loop.supervisor import Cause, State
+from gapbridge.bridge.recording.folder import LOOP_LOG, new_session, require_folder
 from gapbridge.core.errors import InputError, LinkError
+from gapbridge.drivers.controller_address import address_of
 
 __all__ = ["Daemon", "Say", "settings_of"]
 
@@ -69,19 +75,18 @@ class Daemon:
         self._taken = 0
         self._request_lock = threading.RLock()
         self._reader = self.page.reader()
-        self.output: IO[bytes] | int = subprocess.DEVNULL  # of all processes of the run
+        self._output: IO[bytes] | int = subprocess.DEVNULL  # of all processes of the run
         self.sides = Sides()
         self.tally = Tally(n, settings.link.rate)
-        listeners = [self._hear, self.sides.tell]
-        self.book = EventBook(*listeners, *([log] if log else []))
+        listeners = [self._on_event, self.sides.tell]
+        self.event_log = EventLog(*listeners, *([log] if log else []))
         self._posted: queue.SimpleQueue[Event] = queue.SimpleQueue()  # by other threads
         self.manager = ServiceManager()
         self.session = ""
-        self._status = DaemonStatus(self)
+        self._status = DaemonStatus(self.page.slices)
         self._status_at = 0.0
-        self._reload = Reload(self)
+        self._reload = Reload(self.manager, self.event_log)
         self.control = Control(self)
-        self.socket: ControlSocket | None = None
         self.loop: LoopProcess | None = None
         self._failure: Event = {}
         self._faults: list[str] = []
@@ -119,7 +124,7 @@ class Daemon:
     @property
     def sequence(self) -> int:
         """Return the number of the last event."""
-        return self.book.sequence
+        return self.event_log.sequence
 
     @property
     def loop_pid(self) -> int | None:
@@ -140,27 +145,58 @@ class Daemon:
 
     def events_since(self, sequence: int) -> list[Event]:
         """Return the events after a number."""
-        return self.book.since(sequence)
+        return self.event_log.since(sequence)
 
     def status(self) -> dict[str, Any]:
-        """Return the status document."""
-        return self._status.document()
+        """Return the status document; may be called from any thread."""
+        status, tally, recording = self._status, self.tally, self.recording
+        counted = self.page.counts()
+        return {
+            "schema": SCHEMA,
+            "time": time.time(),
+            "pid": os.getpid(),
+            "started": status.started,
+            "session": self.session,
+            "cell": str(self.settings.cell),
+            "configuration_hash": self.configuration.hash,
+            "configured": status.configured,
+            "state": self.state.name.lower(),
+            **status.history(),
+            "may_write": self.may_write,
+            "armed_by": status.armed_by,
+            "latched": status.latched,
+            "correction": status.correction,
+            "loop": {
+                "pid": self.loop_pid,
+                "restarts": self.restarts,
+                "phase": self.phase.name.lower(),
+            },
+            "link": {
+                "driver": self.settings.link.driver,
+                **status.link(),
+                "cycles": tally.cycles,
+                "missed": tally.missed,
+                "late": tally.late,
+                "written": tally.written,
+                "dropped": {reason: counted[count.label] for count, reason in DROPPED.items()},
+            },
+            "counts": counted,
+            "events": dict(self.event_log.counts),
+            "sides": self.sides.status(),
+            "recording": None if recording is None else str(recording),
+            "lost_rows": self.lost_rows,
+        }
 
     def note(self, event: Event) -> None:
-        """Have an event told by the daemon's own thread."""
+        """Emit an event from the daemon's own thread."""
         self._posted.put(event)
-
-    def close_memory(self) -> None:
-        """Let go of what is shared with the loop and who reads along."""
-        self.page.close()
-        self._commands.close()
 
     def stop(self) -> None:
         """Ramp out and end."""
         self._stopping.set()
 
     def reload(self) -> None:
-        """Read the cell file again; what is wrong is told, and the old one stays."""
+        """Read the cell file again; what is wrong is reported, and the old one stays."""
         self._reload.ask()
 
     @property
@@ -181,10 +217,6 @@ class Daemon:
         """
         return self._request(Command.DISARM, by)
 
-    def ramp_out(self) -> None:
-        """Have the loop ramp out and observe, by nobody's wish; for the daemon's own thread."""
-        self._commands.ask(Command.RAMP_OUT)
-
     def _request(self, command: Command, by: str) -> int:
         with self._request_lock:
             number = self._commands.number()
@@ -199,7 +231,7 @@ class Daemon:
         while not self._requests.empty():
             number, command, by = self._requests.get()
             words = f"{command.name.lower()} asked for by {by}"
-            self.book.add(
+            self.event_log.add(
                 {"kind": "request", "command": command.name.lower(), "number": number, "by": by,
                  "detail": words}
             )  # fmt: skip
@@ -210,16 +242,62 @@ class Daemon:
     def run(self, arm: bool = False, duration: float | None = None, by: str = "") -> RunSummary:
         """Run until stopped; ``by`` says who or what has asked for arming. See run_cell."""
         with ExitStack() as stack:
-            arm = open_all(self, stack, arm, by)
+            arm = self._open(stack, arm, by)
             while not self._stopping.is_set():
                 self._run_loop((by or PROGRAM) if arm else "", duration)
-                arm = self._reload.swap()  # else only a person starts the writing again
+                swap = self._reload.swap()
+                self.configuration = swap.configuration or self.configuration
+                arm = swap.rearms  # else only a person starts the writing again
                 by = "the cell file" if arm else ""
-                if not self._stopping.is_set() and not self._reload.swapped:
+                if not self._stopping.is_set() and not swap.in_order:
                     self._pause()
                     self.restarts += 1
             self._take()
             return self._summary()
+
+    def _open(self, stack: ExitStack, arm: bool, by: str) -> bool:
+        """Open locks, sockets and processes; ``stack`` closes them.
+
+        Returns whether the first loop may arm by itself. Raises InputError where the controller has
+        an owner already, or a folder cannot be used.
+        """
+        settings = self.settings
+        stack.callback(self._commands.close)
+        stack.callback(self.page.close)
+        lock = stack.enter_context(OwnerLock(address_of(settings.link), settings.cell))
+        folder = settings.recording.folder
+        if folder is not None:
+            require_folder(folder)
+        self.session = new_session(folder)
+        if folder is not None:
+            log = folder / f"{self.session}{LOOP_LOG}"
+            self._output = stack.enter_context(open(log, "ab", opener=private))  # noqa: SIM115
+        order = {
+            "settings": settings.model_dump(mode="json"), "n": self.configuration.n,
+            "session": self.session, "extra": {"text": self.configuration.text},
+        }  # fmt: skip
+        stack.callback(self.sides.close)
+        self.sides.start(settings, order, self.page, self._output)
+        stack.callback(lambda: self.event_log.add({"kind": "ended"}))
+        path = runtime_folder() / f"{cell_key(settings.cell)}.sock"
+        try:
+            stack.enter_context(ControlSocket(path, self.control.answer))
+        except OSError as error:
+            raise InputError(f"{path}: {error.strerror}, expected a socket to listen on") from None
+        if settings.web is not None:
+            self.event_log.add({"kind": "note", "detail": f"status page: {settings.web.url}"})
+        if settings.setpoints.source == "planner":
+            where = f"setpoints: a planner writes to {settings.setpoints.socket}"
+            self.event_log.add({"kind": "note", "detail": where})
+        # a person at the terminal may arm after a crash; a service that was started anew may not
+        if arm and lock.before and (by != "--arm" or self.manager.present):
+            words = (
+                f"the run before (process {lock.before.get('pid')}) did not end in order: "
+                "not arming by itself; gapbridge arm"
+            )
+            self.event_log.add({"kind": "refused", "detail": words})
+            return False
+        return arm
 
     def _pause(self) -> None:
         """Wait before the next process of the loop, and go on looking after the rest."""
@@ -235,9 +313,9 @@ class Daemon:
         if self.page.promote():
             self.sides.show(self.page)
         for event in self.sides.check():
-            self.book.add(event)
+            self.event_log.add(event)
         while not self._posted.empty():
-            self.book.add(self._posted.get())
+            self.event_log.add(self._posted.get())
         if time.monotonic() >= self._status_at:
             self._status_at = time.monotonic() + STATUS_EVERY
             self.sides.tell({"kind": "status", **self.status()})
@@ -263,7 +341,8 @@ class Daemon:
                 )
                 if over or (self.page.ended and duration is None):
                     self._stopping.set()
-                self._reload.step(self.state, self.phase)
+                if self._reload.step(self.state, self.phase, self.configuration):
+                    self._commands.ask(Command.RAMP_OUT)  # by nobody's wish
                 if (self._stopping.is_set() or self._reload.wants_end) and stop_by is None:
                     needed = LONGEST_STOP + longest_withdrawal(self.settings.limits)
                     stop_by = time.monotonic() + needed + STOP_MARGIN
@@ -272,7 +351,7 @@ class Daemon:
                     loop.ask_to_stop()
                 if loop.hangs or (stop_by is not None and time.monotonic() > stop_by):
                     words = f"the loop stood still for {self.page.silence:.2f} s and was ended"
-                    loop.kill()  # told when it is over: nothing is written after that
+                    loop.kill()  # reported when it is over: nothing is written after that
                     self._fault("hang", words)
             self._take()
             self._after(loop)
@@ -300,7 +379,7 @@ class Daemon:
             self._request(Command.ARM, armed_by)
             self._pass_on()
         self._loops += 1
-        return LoopProcess(self.configuration, self.page, self._commands, order, self.output)
+        return LoopProcess(self.configuration, self.page, self._commands, order, self._output)
 
     def _take(self) -> None:
         """Take cycles and events over from the loop."""
@@ -314,12 +393,12 @@ class Daemon:
         self.tally.add(rows)
         self._status.take(rows)
         for event in events:
-            self.book.add(event)
+            self.event_log.add(event)
 
-    def _hear(self, event: Event) -> None:
-        """Act on an event, and tell it to the person at the terminal."""
+    def _on_event(self, event: Event) -> None:
+        """Act on an event, and report it to the person at the terminal."""
         kind, detail = event["kind"], str(event.get("detail", ""))
-        self._status.hear(event)
+        self._status.on_event(event)
         if kind == "failure":
             self._failure = event
         if kind == "refused":
@@ -330,7 +409,7 @@ class Daemon:
             tail = f": {detail}" if detail else ""
             text = f"{event['from'].lower()} -> {event['to'].lower()} ({event['cause']}){tail}"
             self._say(text)
-            self._refused |= event["cause"] == "start refused"
+            self._refused |= event["cause"] == Cause.START_REFUSED
             if detail:
                 self._faults.append(text)
         elif detail and kind not in ("granted", "summary", "request"):
@@ -356,7 +435,7 @@ class Daemon:
 
     def _fault(self, cause: str, words: str) -> None:
         self._faults.append(words)
-        self.book.add({"kind": "fault", "cause": cause, "detail": words})
+        self.event_log.add({"kind": "fault", "cause": cause, "detail": words})
 
     def _summary(self) -> RunSummary:
         state = self._last_state
@@ -371,5 +450,5 @@ class Daemon:
             exit_code=1 if wrong else 0,
             recording=self.recording,
         )
-        self.book.add({"kind": "summary", "summary": summary.to_json()})
+        self.event_log.add({"kind": "summary", "summary": summary.to_json()})
         return summary

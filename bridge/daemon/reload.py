@@ -9,100 +9,109 @@ from __future__ import annotations
 import threading
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 from gapbridge.bridge.cell.cell import complaints
 from gapbridge.bridge.cell.run_settings import Configuration, read_configuration
+from gapbridge.bridge.daemon.service_manager import ServiceManager
+from gapbridge.bridge.ipc.events import EventLog
 from gapbridge.bridge.ipc.shared_memory import Phase
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.core.errors import GapbridgeError
 from gapbridge.drivers.controller_address import address_of
 
-if TYPE_CHECKING:
-    from gapbridge.bridge.daemon.daemon import Daemon
-
 KEPT_UNTIL_RESTART = ("recording", "web", "metrics")
 """Sections whose processes go on as they are; a changed one takes effect at the next start."""
+
+
+class Swap(NamedTuple):
+    """What the next loop begins with."""
+
+    configuration: Configuration | None  # None: what the last one had
+    rearms: bool  # it was compensating, and the new cell arms by itself
+    in_order: bool  # the last loop was ended for this
 
 
 class Reload:
     """One request to read the cell again, from asking to the new loop."""
 
-    def __init__(self, daemon: Daemon) -> None:
-        self._daemon = daemon
+    def __init__(self, manager: ServiceManager, event_log: EventLog) -> None:
+        self._manager, self._event_log = manager, event_log
         self._asked = threading.Event()
         self._next: Configuration | None = None
         self._rearm = False  # it was compensating, and the new cell arms by itself
         self.wants_end = False  # the loop is to be stopped: nothing is being written
-        self.swapped = False  # the last loop ended for a new cell
 
     def ask(self) -> None:
         """Ask for the cell to be read again; from any thread."""
         self._asked.set()
 
-    def step(self, state: State, phase: Phase) -> None:
-        """Go on with a reload that was asked for."""
+    def step(self, state: State, phase: Phase, running: Configuration) -> bool:
+        """Go on with a reload that was asked for; returns whether the loop is to ramp out now."""
         if self._asked.is_set():
             self._asked.clear()
-            self._read(state)
+            self._read(state, running)
         if self._next is None or self.wants_end or phase == Phase.ARMING:
-            return
+            return False
         if state in (State.ARMED, State.COMPENSATING):
-            self._daemon.ramp_out()
-        elif state != State.HOLDING:
-            self.wants_end = True
+            return True
+        self.wants_end = state != State.HOLDING
+        return False
 
-    def swap(self) -> bool:
-        """Put the new cell in place after a loop has ended; returns whether the next may arm."""
-        following, rearm = self._next, self._rearm and self.wants_end
-        self.swapped = self.wants_end and following is not None
+    def swap(self) -> Swap:
+        """Return what the next loop begins with; one that died instead begins with it too.
+
+        The service manager hears of it with the new loop's first cycle.
+        """
+        following, ended = self._next, self.wants_end
+        rearm = self._rearm and ended
         self._next, self._rearm, self.wants_end = None, False, False
         if following is None:
-            return False
-        self._daemon.configuration = following  # a loop that died instead begins with it too
-        return rearm  # the service manager hears of it with the new loop's first cycle
+            return Swap(None, rearms=False, in_order=False)
+        return Swap(following, rearms=rearm, in_order=ended)
 
-    def _read(self, state: State) -> None:
-        daemon = self._daemon
-        daemon.manager.reloading()
+    def _read(self, state: State, running: Configuration) -> None:
+        before = running.settings
+        self._manager.reloading()
         try:
-            found = read_configuration(daemon.settings.cell)
-            self._next = self._fitting(found)
+            found = read_configuration(before.cell)
+            self._next = _fitting(found, running)
         except GapbridgeError as error:
-            daemon.manager.ready()
-            words = "; ".join(_all_of(daemon.settings.cell, error))
-            self._tell(False, f"the cell file was not taken, the old one stays: {words}")
+            self._manager.ready()
+            words = "; ".join(_all_of(before.cell, error))
+            words = f"the cell file was not taken, the old one stays: {words}"
+            self._report(False, running if self._next is None else self._next, words)
             return
         self._rearm = state == State.COMPENSATING and found.settings.setpoints.arm
         changed = [
             name for name in KEPT_UNTIL_RESTART
-            if getattr(found.settings, name) != getattr(daemon.settings, name)
+            if getattr(found.settings, name) != getattr(before, name)
         ]  # fmt: skip
         later = f"; {', '.join(changed)}: at the daemon's next start" if changed else ""
-        self._tell(True, f"the cell file was read again and is being taken{later}")
+        words = f"the cell file was read again and is being taken{later}"
+        self._report(True, self._next, words)
 
-    def _fitting(self, found: Configuration) -> Configuration:
-        """Return a configuration that this run can go on with. Raises GapbridgeError."""
-        daemon, settings = self._daemon, found.settings
-        if found.n != daemon.configuration.n:
-            raise GapbridgeError(
-                f"{settings.cell}: robot: found {found.n} joints, expected "
-                f"{daemon.configuration.n} as before: stop the daemon and start it anew"
-            )
-        if address_of(settings.link) != address_of(daemon.settings.link):
-            raise GapbridgeError(
-                f"{settings.cell}: link: found {address_of(settings.link)}, expected "
-                f"{address_of(daemon.settings.link)} as before: stop the daemon and start it anew"
-            )
-        before = daemon.settings
-        kept = {name: getattr(before, name) for name in ("model_source", "hang_timeout", "backoff")}
-        return replace(found, settings=settings.model_copy(update=kept))
-
-    def _tell(self, fine: bool, words: str) -> None:
-        hashed = self._next.hash if self._next is not None else self._daemon.configuration.hash
-        self._daemon.book.add(
-            {"kind": "configuration", "ok": fine, "hash": hashed, "detail": words}
+    def _report(self, fine: bool, taken: Configuration, words: str) -> None:
+        self._event_log.add(
+            {"kind": "configuration", "ok": fine, "hash": taken.hash, "detail": words}
         )
+
+
+def _fitting(found: Configuration, running: Configuration) -> Configuration:
+    """Return a configuration that this run can go on with. Raises GapbridgeError."""
+    settings, before = found.settings, running.settings
+    if found.n != running.n:
+        raise GapbridgeError(
+            f"{settings.cell}: robot: found {found.n} joints, expected {running.n} as before: "
+            "stop the daemon and start it anew"
+        )
+    if address_of(settings.link) != address_of(before.link):
+        raise GapbridgeError(
+            f"{settings.cell}: link: found {address_of(settings.link)}, expected "
+            f"{address_of(before.link)} as before: stop the daemon and start it anew"
+        )
+    kept = {name: getattr(before, name) for name in ("model_source", "hang_timeout", "backoff")}
+    return replace(found, settings=settings.model_copy(update=kept))
 
 
 def _all_of(cell: Path, error: GapbridgeError) -> list[str]:

@@ -1,4 +1,4 @@
-"""What systemd is told: ready, alive, reloading, stopping (sd_notify's protocol, no library).
+"""Notifications to systemd: ready, alive, reloading, stopping (sd_notify, no library).
 
 Source: sd_notify(3): datagrams of KEY=VALUE lines to the socket named in NOTIFY_SOCKET.
 """
@@ -30,19 +30,19 @@ class ServiceManager:
         return bool(self._address)
 
     def ready(self) -> None:
-        """Tell that the run has begun."""
+        """Report that the run has begun."""
         self._send("READY=1")
 
     def reloading(self) -> None:
-        """Tell that a changed cell file is being taken; ``ready`` follows."""
+        """Report that a changed cell file is being taken; ``ready`` follows."""
         self._send(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
     def stopping(self) -> None:
-        """Tell that the run ends."""
+        """Report that the run ends."""
         self._send("STOPPING=1")
 
     def status(self, words: str) -> None:
-        """Tell in one line what goes on."""
+        """Report in one line what goes on."""
         self._send(f"STATUS={words.splitlines()[0] if words else ''}")
 
     def kick(self) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import IO, Any
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
 
 SIDES: dict[str, tuple[str, Callable[[DaemonSettings], bool]]] = {
@@ -27,14 +27,18 @@ class Sides:
         self._running: dict[str, SideProcess] = {}
 
     def start(
-        self, settings: DaemonSettings, order: dict[str, Any], page: Page, log: IO[Any] | int
+        self,
+        settings: DaemonSettings,
+        order: dict[str, Any],
+        page: SharedMemory,
+        log: IO[Any] | int,
     ) -> None:
         """Start those that the settings want."""
         for name, (module, wanted) in SIDES.items():
             if wanted(settings):
                 self._running[name] = SideProcess(module, order, page, log)
 
-    def show(self, page: Page) -> None:
+    def show(self, page: SharedMemory) -> None:
         """Have all change over to a page that the daemon shows."""
         for side in self._running.values():
             side.show(page)
@@ -42,17 +46,17 @@ class Sides:
     def tell(self, event: dict[str, Any]) -> None:
         """Pass an event on to each; never blocks."""
         for side in self._running.values():
-            side.tell(event)
+            side.emit(event)
 
     def check(self) -> list[dict[str, Any]]:
-        """Look after all; returns what they have told and what became of them, as events."""
+        """Look after all; returns what they have reported and what became of them, as events."""
         found = []
         for name, side in self._running.items():
             for event in side.events():
                 if event.get("kind") == name:
                     found.append(event)
-                else:  # states and requests are not a side process's to tell of
-                    words = f"{name} told of {str(event.get('kind'))[:40]!r}, not its to tell of"
+                else:  # states and requests are not a side process's to emit
+                    words = f"{name} emitted {str(event.get('kind'))[:40]!r}, which is not its own"
                     found.append({"kind": "side", "side": name, "detail": words})
             if (wrong := side.check()) is not None:
                 found.append({"kind": "side", "side": name, "detail": wrong})
@@ -69,7 +73,7 @@ class Sides:
         }  # fmt: skip
 
     def close(self) -> None:
-        """Tell all that the daemon ends, and wait for what they have to finish."""
+        """Notify all that the daemon ends, and wait for what they have to finish."""
         for side in self._running.values():
             side.begin_close()
         for name, side in self._running.items():

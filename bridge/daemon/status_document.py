@@ -1,4 +1,4 @@
-"""The status document: what ``gapbridge status --json`` prints and every side process is told."""
+"""The status document: what ``gapbridge status --json`` prints and every side process gets."""
 
 from __future__ import annotations
 

@@ -99,7 +99,7 @@ class UrBench(Bench):
         return self._reading()
 
     def hang(self, load: Load) -> None:
-        """Hang a load as on any bench, and tell the controller."""
+        """Hang a load as on any bench, and enter it in the controller."""
         super().hang(load)
         cog = ",".join(f"{v:.9g}" for v in load.cog)
         self._pendant(f"def hang():\n  set_payload({load.mass:.9g}, [{cog}])\nend\n")

@@ -15,7 +15,7 @@ from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.demo.bench import Bench
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.core.errors import LinkError
-from gapbridge.drivers.simulated.peer.peer import OWN_ACCELERATION, OWN_SPEED
+from gapbridge.drivers.simulated.server.arm_controller import OWN_ACCELERATION, OWN_SPEED
 
 Array = NDArray[np.float64]
 LONGEST_START = 60.0  # s until the daemon writes

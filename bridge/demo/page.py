@@ -116,7 +116,7 @@ def _flexibility_table(result: Result) -> str:
     n = len(found.axial)
 
     def cell(value: float, std: float, shown: bool) -> str:
-        told = f"{value * 1e6:.3f} ± {std * 1e6:.3f}" if shown else "not shown by these poses"
+        told = f"{value * 1e6:.3f} ± {std * 1e6:.3f}" if shown else "not identifiable"
         return f"<td>{told}</td>"
 
     rows = "".join(

@@ -1,4 +1,4 @@
-"""Which poses the demo measures: those that tell most about the joints, and others to check on."""
+"""Which poses the demo measures: the most informative about the joints, others to check."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ class Plan:
 
 
 def plan(model: Model, home: Array, seed: int, scene: Scene = UR10E) -> Plan:
-    """Return telling poses per calibration load and random ones per test load."""
+    """Return informative poses per calibration load and random ones per test load."""
     free = candidates(model, seed, scene.workspace)
     n = model.arm.n
     known = np.eye(2 * n) * 1e-2

@@ -49,8 +49,8 @@ def rests(
     """Return the rests at the ``visited`` poses (M, n), in their order.
 
     ``recording`` holds columns by RTDE name, ``readings`` (K, 7) is the tracker's; ``load`` is what
-    the arm carried, where the controller does not tell it. Raises RunError where a visit is missing
-    or the tracker saw too little of it.
+    the arm carried, where the controller does not report it. Raises RunError where a visit is
+    missing or the tracker saw too little of it.
     """
     if load is not None and "payload" not in recording:
         recording = {**recording, **_told(load, len(recording["timestamp"]))}

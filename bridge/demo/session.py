@@ -43,8 +43,8 @@ class Session:
         """Visit poses (M, n) with a load on the arm; returns what was measured at each.
 
         The daemon writes setpoints corrected by the cell's model: a cell without compliance is
-        one without compensation. A run that breaks off is told and repeated from home, at half the
-        rate where deadlines were missed. Raises RunError where that does not help.
+        one without compensation. A run that breaks off is reported and repeated from home, at half
+        the rate where deadlines were missed. Raises RunError where that does not help.
         """
         cell = self._link.declared(cell, load)
         longest = self._link.prepare(self._folder, poses)
@@ -89,7 +89,7 @@ class Session:
         self._runs.append(summary)
         if summary.faults or summary.recording is None:
             raise RunError(summary.faults[0] if summary.faults else "nothing was recorded")
-        recording = read_columns(summary.recording, told_only=True)
+        recording = read_columns(summary.recording, reported_only=True)
         return rests(recording, tracker.readings(), poses, load, self._link.settling)
 
     @property

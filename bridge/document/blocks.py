@@ -1,4 +1,4 @@
-"""Blocks of a report, told once and written twice: as HTML and as PDF."""
+"""Blocks of a report, described once and written twice: as HTML and as PDF."""
 
 from __future__ import annotations
 

@@ -20,9 +20,9 @@ class Section(ABC, Generic[M]):
 
     @abstractmethod
     def blocks(self, material: M) -> list[Block]:
-        """Return the section's blocks; none where there is nothing to tell."""
+        """Return the section's blocks; none where there is nothing to show."""
 
     def part(self, material: M) -> Part | None:
-        """Return the section as a part of a document; None where there is nothing to tell."""
+        """Return the section as a part of a document; None where there is nothing to show."""
         blocks = tuple(self.blocks(material))
         return Part(self.key, self.title, self.about, blocks, self.folded) if blocks else None

@@ -23,7 +23,7 @@ class CellSource(ABC):
         """Return the session's cell file; raises InputError where it has none."""
 
     def warnings(self) -> tuple[str, ...]:
-        """Return what is to be told before the work begins."""
+        """Return what is to be reported before the work begins."""
         return ()
 
 
@@ -67,7 +67,7 @@ class CellBeside(CellSource):
 
 @dataclass(frozen=True)
 class CellTable(CellSource):
-    """A CSV of columns ``arm`` and ``cell``; paths are seen from the table's folder."""
+    """A CSV of columns ``arm`` and ``cell``; paths are relative to the table's folder."""
 
     path: Path
     cells: dict[str, Path]

@@ -30,7 +30,7 @@ class Recurrence:
     always: int  # arms where every session that could show it accuses it
     joints: tuple[tuple[int, int], ...]  # joint, sessions; most first
     shrink: float  # median of what it takes off the gap, held out
-    tied: int  # sessions where the data cannot tell it from another
+    tied: int  # sessions where the data cannot distinguish it from another
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 Array = NDArray[np.float64]
-FEWEST = 3  # sessions from which on a slope can be told
-WRONG = 0.05  # share of the drifts told that may be none (Benjamini, Hochberg 1995)
+FEWEST = 3  # sessions from which on a slope is reported
+WRONG = 0.05  # share of the drifts reported that may be none (Benjamini, Hochberg 1995)
 DAY = 86400.0
 
 
@@ -33,7 +33,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Drift:
-    """A slope that is told."""
+    """A slope that is reported."""
 
     arm: str
     quantity: str
@@ -66,7 +66,7 @@ def drifts(series: Sequence[Series]) -> list[Drift]:
     """Return the slopes that are more than scatter, surest first.
 
     Values scatter more from session to session than their own 1 sigma say: by how much is taken
-    from all series of a group together. Of what is told at most one in twenty is none.
+    from all series of a group together. Of what is reported at most one in twenty is none.
     """
     fits = [(s, *_line(s)) for s in series if len(s.at) >= FEWEST and np.ptp(s.at) > 0]
     scatter: dict[str, tuple[float, int]] = {}

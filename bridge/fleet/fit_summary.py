@@ -20,7 +20,7 @@ from gapbridge.core.estimation.hierarchical_evidence import Evidence
 
 Array = NDArray[np.float64]
 UNIT = "rad/Nm"
-UNLIKE = 3.5  # deviations of what arms of a type scatter, from which on an arm is told
+UNLIKE = 3.5  # deviations of what arms of a type scatter, from which on an arm is reported
 SURPRISING = 3.0  # times the usual noise, in variance
 
 
@@ -32,7 +32,7 @@ class FittedSession:
     fit: SessionFit
     gap_before: float  # m, rms of one coordinate, with the cell's flexibilities
     gap_after: float  # m, with the arm's
-    gap_held_out: float  # m, with the arm's as all other sessions tell it
+    gap_held_out: float  # m, with the arm's as all other sessions predict it
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The work on one session: what it tells of the arm's compliance."""
+"""The work on one session: what it says about the arm's compliance."""
 
 from __future__ import annotations
 
@@ -22,6 +22,6 @@ def work(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
         "evidence": {
             "matrix": found.matrix.tolist(), "right": found.right.tolist(),
             "squares": found.squares, "freedom": found.freedom, "least": found.least,
-            "poses": found.poses, "wild": found.wild,
+            "poses": found.poses, "wild": found.outliers,
         },
     }  # fmt: skip

@@ -1,4 +1,4 @@
-"""What stands out: values far from those of the same kind, told by medians."""
+"""What stands out: values far from those of the same kind, judged by medians."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class Outlier:
 def far_from_median(values: Sequence[float], *, ratios: bool) -> list[tuple[int, float, float]]:
     """Return (index, usual value, deviations) of values far from the median.
 
-    ``ratios``: values are positive, told by their ratio to the median, and only those above it are
-    far. The deviation is the median one; where more than half agree exactly, nothing is far.
+    ``ratios``: values are positive, judged by their ratio to the median, and only those above it
+    are far. The deviation is the median one; where more than half agree exactly, nothing is far.
     """
     given = np.array(values, dtype=float)
     if len(given) < FEWEST:

@@ -26,7 +26,7 @@ class Session:
 
 @dataclass(frozen=True)
 class Found:
-    """All sessions, in the order of their names, and the rule that told the arms."""
+    """All sessions, in the order of their names, and the rule that names the arms."""
 
     folder: Path
     sessions: tuple[Session, ...]

@@ -116,9 +116,9 @@ class ControlSocket:
         self.close()
 
 
-def refusal(words: str) -> dict[str, Any]:
+def refusal(message: str) -> dict[str, Any]:
     """Return the answer to what is not done."""
-    return {"ok": False, "error": words}
+    return {"ok": False, "error": message}
 
 
 def peer_of(connection: socket.socket) -> Peer:

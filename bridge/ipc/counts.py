@@ -36,6 +36,16 @@ class Count(IntEnum):
     MISMATCH = 26  # the controller is set otherwise than the cell says
 
     @property
-    def words(self) -> str:
+    def label(self) -> str:
         """Return the name as people and metrics have it."""
         return self.name.lower()
+
+
+DROPPED = {
+    Count.DROPPED_TORN: "torn",
+    Count.DROPPED_NOT_FINITE: "not_finite",
+    Count.DROPPED_IMPLAUSIBLE: "implausible",
+    Count.DROPPED_STEP: "step",
+    Count.DROPPED_BACKWARDS: "backwards",
+}
+"""Counts of samples that could not be believed, and the reason as people and metrics have it."""

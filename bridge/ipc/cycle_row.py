@@ -13,7 +13,7 @@ Vector = NDArray[np.float64]
 OPTIONAL = ("ft_raw_wrench", "joint_temperatures", "actual_current_as_torque", "payload_cog")
 
 
-def fill_row(
+def write_cycle(
     row: Vector,
     slices: Mapping[str, slice],
     state: RobotState,

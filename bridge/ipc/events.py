@@ -11,7 +11,7 @@ KEPT = 500
 Event = dict[str, Any]
 
 
-class EventBook:
+class EventLog:
     """Numbers events and passes them on; ``listeners`` get each one, in order."""
 
     def __init__(self, *listeners: Callable[[Event], None]) -> None:

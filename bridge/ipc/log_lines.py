@@ -43,7 +43,7 @@ class JsonLines:
     def __init__(self, stream: IO[str]) -> None:
         self._stream = stream
 
-    def tell(self, event: Mapping[str, Any]) -> None:
+    def emit(self, event: Mapping[str, Any]) -> None:
         """Write one event."""
         with contextlib.suppress(OSError, ValueError):
             self._stream.write(log_line(event) + "\n")
@@ -62,8 +62,8 @@ def _level(event: Mapping[str, Any]) -> str:
 
 def _message(event: Mapping[str, Any]) -> str:
     if "to" in event:
-        words = f"{event.get('from', '')} -> {event['to']} ({event.get('cause', '')})".lower()
-        return f"{words}: {event['detail']}" if event.get("detail") else words
+        message = f"{event.get('from', '')} -> {event['to']} ({event.get('cause', '')})".lower()
+        return f"{message}: {event['detail']}" if event.get("detail") else message
     for key in ("detail", "failure", "fault", "ended"):
         if event.get(key):
             return str(event[key])[:LONGEST]

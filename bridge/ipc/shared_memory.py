@@ -69,7 +69,7 @@ def slices_of(n: int) -> dict[str, slice]:
     return found
 
 
-class Page:
+class SharedMemory:
     """The shared memory, seen from any side.
 
     Without ``fd`` it is made; with one it is joined, for reading only unless ``writable``. Who
@@ -95,25 +95,25 @@ class Page:
     # -- the loop's side --------------------------------------------------------------------------
 
     def beat(self) -> None:
-        """Tell that the loop is alive."""
+        """Report that the loop is alive."""
         self._times[_BEAT_TIME] = time.monotonic()
         self._words[_BEATS] += 1
 
     def enter(self, phase: Phase) -> None:
-        """Tell what comes next."""
+        """Report what comes next."""
         self.beat()
         self._words[_PHASE] = phase
 
     def tell_state(self, state: int) -> None:
-        """Tell the supervisor's state."""
+        """Report the supervisor's state."""
         self._words[_STATE] = state
 
     def tell_ended(self) -> None:
-        """Tell that the source has come to its end."""
+        """Report that the source has come to its end."""
         self._words[_ENDED] = 1
 
     def tell_seen(self) -> None:
-        """Tell that a state has been read: the link works."""
+        """Report that a state has been read: the link works."""
         self._words[_SEEN] = 1
 
     def count(self, what: Count, times: int = 1) -> None:
@@ -133,7 +133,7 @@ class Page:
         self._words[_WRITTEN] = written + 1
 
     def tell_taken(self, number: int) -> None:
-        """Tell up to which number requests have been taken; see command_page.py."""
+        """Report up to which number requests have been taken; see command_page.py."""
         self._words[_TAKEN] = number
 
     # -- who reads --------------------------------------------------------------------------------
@@ -183,7 +183,7 @@ class Page:
 
     def counts(self) -> dict[str, int]:
         """Return how often each Count has happened since the daemon's start."""
-        return {what.words: int(self._words[_COUNTS + what]) for what in Count}
+        return {what.label: int(self._words[_COUNTS + what]) for what in Count}
 
     def reader(self, first: int = 0) -> PageReader:
         """Return a reader of its own cursor that begins at row number ``first``."""
@@ -206,7 +206,7 @@ class Page:
         os.close(self.fd)
 
 
-class RunPage(Page):
+class RunPage(SharedMemory):
     """The daemon's view, for reading only: one page after the other, cycles and counts going on."""
 
     def __init__(self, n: int) -> None:
@@ -245,7 +245,7 @@ class RunPage(Page):
         os.close(self._shown)
 
 
-class FollowedPage(Page):
+class FollowedPage(SharedMemory):
     """A side process's view: it changes over to each page that the daemon sends it."""
 
     def __init__(self, n: int, fd: int, successors: socket.socket) -> None:
@@ -269,7 +269,7 @@ class FollowedPage(Page):
 class PageReader:
     """One reader of a page's cycles; any number of them read side by side."""
 
-    def __init__(self, page: Page, first: int) -> None:
+    def __init__(self, page: SharedMemory, first: int) -> None:
         self._page = page
         self.next = first  # number of the first row that it has not read
         self.lost = 0  # rows overwritten before they were read
@@ -284,6 +284,11 @@ class PageReader:
         self.lost += gone
         self.next = last
         return rows
+
+    def take_lost(self) -> int:
+        """Return how many rows were lost since the last call."""
+        lost, self.lost = self.lost, 0
+        return lost
 
 
 def _read_only(fd: int) -> int:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
-from gapbridge.bridge.ipc.shared_memory import FollowedPage, Page
+from gapbridge.bridge.ipc.shared_memory import FollowedPage, SharedMemory
 
 FAREWELL = 5.0  # s that a side process may take to end after the daemon
 NICENESS = 5  # the loop comes first
@@ -52,6 +52,11 @@ class EventLines:
         if not self.closed:
             select.select([self.fd], [], [], timeout)
 
+    def close(self) -> None:
+        """Close the pipe; nothing comes any more."""
+        os.close(self.fd)
+        self.closed = True
+
 
 class EventWriter:
     """Writes events into a pipe, one JSON object a line; never blocks and never tears a line."""
@@ -63,7 +68,7 @@ class EventWriter:
         self.sent = 0
         self.dropped = 0  # events that found the pipe full
 
-    def tell(self, event: dict[str, Any]) -> bool:
+    def emit(self, event: dict[str, Any]) -> bool:
         """Write an event; returns False where the pipe is full or nobody reads it."""
         self._flush()
         if self._rest:
@@ -79,6 +84,11 @@ class EventWriter:
         self.sent += 1
         return True
 
+    def take_dropped(self) -> int:
+        """Return how many events were dropped, once."""
+        dropped, self.dropped = self.dropped, 0
+        return dropped
+
     def _flush(self) -> None:
         """Write what is left of an event that has left in part."""
         with contextlib.suppress(OSError):
@@ -88,19 +98,19 @@ class EventWriter:
 
 @dataclass(frozen=True)
 class Order:
-    """What the daemon tells a side process at its start."""
+    """What the daemon hands a side process at its start."""
 
     settings: DaemonSettings
     n: int  # joints
     session: str  # name of the daemon's run, run-YYYYmmdd-HHMMSS
-    page: Page  # for reading only
+    page: SharedMemory  # for reading only
     events: EventLines
     up: EventWriter
     extra: dict[str, Any]
 
-    def tell(self, event: dict[str, Any]) -> None:
-        """Tell the daemon of an event (a dict with "kind"), who hands it to all; never blocks."""
-        self.up.tell({"time": time.time(), "monotonic": time.monotonic(), **event})
+    def emit(self, event: dict[str, Any]) -> None:
+        """Notify the daemon of an event (a dict with "kind"), who hands it to all; never blocks."""
+        self.up.emit({"time": time.time(), "monotonic": time.monotonic(), **event})
 
 
 def take_order() -> Order:
@@ -133,7 +143,7 @@ def read_event(line: bytes) -> dict[str, Any] | None:
 def _end_after_daemon(fd: int) -> None:
     """End the process, hanging or not, some time after the daemon's end of the pipe closed."""
     watch = select.poll()
-    watch.register(fd, 0)  # hang-ups only, which are always told
+    watch.register(fd, 0)  # hang-ups only, which are always reported
     watch.poll()
     time.sleep(FAREWELL)
     os._exit(1)

@@ -1,4 +1,4 @@
-"""The daemon's half of a side process: start it, tell it of events, start it anew.
+"""The daemon's half of a side process: start it, send it events, restart it.
 
 Whatever a side process does - hang, die, stop reading - the daemon never waits for it.
 """
@@ -16,7 +16,7 @@ import termios
 import time
 from typing import IO, Any
 
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_main import EventLines, EventWriter
 
 BACKOFF = (0.2, 10.0)  # s before a restart: first, most
@@ -34,7 +34,7 @@ class SideProcess:
     """
 
     def __init__(
-        self, module: str, order: dict[str, Any], page: Page, log: IO[Any] | int = -3
+        self, module: str, order: dict[str, Any], page: SharedMemory, log: IO[Any] | int = -3
     ) -> None:
         self.module, self.order = module, order
         self.restarts = 0
@@ -56,14 +56,14 @@ class SideProcess:
         """Return how many events it did not get because it did not read."""
         return self._dropped + self._down.dropped
 
-    def tell(self, event: dict[str, Any]) -> None:
+    def emit(self, event: dict[str, Any]) -> None:
         """Pass an event on; where its pipe is full the event is dropped and counted."""
         if self._down_fd is None:
             self._dropped += 1
         else:
-            self._down.tell(event)
+            self._down.emit(event)
 
-    def show(self, page: Page) -> None:
+    def show(self, page: SharedMemory) -> None:
         """Have it change over to another page; one that does not look gets it when it is anew."""
         if self._process is None:
             return
@@ -73,7 +73,7 @@ class SideProcess:
         os.close(fd)
 
     def events(self) -> list[dict[str, Any]]:
-        """Return the events that it has told."""
+        """Return the events that it has reported."""
         return self._up.poll()
 
     def check(self) -> str | None:
@@ -95,7 +95,7 @@ class SideProcess:
         return f"{self.module} ended with {code}"
 
     def close(self, patience: float = 3.0) -> None:
-        """Tell it that the daemon ends, give it ``patience`` s to finish, then end it."""
+        """Notify it that the daemon ends, give it ``patience`` s to finish, then end it."""
         self.begin_close()
         if self._process is not None:
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -105,7 +105,7 @@ class SideProcess:
             self._let_go()
 
     def begin_close(self) -> None:
-        """Tell it that the daemon ends, without waiting."""
+        """Notify it that the daemon ends, without waiting."""
         if self._process is not None:
             self._close_down()
 
@@ -163,16 +163,14 @@ class SideProcess:
 
     def _close_down(self) -> None:
         if self._down_fd is not None:
-            self._dropped += self._down.dropped
-            self._down.dropped = 0
+            self._dropped += self._down.take_dropped()
             os.close(self._down_fd)
             self._down_fd = None
 
     def _let_go(self) -> None:
         self._process = None
         self._close_down()
-        os.close(self._up.fd)
-        self._up.closed = True
+        self._up.close()
         self._pages.close()
 
 

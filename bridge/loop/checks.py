@@ -1,4 +1,4 @@
-"""What is looked at in every cycle beside the link itself; each finding is told once."""
+"""What is looked at in every cycle beside the link itself; each finding is reported once."""
 
 from __future__ import annotations
 
@@ -261,7 +261,7 @@ class LoopChecks:
         self._judge(Count.NOT_FOLLOWING, words if lasts else None, Cause.NOT_FOLLOWING)
 
     def _judge(self, what: Count, words: str | None, cause: Cause | None) -> None:
-        """Tell the supervisor of a finding; count and tell it once for as long as it lasts."""
+        """Notify the supervisor of a finding; count and report it once for as long as it lasts."""
         if words is None:
             if what in self._lasting:
                 self._lasting.discard(what)
@@ -277,4 +277,4 @@ class LoopChecks:
         self._reports.count(what)
         if not changed and self._supervisor.state != State.FAULT:
             kind = "degraded" if what == Count.SENSOR_LOST else "warning"
-            self._reports.emit({"kind": kind, "what": what.words, "detail": words})
+            self._reports.emit({"kind": kind, "what": what.label, "detail": words})

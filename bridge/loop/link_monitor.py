@@ -41,10 +41,10 @@ class ControllerClock:
 
     The age of a state counts from when its sample could have been here at the earliest, so that
     late packets, late wake-ups and long computing all count. The shortest way over the wire, which
-    one clock alone cannot tell, does not. ``hold``: s after which a state is too old to write by.
+    one clock alone cannot show, does not. ``hold``: s after which a state is too old to write by.
     What a stalled link hands on at once is old for a moment only. Where all samples are older than
     that for as long, either the controller's clock has stood still or the way has become longer,
-    which no clock tells: the two are tied anew only while nothing is written.
+    which no clock shows: the two are tied anew only while nothing is written.
     """
 
     def __init__(self, rate: float, hold: float = 1.0) -> None:
@@ -142,8 +142,8 @@ class SampleCheck:
         return None
 
 
-class StateWatch:
-    """Takes states from a driver and tells the supervisor when they fail to come.
+class LinkMonitor:
+    """Takes states from a driver and notifies the supervisor when they fail to come.
 
     ``lost`` says why the link must be given up, from then on.
     """
@@ -163,7 +163,7 @@ class StateWatch:
         self._check = SampleCheck(arm)
         self._invalid = self._old = 0
         self._left = 0.0  # s, monotonic: when the last reading ended
-        self._stale = self._silent = False  # has been told since the last believable state
+        self._stale = self._silent = False  # has been reported since the last believable state
         self._told: dict[Count, float] = {}  # s, monotonic
         self._heard = time.monotonic()  # s, of the last believable state
         self._has_armed = False
@@ -245,7 +245,7 @@ class StateWatch:
         now = time.monotonic()
         if now - self._told.get(reason, -TELL_EVERY) >= TELL_EVERY:
             self._told[reason] = now
-            self._reports.emit({"kind": "dropped", "what": reason.words, "detail": detail})
+            self._reports.emit({"kind": "dropped", "what": reason.label, "detail": detail})
         if self._invalid >= INVALID_IN_A_ROW:
             self._supervisor.take(Cause.IMPLAUSIBLE, detail)
             self._check.forget()  # the arm may well be there: judge what comes by itself

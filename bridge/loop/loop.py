@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc.command_page import Command, Commands
 from gapbridge.bridge.ipc.counts import Count
-from gapbridge.bridge.ipc.cycle_row import fill_row
-from gapbridge.bridge.ipc.shared_memory import Page, Phase
+from gapbridge.bridge.ipc.cycle_row import write_cycle
+from gapbridge.bridge.ipc.shared_memory import Phase, SharedMemory
 from gapbridge.bridge.loop.checks import NOTHING, RAMPING_OUT, RESYNC, UNSOLVED, LoopChecks
-from gapbridge.bridge.loop.link_monitor import ControllerClock, StateWatch, hold_time
+from gapbridge.bridge.loop.link_monitor import ControllerClock, LinkMonitor, hold_time
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
 from gapbridge.bridge.loop.readiness import ModelCheck
@@ -28,7 +28,7 @@ from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream, longest_withdrawal
 from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
 from gapbridge.bridge.loop.writing import Writing
-from gapbridge.bridge.setpoint_source.source import Source, Told
+from gapbridge.bridge.setpoint_source.source import Source, SourceStatus
 from gapbridge.core.errors import InvalidStateError, LinkError
 from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.loads import Loads
@@ -75,7 +75,7 @@ class Loop:
         model: Model,
         driver: Driver,
         source: Source,
-        page: Page,
+        page: SharedMemory,
         tell: Tell,
         number: int = 0,
     ) -> None:
@@ -93,7 +93,7 @@ class Loop:
         reports = Reports(page, tell)
         self._supervisor = Supervisor(reports.transition)
         patience = settings.link.state_timeout
-        self._watch = StateWatch(driver, model.arm, self._supervisor, reports, patience)
+        self._watch = LinkMonitor(driver, model.arm, self._supervisor, reports, patience)
         self._checks = LoopChecks(
             driver.rate, self._supervisor, reports, patience, driver.moves_arm
         )
@@ -120,7 +120,7 @@ class Loop:
     # -- the frame --------------------------------------------------------------------------------
 
     def run(self, commands: Commands, may_write: bool, latched: str = "") -> Exit:
-        """Connect and loop until told to stop, or until the link is lost.
+        """Connect and loop until asked to stop, or until the link is lost.
 
         ``commands``: the daemon's, and the only way to arm. ``may_write`` False: nothing can arm.
         ``latched``: the fault of a loop before this one that nobody has acknowledged.
@@ -167,8 +167,8 @@ class Loop:
         elif not_ready := self._not_ready():
             words = not_ready
         else:
-            self._supervisor.take(Cause.ARM)
-            self._skip()
+            if self._supervisor.take(Cause.ARM):
+                self._skip()
             return
         self._tell({"kind": "refused", "what": "arm", "detail": words})
 
@@ -318,7 +318,7 @@ class Loop:
         clamped = stream.clamped if setpoint is not None else 0
         late = 0.0 if at is None else time.monotonic() - at  # arming: no part of the cycle
         row, slices = page.next_row(), page.slices
-        fill_row(row, slices, state, nominal, corrected, offset)
+        write_cycle(row, slices, state, nominal, corrected, offset)
         row[2] = self._supervisor.state
         row[3] = left
         row[4] = missed
@@ -332,4 +332,6 @@ class Loop:
         kind = UNSENT if setpoint is not None and not left else int(attempted)
         row[last : last + 4] = (kind, stream.ramp_time, self._driver.rate, self._number)
         page.publish()
-        self._source.tell(Told(self._supervisor.state, nominal, corrected, offset, left, clamped))
+        self._source.emit(
+            SourceStatus(self._supervisor.state, nominal, corrected, offset, left, clamped)
+        )

@@ -28,7 +28,7 @@ from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.ipc.command_page import Commands
 from gapbridge.bridge.ipc.sealed_memory import all_bytes
-from gapbridge.bridge.ipc.shared_memory import Page, Phase
+from gapbridge.bridge.ipc.shared_memory import Phase, SharedMemory
 from gapbridge.bridge.loop.loop import Exit, Loop
 from gapbridge.bridge.loop.realtime import become_realtime
 from gapbridge.bridge.loop.replay import ReplayedLoop
@@ -70,7 +70,7 @@ def main() -> None:
 
 
 def _run(order: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Exit:
-    page = Page(order["n"], order["page"])
+    page = SharedMemory(order["n"], order["page"])
     page.enter(Phase.STARTING)
     files = pickle.loads(all_bytes(order["files"]))  # by the daemon, which started this process
     read_only_from(files)  # the disk is the daemon's to read, at start and reload
@@ -110,7 +110,7 @@ def _make_loop(
 
 
 def _teller(events: int) -> Callable[[dict[str, Any]], None]:
-    """Return a function that tells the daemon of an event and never blocks."""
+    """Return a function that notifies the daemon of an event and never blocks."""
 
     def tell(event: dict[str, Any]) -> None:
         if len(event.get("detail", "")) > LONGEST_WORDS:

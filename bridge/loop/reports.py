@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gapbridge.bridge.ipc.counts import Count
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.loop.supervisor import Cause, State
 
 
@@ -15,7 +15,7 @@ from gapbridge.bridge.loop.supervisor import Cause, State
 class Reports:
     """What every part of the loop reports by."""
 
-    page: Page
+    page: SharedMemory
     emit: Callable[[dict[str, Any]], None]  # one event; never blocks
 
     def count(self, what: Count, times: int = 1) -> None:

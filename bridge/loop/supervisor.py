@@ -11,7 +11,7 @@ class State(IntEnum):
 
     DISCONNECTED = 0
     OBSERVING = 1  # reads, computes, records; writes nothing
-    ARMED = 2  # told to write; waits for the source's first setpoint
+    ARMED = 2  # asked to write; waits for the source's first setpoint
     COMPENSATING = 3  # writes; the offset ramps in and stays
     HOLDING = 4  # writes; the offset ramps out, the arm comes to rest
     FAULT = 5  # writes nothing until a person has acknowledged it
@@ -101,7 +101,7 @@ Listener = Callable[[State, State, Cause, str], None]
 
 
 class Supervisor:
-    """Holds the state; every change goes through the table and is told to one listener."""
+    """Holds the state; every change goes through the table and is reported to one listener."""
 
     def __init__(self, listener: Listener) -> None:
         self.state = State.DISCONNECTED

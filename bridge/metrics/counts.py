@@ -1,4 +1,4 @@
-"""What is counted: from the cycles in the shared page, and from what the daemon tells."""
+"""What is counted: from the cycles in the shared page, and from what the daemon reports."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.reread import RereadSettings
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.core.limits import CLAMPS
 
 Array = NDArray[np.float64]
@@ -44,7 +44,9 @@ class Buckets:
 class Counts:
     """Everything that is counted since this process began to read, and the last of what changes."""
 
-    def __init__(self, page: Page, settings: DaemonSettings, text: str | None = None) -> None:
+    def __init__(
+        self, page: SharedMemory, settings: DaemonSettings, text: str | None = None
+    ) -> None:
         self._page, self._slices = page, page.slices
         self._reread = RereadSettings(settings, text)  # text: the cell file's
         self._reader = page.reader()
@@ -88,7 +90,7 @@ class Counts:
     def turn(self, events: list[dict[str, Any]]) -> None:
         """Take what has come."""
         for event in events:
-            self._hear(event)
+            self._on_event(event)
         rows, s = self._reader.drain(), self._slices
         if not len(rows):
             return
@@ -105,9 +107,9 @@ class Counts:
         self.offset = rows[-1, s["offset"]]
         self.received = float(rows[-1, s["received"].start])
 
-    def _hear(self, event: dict[str, Any]) -> None:
+    def _on_event(self, event: dict[str, Any]) -> None:
         kind = str(event.get("kind", "note"))
-        self._reread.hear(event)
+        self._reread.on_event(event)
         if kind == "status":
             self.status = event
             return

@@ -17,11 +17,11 @@ from prometheus_client.core import (
 )
 from prometheus_client.registry import Collector
 
+from gapbridge.bridge.ipc.counts import DROPPED
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.metrics.counts import Buckets, Counts
 
 AXES = ("x", "y", "z")
-DROPPED = "dropped_"  # what counts of samples that could not be believed begin with
 
 
 class Families(Collector):
@@ -38,7 +38,7 @@ class Families(Collector):
         yield from self._cycles()
         yield from self._histograms()
         yield from self._offset()
-        yield from self._told()
+        yield from self._reported()
         yield from self._processes()
         yield from self._recorder()
         yield _counter(
@@ -72,14 +72,14 @@ class Families(Collector):
 
     def _cycles(self) -> Iterator[Metric]:
         counts = self._counts
-        for name, words, value in (
+        for name, message, value in (
             ("cycles", "Cycles of the controller that were seen.", counts.cycles),
             ("missed_cycles", "Cycles of the controller that were not seen.", counts.missed),
             ("late_cycles", "Cycles finished later than a period after their state.", counts.late),
             ("setpoints_written", "Setpoints that left for the robot.", counts.written),
             ("uncounted_cycles", "Cycles overwritten before they could be counted.", counts.lost),
         ):
-            yield CounterMetricFamily(f"gapbridge_{name}", words, float(value))
+            yield CounterMetricFamily(f"gapbridge_{name}", message, float(value))
         yield _counter(
             "gapbridge_setpoints_clamped",
             "Setpoints that a limit held back.",
@@ -137,7 +137,7 @@ class Families(Collector):
             limits.offset_rotation,
         )
 
-    def _told(self) -> Iterator[Metric]:
+    def _reported(self) -> Iterator[Metric]:
         counts = self._counts
         yield _counter("gapbridge_faults", "Faults, by what caused them.", counts.faults, "cause")
         yield _counter("gapbridge_events", "Events of the daemon, by kind.", counts.events, "kind")
@@ -147,13 +147,12 @@ class Families(Collector):
         for (to, cause), times in sorted(counts.transitions.items()):
             transitions.add_metric([to, cause], float(times))
         yield transitions
-        told = _numbers(counts.status.get("counts"))
-        dropped = {k.removeprefix(DROPPED): v for k, v in told.items() if k.startswith(DROPPED)}
-        others = {k: v for k, v in told.items() if not k.startswith(DROPPED)}
+        reported = _numbers(counts.status.get("counts"))
+        dropped = {r: reported.pop(c.label) for c, r in DROPPED.items() if c.label in reported}
         yield _counter(
             "gapbridge_dropped_samples", "Samples that could not be believed.", dropped, "reason"
         )
-        yield _counter("gapbridge_incidents", "What the loop met with, by kind.", others, "kind")
+        yield _counter("gapbridge_incidents", "What the loop met with, by kind.", reported, "kind")
 
     def _processes(self) -> Iterator[Metric]:
         status = self._counts.status
@@ -191,15 +190,15 @@ class Families(Collector):
             )
 
 
-def _counter(name: str, words: str, values: Mapping[str, float], label: str) -> Metric:
-    found = CounterMetricFamily(name, words, labels=[label])
+def _counter(name: str, message: str, values: Mapping[str, float], label: str) -> Metric:
+    found = CounterMetricFamily(name, message, labels=[label])
     for key, value in sorted(values.items()):
         found.add_metric([key], float(value))
     return found
 
 
-def _histogram(name: str, words: str, buckets: Buckets) -> Metric:
-    found = HistogramMetricFamily(name, words)
+def _histogram(name: str, message: str, buckets: Buckets) -> Metric:
+    found = HistogramMetricFamily(name, message)
     found.add_metric([], buckets.cumulative(), buckets.sum)
     return found
 

@@ -31,7 +31,7 @@ def main() -> int:
     try:
         run(order)
     except GapbridgeError as error:
-        order.tell({"kind": "metrics", "failure": str(error)})
+        order.emit({"kind": "metrics", "failure": str(error)})
         sys.stderr.write(f"{error}\n")
         return 1
     return 0

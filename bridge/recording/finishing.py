@@ -156,8 +156,8 @@ def _chunk(file: IO[bytes], at: int, length: int, whole: _Whole) -> ChunkIndex |
             schema = Schema.read(ReadDataStream(BytesIO(body)))
             whole.schemas[schema.id] = schema
         elif code == Opcode.CHANNEL:
-            told = Channel.read(ReadDataStream(BytesIO(body)))
-            whole.channels[told.id] = told
+            reported = Channel.read(ReadDataStream(BytesIO(body)))
+            whole.channels[reported.id] = reported
     return _index(chunk, at, length)
 
 

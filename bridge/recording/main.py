@@ -24,12 +24,12 @@ LONGEST_FAREWELL = 4.0  # s: then the process is ended by force
 
 def main() -> None:
     """Record until the daemon has ended."""
-    # a service manager tells all processes to end at once; this one ends when it has everything
+    # a service manager ends all processes at once; this one ends when it has everything
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.SIG_IGN)
     order = take_order()
     recorder = Recorder(
-        order.settings.recording, order.session, order.page, _configuration(order), order.tell
+        order.settings.recording, order.session, order.page, _configuration(order), order.emit
     )
     ended = _follow(order, recorder)
     if not ended:

@@ -2,7 +2,7 @@
 
 What counts is the number of the last cycle that a whole flush has written. After a failure, or in a
 new process, reading goes on behind it as long as the ring still holds what comes next; what it no
-longer holds is counted and told.
+longer holds is counted and reported.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from typing import Any
 
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
 from gapbridge.bridge.document.output_file import FOLDER_MODE
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.recording.event_text import LEVELS, level_of, text_of
 from gapbridge.bridge.recording.finishing import finish, unfinished
 from gapbridge.bridge.recording.folder import next_path, number_after, prune, segments
 from gapbridge.bridge.recording.segment import Segment
-from gapbridge.bridge.recording.words import LEVELS, level_of, words_of
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.mcap_schema import CONFIGURATION, EVENTS, LOG, STATUS
 
@@ -33,13 +33,13 @@ MOST_EVENTS = 10_000  # kept while nothing can be written
 MB = 1e6
 
 Event = Mapping[str, Any]
-Tell = Callable[[dict[str, Any]], None]
+Emit = Callable[[dict[str, Any]], None]
 
 
 class Recorder:
     """Records one run. ``step`` is called some ten times a second; it never raises for the disk.
 
-    ``configuration`` is the document that every file begins with; ``tell`` takes events of the
+    ``configuration`` is the document that every file begins with; ``emit`` takes events of the
     recorder's own (kind "recorder").
     """
 
@@ -47,13 +47,13 @@ class Recorder:
         self,
         settings: RecordingSettings,
         session: str,
-        page: Page,
+        page: SharedMemory,
         configuration: Mapping[str, Any],
-        tell: Tell,
+        emit: Emit,
     ) -> None:
         assert settings.folder is not None
         self._settings, self._folder, self._session = settings, settings.folder, session
-        self._page, self._tell = page, tell
+        self._page, self._emit = page, emit
         self.configuration: dict[str, Any] = dict(configuration)
         self._states = [state.name for state in State]
         self._segment: Segment | None = None
@@ -134,9 +134,7 @@ class Recorder:
             self._write_event(segment, event)
         segment.flush()
         self._events.clear()
-        if self._reader.lost:
-            self._tell_lost(self._reader.lost)
-            self._reader.lost = 0
+        self._tell_lost(self._reader.take_lost())
         self._next, self._flushed = self._reader.next, now
         room = self._room()
         if room < self._settings.keep_free:
@@ -154,15 +152,15 @@ class Recorder:
         at = event.get("time")
         at = at if isinstance(at, int | float) else time.time()
         if event.get("kind") == "status":
-            segment.tell(STATUS, event, at)
+            segment.emit(STATUS, event, at)
             return
-        segment.tell(EVENTS, event, at)
+        segment.emit(EVENTS, event, at)
         second, rest = divmod(int(at * 1e9), 10**9)
         log = {
             "timestamp": {"sec": second, "nsec": rest}, "level": LEVELS[level_of(event)],
-            "message": words_of(event), "name": "gapbridge", "file": "", "line": 0,
+            "message": text_of(event), "name": "gapbridge", "file": "", "line": 0,
         }  # fmt: skip
-        segment.tell(LOG, log, at)
+        segment.emit(LOG, log, at)
 
     def _open(self) -> bool:
         """Begin a new file; returns whether there is one."""
@@ -192,7 +190,7 @@ class Recorder:
             "clock": self._segment.clock / 1e9, "every": self._settings.every,
             "first_cycle": self._next, **self.configuration,
         }  # fmt: skip
-        self._segment.tell(CONFIGURATION, document)
+        self._segment.emit(CONFIGURATION, document)
 
     def change_configuration(self, configuration: Mapping[str, Any]) -> None:
         """Note that the daemon runs by another configuration from now on."""
@@ -217,12 +215,12 @@ class Recorder:
             self.lost += lost
             self._say(f"{lost} cycles lost before cycle {self._page.written}", lost=lost)
 
-    def _say(self, words: str, **more: Any) -> None:
+    def _say(self, message: str, **more: Any) -> None:
         event = {
             "time": time.time(), "monotonic": time.monotonic(), "kind": "recorder",
-            "detail": words, **more,
+            "detail": message, **more,
         }  # fmt: skip
-        self._tell(event)
+        self._emit(event)
 
     def _room(self) -> float:
         """Return the MB that are free for us."""

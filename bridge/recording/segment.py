@@ -145,7 +145,7 @@ class Segment:
                 add(channel, at, messages[k], at, number)
         self.rows += len(rows)
 
-    def tell(self, topic: str, document: Mapping[str, Any], at: float | None = None) -> None:
+    def emit(self, topic: str, document: Mapping[str, Any], at: float | None = None) -> None:
         """Take a JSON message over; ``at``: s since 1970, else now."""
         stamp = int((time.time() if at is None else at) * 1e9)
         data = _json(document)

@@ -55,7 +55,7 @@ def cause_words(cause: Cause) -> str:
     """Return a cause in plain words with its joints."""
     where = f" ({joints_words(cause.joints)})" if cause.joints else ""
     ties = [effect_words(name) for name in cause.indistinguishable_from]
-    tie = f" – or, these data cannot tell, {listed(ties, 'or')}" if ties else ""
+    tie = f" – or, these data cannot distinguish between, {listed(ties, 'or')}" if ties else ""
     return f"{effect_words(cause.effect)}{where}{tie}"
 
 

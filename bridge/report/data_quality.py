@@ -1,4 +1,4 @@
-"""Data quality: findings, wild readings, rows used, and what could not be seen."""
+"""Data quality: findings, outliers, rows used, and what could not be seen."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from gapbridge.bridge.report.words import CHANNELS, told
 from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
 from gapbridge.core.log.log import Log
 
-WILD = 20  # wild readings listed a channel
+WILD = 20  # outliers listed a channel
 
 
 def section(material: Material) -> str:
-    """Return rows used, findings, wild readings, channels that the log does not show."""
+    """Return rows used, findings, outliers, channels that the log does not show."""
     diagnosis = material.diagnosis
     rows = [
         [CHANNELS[c.channel], str(len(material.log)), str(c.samples),
@@ -23,7 +23,7 @@ def section(material: Material) -> str:
         for c in diagnosis.channels
     ]  # fmt: skip
     parts = [
-        table(("channel", "rows in the log", "samples used", "wild, set aside",
+        table(("channel", "rows in the log", "samples used", "excluded as outliers",
                "different poses or stretches of time"), rows),
     ]  # fmt: skip
     parts.append(heading("Findings"))
@@ -50,6 +50,6 @@ def _wild(channel: ChannelDiagnosis, log: Log) -> str:
          channel.unit)] for i in worst
     ]  # fmt: skip
     more = f" The {WILD} largest of {len(wild)}:" if len(wild) > WILD else ""
-    return heading(f"Wild readings: {CHANNELS[channel.channel]}") + paragraph(
-        f"They fit nothing around them and were set aside before any effect was judged.{more}"
+    return heading(f"Outliers: {CHANNELS[channel.channel]}") + paragraph(
+        f"They fit nothing around them and were excluded before any effect was judged.{more}"
     ) + table(("line of the file", "distance from the model"), rows)  # fmt: skip

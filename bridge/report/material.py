@@ -14,7 +14,7 @@ from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-SHOWN = 1500  # points a figure draws at most; wild readings and extremes are not thinned away
+SHOWN = 1500  # points a figure draws at most; outliers and extremes are not thinned away
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,7 @@ def _ties(causes: list[Cause]) -> str:
         "The simpler or likelier one is named; a measurement below would decide."
         for c in causes if c.indistinguishable_from
     ]  # fmt: skip
-    return heading("What these data cannot tell apart") + bullets(told) if told else ""
+    return heading("What these data cannot separate") + bullets(told) if told else ""
 
 
 def _next(measurements: tuple[Measurement, ...]) -> str:

@@ -39,7 +39,7 @@ SECTIONS: dict[str, Section] = {
         parameters.section,
     ),
     "data_quality": Section(
-        "Data quality", "What was used, what was set aside, what could not be seen.",
+        "Data quality", "What was used, what was excluded, what could not be seen.",
         data_quality.section,
     ),
 }  # fmt: skip

@@ -83,7 +83,7 @@ def _depends(channel: ChannelDiagnosis) -> str:
 
 
 def _quantities(channel: ChannelDiagnosis) -> list[str]:
-    """Return the quantities worth a look, most telling first."""
+    """Return the quantities worth a look, most informative first."""
     have = channel.selection.observation.quantities
     first = [n for n, _ in (*channel.depends_on, *channel.where.depends_on)]
     plain = [n for n in ("payload", "timestamp") if n in have]

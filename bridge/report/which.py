@@ -65,7 +65,7 @@ def _accused(cause: Cause) -> list[Cell]:
         )
     if cause.indistinguishable_from:
         ties = listed([effect_words(n) for n in cause.indistinguishable_from], "or")
-        why += f"; these data cannot tell it from: {ties}"
+        why += f"; these data cannot separate it from: {ties}"
     word = badge("cause, tied", "doubtful") if cause.indistinguishable_from else badge(
         "cause", "good")  # fmt: skip
     alone = bar(cause.shrink_alone, percent(cause.shrink_alone), AFTER)

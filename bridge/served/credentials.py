@@ -60,9 +60,9 @@ def tls_context(settings: ServedSettings, section: str) -> ssl.SSLContext | None
         # a password would be asked for on the terminal: the key must have none
         context.load_cert_chain(settings.certificate, settings.key, password=lambda: b"")
     except (ssl.SSLError, OSError, ValueError) as error:
-        words = getattr(error, "reason", None) or getattr(error, "strerror", None) or str(error)
+        message = getattr(error, "reason", None) or getattr(error, "strerror", None) or str(error)
         raise InputError(
             f"{section}.certificate: {settings.certificate}: cannot be used with "
-            f"{settings.key}: {words}, expected PEM of one pair without a password"
+            f"{settings.key}: {message}, expected PEM of one pair without a password"
         ) from None
     return context

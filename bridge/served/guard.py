@@ -134,9 +134,9 @@ class Guard:
         right = hmac.compare_digest(bearer.encode(), self._token)
         return hmac.compare_digest(shown.encode(), self._pass) or right
 
-    def _refuse(self, reason: str, status: int, words: str, **headers: str) -> Response:
+    def _refuse(self, reason: str, status: int, text: str, **headers: str) -> Response:
         self._count(reason)
-        return PlainTextResponse(words + "\n", status, headers)
+        return PlainTextResponse(text + "\n", status, headers)
 
     def _count(self, reason: str) -> None:
         self.refused[reason] = self.refused.get(reason, 0) + 1

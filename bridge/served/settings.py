@@ -72,6 +72,6 @@ class ServedSettings(BaseModel):
         return self
 
     def located(self, folder: Path) -> Self:
-        """Return the settings with their paths seen from here instead of ``folder``."""
+        """Return the settings with paths made absolute from ``folder``."""
         seen = {name: (folder / path).resolve() for name in GUARDS if (path := getattr(self, name))}
         return self.model_copy(update=seen)

@@ -22,7 +22,7 @@ class Glide:
     def __init__(self, timeout: float, what: str) -> None:
         self._timeout, self._what = timeout, what
         self._newest: Vector | None = None
-        self._heard = 0.0  # s, monotonic
+        self._last_received = 0.0  # s, monotonic
         self._from: Vector | None = None
         self._length = 0.0  # s
         self._now: Vector | None = None
@@ -30,12 +30,14 @@ class Glide:
     def take(self, q: Vector) -> None:
         """Take a new setpoint (n,), rad."""
         now = time.monotonic()
-        self._length = min(now - self._heard, LONGEST_GLIDE) if self._newest is not None else 0.0
-        self._newest, self._heard = q, now
+        self._length = (
+            min(now - self._last_received, LONGEST_GLIDE) if self._newest is not None else 0.0
+        )
+        self._newest, self._last_received = q, now
 
     def first(self) -> Vector | None:
         """Return the newest setpoint where one has come lately."""
-        if self._newest is None or time.monotonic() - self._heard > self._timeout:
+        if self._newest is None or time.monotonic() - self._last_received > self._timeout:
             return None
         return self._newest
 
@@ -50,7 +52,7 @@ class Glide:
 
     def sample(self) -> Vector:
         """Return the setpoint of this moment. Raises SourceDryError where none came in time."""
-        silent = time.monotonic() - self._heard
+        silent = time.monotonic() - self._last_received
         if self._newest is None or silent > self._timeout:
             raise SourceDryError(f"setpoints: found no {self._what} for {silent:.3f} s")
         share = min(silent / self._length, 1.0) if self._length > 0.0 else 1.0

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.setpoint_source.glide import Glide
 from gapbridge.bridge.setpoint_source.modbus_page import MOST_JOINTS, PlcPage
-from gapbridge.bridge.setpoint_source.source import Source, Told
+from gapbridge.bridge.setpoint_source.source import Source, SourceStatus
 from gapbridge.core.errors import InputError, RunError
 
 Vector = NDArray[np.float64]
@@ -24,7 +24,7 @@ SERVER = "gapbridge.bridge.setpoint_source.modbus_server"  # module that the PLC
 
 
 class ModbusSource(Source):
-    """Listens, in a process of its own, for a PLC; tells it what became of its setpoints.
+    """Listens, in a process of its own, for a PLC; reports back what became of its setpoints.
 
     Raises InputError for an arm with more joints than the registers hold.
     """
@@ -56,14 +56,14 @@ class ModbusSource(Source):
         order = {"host": self.settings.host, "port": self.settings.port, "n": self.n}
         server.stdin.write(json.dumps({**order, "pages": page.fds}) + "\n")
         server.stdin.flush()
-        said = json.loads(server.stdout.readline() or '{"failure": "its server ended"}')
-        if "failure" in said:
+        reply = json.loads(server.stdout.readline() or '{"failure": "its server ended"}')
+        if "failure" in reply:
             self.close()
-            raise RunError(f"setpoints: {said['failure']}")
+            raise RunError(f"setpoints: {reply['failure']}")
         if not page.is_sealed:
             self.close()
             raise RunError("setpoints: its server did not seal what it writes to")
-        self.port = int(said["port"])
+        self.port = int(reply["port"])
 
     def close(self) -> None:
         """End the server."""
@@ -101,13 +101,13 @@ class ModbusSource(Source):
         self._glide.take(found[1])
         return True
 
-    def tell(self, told: Told) -> None:
+    def emit(self, reported: SourceStatus) -> None:
         """Hand state, corrected and nominal joints on to the PLC."""
         if self._page is None:
             return
         self._cycle += 1
-        flags = (WRITTEN if told.written else 0) | (LIMITED if told.clamped else 0)
+        flags = (WRITTEN if reported.written else 0) | (LIMITED if reported.clamped else 0)
         self._page.put_status(
-            (int(told.state), self._sequence or 0, self._cycle, flags),
-            np.concatenate([told.corrected_q, told.nominal_q, told.offset_in_base]),
+            (int(reported.state), self._sequence or 0, self._cycle, flags),
+            np.concatenate([reported.corrected_q, reported.nominal_q, reported.offset_in_base]),
         )

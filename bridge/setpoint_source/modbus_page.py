@@ -1,4 +1,4 @@
-"""What the loop and its Modbus server tell each other, through memory that neither waits for."""
+"""What the loop and its Modbus server exchange, through memory that neither waits for."""
 
 from __future__ import annotations
 
@@ -93,11 +93,11 @@ class PlcPage:
     # -- to the PLC -------------------------------------------------------------------------------
 
     def put_status(self, words: tuple[int, int, int, int], values: Vector) -> None:
-        """Tell state, sequence taken, cycle and flags; corrected, nominal (n,), offset (6,)."""
+        """Report state, sequence taken, cycle and flags; corrected, nominal (n,), offset (6,)."""
         self._status.write(words, values)
 
     def status(self) -> tuple[tuple[int, ...], Vector] | None:
-        """Return what ``put_status`` has told last."""
+        """Return what ``put_status`` has reported last."""
         return self._status.read(2 * self.n + 6)
 
     def close(self) -> None:

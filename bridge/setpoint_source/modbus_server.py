@@ -78,10 +78,10 @@ class PlcServer:
         found = [0] * INPUTS
         n = self._page.n
         found[0], found[1] = VERSION, n
-        told = self._page.status()
-        if told is None:
+        reported = self._page.status()
+        if reported is None:
             return found
-        (state, sequence, cycle, flags), values = told
+        (state, sequence, cycle, flags), values = reported
         found[2:6] = [state, sequence, cycle & 0xFFFF, flags]
         numbers = np.nan_to_num(values, nan=0.0, posinf=LIMIT, neginf=-LIMIT)
         words = CODING.encode((np.clip(numbers, -LIMIT, LIMIT) / UNIT).tolist())
@@ -92,7 +92,7 @@ class PlcServer:
 
 
 async def serve(page: PlcPage, host: str, port: int) -> None:
-    """Serve until the process ends; tells the port, or the reason, in a line on stdout."""
+    """Serve until the process ends; reports the port, or the reason, in a line on stdout."""
     server = ModbusTcpServer(PlcServer(page).device(), address=(host, port))
     try:
         await server.serve_forever(background=True)

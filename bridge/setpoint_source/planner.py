@@ -51,6 +51,14 @@ class Connection:
         self.admitted = False  # a token has been given, or none is asked for
         self.closed = False
 
+    def admit(self) -> None:
+        """Take note that a token has been given, or none is asked for."""
+        self.admitted = True
+
+    def note_line(self) -> None:
+        """Take note of a good line now."""
+        self.heard = time.monotonic()
+
     def lines(self) -> list[bytes]:
         """Return the lines that have arrived, some of them; closes where there is no end."""
         if b"\n" not in self._buffer:
@@ -80,10 +88,10 @@ class Connection:
             self.close()
         self._buffer += data
 
-    def refuse(self, words: str) -> None:
+    def refuse(self, message: str) -> None:
         """Say why, and close."""
         with contextlib.suppress(OSError):
-            self._link.send(f"error: {words}\n".encode())
+            self._link.send(f"error: {message}\n".encode())
         self.close()
 
     def close(self) -> None:
@@ -151,7 +159,7 @@ class PlannerSource(Source):
 
     def _admit(self, connection: Connection, line: bytes) -> bool:
         """Return whether a first line admits a connection and is used up by that."""
-        connection.admitted = True
+        connection.admit()
         return False
 
     def close(self) -> None:
@@ -245,8 +253,8 @@ class PlannerSource(Source):
             self._end(connection, f'found {shown!r}, expected {{"q": [...]}}')
             return False
         if len(values) != self.n or not all(map(math.isfinite, values)):
-            words = f"found {len(values)} numbers, expected {self.n} finite ones, rad"
-            self._end(connection, words)
+            message = f"found {len(values)} numbers, expected {self.n} finite ones, rad"
+            self._end(connection, message)
             return False
         if connection is not self._planner:
             if self._is_held:
@@ -255,10 +263,10 @@ class PlannerSource(Source):
             if self._planner is not None:
                 self._planner.refuse("silent, and another planner has taken the feed")
             self._planner = connection
-        connection.heard = time.monotonic()
+        connection.note_line()
         self._glide.take(np.array(values))
         return True
 
-    def _end(self, connection: Connection, words: str) -> None:
+    def _end(self, connection: Connection, message: str) -> None:
         self.refused += 1
-        connection.refuse(words)
+        connection.refuse(message)

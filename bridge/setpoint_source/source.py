@@ -15,7 +15,7 @@ from gapbridge.core.errors import RunError
 Vector = NDArray[np.float64]
 
 
-class Told(NamedTuple):
+class SourceStatus(NamedTuple):
     """What the loop did in one cycle. A tuple, because one is made in each."""
 
     state: int  # of the supervisor
@@ -61,7 +61,7 @@ class Source(ABC):
     def sample(self, timestamp: float, own_q: Vector) -> Vector:
         """Return the setpoint (n,) rad at controller time ``timestamp``. Raises SourceDryError."""
 
-    def tell(self, told: Told) -> None:
+    def emit(self, reported: SourceStatus) -> None:
         """Take note of what the loop did in this cycle, for whom it concerns. Never blocks."""
 
     @property

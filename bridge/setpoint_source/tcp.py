@@ -61,7 +61,7 @@ class TcpSource(PlannerSource):
     def _admit(self, connection: Connection, line: bytes) -> bool:
         word, _, given = line.partition(b" ")
         if word == b"token" and hmac.compare_digest(given.strip(), self._token):
-            connection.admitted = True
+            connection.admit()
         else:
             self._end(connection, "expected the token in the first line: token TOKEN")
         return True

@@ -15,7 +15,7 @@ COLUMNS = (
     "predicted_fx", "predicted_fy", "predicted_fz", "predicted_mx", "predicted_my", "predicted_mz",
 )  # fmt: skip
 """time: s since the epoch; state: number; offsets: m and rad in base; wrenches: N and Nm, their
-axes as the page is told; NaN where there is none."""
+axes as the page is given; NaN where there is none."""
 OFFSET, MEASURED, PREDICTED = slice(2, 8), slice(8, 14), slice(14, 20)
 
 

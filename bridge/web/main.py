@@ -25,7 +25,7 @@ def main() -> int:
     try:
         run(order)
     except GapbridgeError as error:
-        order.tell({"kind": "web", "failure": str(error)})
+        order.emit({"kind": "web", "failure": str(error)})
         sys.stderr.write(f"{error}\n")
         return 1
     return 0

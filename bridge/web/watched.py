@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.reread import RereadSettings
-from gapbridge.bridge.ipc.shared_memory import ROWS, Page
+from gapbridge.bridge.ipc.shared_memory import ROWS, SharedMemory
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.web.history import COLUMNS, STEP, History
 from gapbridge.bridge.web.prediction import WrenchPrediction
@@ -36,7 +36,7 @@ class Watched:
         settings: DaemonSettings,
         n: int,
         session: str,
-        page: Page,
+        page: SharedMemory,
         text: str | None = None,
     ) -> None:
         assert settings.web is not None
@@ -66,8 +66,8 @@ class Watched:
 
     def turn(self, events: list[dict[str, Any]]) -> list[Message]:
         """Take what has come; returns messages for the pages that are open."""
-        messages = [message for event in events for message in self._hear(event)]
-        changed = [self._reread.hear(event) for event in events]
+        messages = [message for event in events for message in self._on_event(event)]
+        changed = [self._reread.on_event(event) for event in events]
         if any(changed):
             self._prediction = WrenchPrediction(self._settings, self._slices)
             messages.append(("hello", self.snapshot()))  # limits and rate may be others
@@ -78,7 +78,7 @@ class Watched:
             messages.append(("timing", self._timing.figures()))
         return messages
 
-    def _hear(self, event: dict[str, Any]) -> list[Message]:
+    def _on_event(self, event: dict[str, Any]) -> list[Message]:
         if event.get("kind") == "status":
             self.status = event
             return [("status", event)]

@@ -2,7 +2,7 @@
 
 A payload times a flexibility bends the arm: such products make Gauss and Newton's full steps
 overshoot. Each step is tried against the exact prediction; one that does not keep what it promises
-is shortened, most along what the readings hardly tell apart (columns scaled to length one,
+is shortened, most along what the readings hardly separate (columns scaled to length one,
 Marquardt, J. SIAM 11 (1963) 431). Derivatives are taken anew where they promise too much.
 """
 
@@ -43,7 +43,7 @@ class Standing:
     columns: Columns  # J (N*k, p) and F (N*k, m)
     anchor: Array  # (p,) where the derivatives were taken
     system: System  # divided by the noise, weighed
-    weights: Array  # (N,) 0 wild, 1 calm
+    weights: Array  # (N,) 0 outlier, 1 inlier
     stuck: Mask  # (p,) on a bound
     covariance: Array  # (p, p)
     spent: float  # numbers that the fit spent
@@ -81,7 +81,7 @@ def standing(
 
 
 def descended(problem: Problem, at: Standing, noise: Noise) -> Standing:
-    """Return where steps from ``at`` come to rest under this noise, or where patience ends."""
+    """Return where steps from ``at`` converge under this noise, or where patience ends."""
     damping = 0.0
     at = standing(
         problem, at.values, at.nuisance, noise, at.columns, at.anchor, at.share

@@ -30,7 +30,7 @@ from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
-TELLING = 1.0  # usual sizes: a parameter that is known no better is not shown
+TELLING = 1.0  # usual sizes: a parameter that is known no better counts as not identifiable
 TCP_STEP = 1e-3  # share of a parameter's scale, for derivatives of the predicted TCP
 
 
@@ -67,8 +67,9 @@ def calibrate(  # noqa: PLR0913 (the public call: what is left out has its defau
 
     ``parameters`` say what is to be found (``Parameters.of(model, ...)``), ``metrology`` what is
     known of the instrument; ``observable`` may be left out for kinds without options. Readings
-    marked as held out are never fitted. ``expected`` is the plan's promise, told beside what came.
-    ``diagnose`` runs the diagnosis on what is left over (positions and poses), which takes seconds.
+    marked as held out are never fitted. ``expected`` is the plan's promise, reported beside what
+    came.
+    ``diagnose`` runs the diagnosis on the residual (positions and poses), which takes seconds.
     Raises ExcitationError where the readings are too few, InputError where they do not fit the arm.
     """
     fit = fit_session(
@@ -168,7 +169,7 @@ def _floor(diagnosis: Diagnosis | None) -> float:
 
 
 def _with_places(readings: Readings) -> tuple[Readings, tuple[str, ...]]:
-    """Return the readings with those to verify fitted where nothing else tells of their place.
+    """Return the readings with those to verify fitted where nothing else determines their place.
 
     Where an instrument stands, or a target sits, only readings there can say; and a note of it.
     """
@@ -179,7 +180,7 @@ def _with_places(readings: Readings) -> tuple[Readings, tuple[str, ...]]:
     if not alone.any():
         return readings, ()
     note = (
-        f"{int(alone.sum())} reading(s) to verify were fitted: no others tell where their "
+        f"{int(alone.sum())} reading(s) to verify were fitted: no others determine where their "
         "instrument stands, or their target sits"
     )
     return replace(readings, held_out=held & ~alone), (note,)
@@ -188,7 +189,7 @@ def _with_places(readings: Readings) -> tuple[Readings, tuple[str, ...]]:
 def estimates_of(
     parameters: Parameters, rest: Rest, expected: Expectation | None
 ) -> tuple[Estimate, ...]:
-    """Return the parameters as they are told, beside what was ``expected`` of them."""
+    """Return the parameters as they are reported, beside what was ``expected`` of them."""
     promised = {} if expected is None else dict(
         zip(expected.names, expected.std, strict=True)
     )  # fmt: skip

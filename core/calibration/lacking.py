@@ -23,7 +23,7 @@ from gapbridge.core.estimation.identification import pose_groups
 Array = NDArray[np.float64]
 TOLD = 3  # effects at most
 SURE = 6.0  # how much more likely (log) than nothing, the number of effects tried paid for
-SMALL = 0.05  # share of the remainder below which an effect is not worth telling
+SMALL = 0.05  # share of the remainder below which an effect is not worth reporting
 SHOWN = 1e-6  # share of a column that the parameters leave of it, below which it is one of them
 FOLDS = 8
 FEWEST = 6  # poses, below which no further effect can be judged

@@ -1,4 +1,4 @@
-"""The noise of a session's readings: instrument and arm, told apart by their lever.
+"""The noise of a session's readings: instrument and arm, separated by their lever.
 
 An instrument's noise is the same at every pose; the arm's repeatability comes through its joints,
 so that it grows with the lever and is shared between coordinates. Both sizes are estimated by
@@ -51,7 +51,7 @@ class Noise:
 
     @property
     def instrument(self) -> float:
-        """Return 1 sigma of one coordinate of a calm reading, the instrument alone (m)."""
+        """Return 1 sigma of one coordinate of an inlier, the instrument alone (m)."""
         return float(self.sizes[0])
 
     @property
@@ -141,7 +141,7 @@ def estimated(
 
     ``columns`` (N*k, p) are what was fitted, ``precision`` (p,) the inverse variances that held
     each number around zero, 0 for those that were free; ``left`` is what remains with all of them
-    at zero. ``kept`` (N,) bool leaves wild readings out.
+    at zero. ``kept`` (N,) bool leaves outliers out.
     """
     N, k = left.shape
     use = np.flatnonzero(kept)

@@ -1,7 +1,7 @@
 """The parameters of a calibration: which effects at which sites are to be found.
 
-Those that no readings of the kind at hand can tell from the others are left out by rank, the rest
-are base parameters: they carry what the left-out ones would add (Gautier, Khalil, IEEE Trans.
+Those that no readings of the kind at hand can separate from the others are left out by rank, the
+rest are base parameters: they carry what the left-out ones would add (Gautier, Khalil, IEEE Trans.
 Robotics and Automation 6 (1990) 368).
 """
 
@@ -182,8 +182,8 @@ def _sites(model: Model, named: str) -> list[tuple[str, Site]]:
 def _smaller(model: Model, term: Term, value: int) -> float:
     """Return how a joint that carries less than the arm's foot changes a usual size.
 
-    Where a curve bends is told by the moment at the joint itself: a wrist's is reached long before
-    the moment that the whole arm puts on its first joint.
+    Where a curve bends is determined by the moment at the joint itself: a wrist's is reached long
+    before the moment that the whole arm puts on its first joint.
     """
     if not CATALOGUE[term.effect].curved or term.site.joint is None:
         return 1.0

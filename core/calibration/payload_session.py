@@ -2,7 +2,7 @@
 
 At rest the sensor reads the weight of what hangs on it and a constant of its own. Turned against
 gravity the weight turns and the constant does not; both are linear in mass, mass times centre of
-gravity, and bias, so that a handful of orientations tells all ten numbers.
+gravity, and bias, so that a handful of orientations determines all ten numbers.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class PayloadCalibration:
     covariance: Array  # (10, 10)
     noise: tuple[float, float]  # N and Nm, 1 sigma of one axis of one reading
     residual: Array  # (N, 6) reading minus prediction
-    outliers: NDArray[np.int64]  # readings weighed down as wild
+    outliers: NDArray[np.int64]  # readings down-weighted as outlier
     verdict: str  # one sentence
     notes: tuple[str, ...]
 
@@ -86,8 +86,8 @@ def calibrate_payload(model: Model, q: Array, wrench: Array) -> PayloadCalibrati
     """Return mass, centre of gravity and sensor bias from readings at rest.
 
     ``q`` (N, n) rad, ``wrench`` (N, 6): ``ft_raw_wrench`` of docs/conventions.md, averaged at each
-    pose. Wild readings are weighed down and listed. Raises InputError where the readings do not
-    fit together, ExcitationError where the orientations do not tell load from bias.
+    pose. Outliers are down-weighted and listed. Raises InputError where the readings do not
+    fit together, ExcitationError where the orientations do not separate load from bias.
     """
     q, wrench = np.asarray(q, dtype=float), np.asarray(wrench, dtype=float)
     _check(model, q, wrench)
@@ -134,7 +134,7 @@ def _require_turning(columns: Array, count: int) -> None:
     if size[-1] < 0.02 * np.sqrt(count):
         raise ExcitationError(
             f"payload session: in {count} readings gravity hardly turns in the flange, so that "
-            "load and sensor bias cannot be told apart; expected orientations tens of degrees "
+            "load and sensor bias cannot be separated; expected orientations tens of degrees "
             "apart about two axes"
         )
 
@@ -156,7 +156,7 @@ def _told(values: Array, covariance: Array) -> tuple[Array, Array]:
 def _notes(mass: float, std: float, outliers: NDArray[np.int64]) -> tuple[str, ...]:
     notes = []
     if abs(mass) < LIGHT * std:
-        notes.append("nothing that weighs hangs on the sensor: a centre of gravity is not told")
+        notes.append("nothing that weighs hangs on the sensor: no centre of gravity can be found")
     elif mass < 0:
         notes.append(
             f"the load weighs {mass:.3f} kg: the sensor's signs or axes are not those of a log "
@@ -164,7 +164,7 @@ def _notes(mass: float, std: float, outliers: NDArray[np.int64]) -> tuple[str, .
         )
     if len(outliers):
         rows = ", ".join(str(int(r) + 1) for r in outliers)
-        notes.append(f"weighed down as wild: reading {rows}")
+        notes.append(f"down-weighted as outlier: reading {rows}")
     return tuple(notes)
 
 

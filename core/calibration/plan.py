@@ -35,9 +35,9 @@ class PlannedPose:
 
 @dataclass(frozen=True)
 class Expectation:
-    """What readings at some poses will tell, before anyone moves."""
+    """What readings at some poses will determine, before anyone moves."""
 
-    names: tuple[str, ...]  # of the parameters, as reports tell them
+    names: tuple[str, ...]  # of the parameters, as reports name them
     units: tuple[str, ...]
     std: Array  # (p,) 1 sigma; inf where the poses do not show it
     prior: Array  # (p,) usual size of each before the session

@@ -80,7 +80,7 @@ def weighed_system(
     """Return the system of ``left`` (N, k) divided by the noise and weighed, and the weights (N,).
 
     ``share`` (N,) are the numbers that the fit spent on each reading, so that small residuals of
-    readings with much influence are not taken for calm.
+    readings with much influence are not taken for inliers.
     """
     N, k = left.shape
     W = noise.whitener

@@ -1,4 +1,4 @@
-"""Which parameters no readings can tell from the others, whatever the poses.
+"""Which parameters no readings can separate from the others, whatever the poses.
 
 Parameters are taken one after the other; one stays if it changes readings at random poses in a way
 that the frames of the instrument and those before it do not. What is the sum of others is taken

@@ -1,4 +1,4 @@
-"""A calibration comes to rest: staged, then everything together, then the noise along with it."""
+"""A calibration converges: staged, then everything together, then the noise along with it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from gapbridge.core.metrology import Metrology
 Array = NDArray[np.float64]
 NOISES = 6  # times at most that the noise is estimated anew
 SAME = 0.02  # relative change of the noise that is none
-WILD = 0.1  # weight below which a reading counts as wild
+WILD = 0.1  # weight below which a reading counts as an outlier
 
 
 @dataclass(frozen=True)
@@ -32,12 +32,12 @@ class Rest:
     values: Array  # (p,)
     nuisance: Nuisance
     noise: Noise
-    weights: Array  # (N,) 0 wild, 1 calm
+    weights: Array  # (N,) 0 outlier, 1 inlier
     stuck: Mask  # (p,) on a bound
     covariance: Array  # (p, p)
     spent: float  # numbers that the fit spent
     system: System  # at rest, divided by the noise, weighed
-    settled: bool = True  # False: patience ended before the fit came to rest
+    settled: bool = True  # False: patience ended before the fit converged
 
     @property
     def freedom(self) -> float:
@@ -73,7 +73,7 @@ def come_to_rest(
     progress("fitting, look 1")
     at = _staged(problem, standing(problem, values, nuisance, noise), noise)
     at = descended(problem, at, noise)
-    for look in range(NOISES):  # the noise is told by what is left once the fit is at rest
+    for look in range(NOISES):  # the noise is determined by what is left once the fit is at rest
         progress(f"fitting, look {look + 2}")
         before, noise = noise, _noise(problem, at, noise)
         at = descended(problem, at, noise)
@@ -105,7 +105,7 @@ def _staged(problem: Problem, at: Standing, noise: Noise) -> Standing:
 
 
 def _noise(problem: Problem, at: Standing, noise: Noise) -> Noise:
-    """Return the noise that what is left over tells."""
+    """Return the noise that the residual implies."""
     J, F = at.columns
     left = problem.left(at.values, at.nuisance)
     assert left is not None

@@ -25,7 +25,7 @@ class Estimate:
     std: float  # 1 sigma
     unit: str
     expected_std: float | None = None  # what the plan had promised
-    shown: bool = True  # False: the data do not tell it; it stands where it stood
+    shown: bool = True  # False: the data do not determine it; it stands where it stood
     on_bound: bool = False
     freedom: float = np.inf  # degrees of freedom behind std: few make the interval wider
 
@@ -73,17 +73,17 @@ class Calibration:
     readings: Readings
     estimates: tuple[Estimate, ...]
     covariance: Array  # (p, p) of the estimates that are shown, in their order
-    combinations: tuple[str, ...]  # in words: what cannot be told apart
+    combinations: tuple[str, ...]  # in words: what cannot be separated
     before: Errors  # fitted poses, nominal model
     after: Errors
     held_out_before: Errors  # held-out poses
     held_out_after: Errors
-    outliers: NDArray[np.int64]  # rows of the readings that were weighed down as wild
+    outliers: NDArray[np.int64]  # rows of the readings that were down-weighted as outlier
     noise: float  # m, 1 sigma of one coordinate that the fit leaves
     repeatability: float  # m, 1 sigma of one coordinate, from repeated poses; nan: none were
     stations: tuple[Registration, ...]  # frame of each place of the instrument
     tcp_std: Array  # (M,) m, 1 sigma (3D) of the predicted TCP at the held-out poses
-    diagnosis: Diagnosis | None  # of what is left over; None where the readings do not allow it
+    diagnosis: Diagnosis | None  # of the residual; None where the readings do not allow it
     complete: bool  # True: nothing is left that a further effect could explain
     verdict: str  # one sentence
     notes: tuple[str, ...] = field(default=())

@@ -119,7 +119,7 @@ def at_odds(
     variance = posterior(part, narrow)[0] - covariance[np.ix_(mine, mine)]
     scale = 1 / bounds.held[mine]
     sizes, directions = np.linalg.eigh(variance * np.outer(scale, scale))
-    seen = sizes > 1e-4  # what differences alone hardly tell is no contradiction
+    seen = sizes > 1e-4  # what differences alone hardly determine is no contradiction
     seen &= sizes < 0.25
     if not seen.any():
         return None

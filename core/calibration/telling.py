@@ -1,4 +1,4 @@
-"""A calibration in words: its verdict, what cannot be told apart, what deserves a second look."""
+"""A calibration in words: its verdict, what cannot be separated, what deserves a second look."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MEMBER = 0.35  # share of a combination from which a parameter is named in it
 
 
 def combinations(parameters: Parameters, rest: Rest, shown: NDArray[np.bool_]) -> tuple[str, ...]:
-    """Return what these readings do not tell, or only together."""
+    """Return what these readings do not determine, or only together."""
     told = []
     names = parameters.names
     std = np.sqrt(np.diag(rest.covariance))
@@ -31,10 +31,10 @@ def combinations(parameters: Parameters, rest: Rest, shown: NDArray[np.bool_]) -
         best = partners[0] if partners else -1
         if best >= 0 and abs(correlation[i, best]) > CLOSE:
             what = "difference" if correlation[i, best] > 0 else "sum"
-            told.append(f"{names[i]}: these readings tell only its {what} with {names[best]}")
+            told.append(f"{names[i]}: these readings determine only its {what} with {names[best]}")
         elif others := _company(correlation, int(i)):
             company = ", ".join(names[j] for j in others)
-            told.append(f"{names[i]}: these readings tell it only together with {company}")
+            told.append(f"{names[i]}: these readings determine it only together with {company}")
         else:
             told.append(f"{names[i]}: these readings hardly show it; it stays near its beginning")
     for i in np.flatnonzero(shown):
@@ -68,7 +68,7 @@ def notes_of(
     notes = []
     if not rest.settled:
         notes.append(
-            "the fit did not come to rest: take its figures for where it stood, and fit fewer "
+            "the fit did not converge: take its figures for where it stood, and fit fewer "
             "effects or measure more poses"
         )
     bound = [e.name for e in estimates if e.on_bound]
@@ -76,7 +76,7 @@ def notes_of(
         notes.append(f"on their bound: {', '.join(bound)}")
     wild = np.flatnonzero(~rest.calm)
     if len(wild):
-        notes.append(f"{len(wild)} wild reading(s) weighed down")
+        notes.append(f"{len(wild)} outlier(s) down-weighted")
     if len(remainder.wild):
         rows = ", ".join(str(int(r) + 1) for r in remainder.wild)
         notes.append(f"held-out reading(s) far beyond what the fit promises: row {rows}")

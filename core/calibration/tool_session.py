@@ -38,7 +38,7 @@ class ToolCalibration:
     noise: float  # m, 1 sigma of one coordinate of one touch: hand, arm, and what the model lacks
     residual: Array  # (N,) m, how far each touch is from the fixed point or ball
     nominal_residual: Array  # (N,) m, the same with the tool that the cell had, point fitted
-    outliers: NDArray[np.int64]  # touches weighed down as wild
+    outliers: NDArray[np.int64]  # touches down-weighted as outlier
     verdict: str  # one sentence
     notes: tuple[str, ...]
 
@@ -57,7 +57,7 @@ def calibrate_tool(
     """Return where the tip sits, from joint angles ``q`` (N, n) rad at which it touched.
 
     ``distance`` (m) is 0 where the tip itself was brought onto a fixed point, else the distance of
-    the two balls' centres when they touch (the sum of their radii). Wild touches are weighed down
+    the two balls' centres when they touch (the sum of their radii). Outliers are down-weighted
     and listed. Raises InputError where the angles do not fit the arm, ExcitationError where the
     orientations leave the tool open.
     """
@@ -76,7 +76,7 @@ def calibrate_tool(
     notes: tuple[str, ...] = ()
     if len(inner.outliers):
         rows = ", ".join(str(int(r) + 1) for r in inner.outliers)
-        notes = (f"weighed down as wild: touch {rows}",)
+        notes = (f"down-weighted as outlier: touch {rows}",)
     return ToolCalibration(
         values[:3].copy(), values[3:].copy(), estimates, inner.covariance[:3, :3].copy(),
         float(inner.noise[0]), _off(position, rotation, values, distance),
@@ -157,7 +157,7 @@ def _require_turning(A: Array, count: int) -> None:
     if size[-1] < TURNED * np.sqrt(count) / 4:
         raise ExcitationError(
             f"tool session: in {count} touches the tool hardly turns, or about one axis only, so "
-            "that its tip is not told; expected orientations tens of degrees apart about two axes"
+            "that its tip is not found; expected orientations tens of degrees apart about two axes"
         )
 
 

@@ -33,7 +33,7 @@ from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 BROKEN = 1e-3  # chance below which a promise counts as broken
-BESIDE = 6.0  # of chi-square: suspects that explain as much are told beside the best one
+BESIDE = 6.0  # of chi-square: suspects that explain as much are reported beside the best one
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def verify(
     left = how.residual(model, readings, nuisance)
     if left.size <= how.layout(readings).size + 1:
         raise ExcitationError(
-            f"verification: {len(readings)} reading(s) only tell where the instrument stands, "
+            f"verification: {len(readings)} reading(s) only determine where the instrument stands, "
             "expected more poses"
         )
     task, spread = _task(model, how, readings, nuisance, promise, parameters, metrology)

@@ -47,8 +47,8 @@ CHANNELS: Mapping[str, Observe] = {
 }
 
 
-# samples that a diagnosis looks at: more cost time and tell hardly more
-MOST = {"position": 1200, "wrench": 300, "tracking": 300, "torque": 900}
+# samples that a diagnosis looks at: more cost time and add hardly anything
+MOST = {"position": 1200, "wrench": 300, "tracking": 300, "torque": 300}
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,7 @@ def _thinned(
     if seen.channel != "position":
         return thinned(seen, MOST[seen.channel])
     take = np.unique(np.linspace(0, len(seen.rows) - 1, MOST["position"]).astype(int))
-    # last motions come from neighbouring rows: they are told before rows are left out
+    # last motions come from neighbouring rows: they are reported before rows are left out
     approach = log.approach()
     columns = dict(log.columns) | ({} if approach is None else {"approach": approach})
     part = observe(model, replace(log, columns=columns).select(seen.rows[take]), metrology)
@@ -394,7 +394,7 @@ def _channel_findings(channel: ChannelDiagnosis, log: Log) -> list[str]:
     if len(wild):
         rows = ", ".join(_line_of(log, int(r)) for r in wild[:8])
         told.append(
-            f"{channel.channel}: {len(wild)} wild reading(s) set aside (row {rows}"
+            f"{channel.channel}: {len(wild)} outlier(s) excluded (row {rows}"
             f"{', ...' if len(wild) > 8 else ''} of the file)"
         )
     for position_, reason in channel.judgement.withdrawn:

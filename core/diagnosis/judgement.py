@@ -32,10 +32,9 @@ from gapbridge.core.diagnosis.regions import parts
 from gapbridge.core.diagnosis.remainder import links_withstand, withstanding
 from gapbridge.core.diagnosis.residual_structure import dependence, structure_p_value
 from gapbridge.core.diagnosis.selection.bent import not_bent
-from gapbridge.core.diagnosis.selection.candidate import shows_alone
 from gapbridge.core.diagnosis.selection.local_search import rivals
 from gapbridge.core.diagnosis.selection.problem import Found, Space
-from gapbridge.core.diagnosis.selection.refit import may_be_none
+from gapbridge.core.diagnosis.selection.refit import worth
 from gapbridge.core.diagnosis.selection.selection import Selection
 
 Array = NDArray[np.float64]
@@ -116,7 +115,7 @@ def _no_value(selection: Selection) -> dict[int, str]:
     """Return positions of terms that only a bound holds, or whose value may as well be none."""
     found = dict.fromkeys(
         not_bent(selection.terms, selection.covariance),
-        "its curve cannot be told from a straight line",
+        "its curve cannot be distinguished from a straight line",
     )
     for position, (c, term) in enumerate(zip(selection.term_index, selection.terms, strict=True)):
         if c in selection.block:
@@ -127,21 +126,16 @@ def _no_value(selection: Selection) -> dict[int, str]:
             for p, v in zip(candidate.parameters, term.values, strict=False)
         ):
             found[position] = "its value stands on its bound"
-        if may_be_none(term, spread):
+        if worth(term, spread) < 1:
             found[position] = "its value may as well be none"
     return found
 
 
 def _without_mass(selection: Selection, stays: Sequence[int]) -> list[int]:
     """Return the candidates that show nothing without an effect that is not accused beside them."""
-    space = selection.space
-    families = {space.candidates[c].family for c in stays}
-    return [
-        c for c in stays
-        if (needed := space.candidates[c].effect.shown_by) is not None
-        and needed.effect not in families
-        and not shows_alone(selection.observation, space.candidates[c])
-    ]  # fmt: skip
+    own = selection.space.candidates
+    families = {"", *(own[c].family for c in stays)}
+    return [c for c in stays if own[c].beside not in families]
 
 
 def _gainless(selection: Selection, stays: Sequence[int], held: HeldOut) -> list[int]:
@@ -227,7 +221,7 @@ def _too_much_left(selection: Selection) -> float:
 def pure_error(left: Array, groups: NDArray[np.int64]) -> tuple[float, int]:
     """Return the variance of one coordinate among repeats of a pose, and its degrees of freedom.
 
-    Repeats under other loads count too: the leftover of a good model does not depend on them.
+    Repeats under other loads count too: the residual of a good model does not depend on them.
     """
     total, freedom = 0.0, 0
     for group in np.unique(groups):

@@ -41,7 +41,7 @@ class Observation:
     weight: Array  # (k,) 1/unit: makes the coordinates comparable (1 for the channel's own unit)
     sigma: float  # 1 sigma of one coordinate that is known beforehand; 0: nothing is
     sigma_is_whole: bool  # True: nothing comes on top of sigma
-    quantities: Mapping[str, Array]  # column name -> (N,): what a leftover may depend on
+    quantities: Mapping[str, Array]  # column name -> (N,): what a residual may depend on
     groups: NDArray[np.int64]  # (N,) condition of each sample: held out as a whole
     rows: NDArray[np.int64]  # (N,) row of each sample in the log
     axes: tuple[str, ...]  # name of each coordinate

@@ -1,6 +1,6 @@
-"""The leftover: whether it has structure that no accepted term accounts for, and what it follows.
+"""The residual: whether it has structure that no accepted term accounts for, and what it follows.
 
-The test is a variance-component score test (Goeman's global test): the leftover against the sum of
+The test is a variance-component score test (Goeman's global test): the residual against the sum of
 all columns that anything in the catalogue or any smooth function could make. Many small traces add
 up in it where each alone would drown in the number of hypotheses tried.
 """
@@ -65,7 +65,7 @@ def structure_p_value(
 
 
 def _squares_along(X: Array, columns: NDArray[np.int64], sizes: Array, left: Array) -> Array:
-    """Return the sum of squares of every leftover (D, m) along the columns, a few at once."""
+    """Return the sum of squares of every residual (D, m) along the columns, a few at once."""
     total = np.zeros(len(left))
     for few in np.array_split(np.arange(len(columns)), 1 + len(columns) // AT_ONCE):
         along = left @ (X[:, columns[few]] / sizes[few])
@@ -100,7 +100,7 @@ def dependence(
     groups: NDArray[np.int64],
     seed: int = 0,
 ) -> list[tuple[str, float]]:
-    """Return quantities and the share of the leftover that each predicts held out, best first.
+    """Return quantities and the share of the residual that each predicts held out, best first.
 
     ``groups`` (m,) says which rows of the sample space are held out together.
     """

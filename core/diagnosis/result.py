@@ -115,7 +115,7 @@ def _not_shown(effect: str, term: Term, deviation: Array, arm: Arm) -> list[str]
     ):
         if spread == 0 or spread > OPEN * parameter.scale:
             name = CATALOGUE[effect].label(term.site, parameter)
-            notes.append(f"{name} is not shown by these data: others can stand in for it")
+            notes.append(f"{name} is not identifiable from these data: others can stand in for it")
     return notes
 
 

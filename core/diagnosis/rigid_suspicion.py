@@ -1,4 +1,4 @@
-"""A cell without flexibilities, a soft arm: more causes than a short log can tell one by one.
+"""A cell without flexibilities, a soft arm: more causes than a short log can determine one by one.
 
 The catalogue holds every joint's softness, but a search among all effects wants proof for each;
 a fit that asks for the softness alone does not.

@@ -87,7 +87,7 @@ def next_measurements(
 def _questions(
     model: Model, channel: ChannelDiagnosis, trials: Trials, predict: Predict
 ) -> Iterator[_Question]:
-    """Yield what is open: effects to be told apart, and effects that the log cannot show."""
+    """Yield what is open: effects to be separated, and effects that the log cannot show."""
     selection = channel.selection
     space, found = selection.working, selection.found
     for position in channel.judgement.accused:

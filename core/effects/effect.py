@@ -182,16 +182,16 @@ class Effect(ABC):
         return ()
 
     def reported(self, arm: Arm, term: Term, covariance: Array | None) -> tuple[Reported, ...]:
-        """Return the term's parameters as they are told; ``covariance`` is (k, k) or None."""
-        told = []
+        """Return the term's parameters as they are reported; ``covariance`` is (k, k) or None."""
+        lines = []
         for k, parameter in enumerate(self.parameters(arm, term.site)):
             std = None
             if covariance is not None and k < len(covariance):  # the rest was not fitted
                 std = float(np.sqrt(max(covariance[k, k], 0.0)))
-            told.append(
+            lines.append(
                 Reported(self.label(term.site, parameter), term.values[k], std, parameter.unit)
             )
-        return tuple(told)
+        return tuple(lines)
 
     def label(self, site: Site, parameter: Parameter) -> str:
         """Return the public name of a parameter: ``axial_compliance_2``, ``link_geometry_3_a``."""

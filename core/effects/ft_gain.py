@@ -22,8 +22,8 @@ class FtGain(Effect):
     """Each axis of the flange sensor is scaled: reading = (1 + gain) wrench, axis by axis.
 
     Comes from a wrong calibration matrix, an amplifier, an overload. An axis whose wrench stays
-    zero tells nothing of its gain. With one payload for the whole log, six equal gains are the
-    same as another payload; other payloads or pulls separate them.
+    zero contains nothing about its gain. With one payload for the whole log, six equal gains are
+    the same as another payload; other payloads or pulls separate them.
     Source: Hollerbach, Khalil, Gautier, "Model Identification", Springer Handbook of
     Robotics (2016), ch. 6.
     """
@@ -32,6 +32,7 @@ class FtGain(Effect):
     title = "force sensor scale is off"
     order = 60
     scales_reading = True
+    shown_by = Term("payload", Site(), (1.0,))
     channels = ("wrench",)
     motion = "a load on every axis: the flange turned every way, with pulls or several payloads"
     instead = "divide the sensor's readings by 1 + gain"

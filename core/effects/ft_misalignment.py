@@ -21,7 +21,7 @@ class FtMisalignment(Effect):
 
     r is the rotation vector of the sensor's axes in flange axes; force and torque turn alike,
     about the flange origin. Comes from a wrong bolt pattern or adapter. About z it looks like a
-    joint offset of the last joint, which the encoders and a pose measurement tell apart.
+    joint offset of the last joint, which the encoders and a pose measurement separate.
     Source: Hollerbach, Khalil, Gautier, "Model Identification", Springer Handbook of
     Robotics (2016), ch. 6.
     """
@@ -30,6 +30,7 @@ class FtMisalignment(Effect):
     title = "force sensor is turned"
     order = 55
     scales_reading = True
+    shown_by = Term("payload", Site(), (1.0,))
     channels = ("wrench",)
     motion = "loads along at least two directions of the flange"
     instead = "turn the sensor's frame, or its readings"

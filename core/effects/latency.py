@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 
 class Latency(JointEffect):
-    """The joint does what it was told, but later: actual_q(t) = target_q(t - latency).
+    """The joint does what it was commanded, but later: actual_q(t) = target_q(t - latency).
 
     Comes from communication, buffering, interpolation. A delay of the whole arm shows as the same
-    delay at every joint that moved; told per joint, because one joint's drive can have it alone
-    and a joint that stood still cannot tell. Differs from a lag in that corners stay sharp: only
+    delay at every joint that moved; reported per joint, because one joint's drive can have it alone
+    and a joint that stood still cannot show it. Differs from a lag in that corners stay sharp: only
     fast changes of the command separate the two, slow motion gives their sum.
     Exact: the command is interpolated by a cubic spline at t - latency. Rows
     right after the start of a recording, or after a gap, hold the first command.

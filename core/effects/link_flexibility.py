@@ -17,7 +17,7 @@ class LinkFlexibility(Effect):
     """A link bends as a cantilever from its joint to the next, loaded at its far end.
 
     One EI a link; the parameter is 1/EI. Deflection F L^3/3EI + M L^2/2EI, slope F L^2/2EI + ML/EI;
-    the link's own weight is left out. A near twin of the compliance of its two joints, told apart
+    the link's own weight is left out. A near twin of the compliance of its two joints, separated
     by force and moment that change separately.
     Source: Euler-Bernoulli cantilever; Klimchik, Pashkevich, "Complete stiffness model".
     """

@@ -61,7 +61,8 @@ class LinkGeometry(Effect):
     """A link is longer, offset or twisted otherwise than its drawing: a, d, alpha of a link.
 
     Comes from machining and assembly; for UR arms it is what the factory calibration holds. Between
-    parallel axes d of one link cannot be told from d of the next, and a small twist beta about y is
+    parallel axes d of one link cannot be distinguished from d of the next, and a small twist beta
+    about y is
     added (Hayati), because alpha alone cannot describe a slight misalignment there. The last link
     is part of the tool frame. The joint's zero is ``joint_offset``.
     Source: Hayati, Mirmirani, J. Robotic Systems 2 (1985) 397; standard DH rows.

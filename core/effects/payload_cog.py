@@ -23,7 +23,7 @@ class PayloadCog(Effect):
     Comes from a drawing of the gripper without its hoses, or a part that is held off centre. Shows
     as moment at the flange sensor, as joint torque and as bending; needs a payload, and poses that
     turn the flange against gravity. Under one constant load the last link's ``link_cog`` is the
-    same; a second payload tells them apart. A shift along gravity alone shows nothing.
+    same; a second payload separates them. A shift along gravity alone shows nothing.
     Source: Hollerbach, Khalil, Gautier, "Model Identification", Springer Handbook of Robotics
     (2016), ch. 6.
     """

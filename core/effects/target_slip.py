@@ -23,7 +23,7 @@ class TargetSlip(Effect):
     ``timestamp``, or the number of the row where the log has none) have the tool centre point
     there; live setpoints always do. The moment is found by likelihood over all rows, so it lies
     between two of them. A joint that slips turns with the joints before it, a target with the
-    flange: poses that differ in the last joints tell them apart. A shift that was there all the
+    flange: poses that differ in the last joints separate them. A shift that was there all the
     time is ``tool_frame``.
     Source: Page, Biometrika 41 (1954) 100; Hinkley, Biometrika 57 (1970) 1, on change points.
     """

@@ -18,7 +18,7 @@ from gapbridge.core.effects import flexibility_effects
 from gapbridge.core.estimation.compliance_fit import Linear, Mask, solve
 
 Array = NDArray[np.float64]
-VAGUE = 0.3  # of the prior's sigma: what is known no better is not shown
+VAGUE = 0.3  # of the prior's sigma: what is known no better counts as not identifiable
 VISIBLE = float(
     np.sqrt(VAGUE**-2 - 1)
 )  # length of a column, in units of noise, that is shown alone
@@ -32,7 +32,7 @@ class Shown:
 
     kept: Mask  # (2n,) fitted; the others stay at the model's value
     covariance: Array  # (2n, 2n): of the kept ones, the others held; prior's square for the others
-    told: tuple[str, ...]  # what is not shown, or only together
+    reported: tuple[str, ...]  # what is not identifiable, or only in combination
 
 
 def choose(linear: Linear, prior: tuple[Array, float], nonnegative: bool) -> Mask:
@@ -82,9 +82,9 @@ def what_is_shown(linear: Linear, kept: Mask, sigma: float) -> Shown:
     root = _root(linear, kept, sigma) * sigma
     covariance[np.ix_(kept, kept)] = root @ root.T
     columns = linear.matrix * sigma
-    told = [_held(int(i), columns, kept) for i in np.flatnonzero(~kept)]
-    told += _faint(columns, kept) + _alike(covariance, kept)
-    return Shown(kept, covariance, tuple(told))
+    reported = [_held(int(i), columns, kept) for i in np.flatnonzero(~kept)]
+    reported += _faint(columns, kept) + _alike(covariance, kept)
+    return Shown(kept, covariance, tuple(reported))
 
 
 def name(i: int | np.integer[Any], count: int) -> str:
@@ -109,10 +109,10 @@ def _held(i: int, columns: Array, kept: Mask) -> str:
         ]
         if members and left < VAGUE * size:
             return (
-                f"{this}: not shown alone by these data, it acts like {' '.join(members)}; what "
-                "they make together is written there, this one stays at the model's value"
+                f"{this}: not identifiable alone from these data, it acts like {' '.join(members)}"
+                "; what they make together is written there, this one stays at the model's value"
             )
-    return f"{this}: not shown by these data, stays at the model's value"
+    return f"{this}: not identifiable from these data, stays at the model's value"
 
 
 def _faint(columns: Array, kept: Mask) -> list[str]:
@@ -124,30 +124,30 @@ def _faint(columns: Array, kept: Mask) -> list[str]:
     if kept.any():
         left = left - columns[:, kept] @ np.linalg.lstsq(columns[:, kept], left, rcond=1e-9)[0]
     values, vectors = np.linalg.eigh(left.T @ left)
-    told = []
+    reported = []
     for value, vector in zip(values, vectors.T, strict=True):
         members = np.flatnonzero(np.abs(vector) > 0.3 * np.abs(vector).max())
         if value > VISIBLE**2 and len(members) > 1:
             sign = np.sign(vector[members[0]])
             parts = [f"{sign * vector[k]:+.2f} {name(held[k], len(kept))}" for k in members]
-            told.append(
+            reported.append(
                 f"{' '.join(parts)}: shown together, none of them alone; they stay at the model's "
                 "values"
             )
-    return told
+    return reported
 
 
 def _alike(covariance: Array, kept: Mask) -> list[str]:
-    """Return the pairs of kept flexibilities that the data hardly tell apart."""
-    told, std, count = [], np.sqrt(np.diag(covariance)), len(kept)
+    """Return the pairs of kept flexibilities that the data hardly separate."""
+    reported, std, count = [], np.sqrt(np.diag(covariance)), len(kept)
     for i in np.flatnonzero(kept):
         for j in np.flatnonzero(kept):
             if j > i and std[i] > 0 and std[j] > 0:
                 correlation = covariance[i, j] / (std[i] * std[j])
                 if abs(correlation) > CLOSE:
                     what = "difference" if correlation > 0 else "sum"
-                    told.append(
+                    reported.append(
                         f"{name(i, count)} and {name(j, count)}: mostly their {what} is known "
                         f"(correlation {correlation:+.3f})"
                     )
-    return told
+    return reported

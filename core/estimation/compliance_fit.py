@@ -28,9 +28,9 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 ROUNDS = 12
 NUISANCE_ROUNDS = 20
-SETTLED = 1e-8  # relative step at which a fit has come to rest
+CONVERGED = 1e-8  # relative step at which a fit has converged
 RANK = 1e-10  # singular values of the nuisances below this share are rounding
-WILD = 5.0  # standard deviations beyond which a reading counts as wild
+OUTLIER = 5.0  # standard deviations beyond which a reading counts as an outlier
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Linear:
 
 @dataclass(frozen=True)
 class Fit:
-    """Where a fit came to rest."""
+    """State of a fit that has converged."""
 
     model: Model  # with the flexibilities and the tool point found
     frame: Registration | Placements
@@ -194,7 +194,7 @@ def fit_nuisances(model: Model, data: Data) -> Fit:
         flat = columns.reshape(gap.size, -1)
         step = np.linalg.lstsq(flat, (gap * per_cell).ravel(), rcond=RANK)[0]
         model, frame = moved(model, frame, step)
-        if np.abs(step).max() < SETTLED:
+        if np.abs(step).max() < CONVERGED:
             break
     return Fit(model, frame, weights)
 
@@ -218,7 +218,7 @@ def placed_gap(model: Model, data: Data) -> Array:
         step = np.zeros(one.nuisances)
         step[free] = np.linalg.lstsq(flat, (gap * per_cell).ravel(), rcond=RANK)[0]
         model, frame = moved(model, frame, step)
-        if np.abs(step).max() < SETTLED:
+        if np.abs(step).max() < CONVERGED:
             break
     return residual(model, one, frame)[0]
 
@@ -253,7 +253,7 @@ def fit_flexibilities(
     for _ in range(rounds):
         before = now.flexibility
         now = _round(now, data, kept, prior, nonnegative)
-        if np.abs(now.flexibility - before).max() < SETTLED * max(np.abs(before).max(), 1e-12):
+        if np.abs(now.flexibility - before).max() < CONVERGED * max(np.abs(before).max(), 1e-12):
             break
     return now
 
@@ -373,7 +373,7 @@ def per_cell_of(weights: Array, scale: Array, width: int) -> Array:
 
 
 def _robust_weights(gap: Array) -> tuple[Array, Array]:
-    """Return weights (N,) (Tukey's biweight on wild rows) and the noise scale of each unit."""
+    """Return weights (N,) (Tukey's biweight on outliers) and the noise scale of each unit."""
 
     def middle(part: Array) -> float:
         return float(np.median(np.abs(part)))
@@ -391,8 +391,8 @@ def noise_scale(middle: float, turned: float | None) -> Array:
 def weights_at(gap: Array, scale: Array) -> Array:
     """Return the weights (N,) of gaps (N, 3 or 6) where the noise is ``scale`` (2,)."""
     distance = np.linalg.norm(gap / np.repeat(scale, 3)[: gap.shape[1]], axis=1)
-    limit = WILD * np.sqrt(gap.shape[1])
+    limit = OUTLIER * np.sqrt(gap.shape[1])
     weights = np.clip(1 - (distance / limit) ** 2, 0, 1) ** 2
-    # below two deviations nothing is weighed down: clean data keep their full information
+    # below two deviations nothing is down-weighted: clean data keep their full information
     weights = np.where(distance < 2 * np.sqrt(gap.shape[1]), 1.0, weights)
     return np.asarray(np.maximum(weights, 1e-12))

@@ -29,7 +29,7 @@ from gapbridge.core.estimation.hierarchical_prior import (
 from gapbridge.core.estimation.hierarchical_sampling import draws
 
 Array = NDArray[np.float64]
-MOST = 400  # arms from which scatters are estimated: more tell hardly more
+MOST = 400  # arms from which scatters are estimated: more add hardly anything
 SURE = 100  # arms from which on the scatters count as known
 NOISE_WEIGHT = 10.0  # coordinates that the type's noise counts for beside a session's own
 
@@ -228,7 +228,7 @@ def _sessions(
 
 
 def _without(data: Information, now: Type) -> Array:
-    """Return each session's arm (S, p) as all its other sessions tell it."""
+    """Return each session's arm (S, p) as all its other sessions report it."""
     J, k = through(data.M, now.omega, data.k)
     J, k = data.summed(J)[data.arm] - J, data.summed(k)[data.arm] - k
     own = np.linalg.inv(np.eye(len(now.mean)) + now.tau[:, None] * J)

@@ -1,4 +1,4 @@
-"""What one session tells of the joint flexibilities, in as few numbers as it takes.
+"""What one session says about the joint flexibilities, in as few numbers as it takes.
 
 The session's poses, its instrument's frame and its tool point are folded into 2n equations for the
 2n flexibilities, so that a fleet's fit needs neither logs nor models (hierarchical.py).
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gapbridge.core.effects.effect import typical_moment
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.estimation.compliance_fit import (
-    WILD,
+    OUTLIER,
     Data,
     Fit,
     fit_flexibilities,
@@ -44,15 +44,15 @@ class Evidence:
 
     matrix: Array  # (2n, 2n) m per rad/Nm
     right: Array  # (2n,) m
-    squares: float  # m2, left over by the best flexibilities
+    squares: float  # m2, remaining with the best flexibilities
     freedom: float  # coordinates, less what was fitted
     least: float  # m, 1 sigma of one coordinate: the instrument alone
     poses: int
-    wild: int  # poses set aside
+    outliers: int  # poses left out
 
 
 def evidence(model: Model, log: Log, metrology: Metrology | None = None) -> Evidence:
-    """Return what a log tells of the flexibilities of an arm.
+    """Return what a log says about the flexibilities of an arm.
 
     The equations are taken at the shape that fits the log best, so that their linear form holds.
     A log that excites little is no error here: it says little, and weighs little. Raises LogError
@@ -98,17 +98,17 @@ def _folded(fit: Fit, data: Data, metrology: Metrology) -> Evidence:
     gap, poses = residual(fit.model, data, fit.frame)
     width, count = gap.shape[1], 2 * fit.model.arm.n
     units = _units(gap)
-    calm = _calm(gap * units, count + data.nuisances, metrology.sigma)
-    if not calm.any():
-        raise ExcitationError("found wild readings alone, expected measured poses")
-    unit = units * np.ones((int(calm.sum()), 1))
-    form = fit.model.linear_form(data.q, data.loads).regressor[calm, :width]
+    inlier = _inliers(gap * units, count + data.nuisances, metrology.sigma)
+    if not inlier.any():
+        raise ExcitationError("found outliers alone, expected measured poses")
+    unit = units * np.ones((int(inlier.sum()), 1))
+    form = fit.model.linear_form(data.q, data.loads).regressor[inlier, :width]
     A = (form * unit[..., None]).reshape(-1, count)
-    b = (gap[calm] * unit).ravel() + A @ fit.flexibility
+    b = (gap[inlier] * unit).ravel() + A @ fit.flexibility
     whole = np.column_stack([A, b])
     spent = 0
     if data.nuisances:
-        columns = nuisance_columns(fit.model, poses, width)[calm] * unit[..., None]
+        columns = nuisance_columns(fit.model, poses, width)[inlier] * unit[..., None]
         Q = orthonormal(columns.reshape(len(A), -1))
         whole, spent = whole - Q @ (Q.T @ whole), Q.shape[1]
     R = np.zeros((count + 1, count + 1))
@@ -116,25 +116,25 @@ def _folded(fit: Fit, data: Data, metrology: Metrology) -> Evidence:
     R[: len(upper)] = upper
     U, size, _ = np.linalg.svd(R[:count, :count])
     U = U[:, size > RANK * size.max()]
-    # what no flexibility reaches is left over too
+    # what no flexibility reaches remains too
     right = U @ (U.T @ R[:count, count])
     squares = float(np.sum(R[:, count] ** 2) - right @ right)
     return Evidence(
         R[:count, :count], right, max(squares, 0.0),
         max(float(A.shape[0] - spent - U.shape[1]), 0.0), metrology.sigma,
-        int(calm.sum()), int((~calm).sum()),
+        int(inlier.sum()), int((~inlier).sum()),
     )  # fmt: skip
 
 
-def _calm(gap: Array, spent: int, least: float) -> NDArray[np.bool_]:
-    """Return the rows (N,) that are no wild readings.
+def _inliers(gap: Array, spent: int, least: float) -> NDArray[np.bool_]:
+    """Return the rows (N,) that are no outliers.
 
     ``spent`` numbers were fitted to them; ``least`` (m) is the noise that there is in any case.
     """
     # of few poses the fit takes up much of the noise: what is left understates it
     share = max(1 - spent / gap.size, 0.1)
     scale = max(1.4826 * float(np.median(np.abs(gap))) / np.sqrt(share), least)
-    limit = WILD * scale * np.sqrt(gap.shape[1])
+    limit = OUTLIER * scale * np.sqrt(gap.shape[1])
     return np.asarray(np.linalg.norm(gap, axis=1) < limit)
 
 

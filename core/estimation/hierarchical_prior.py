@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 ROUNDS = 400
-SETTLED = 1e-5  # relative change of every scatter at which it has come to rest
+CONVERGED = 1e-5  # relative change of every scatter at which it has converged
 SPREAD_WEIGHT = 3.0  # arms that the scatter of all joints counts for beside a joint's own
 WEAK = 0.1  # of a type's values, per usual flexibility: what no session shows stays at the nominal
-VAGUE = 0.3  # share of that sigma: a value that is known no better is not shown
+VAGUE = 0.3  # share of that sigma: a value that is known no better counts as not identifiable
 BEGIN = 0.3  # relative scatter of arms to begin with
 SMALLEST, LARGEST = 0.01, 2.0  # relative scatters that are believed
 
@@ -99,7 +99,7 @@ def estimated(data: Information, centre: Array) -> Type:
         if repeated:
             change = max(change, float(np.abs(np.log(new_omega / omega)).max()))
         tau, omega = new_tau, new_omega
-        if change < SETTLED:
+        if change < CONVERGED:
             break
     return with_mean(data, tau, omega, centre)
 

@@ -1,4 +1,4 @@
-"""Scatters as surely as a fleet tells them: draws from what is believed of them given the data.
+"""How well a fleet determines its scatters: draws from their posterior given the data.
 
 With few arms the scatter between them is itself uncertain, and intervals that take it as known are
 too narrow (Kass, Steffey, J. Am. Stat. Assoc. 84 (1989) 717). Gibbs sampling (Gelfand, Smith,

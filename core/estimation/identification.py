@@ -47,18 +47,18 @@ UNSEEN = float("nan")
 class Identification:
     """Flexibilities found, what they rest on and how far they carry.
 
-    All four rms are of one coordinate over the same rows, wild readings left out; frame and tool
+    All four rms are of one coordinate over the same rows, outliers left out; frame and tool
     point are fitted before as well as after, and the degrees of freedom spent are counted for both.
     """
 
     model: Model  # with the flexibilities, and the tool point that ``tool_offset`` moves
     axial: Array  # (n,) rad/Nm
     radial: Array  # (n,) rad/Nm
-    std_axial: Array  # (n,) rad/Nm, 1 sigma; the prior's where not shown
-    std_radial: Array  # (n,) rad/Nm, 1 sigma; the prior's where not shown
+    std_axial: Array  # (n,) rad/Nm, 1 sigma; the prior's where not identifiable
+    std_radial: Array  # (n,) rad/Nm, 1 sigma; the prior's where not identifiable
     covariance: Array  # (2n, 2n), axial then radial, of those shown with the others held
     identifiable: Mask  # (2n,): shown by the data; the others stand at the model's value
-    combinations: tuple[str, ...]  # what the data cannot tell apart or do not show
+    combinations: tuple[str, ...]  # what the data cannot separate or do not show
     registration: Registration | Placements  # one frame, or one a session
     tool_offset: Array  # (3,) m, flange axes: found tool point minus the cell's; 0 if registered
     samples: int
@@ -66,7 +66,7 @@ class Identification:
     remaining_rms: float  # m, after
     gap_rms_held_out: float  # m, before, on poses that the fit did not see; nan: too few poses
     remaining_rms_held_out: float  # m, after, on the same poses
-    outliers: NDArray[np.int64]  # rows weighed down as wild
+    outliers: NDArray[np.int64]  # rows down-weighted as outlier
     notes: tuple[str, ...]
     remaining_rms_new_region: float = UNSEEN  # m, folds are regions of joint space
     remaining_rms_new_session: float = UNSEEN  # m, folds are sessions
@@ -121,18 +121,18 @@ def identify_compliance(
     centre = flexibilities(model)
     scale = prior_std if np.isfinite(prior_std) else usual
     task = _Task((centre, prior_std), scale, nonnegative)
-    tell = progress or (lambda text: None)
-    tell("fitting")
+    emit = progress or (lambda text: None)
+    emit("fitting")
     before = fit_nuisances(model, data)
     fit, shown = task.run(before, data)
-    tell("checking on held-out poses")
-    calm = fit.weights > 1e-6
-    held_out = _held_out(model, data, task, calm)
+    emit("checking on held-out poses")
+    inlier = fit.weights > 1e-6
+    held_out = _held_out(model, data, task, inlier)
     found = _result(model, data, used, (before, fit), shown, held_out)
     return replace(
         found,
-        remaining_rms_new_region=_in_new_regions(model, data, task, calm),
-        remaining_rms_new_session=_in_new_sessions(model, data, task, calm),
+        remaining_rms_new_region=_in_new_regions(model, data, task, inlier),
+        remaining_rms_new_session=_in_new_sessions(model, data, task, inlier),
     )
 
 
@@ -217,8 +217,8 @@ def pose_groups(q: Array, tolerance: float = 1e-3) -> NDArray[np.int64]:
     return groups
 
 
-def _held_out(model: Model, data: Data, task: _Task, calm: Mask) -> tuple[float, float]:
-    """Return the rms before and after over calm rows of poses left out; nan: too few poses."""
+def _held_out(model: Model, data: Data, task: _Task, inlier: Mask) -> tuple[float, float]:
+    """Return the rms before and after over inlier rows of poses left out; nan: too few poses."""
     groups = pose_groups(data.q[:2000]) if len(data.q) <= 2000 else np.arange(len(data.q))
     poses = int(groups.max()) + 1
     if poses < 2 * FOLDS:
@@ -226,7 +226,7 @@ def _held_out(model: Model, data: Data, task: _Task, calm: Mask) -> tuple[float,
     fold = np.random.default_rng(0).permutation(poses)[groups] % FOLDS
     left: tuple[list[Array], list[Array]] = ([], [])
     for k in range(FOLDS):
-        seen, unseen = data.part(fold != k), data.part((fold == k) & calm)
+        seen, unseen = data.part(fold != k), data.part((fold == k) & inlier)
         if not len(unseen.q):
             continue
         before = fit_nuisances(model, seen)
@@ -235,13 +235,13 @@ def _held_out(model: Model, data: Data, task: _Task, calm: Mask) -> tuple[float,
     return _rms(np.vstack(left[0])), _rms(np.vstack(left[1]))
 
 
-def _in_new_regions(model: Model, data: Data, task: _Task, calm: Mask) -> float:
-    """Return the rms over calm rows of regions of joint space left out; nan: too few poses."""
+def _in_new_regions(model: Model, data: Data, task: _Task, inlier: Mask) -> float:
+    """Return the rms over inlier rows of regions of joint space left out; nan: too few poses."""
     if len(np.unique(np.round(data.q, 3), axis=0)) < 2 * FOLDS:
         return UNSEEN
     fold, left = joint_regions(data.q, FOLDS), []
     for k in range(int(fold.max()) + 1):
-        seen, judged = data.part(fold != k), (fold == k) & calm
+        seen, judged = data.part(fold != k), (fold == k) & inlier
         if data.session is not None and seen.session is not None:
             judged &= np.isin(data.session, _placed_sessions(seen))
         if not judged.any() or 3 * len(seen.q) <= data.nuisances + 2:
@@ -257,13 +257,13 @@ def _placed_sessions(data: Data) -> list[int]:
     return [s for s in range(data.sessions) if 3 * int((data.session == s).sum()) >= 12]
 
 
-def _in_new_sessions(model: Model, data: Data, task: _Task, calm: Mask) -> float:
-    """Return the rms over calm rows of sessions left out, each placed on itself; nan: only one."""
+def _in_new_sessions(model: Model, data: Data, task: _Task, inlier: Mask) -> float:
+    """Return the rms over inlier rows of sessions left out, each registered on itself; nan: one."""
     if data.session is None or data.sessions < 2:
         return UNSEEN
     left = []
     for s in range(data.sessions):
-        rest, own = data.session != s, (data.session == s) & calm
+        rest, own = data.session != s, (data.session == s) & inlier
         if not (rest.any() and own.any()):
             continue
         others = data.part(rest)
@@ -283,23 +283,24 @@ def _result(
 ) -> Identification:  # fmt: skip
     n, kept = model.arm.n, shown.kept
     after = fits[1]
-    calm = after.weights > 1e-6
-    gaps = [residual(fit.model, data, fit.frame)[0][calm][:, :3] for fit in fits]
+    inlier = after.weights > 1e-6
+    gaps = [residual(fit.model, data, fit.frame)[0][inlier][:, :3] for fit in fits]
     std, flexibility = np.sqrt(np.diag(shown.covariance)), after.flexibility
     return Identification(
         after.model, flexibility[:n], flexibility[n:], std[:n], std[n:], shown.covariance, kept,
-        shown.told, after.frame,
+        shown.reported, after.frame,
         after.model.tool_in_flange[:3, 3] - model.tool_in_flange[:3, 3], len(data.q),
         _rms(gaps[0], data.nuisances), _rms(gaps[1], data.nuisances + int(kept.sum())),
-        *held_out, used[~calm], tuple(notes_of(after, kept, int((~calm).sum()), data.nuisances)),
+        *held_out, used[~inlier],
+        tuple(notes_of(after, kept, int((~inlier).sum()), data.nuisances)),
     )  # fmt: skip
 
 
-def notes_of(fit: Fit, kept: Mask, wild: int, nuisances: int) -> list[str]:
-    """Return in words what a fit was like: wild readings, bounds reached, what was not shown."""
+def notes_of(fit: Fit, kept: Mask, outlier: int, nuisances: int) -> list[str]:
+    """Return in words what a fit was like: outliers, bounds reached, what was not identifiable."""
     notes = []
-    if wild:
-        notes.append(f"{wild} wild reading(s) weighed down")
+    if outlier:
+        notes.append(f"{outlier} outlier(s) down-weighted")
     at_zero = np.flatnonzero((fit.flexibility <= 0) & kept)
     if len(at_zero):
         names = ", ".join(base_parameters.name(i, len(kept)) for i in at_zero)

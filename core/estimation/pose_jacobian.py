@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.effects.effect import Effect
-from gapbridge.core.kernels.pose_slopes import slope_blocks
+from gapbridge.core.kernels.pose_jacobian import jacobian_blocks
 from gapbridge.core.kernels.rates import chain_rate, of_rows, slots
 from gapbridge.core.kernels.reference import Chain, Rows
 from gapbridge.core.kernels.threads import in_ranges
@@ -35,7 +35,7 @@ class PoseColumns:
     """TCP poses of N rows, and how they change with p parameters, base axes."""
 
     poses: Poses
-    slopes: Array  # (6, p, N) m and rad per unit: position, then turn
+    jacobian: Array  # (6, p, N) m and rad per unit: position, then turn
 
 
 def pose_columns(
@@ -47,16 +47,16 @@ def pose_columns(
     row has no equilibrium.
     """
     loads = loads or Loads()
-    slopes = np.empty((6, len(values), len(q)))
+    jacobian = np.empty((6, len(values), len(q)))
     chain, rows = model.chain(), model.rows(q, loads)
     rates, known = _chain_rates(model, chain, values)
-    varying, told = _row_rates(model, q, loads, values, steps)
-    poses = _swept(chain, rows, _entries(rates), varying, slopes)
+    varying, first_order_ok = _row_rates(model, q, loads, values, steps)
+    poses = _swept(chain, rows, _entries(rates), varying, jacobian)
     if poses is None:
         poses, known = model.predict(q, loads), np.zeros(len(values), dtype=bool)
-    for c in np.flatnonzero(~(known & told)).tolist():
-        slopes[:, c] = _difference(model, q, loads, values[c], float(steps[c]))
-    return PoseColumns(poses, slopes)
+    for c in np.flatnonzero(~(known & first_order_ok)).tolist():
+        jacobian[:, c] = _difference(model, q, loads, values[c], float(steps[c]))
+    return PoseColumns(poses, jacobian)
 
 
 def _chain_rates(model: Model, chain: Chain, values: Sequence[Value]) -> tuple[Array, Mask]:
@@ -85,7 +85,7 @@ def _row_rates(
     n, bare = model.arm.n, model.without_terms().rows(q, loads)
     terms, own = model.conditions(), Effect.condition
     starts, found_slots, found = [0], [], []
-    told = np.ones(len(values), dtype=bool)
+    first_order_ok = np.ones(len(values), dtype=bool)
     for c, (t, k) in enumerate(values):
         if type(CATALOGUE[model.terms[t].effect]).condition is not own:
             ends = []
@@ -96,18 +96,20 @@ def _row_rates(
                     ends[-1], loads, q, [moved if o is model.terms[t] else o for o in terms]
                 )
             one, other = ends
-            told[c] = all(np.array_equal(a, b) for a, b in zip(one[3:], other[3:], strict=True))
+            first_order_ok[c] = all(
+                np.array_equal(a, b) for a, b in zip(one[3:], other[3:], strict=True)
+            )
             change = np.column_stack([a - b for a, b in zip(one[:3], other[:3], strict=True)])
             for j in np.flatnonzero(change.any(axis=0)):
                 found_slots.append(of_rows(n) + j)
                 found.append(change[:, j] / (2 * steps[c]))
         starts.append(len(found))
     rates = np.array(found) if found else np.zeros((0, len(q)))
-    return (np.array(starts), np.array(found_slots, dtype=np.int64), rates), told
+    return (np.array(starts), np.array(found_slots, dtype=np.int64), rates), first_order_ok
 
 
 def _swept(
-    chain: Chain, rows: Rows, rates: Entries, varying: Entries, slopes: Array
+    chain: Chain, rows: Rows, rates: Entries, varying: Entries, jacobian: Array
 ) -> Poses | None:
     """Write the slopes (6, p, N) and return the poses; None where the sweep cannot."""
     if bool(chain.flexibility.any()) or bool(getattr(config, "DISABLE_JIT", 0)):
@@ -117,7 +119,7 @@ def _swept(
 
     def work(first: int, last: int) -> int:
         return int(
-            slope_blocks(chain, rows, rates, varying, first, last, position, rotation, slopes)
+            jacobian_blocks(chain, rows, rates, varying, first, last, position, rotation, jacobian)
         )
 
     if any(bad >= 0 for bad in in_ranges(work, count)):

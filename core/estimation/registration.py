@@ -53,7 +53,7 @@ def register(measured: Array, predicted: Array, weights: Array | None = None) ->
 
 
 def register_robustly(measured: Array, predicted: Array, rounds: int = 8) -> Registration:
-    """Return the frame with wild readings weighed down (Cauchy weights on the distance)."""
+    """Return the frame with outliers down-weighted (Cauchy weights on the distance)."""
     frame = register(measured, predicted)
     for _ in range(rounds):
         distance = np.linalg.norm(frame.in_base(measured) - predicted, axis=1)

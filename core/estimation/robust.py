@@ -1,4 +1,4 @@
-"""Least squares that a few wild readings cannot spoil, noise estimated along, per unit."""
+"""Least squares that a few outliers cannot spoil, noise estimated along, per unit."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 ROUNDS = 60
-SETTLED = 1e-9  # change of the weights at which the fit has come to rest
-CALM = 2.2  # scaled length below which nothing is weighed down: clean data keep all they tell
-WILD = 4.5  # scaled length beyond which a reading counts for nothing
+CONVERGED = 1e-9  # change of the weights at which the fit has converged
+INLIER = 2.2  # scaled length below which nothing is down-weighted
+OUTLIER = 4.5  # scaled length beyond which a reading counts for nothing
 TINY = 1e-12
 
 
 @dataclass(frozen=True)
 class Weighed:
-    """Where a weighed fit came to rest."""
+    """State of a weighted fit that has converged."""
 
     values: Array  # (p,)
     covariance: Array  # (p, p)
     noise: Array  # (units,) 1 sigma of one cell
     freedom: float  # degrees of freedom left
-    weights: Array  # (rows,) 0: wild, 1: calm
+    weights: Array  # (rows,) 0: outlier, 1: inlier
     outliers: Index  # rows of weight zero, or nearly
 
 
 def weights_of(length: Array) -> Array:
     """Return weights for scaled lengths: 1 up to CALM, falling to 0 at WILD."""
-    fall = np.clip((length - CALM) / (WILD - CALM), 0.0, 1.0)
+    fall = np.clip((length - INLIER) / (OUTLIER - INLIER), 0.0, 1.0)
     return np.asarray((1 - fall**2) ** 2)
 
 
 def scaled_length(square: Array, cells: Array) -> Array:
-    """Return lengths that compare readings of different width: a calm one's is around one.
+    """Return lengths that compare readings of different width: an inlier's is around one.
 
     ``square`` is a reading's sum of squares over the noise, ``cells`` its number of cells
     (Wilson and Hilferty's cube root, so that one limit means the same chance for any width).
@@ -49,8 +49,8 @@ def weighed(A: Array, b: Array, unit: Index, row: Index, rounds: int = ROUNDS) -
     """Return the robust fit of A (M, p) @ values = b (M,).
 
     ``unit`` (M,) numbers cells that share one unknown noise, ``row`` (M,) the reading that a cell
-    belongs to: wild readings are weighed down as wholes. Starts from a fit of least absolute
-    deviations, so that a large minority of wild readings is seen.
+    belongs to: outliers are down-weighted as wholes. Starts from a fit of least absolute
+    deviations, so that a large minority of outliers is seen.
     """
     rows, units = int(row.max()) + 1, int(unit.max()) + 1
     cells: Array = np.bincount(row, minlength=rows).astype(np.float64)
@@ -65,7 +65,7 @@ def weighed(A: Array, b: Array, unit: Index, row: Index, rounds: int = ROUNDS) -
         root = np.sqrt(weights[row]) / noise[unit]
         values = np.asarray(np.linalg.lstsq(A * root[:, None], b * root, rcond=None)[0], float)
         noise, spare = _noise(A, b - A @ values, root, weights[row], unit, units)
-        if np.abs(weights - before).max() < SETTLED:
+        if np.abs(weights - before).max() < CONVERGED:
             break
     root = np.sqrt(weights[row]) / noise[unit]
     scaled = A * root[:, None]

@@ -1,7 +1,7 @@
 """Identification from logs of any length: rows pass by in pieces, memory does not grow with them.
 
 The same least squares, weights and choice as identification.py. Held-out figures leave out every
-fifth row by chance, not whole poses: among many thousands of rows, poses are not told apart.
+fifth row by chance, not whole poses: among many thousands of rows, poses are not separated.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from gapbridge.core.estimation.identification import (
 )
 from gapbridge.core.estimation.streamed_fit import (
     NONE,
+    FitState,
     Piece,
-    Settled,
     Stream,
     fit_flexibilities,
     fit_nuisances,
@@ -48,7 +48,7 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 SAMPLE = 20_000  # rows kept at most, for the first guess and the look whether anything bends
 MANY_OUTLIERS = 100_000  # rows that are named at most
-CALM = 1e-6  # weight below which a row counts as wild
+INLIER = 1e-6  # weight below which a row counts as an outlier
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class _Task:
     scale: float
     nonnegative: bool
 
-    def run(self, before: Settled, stream: Stream) -> tuple[Settled, base_parameters.Shown]:
+    def run(self, before: FitState, stream: Stream) -> tuple[FitState, base_parameters.Shown]:
         """Fit everything, choose what the data show, fit that alone."""
         centre = self.prior[0]
         everything = np.ones(len(centre), dtype=bool)
@@ -70,7 +70,7 @@ class _Task:
         )  # fmt: skip
         values, n = np.where(kept, look.fit.flexibility, centre), len(centre) // 2
         model = look.fit.model.with_compliance(values[:n], values[n:])
-        begin = Settled(Fit(model, look.fit.frame, NONE), look.scale)
+        begin = FitState(Fit(model, look.fit.frame, NONE), look.scale)
         found = fit_flexibilities(begin, stream, kept, self.prior, nonnegative=self.nonnegative)
         assert found.fit.linear is not None
         return found, base_parameters.what_is_shown(found.fit.linear, kept, self.scale)
@@ -92,20 +92,20 @@ def identify_streamed(
     ``held_out`` False spares the five further fits. Raises as ``identify_compliance``.
     """
     metrology = metrology or Metrology()
-    tell = progress or (lambda text: None)
-    tell("reading")
+    emit = progress or (lambda text: None)
+    emit("reading")
     stream = _stream(log, metrology)
     usual = 1e-2 / typical_moment(model.arm)
     prior_std = usual if prior_std is None else prior_std
     require_excitation(model, stream.sample, metrology, min(prior_std, usual))
     scale = prior_std if np.isfinite(prior_std) else usual
     task = _Task((flexibilities(model), prior_std), scale, nonnegative)
-    tell("fitting")
+    emit("fitting")
     before = fit_nuisances(model, stream)
     after, shown = task.run(before, stream)
     unseen = (float("nan"), float("nan"))
     if held_out:
-        tell("checking on held-out rows")
+        emit("checking on held-out rows")
         unseen = _held_out(model, stream, task, after)
     return _result(model, stream, (before, after), shown, unseen)
 
@@ -159,8 +159,8 @@ def fold_of(rows: Rows) -> Rows:
     return ((x ^ (x >> np.uint64(31))) % np.uint64(FOLDS)).astype(np.int64)
 
 
-def _held_out(model: Model, stream: Stream, task: _Task, after: Settled) -> tuple[float, float]:
-    """Return the rms before and after over calm rows that each fit did not see."""
+def _held_out(model: Model, stream: Stream, task: _Task, after: FitState) -> tuple[float, float]:
+    """Return the rms before and after over inlier rows that each fit did not see."""
     sums, count = np.zeros(2), 0
     for k in range(FOLDS):
         seen = stream.part(lambda rows, k=k: fold_of(rows) != k, 1 - 1 / FOLDS)  # type: ignore[misc]
@@ -168,39 +168,39 @@ def _held_out(model: Model, stream: Stream, task: _Task, after: Settled) -> tupl
         before = fit_nuisances(model, seen)
         fits = (before.fit, task.run(before, seen)[0].fit)
         for piece in unseen.pieces():
-            calm = _calm(after, piece.data)
-            gaps = [residual(fit.model, piece.data, fit.frame)[0][calm, :3] for fit in fits]
+            inlier = _inliers(after, piece.data)
+            gaps = [residual(fit.model, piece.data, fit.frame)[0][inlier, :3] for fit in fits]
             sums += [float(np.sum(gap**2)) for gap in gaps]
             count += gaps[0].size
     before_rms, after_rms = np.sqrt(sums / max(count, 1))
     return float(before_rms), float(after_rms)
 
 
-def _calm(settled: Settled, data: Data) -> Mask:
+def _inliers(settled: FitState, data: Data) -> Mask:
     gap = residual(settled.fit.model, data, settled.fit.frame)[0]
-    return np.asarray(weights_at(gap, settled.scale) > CALM)
+    return np.asarray(weights_at(gap, settled.scale) > INLIER)
 
 
 def _result(
-    model: Model, stream: Stream, fits: tuple[Settled, Settled], shown: base_parameters.Shown,
+    model: Model, stream: Stream, fits: tuple[FitState, FitState], shown: base_parameters.Shown,
     held_out: tuple[float, float],
 ) -> Identification:  # fmt: skip
     n, kept, after = model.arm.n, shown.kept, fits[1].fit
-    sums, calm_cells, wild = np.zeros(2), 0, list[Rows]()
+    sums, inlier_cells, outliers = np.zeros(2), 0, list[Rows]()
     for piece in stream.pieces():
         gaps = [residual(one.fit.model, piece.data, one.fit.frame)[0] for one in fits]
-        calm = weights_at(gaps[1], fits[1].scale) > CALM
-        sums += [float(np.sum(gap[calm, :3] ** 2)) for gap in gaps]
-        calm_cells += 3 * int(calm.sum())
-        wild.append(piece.rows[~calm])
+        inlier = weights_at(gaps[1], fits[1].scale) > INLIER
+        sums += [float(np.sum(gap[inlier, :3] ** 2)) for gap in gaps]
+        inlier_cells += 3 * int(inlier.sum())
+        outliers.append(piece.rows[~inlier])
     spent = np.array([stream.nuisances, stream.nuisances + int(kept.sum())])
-    gap_rms, remaining_rms = np.sqrt(sums / np.maximum(calm_cells - spent, 1))
+    gap_rms, remaining_rms = np.sqrt(sums / np.maximum(inlier_cells - spent, 1))
     std, flexibility = np.sqrt(np.diag(shown.covariance)), after.flexibility
-    count = stream.count - calm_cells // 3
-    named = np.fromiter(islice((row for rows in wild for row in rows), MANY_OUTLIERS), np.int64)
+    count = stream.count - inlier_cells // 3
+    named = np.fromiter(islice((row for rows in outliers for row in rows), MANY_OUTLIERS), np.int64)
     return Identification(
         after.model, flexibility[:n], flexibility[n:], std[:n], std[n:], shown.covariance, kept,
-        shown.told, after.frame,
+        shown.reported, after.frame,
         after.model.tool_in_flange[:3, 3] - model.tool_in_flange[:3, 3], stream.count,
         float(gap_rms), float(remaining_rms), *held_out, named,
         tuple(notes_of(after, kept, count, stream.nuisances)),

@@ -1,7 +1,8 @@
 """The least squares of core.estimation.compliance_fit over rows that pass by in pieces.
 
 Each step of Gauss and Newton passes twice over the rows: once for the gap, whose median says what
-is noise and what is wild, once for the R factor of all weighed columns, into which every block of
+is noise and what is an outlier, once for the R factor of all weighed columns, into which every
+block of
 rows is folded (core.kernels). What is kept does not grow with the rows; the gaps wait in a file.
 """
 
@@ -14,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.estimation.compliance_fit import (
+    CONVERGED,
     NUISANCE_ROUNDS,
     RANK,
     ROUNDS,
-    SETTLED,
     Data,
     Fit,
     Mask,
@@ -70,19 +71,19 @@ class Stream:
 
 
 @dataclass(frozen=True)
-class Settled:
+class FitState:
     """A fit, and the noise by which its rows were weighed."""
 
     fit: Fit
     scale: Array  # (2,) m, rad
 
 
-def fit_nuisances(model: Model, stream: Stream) -> Settled:
+def fit_nuisances(model: Model, stream: Stream) -> FitState:
     """Return the frame and tool point that fit best, the model's flexibilities left alone."""
     if not stream.nuisances:
         fit = Fit(model, IDENTITY, NONE)
         with _gaps(fit, stream) as gaps:
-            return Settled(fit, _scale(gaps))
+            return FitState(fit, _scale(gaps))
     sample = stream.sample
     frame = register_robustly(sample.position, model.predict(sample.q, sample.loads).position)
     fit = Fit(model, frame, NONE)
@@ -90,15 +91,15 @@ def fit_nuisances(model: Model, stream: Stream) -> Settled:
         scale, R = weighed(fit, stream)
         step = np.linalg.lstsq(R[:, :9], R[:, -1], rcond=RANK)[0]
         fit = Fit(*moved(fit.model, fit.frame, step), NONE)
-        if np.abs(step).max() < SETTLED:
+        if np.abs(step).max() < CONVERGED:
             break
-    return Settled(fit, scale)
+    return FitState(fit, scale)
 
 
 def fit_flexibilities(
-    begin: Settled, stream: Stream, kept: Mask, prior: tuple[Array, float], *,
+    begin: FitState, stream: Stream, kept: Mask, prior: tuple[Array, float], *,
     nonnegative: bool, rounds: int = ROUNDS,
-) -> Settled:  # fmt: skip
+) -> FitState:  # fmt: skip
     """Return the fit of the ``kept`` flexibilities, as ``compliance_fit.fit_flexibilities``."""
     now = begin
     for _ in range(rounds):
@@ -107,8 +108,8 @@ def fit_flexibilities(
         m = stream.nuisances
         problem = (R[:, :m], R[:, m:-1], R[:, -1])
         fit = stepped(now.fit, problem, NONE, kept, prior, nonnegative=nonnegative)
-        now = Settled(fit, scale)
-        if np.abs(fit.flexibility - before).max() < SETTLED * max(np.abs(before).max(), 1e-12):
+        now = FitState(fit, scale)
+        if np.abs(fit.flexibility - before).max() < CONVERGED * max(np.abs(before).max(), 1e-12):
             break
     return now
 

@@ -37,7 +37,7 @@ OWN = 28
 SUM, OUTER, CHANGED = 0, 3, 12
 BESIDE = 13
 ROUNDS = 60
-SETTLED = 1e-12  # of m/rad: the next round would change a thousandth of it
+CONVERGED = 1e-12  # of m/rad: the next round would change a thousandth of it
 _L = LANES
 
 
@@ -257,13 +257,13 @@ def _pulled(w, u, s, record):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
-def solve(w, v, u, s, n, axis, turning, bent):  # type: ignore[no-untyped-def]
+def solve(w, v, u, s, n, axis, turning, deflected):  # type: ignore[no-untyped-def]
     """Write the derivatives of one coordinate by twists, and the adjoints; whether it settled."""
     for record in range(n + 2):
         a = record * OWN * _L
         for k in range(PULL * _L, SHIFT * _L):
             u[a + k] = 0.0
-    for _ in range(ROUNDS if bent else 1):
+    for _ in range(ROUNDS if deflected else 1):
         for k in range(_L):
             s[CHANGED * _L + k] = 0.0
             for j in range(3):
@@ -280,9 +280,9 @@ def solve(w, v, u, s, n, axis, turning, bent):  # type: ignore[no-untyped-def]
         change = 0.0
         for k in range(_L):
             change = max(change, s[CHANGED * _L + k])
-        if change < SETTLED:
+        if change < CONVERGED:
             return True
-    return not bent
+    return not deflected
 
 
 @njit(**JIT)

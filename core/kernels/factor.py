@@ -137,9 +137,9 @@ def factor_blocks(chain, rows, gap, per_cell, nuisances, first, last, R):  # typ
     columns, size = nuisances + 2 * n + 1, width * LANES
     w, v = lanes_of(n)
     X, cells = np.empty(columns * size), np.empty(size)
-    bent = bends(chain)
+    deflected = bends(chain)
     for r in range(first, last, LANES):
-        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, bent)):
+        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, deflected)):
             return r
         if nuisances:
             nuisance_columns(v, X, chain.tool_rotation, width)
@@ -160,9 +160,9 @@ def normal_blocks(chain, rows, gap, first, last, G):  # type: ignore[no-untyped-
     size = width * LANES
     w, v = lanes_of(n)
     X = np.zeros(columns * size)
-    bent = bends(chain)
+    deflected = bends(chain)
     for r in range(first, last, LANES):
-        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, bent)):
+        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, deflected)):
             return r
         flexibility_columns(w, v, X, 0, n, width)
         if r + LANES > last:
@@ -184,9 +184,9 @@ def regressor_blocks(chain, rows, first, last, A):  # type: ignore[no-untyped-de
     n, width = chain.mass.shape[0], A.shape[1]
     w, v = lanes_of(n)
     X = np.empty(2 * n * width * LANES)
-    bent = bends(chain)
+    deflected = bends(chain)
     for r in range(first, last, LANES):
-        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, bent)):
+        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, deflected)):
             return r
         flexibility_columns(w, v, X, 0, n, width)
         count = min(LANES, last - r)

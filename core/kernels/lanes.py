@@ -104,7 +104,7 @@ def _spread(given, first, width, to, begin, apart):  # type: ignore[no-untyped-d
 
 
 @njit(**JIT)
-def settle(chain, w, v, bent):  # type: ignore[no-untyped-def]
+def settle(chain, w, v, deflected):  # type: ignore[no-untyped-def]
     """Solve the lanes to equilibrium where ``bent``, else place and load the rigid arm once.
 
     Returns whether all lanes have settled.
@@ -113,7 +113,7 @@ def settle(chain, w, v, bent):  # type: ignore[no-untyped-def]
     tilts = np.any(chain.base_compliance != 0.0)
     if tilts:
         _level(w)
-    if bent:
+    if deflected:
         _straighten(w, n)
     for i in range(n):
         sines(w, i + 1)
@@ -123,15 +123,15 @@ def settle(chain, w, v, bent):  # type: ignore[no-untyped-def]
             turn_joint(w, 0)
         for i in range(n):
             place_joint(w, i, chain.rotation[i], chain.position[i])
-            if bent and step:
+            if deflected and step:
                 turn_joint(w, i + 1)
         place_flange(w, v, n, chain)
         load_flange(w, v, n, chain.gravity)
         for i in range(n - 1, -1, -1):
             load_joint(w, i, chain.mass[i], chain.cog[i], chain.gravity)
-            if bent:
+            if deflected:
                 bend_joint(w, v, i + 1, chain.compliance[i], chain.softening[i])
-        if not bent:
+        if not deflected:
             return True
         if tilts:
             bend_base(w, v, chain.base_compliance)

@@ -280,8 +280,8 @@ def bend_base(w, v, compliance):  # type: ignore[no-untyped-def]
     c = RECORD * LANES
     for axis in range(3):
         for k in range(LANES):
-            tilt = compliance[axis] * w[U(c + (TOTAL + 3 + axis) * LANES + k)]
-            d = abs(tilt - w[U((BEND + axis) * LANES + k)])
+            base_rotation = compliance[axis] * w[U(c + (TOTAL + 3 + axis) * LANES + k)]
+            d = abs(base_rotation - w[U((BEND + axis) * LANES + k)])
             change = v[U(CHANGE * LANES + k)]
             v[U(CHANGE * LANES + k)] = d if d > change else change
-            w[U((BEND + axis) * LANES + k)] = tilt
+            w[U((BEND + axis) * LANES + k)] = base_rotation

@@ -35,7 +35,7 @@ def turn(x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def place(b, n, w, bent, tx, ty, tz):  # type: ignore[no-untyped-def]
+def place(b, n, w, deflected, tx, ty, tz):  # type: ignore[no-untyped-def]
     """Place all frames of the block's row for the present bending and tilt of the base."""
     first, second = turn(tx, ty, tz)
     a00, a01, a02 = 1.0 - second * (ty * ty + tz * tz), second * tx * ty - first * tz, (
@@ -78,7 +78,7 @@ def place(b, n, w, bent, tx, ty, tz):  # type: ignore[no-untyped-def]
             b10, b11 = c * b10 + s * b11, c * b11 - s * b10
             b20, b21 = c * b20 + s * b21, c * b21 - s * b20
             b[U(j + AXIS)], b[U(j + AXIS + 1)], b[U(j + AXIS + 2)] = b02, b12, b22
-        if bent and i < n:
+        if deflected and i < n:
             x, y, z = b[U(j + BEND)], b[U(j + BEND + 1)], b[U(j + BEND + 2)]
             first, second = turn(x, y, z)
             t00, t11, t22 = (

@@ -21,10 +21,10 @@ def predict_blocks(chain, rows, first, last, position, rotation):  # type: ignor
     """
     n = chain.mass.shape[0]
     w, v = lanes_of(n)
-    bent, bad = bends(chain), -1
+    deflected, bad = bends(chain), -1
     for r in range(first, last, LANES):
         end = min(r + LANES, last)
-        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, bent)):
+        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, deflected)):
             found = _one_by_one(chain, rows, r, end, position, rotation)
             bad = found if bad < 0 else bad
             continue
@@ -45,9 +45,9 @@ def linear_blocks(chain, rows, first, last, A, jacobians, moments):  # type: ign
     n = chain.mass.shape[0]
     w, v = lanes_of(n)
     X = np.empty(2 * n * 6 * LANES)
-    bent = bends(chain)
+    deflected = bends(chain)
     for r in range(first, last, LANES):
-        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, bent)):
+        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, deflected)):
             return r
         flexibility_columns(w, v, X, 0, n, 6)
         for k in range(min(LANES, last - r)):

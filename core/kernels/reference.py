@@ -99,10 +99,10 @@ def _turn(x, y, z, out):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
-def place(chain, rows, r, shape, tilt, A, B):  # type: ignore[no-untyped-def]
+def place(chain, rows, r, shape, base_rotation, A, B):  # type: ignore[no-untyped-def]
     """Place all frames for the present bending (exact finite rotations)."""
     n = chain.mass.shape[0]
-    _turn(tilt[0], tilt[1], tilt[2], A)
+    _turn(base_rotation[0], base_rotation[1], base_rotation[2], A)
     ox = oy = oz = 0.0
     for i in range(n + 1):
         g = 1.0
@@ -154,7 +154,7 @@ def _add_load(total, fx, fy, fz, px, py, pz):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
-def _load(chain, rows, r, shape, tilt, total):  # type: ignore[no-untyped-def]
+def _load(chain, rows, r, shape, base_rotation, total):  # type: ignore[no-untyped-def]
     """Newton-Euler statics from tip to base (paper eqs. 6-8) and the bending it makes.
 
     Returns the largest change of the bending; ``tilt`` gets the base's own.
@@ -198,8 +198,8 @@ def _load(chain, rows, r, shape, tilt, total):  # type: ignore[no-untyped-def]
             shape.bend[i, k] = bend
     for k in range(3):
         bend = chain.base_compliance[k] * total[3 + k]
-        change = max(change, abs(bend - tilt[k]))
-        tilt[k] = bend
+        change = max(change, abs(bend - base_rotation[k]))
+        base_rotation[k] = bend
     return change
 
 
@@ -246,10 +246,10 @@ def equilibrium(chain, rows, r, shape):  # type: ignore[no-untyped-def]
     (a load under which the arm would buckle) or a number is not finite.
     """
     A, B = np.empty((3, 3)), np.empty((3, 3))
-    tilt, total = np.zeros(3), np.empty(6)
+    base_rotation, total = np.zeros(3), np.empty(6)
     for step in range(MAX_ITERATIONS):
-        place(chain, rows, r, shape, tilt, A, B)
-        change = _load(chain, rows, r, shape, tilt, total)
+        place(chain, rows, r, shape, base_rotation, A, B)
+        change = _load(chain, rows, r, shape, base_rotation, total)
         # a change that is not a number would pass for none
         if change < TOLERANCE and np.isfinite(total.sum()):
             return step + 1

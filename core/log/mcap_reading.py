@@ -91,16 +91,18 @@ def read_configuration(path: Path) -> Document:
     raise LogError(f"{path}: found no configuration, expected one at the beginning of a recording")
 
 
-def read_columns(path: Path, told_only: bool = False) -> dict[str, Array]:
+def read_columns(path: Path, reported_only: bool = False) -> dict[str, Array]:
     """Return all cycles of a recording by field name, empty where there are none.
 
-    ``told_only``: without what the controller never told, which is NaN throughout.
+    ``reported_only``: without what the controller never reported, which is NaN throughout.
     """
     batches = [batch.columns for batch in read_batches(path) if len(batch)]
     names = list(batches[0]) if batches else []
     found = {name: np.concatenate([columns[name] for columns in batches]) for name in names}
     return {
-        name: values for name, values in found.items() if not (told_only and np.isnan(values).all())
+        name: values
+        for name, values in found.items()
+        if not (reported_only and np.isnan(values).all())
     }
 
 

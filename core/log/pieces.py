@@ -151,7 +151,7 @@ def _recording(path: Path) -> Iterator[tuple[list[str], Array]]:
         for name, values in batch.columns.items():
             flat = values.reshape(len(values), -1)
             ends = [""] if values.ndim == 1 else [f"_{k}" for k in range(flat.shape[1])]
-            # what the controller never told is no column
+            # what the controller never reported is no column
             if len(values) and is_known(name + ends[0]) and not np.isnan(flat).all():
                 names += [name + end for end in ends]
                 parts.append(flat)

@@ -1,4 +1,4 @@
-"""The plan of a calibration session: which poses and loads tell most of the parameters at hand."""
+"""The plan of a calibration session: the poses and loads most informative for its parameters."""
 
 from __future__ import annotations
 
@@ -18,7 +18,13 @@ from gapbridge.core.errors import PlanError
 from gapbridge.core.loads import Loads
 from gapbridge.core.planning.candidates import STOPS, Candidates, candidates_of, joined
 from gapbridge.core.planning.exchange import Choice, exchanged, grown, shrunk
-from gapbridge.core.planning.information import Reference, blocks, expectation_of, gathered, inverse
+from gapbridge.core.planning.information import (
+    Reference,
+    blocks,
+    expectation_of,
+    information_of,
+    inverse,
+)
 from gapbridge.core.planning.refinement import Refined, Refiner
 from gapbridge.core.planning.route import Stop, itinerary
 from gapbridge.core.planning.travel import joint_speed, leg_times
@@ -54,7 +60,7 @@ def plan(
     wish: Wish,
     progress: Progress | None = None,
 ) -> Plan:
-    """Return the poses, loads and approaches that tell most, in the order of travel.
+    """Return the most informative poses, loads and approaches, in the order of travel.
 
     Chosen so that the TCP predicted by the calibrated model is known best over the whole reachable
     space and under all ``loads``, the worst places before the others.
@@ -65,7 +71,7 @@ def plan(
 
 
 def _silent(text: str, share: float) -> None:
-    """Tell nobody."""
+    """Report to nobody."""
 
 
 def _planned(
@@ -74,33 +80,33 @@ def _planned(
     loads: Sequence[Payload],
     space: Space,
     wish: Wish,
-    tell: Progress,
+    emit: Progress,
 ) -> Plan:
     loads = _in_order(parameters, loads)
     _require_numbers(parameters, observable, wish)
-    tell("looking for poses", 0.0)
+    emit("looking for poses", 0.0)
     space = replace(space, hung=(*space.hung, *(far_end(load) for load in loads)))
     found = candidates_of(parameters, observable, loads, space, wish.seed, wish.stops)
     _require_enough(parameters, observable, found, wish)
-    tell("working out what each pose tells", 0.1)
+    emit("working out what each pose contributes", 0.1)
     rows = blocks(parameters, observable, found.readings, found.nuisance, wish.sigma)
     reference = reference_of(parameters, loads, space, wish.seed)
     cost = _cost(parameters, found, wish)
     choice = Choice.of(rows, reference.weight(rows.shape[2]), cost)
-    chosen = _chosen(choice, wish, lambda share: tell("choosing poses", 0.2 + 0.3 * share))
+    chosen = _chosen(choice, wish, lambda share: emit("choosing poses", 0.2 + 0.3 * share))
     share = leaning(reference, rows[chosen])
     weight = reference.weight(rows.shape[2], share)
     chosen = exchanged(Choice.of(rows, weight, cost), chosen)
     refiner = Refiner(parameters, observable, space, found, weight, wish.sigma)
     best, weight = evened(
         refiner, reference, Refined(found.readings[np.array(chosen)], rows[chosen]), share,
-        wish.seed, lambda share: tell("moving poses to where they tell more", 0.5 + 0.2 * share),
+        wish.seed, lambda share: emit("moving poses to more informative places", 0.5 + 0.2 * share),
     )  # fmt: skip
     choice, refiner = Choice.of(rows, weight, cost), replace(refiner, weight=weight)
-    tell("working out what more or fewer poses buy", 0.7)
+    emit("working out what more or fewer poses buy", 0.7)
     bought = _bought(choice, chosen, wish, refiner, reference)
     bought[wish.poses] = _rms(reference, best.rows)
-    tell("finding a short way", 0.95)
+    emit("finding a short way", 0.95)
     checks = [Stop(row, held_out=True) for row in _held_out(found, chosen, wish)]
     found = joined(found, best.readings)
     fit = [Stop(len(rows) + i) for i in range(wish.poses)]
@@ -108,7 +114,7 @@ def _planned(
     again = [stop.row - len(rows) for stop in way.stops if stop.repeat]
     measured = np.concatenate([best.rows, best.rows[again]])
     expected = expectation_of(parameters, measured, reference)
-    tell("planned", 1.0)
+    emit("planned", 1.0)
     hung = set(found.readings.load[len(rows) :])
     unseen = () if space.places or observable.unknown else (SIGHT,)
     notes = (*found.notes, *unseen, *way.notes, *_notes(parameters, loads, hung, expected.std))
@@ -206,12 +212,12 @@ def _cost(
 
 def _rms(reference: Reference, rows: Array) -> float:
     """Return the expected rms error of the TCP (m) over the reference, each pose alike."""
-    return float(np.sqrt(np.mean(reference.std(inverse(gathered(rows))) ** 2)))
+    return float(np.sqrt(np.mean(reference.std(inverse(information_of(rows))) ** 2)))
 
 
-def _chosen(choice: Choice, wish: Wish, told: Callable[[float], None]) -> list[int]:
+def _chosen(choice: Choice, wish: Wish, report: Callable[[float], None]) -> list[int]:
     size, k = choice.rows.shape[2], choice.rows.shape[1]
-    return exchanged(choice, grown(choice, [], wish.poses, -(-size // k)), told=told)
+    return exchanged(choice, grown(choice, [], wish.poses, -(-size // k)), report=report)
 
 
 def _bought(
@@ -220,7 +226,7 @@ def _bought(
     """Return what fewer and more poses would give, each number's poses chosen anew."""
     size, k = choice.rows.shape[2], choice.rows.shape[1]
     fewest = -(-size // k)
-    told: dict[int, float] = {}
+    std_of: dict[int, float] = {}
     for count in sorted({max(round(share * wish.poses), fewest) for share in BOUGHT}):
         if count == len(chosen):
             continue
@@ -230,8 +236,8 @@ def _bought(
         readings = refiner.found.readings[np.array(some)]
         random = np.random.default_rng(wish.seed)
         best = refiner.refined(Refined(readings, choice.rows[some]), BOUGHT_ROUNDS, random)
-        told[len(some)] = _rms(reference, best.rows)
-    return told
+        std_of[len(some)] = _rms(reference, best.rows)
+    return std_of
 
 
 def _held_out(found: Candidates, chosen: list[int], wish: Wish) -> list[int]:
@@ -256,14 +262,14 @@ def _notes(
     notes = []
     vague = [n for n, s in zip(parameters.names, std, strict=True) if not np.isfinite(s)]
     if vague:
-        notes.append(f"not shown by these poses: {', '.join(vague)}")
+        notes.append(f"not identifiable from these poses: {', '.join(vague)}")
     idle = [f"{load.mass:g} kg" for i, load in enumerate(loads) if i not in hung]
     if idle:
-        notes.append(f"loads that tell nothing more and need not be hung: {', '.join(idle)}")
+        notes.append(f"loads that add nothing and need not be hung: {', '.join(idle)}")
     soft = [e for e in flexibility_effects().values() if parameters.joints(e)]
     if soft and len(loads) == 1:
         notes.append(
-            "one load alone: compliance is told from what the arm itself weighs; a second load "
-            "tells it better"
+            "one load alone: compliance is found from the arm's own weight; a second load "
+            "determines it better"
         )
     return notes

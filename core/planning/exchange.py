@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.planning.information import gathered, inverse
+from gapbridge.core.planning.information import information_of, inverse
 
 Array = NDArray[np.float64]
-SETTLED = 2e-3  # relative gain of a whole round of exchanges that ends the search
+CONVERGED = 2e-3  # relative gain of a whole round of exchanges that ends the search
 BETTER = 1e-6  # in the logarithm of the criterion
 ROUNDS = 6
 
@@ -41,7 +41,7 @@ class Choice:
 
     def value(self, chosen: Sequence[int]) -> float:
         """Return the expected rms error of the TCP (m)."""
-        covariance = inverse(gathered(self.rows[list(chosen)]))
+        covariance = inverse(information_of(self.rows[list(chosen)]))
         return float(np.sqrt(np.sum(self.root * (covariance @ self.root))))
 
     def gains(self, chosen: Sequence[int]) -> Array:
@@ -63,7 +63,7 @@ class Choice:
     def _inner(self, chosen: Sequence[int]) -> tuple[Array, Array, Array]:
         """Return covariance S, rows @ S (R*k, P), and 1 + row S row^T (R, k, k)."""
         count, k, size = self.rows.shape
-        S = inverse(gathered(self.rows[list(chosen)]))
+        S = inverse(information_of(self.rows[list(chosen)]))
         HS = self.rows.reshape(-1, size) @ S
         inner = HS.reshape(count, k, size) @ np.swapaxes(self.rows, 1, 2)
         return S, HS, np.asarray(np.eye(k) + inner)
@@ -89,7 +89,7 @@ def exchanged(
     choice: Choice,
     chosen: Sequence[int],
     rounds: int = ROUNDS,
-    told: Callable[[float], None] | None = None,
+    report: Callable[[float], None] | None = None,
 ) -> list[int]:
     """Return the choice after each of its members was offered a better place, round by round."""
     found = list(chosen)
@@ -101,9 +101,9 @@ def exchanged(
             best = int(np.argmin(score))
             if score[best] < score[found[place]] - BETTER:
                 found[place] = best
-            if told:
-                told((number + (place + 1) / len(found)) / rounds)
-        if choice.value(found) > (1 - SETTLED) * begin:
+            if report:
+                report((number + (place + 1) / len(found)) / rounds)
+        if choice.value(found) > (1 - CONVERGED) * begin:
             break
     return found
 

@@ -1,4 +1,4 @@
-"""What a session will tell, before anyone moves: expected deviations of parameters and TCP."""
+"""What a session will determine, before anyone moves: expected deviations of parameters and TCP."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def expectation(
     sigma: float,
     reference: tuple[Array, Loads],
 ) -> Expectation:
-    """Return what the fitted readings (held-out ones are left out) tell of each parameter.
+    """Return what the fitted readings (held-out ones are left out) determine of each parameter.
 
     ``sigma`` is 1 sigma of one coordinate of a reading (m), instrument and arm together.
     ``reference`` are the poses (M, n) and loads over which the predicted TCP is judged. Values are

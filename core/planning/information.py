@@ -1,4 +1,4 @@
-"""What readings tell: the information matrix of parameters and nuisances, and what it foretells.
+"""What readings determine: the information matrix of parameters and nuisances.
 
 Everything is counted in usual sizes: a parameter in its weak prior's sigma, a nuisance in metres
 and radians. The nuisances stay in the matrix, so that its inverse has them projected out.
@@ -76,7 +76,7 @@ def blocks(
     return np.asarray(whole / (sigma * observable.sigmas)[None, :, None])
 
 
-def gathered(rows: Array) -> Array:
+def information_of(rows: Array) -> Array:
     """Return the information (P, P) of equations (N, k, P), weak prior included."""
     flat = rows.reshape(-1, rows.shape[2])
     return np.asarray(np.eye(rows.shape[2]) + flat.T @ flat)
@@ -89,8 +89,8 @@ def inverse(information: Array) -> Array:
 
 
 def expectation_of(parameters: Parameters, rows: Array, reference: Reference) -> Expectation:
-    """Return what equations (N, k, p+m) will tell."""
-    covariance = inverse(gathered(rows))
+    """Return what equations (N, k, p+m) will determine."""
+    covariance = inverse(information_of(rows))
     share = np.sqrt(np.diag(covariance))[: len(parameters)]
     std = np.where(share < UNSHOWN, share * parameters.prior, np.inf)
     tcp = reference.std(covariance)

@@ -40,13 +40,13 @@ def plan_payload(
     noise: tuple[float, float] = USUAL_NOISE,
     seed: int = 0,
 ) -> PayloadPlan:
-    """Return poses around ``begin`` (n,) rad that tell load and sensor bias best (D-optimal).
+    """Return poses around ``begin`` (n,) rad that separate load and sensor bias best (D-optimal).
 
     Only the last three joints turn, within their limits: whoever stands by sees the tool turn on
     the spot. ``mass`` (kg; default: the model's) is what is expected to hang there, ``noise``
     1 sigma of one axis of an averaged reading (N, Nm). ``poses`` None takes as many as bring mass
     and centre of gravity to 20 g and 2 mm, between 6 and 20. Raises ExcitationError where the
-    limits leave no orientations that tell load from bias.
+    limits leave no orientations that separate load from bias.
     """
     begin = np.asarray(begin, dtype=float)
     candidates = _candidates(model, begin, np.random.default_rng(seed))
@@ -68,7 +68,7 @@ def plan_payload(
     if not np.isfinite(std).all():
         raise ExcitationError(
             "payload session: within the joint limits the wrist cannot turn the flange far enough "
-            "to tell load from sensor bias; begin elsewhere"
+            "to separate load from sensor bias; begin elsewhere"
         )
     order = tour(begin, candidates[chosen])
     return PayloadPlan(tuple(order), NAMES, UNITS, std, tuple(bought))

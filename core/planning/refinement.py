@@ -1,4 +1,4 @@
-"""Chosen poses moved a little, joint by joint, to where they tell more.
+"""Chosen poses moved a little, joint by joint, to where they are more informative.
 
 The candidates of a plan are a coarse sample of six or more joints; between them lie better poses.
 Each pose goes down the gradient of the criterion, as far as limits, obstacles and sight allow.
@@ -17,14 +17,14 @@ from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.planning.candidates import Candidates, readable
 from gapbridge.core.planning.exchange import Choice
-from gapbridge.core.planning.information import blocks, gathered, inverse
+from gapbridge.core.planning.information import blocks, information_of, inverse
 from gapbridge.core.planning.workspace import Space
 
 Array = NDArray[np.float64]
 NUDGE = 0.02  # rad, for the gradient
 LENGTHS = (0.03, 0.06, 0.12, 0.25, 0.5)  # rad, down the gradient
 ASIDE = 0.5  # how far beside the gradient as many more steps go
-SETTLED = 5e-4  # relative gain of a round that ends the search
+CONVERGED = 5e-4  # relative gain of a round that ends the search
 
 
 @dataclass(frozen=True)
@@ -51,23 +51,23 @@ class Refiner:
         now: Refined,
         rounds: int,
         random: np.random.Generator,
-        told: Callable[[float], None] | None = None,
+        report: Callable[[float], None] | None = None,
     ) -> Refined:
         """Return the poses after some rounds of moves."""
         before = self.value(now.rows)
         for number in range(rounds):
             now = self._round(now, random)
             after = self.value(now.rows)
-            if told:
-                told((number + 1) / rounds)
-            if after > (1 - SETTLED) * before:
+            if report:
+                report((number + 1) / rounds)
+            if after > (1 - CONVERGED) * before:
                 break
             before = after
         return now
 
     def value(self, rows: Array) -> float:
         """Return the expected rms error of the TCP (m) that equations (N, k, P) leave."""
-        return float(np.sqrt(np.sum(self.weight * inverse(gathered(rows)))))
+        return float(np.sqrt(np.sum(self.weight * inverse(information_of(rows)))))
 
     def _rows(self, readings: Readings) -> Array:
         layout = self.observable.layout(self.found.readings)
@@ -103,7 +103,7 @@ class Refiner:
         own = np.repeat(np.arange(count), 2 * n)
         nudges = NUDGE * np.concatenate([np.eye(n), -np.eye(n)])
         near = replace(now.readings[own], q=now.readings.q[own] + np.tile(nudges, (count, 1)))
-        S = inverse(gathered(now.rows))
+        S = inverse(information_of(now.rows))
         pull = now.rows @ (S @ self.weight @ S)
         fall = np.einsum("nkp,nkp->n", self._rows(near) - now.rows[own], pull[own])
         one, other = -fall.reshape(count, 2, n).transpose(1, 0, 2)

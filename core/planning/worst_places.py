@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.planning.information import Reference, gathered, inverse
+from gapbridge.core.planning.information import Reference, information_of, inverse
 from gapbridge.core.planning.refinement import Refined, Refiner
 
 Array = NDArray[np.float64]
@@ -29,24 +29,24 @@ def leaning(reference: Reference, rows: Array, before: Array | None = None) -> A
 
     ``before`` are those with which that choice was made; none: all alike.
     """
-    share = reference.std(inverse(gathered(rows))) ** (2 * LEANING)
+    share = reference.std(inverse(information_of(rows))) ** (2 * LEANING)
     share = share if before is None else share * before
     return np.asarray(share / share.mean())
 
 
 def evened(
     refiner: Refiner, reference: Reference, begin: Refined, share: Array, seed: int,
-    told: Callable[[float], None],
+    reported: Callable[[float], None],
 ) -> tuple[Refined, Array]:  # fmt: skip
     """Return the poses after some bouts of moves, and the weight (P, P) of the last one.
 
-    ``share`` (M,) are the places' weights in the first; ``told`` gets the share that is done.
+    ``share`` (M,) are the places' weights in the first; ``report`` gets the share that is done.
     """
     now, size = begin, begin.rows.shape[2]
     for number in range(BOUTS):
 
         def along(part: float, begun: int = number) -> None:
-            told((begun + part) / BOUTS)
+            reported((begun + part) / BOUTS)
 
         if number:
             share = leaning(reference, now.rows, share)

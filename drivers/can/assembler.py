@@ -20,7 +20,7 @@ Vector = NDArray[np.float64]
 
 
 class Sample(NamedTuple):
-    """One complete sample, SI units; (n,) each, NaN where a joint has not told yet.
+    """One complete sample, SI units; (n,) each, NaN where a joint has not reported yet.
 
     All quantities are rows of ``table`` (q, n), the position first, then ``others`` in order. A
     tuple, because one is made in every cycle.
@@ -51,8 +51,8 @@ class Assembler:
         self.dropped: Counter[str] = Counter()  # reason -> frames or sets
         self.status: dict[tuple[Key, str], tuple[float, str, bool]] = {}
         self.enabled: dict[tuple[Key, str], bool] = {}
-        self.heard: dict[Key, float] = {}  # s, monotonic, of each message that we read
-        self.troubled: set[tuple[Key, str]] = set()  # members of ``status`` that tell of trouble
+        self.received_at: dict[Key, float] = {}  # s, monotonic, of each message that we read
+        self.troubled: set[tuple[Key, str]] = set()  # members of ``status`` that report trouble
         self._seen: dict[Key, bytes] = {}  # last bytes of messages beside the sample
 
     @property
@@ -80,11 +80,11 @@ class Assembler:
         if incoming is None:
             return None
         if self._seen.get(key) == data:  # the same bytes say the same: most of an arm's status
-            self.heard[key] = received
+            self.received_at[key] = received
             return None
         slot = self._slots.get(key)
         if slot is not None and len(data) == incoming.length:
-            self.heard[key] = received
+            self.received_at[key] = received
             if key in self._members:
                 return self._collect(incoming, data, stamp, received)
             self._seen[key] = data
@@ -95,7 +95,7 @@ class Assembler:
         except ValueError:
             self.dropped["malformed"] += 1
             return None
-        self.heard[key] = received
+        self.received_at[key] = received
         if incoming.checks or incoming.enabled:
             self._note(incoming, values)
         if key in self._members:

@@ -49,15 +49,15 @@ def _float_of(bits, length):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
-def fill(raw, told, places, factors, lines, found):  # type: ignore[no-untyped-def]
-    """Write all quantities (q n,) in SI units that the frames in ``raw`` (8 bytes a slot) tell.
+def fill(raw, received, places, factors, lines, found):  # type: ignore[no-untyped-def]
+    """Write all quantities (q n,) in SI units that the frames in ``raw`` (8 bytes a slot) contain.
 
     ``factors`` (m, 2): scale and offset of each signal; ``lines`` (3, q n): wire values, where
-    those of slots not ``told`` stay as they are, then scale and zero of each.
+    those of slots not ``received`` stay as they are, then scale and zero of each.
     """
     for k in range(places.shape[0]):
         slot, start, length = places[k, 0], places[k, 1], places[k, 2]
-        if not told[slot]:
+        if not received[slot]:
             continue
         word = np.uint64(0)
         for i in range(8):
@@ -95,7 +95,7 @@ class Reading:
                 rows.append((slot, *place, self.names.index(reading.quantity) * n + reading.joint))
                 conversion = conversion_of(incoming.message, reading.signal)
                 factors.append((float(conversion.scale), float(conversion.offset)))
-        self._raw, self._told = bytearray(SLOT * len(self.slots)), bytearray(len(self.slots))
+        self._raw, self._received = bytearray(SLOT * len(self.slots)), bytearray(len(self.slots))
         joints = profile.joints
         scale = np.concatenate([joints.scale[name] for name in self.names])
         zero = np.zeros(len(scale))
@@ -103,7 +103,7 @@ class Reading:
         self._lines = np.array([np.full(len(scale), np.nan), scale, zero])
         self.wire = {name: self._lines[0, i * n : i * n + n] for i, name in enumerate(self.names)}
         self._arguments = (
-            np.frombuffer(self._raw, np.uint8), np.frombuffer(self._told, np.uint8),
+            np.frombuffer(self._raw, np.uint8), np.frombuffer(self._received, np.uint8),
             np.array(rows, np.int64).reshape(-1, 7), np.array(factors).reshape(-1, 2), self._lines,
         )  # fmt: skip
         self.table()  # compiled here: the first sample must not wait for a compiler
@@ -120,10 +120,10 @@ class Reading:
         """Take the bytes of a frame, of the length that its message has."""
         start = SLOT * slot
         self._raw[start : start + len(data)] = data
-        self._told[slot] = 1
+        self._received[slot] = 1
 
     def table(self) -> Vector:
-        """Return all quantities (q, n) in SI units, in the order of ``names``; NaN: not told."""
+        """Return all quantities (q, n) in SI units, in order of ``names``; NaN: not received."""
         found = np.empty(len(self.names) * self._n)
         fill(*self._arguments, found)
         return found.reshape(-1, self._n)

@@ -1,4 +1,4 @@
-"""A DBC read by cantools and checked, its errors told with the line that is wrong."""
+"""A DBC read by cantools and checked, its errors reported with the line that is wrong."""
 
 from __future__ import annotations
 

@@ -27,13 +27,13 @@ from gapbridge.drivers.can.writer import FrameWriter
 from gapbridge.drivers.driver import Driver
 
 Vector = NDArray[np.float64]
-FIRST_SAMPLE = 2.0  # s in which an arm on the bus must have told everything once
+FIRST_SAMPLE = 2.0  # s in which an arm on the bus must have reported everything once
 SLICE = 0.02  # s, of one wait for a frame
 ANSWER = 0.02  # s after which an answer that is not there does not come
 
 
 class CanDriver(Driver):
-    """One arm whose joints are told and commanded in CAN frames, as a profile maps them.
+    """One arm whose joints are reported and commanded in CAN frames, as a profile maps them.
 
     Who else sends our control identifiers is another commander: then nothing is armed, and what is
     armed writes no more.
@@ -56,17 +56,17 @@ class CanDriver(Driver):
         self._slot = 0.0  # s, when an arm that must be asked is asked next
         self._changed = 0.0  # s, monotonic: when the joints last changed
         self._q: Vector | None = None
-        self._angles: list[float] = []  # the same, as they were told in the last sample
-        self._broken = 0  # samples dropped, as far as they were told
-        self._kept: Sample | None = None  # came before a dropped one was told
+        self._angles: list[float] = []  # the same, as they were reported in the last sample
+        self._broken = 0  # samples dropped, as far as they were reported
+        self._kept: Sample | None = None  # came before a dropped one was reported
         self._listening = 0.0  # s, monotonic: since when other commanders would be heard
 
     # -- reading ----------------------------------------------------------------------------------
 
     def connect(self) -> None:
-        """Open the bus and wait until the arm has told everything once. Sends no command."""
+        """Open the bus and wait until the arm has reported everything once. Sends no command."""
         self.reader.open()
-        self.writer.bus = self.reader.bus
+        self.writer.use(self.reader.bus)
         self._listening = time.monotonic()
         end = time.monotonic() + min(FIRST_SAMPLE, self.settings.connect_timeout)
         found = False
@@ -85,18 +85,18 @@ class CanDriver(Driver):
 
     def _nothing_heard(self, complete: bool) -> LinkError:
         """Return what was missed, and close: a link that is not there is not half open."""
-        heard = self.reader.assembler.heard
-        missing = [i.name for key, i in self.profile.incoming.items() if key not in heard]
+        received_at = self.reader.assembler.received_at
+        missing = [i.name for key, i in self.profile.incoming.items() if key not in received_at]
         dropped = dict(self.reader.assembler.dropped)
-        words = f"never heard {', '.join(missing)}" if missing else "no complete sample"
+        message = f"never heard {', '.join(missing)}" if missing else "no complete sample"
         if not missing and complete:
-            words = f"{self.reader.silent_status()} has fallen silent"
+            message = f"{self.reader.silent_status()} has fallen silent"
         self.close()
-        told = f"; dropped: {dropped}" if dropped else ""
-        return LinkError(f"{self.settings.where()}: {self.profile.name}: {words}{told}")
+        detail = f"; dropped: {dropped}" if dropped else ""
+        return LinkError(f"{self.settings.where()}: {self.profile.name}: {message}{detail}")
 
     def _ask(self) -> None:
-        with contextlib.suppress(WriteError):  # silence follows, and is told
+        with contextlib.suppress(WriteError):  # silence follows, and is reported
             self.writer.request()
 
     def read_state(self) -> RobotState:
@@ -128,13 +128,13 @@ class CanDriver(Driver):
         return sample
 
     def _check_torn(self, sample: Sample | None) -> None:
-        """Tell, once, that frames have come which make no sample; a good one is kept."""
+        """Report, once, that frames have come which make no sample; a good one is kept."""
         broken, self._broken = self._broken, self.reader.assembler.broken
         if self._broken > broken:
             self._kept = sample
-            told = ", ".join(f"{n} {why}" for why, n in self.reader.assembler.dropped.items())
+            detail = ", ".join(f"{n} {why}" for why, n in self.reader.assembler.dropped.items())
             raise InvalidStateError(
-                f"{self.profile.name}: frames that make no sample were dropped (so far {told})"
+                f"{self.profile.name}: frames that make no sample were dropped (so far {detail})"
             )
 
     def _asked(self) -> Sample:
@@ -161,9 +161,9 @@ class CanDriver(Driver):
     def _stale(self) -> StaleStateError:
         silent = f"for {time.monotonic() - self._given:.3f} s" if self._given > 0.0 else "yet"
         errors = self.reader.error_frames
-        told = f" ({errors} error frames so far)" if errors else ""
+        detail = f" ({errors} error frames so far)" if errors else ""
         return StaleStateError(
-            f"{self.settings.where()}: {self.profile.name}: no complete sample {silent}{told}"
+            f"{self.settings.where()}: {self.profile.name}: no complete sample {silent}{detail}"
         )
 
     def _check_frozen(self, sample: Sample) -> None:
@@ -185,7 +185,7 @@ class CanDriver(Driver):
             )
 
     def _target(self) -> Vector | None:
-        """Return what the arm was last told, by us or by another commander."""
+        """Return what the arm was last commanded, by us or by another commander."""
         if self._armed_at is not None:
             return self.writer.target
         return self.reader.foreign_target(self.settings.foreign_quiet)
@@ -202,9 +202,9 @@ class CanDriver(Driver):
         if foreign is not None and time.monotonic() - foreign.seen < quiet:
             raise self._commanded_by_another()
         self._kept = None
-        trouble, words = self.reader.trouble(writing=False)
+        trouble, message = self.reader.trouble(writing=False)
         if trouble:
-            raise WriteError(f"{self.profile.name}: {trouble}: {words}")
+            raise WriteError(f"{self.profile.name}: {trouble}: {message}")
         start = self._present()
         try:
             self.writer.run(self.profile.enable, self._present, self._listen, self._reached)
@@ -239,8 +239,8 @@ class CanDriver(Driver):
     def _reached(self, goal: str) -> bool:
         if goal == "disabled":
             return self.reader.disabled
-        told = not self.profile.enabled_values or self.reader.enabled
-        return told and (goal == "enabled" or not self.reader.trouble(writing=True)[0])
+        detail = not self.profile.enabled_values or self.reader.enabled
+        return detail and (goal == "enabled" or not self.reader.trouble(writing=True)[0])
 
     def _commanded_by_another(self) -> ForeignCommandError:
         foreign = self.reader.foreign
@@ -281,5 +281,5 @@ class CanDriver(Driver):
         with contextlib.suppress(LinkError, InvalidStateError):
             self.release()
         self._armed_at = None
-        self.writer.bus = None
+        self.writer.use(None)
         self.reader.close()

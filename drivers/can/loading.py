@@ -34,7 +34,7 @@ def shipped_profiles() -> tuple[str, ...]:
 
 
 def load_profile(name: str, folder: Path | None = None) -> CanProfile:
-    """Return a shipped profile by name, or one by its path seen from ``folder``.
+    """Return a shipped profile by name, or one by its path relative to ``folder``.
 
     Raises ProfileError in one line: file, line, key, found, expected.
     """
@@ -67,14 +67,14 @@ def _schema_error(document: ProfileDocument, error: ValidationError) -> ProfileE
     keys = tuple(key for key in worst["loc"] if key != "list[constrained-float]")
     found = worst["input"] if not isinstance(worst["input"], dict | list) else "something else"
     if worst["type"] == "missing":
-        words = "found nothing, expected this key"
+        text = "found nothing, expected this key"
     elif worst["type"] == "extra_forbidden":
-        words = "found an unknown key"
+        text = "found an unknown key"
     elif worst["type"] == "value_error":
-        words = worst["msg"].removeprefix("Value error, ")
+        text = worst["msg"].removeprefix("Value error, ")
     else:
-        words = f"found {found!r}, {worst['msg'][0].lower()}{worst['msg'][1:]}"
-    return document.error(keys, words)
+        text = f"found {found!r}, {worst['msg'][0].lower()}{worst['msg'][1:]}"
+    return document.error(keys, text)
 
 
 class _Loading:
@@ -166,10 +166,10 @@ class _Loading:
                 factors.append(UNITS[name][unit])
                 continue
             known = ", ".join(UNITS[name])
-            words = f"found unit {unit!r}, expected one of {known}"
+            text = f"found unit {unit!r}, expected one of {known}"
             if quantity.unit:
-                raise self.names.error((*keys, "unit"), words)
-            raise self.dbc.error(message.name, signal.name, words)
+                raise self.names.error((*keys, "unit"), text)
+            raise self.dbc.error(message.name, signal.name, text)
         return np.array(factors)
 
     # -- incoming ---------------------------------------------------------------------------------

@@ -82,7 +82,7 @@ class OutgoingLoading:
         found = []
         for i, step in enumerate(steps):
             if step.until in ("enabled", "disabled") and self.file.enabled is None:
-                raise self.names.error((key, i, "until"), "found no key `enabled` that would tell")
+                raise self.names.error((key, i, "until"), "found no key `enabled` to show it")
             if step.hold and self.file.setpoint is None:
                 raise self.names.error((key, i, "hold"), "found no key `setpoint` to hold with")
             frames = self.frames(step.send, (key, i, "send"))

@@ -1,4 +1,4 @@
-"""Names in a profile, looked up in its DBC; what is not there is told with its line."""
+"""Names in a profile, looked up in its DBC; what is not there is reported with its line."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Names:
     def __init__(self, document: ProfileDocument, file: ProfileFile, dbc: Dbc) -> None:
         self.document, self.file, self.dbc = document, file, dbc
 
-    def error(self, keys: Sequence[str | int], words: str) -> ProfileError:
+    def error(self, keys: Sequence[str | int], text: str) -> ProfileError:
         """Return the error that says ``words`` about a key of the profile."""
-        return self.document.error(keys, words)
+        return self.document.error(keys, text)
 
     def message(self, name: str, keys: Keys) -> tuple[Any, Key]:
         """Return a message (cantools) and its identifier. Raises ProfileError."""

@@ -26,7 +26,7 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """A signal that tells whether the arm is well."""
+    """A signal that reports whether the arm is well."""
 
     signal: str
     normal: frozenset[int]
@@ -84,8 +84,8 @@ class Outgoing:
         try:
             return bytes(self.message.encode(values, strict=True))
         except Exception as error:  # cantools, bitstruct and struct each raise their own
-            words = " ".join(str(error).split())
-            raise ValueError(f"{self.name}: {words}") from None
+            text = " ".join(str(error).split())
+            raise ValueError(f"{self.name}: {text}") from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +146,7 @@ class CanProfile:
 
     @property
     def quantities(self) -> frozenset[str]:
-        """Return what the feedback tells."""
+        """Return what the feedback reports."""
         return frozenset(self.joints.scale)
 
     @property

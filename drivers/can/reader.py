@@ -153,14 +153,14 @@ class FrameReader:
     @property
     def enabled(self) -> bool:
         """Return whether every motor has said that it is enabled."""
-        told = self.assembler.enabled
-        return len(told) == self._motors and all(told.values())
+        motors = self.assembler.enabled
+        return len(motors) == self._motors and all(motors.values())
 
     @property
     def disabled(self) -> bool:
         """Return whether every motor has said that it is not enabled."""
-        told = self.assembler.enabled
-        return bool(told) and not any(told.values())
+        motors = self.assembler.enabled
+        return bool(motors) and not any(motors.values())
 
     def trouble(self, writing: bool) -> tuple[str, str]:
         """Return what is wrong with the arm and the words for it; empty where nothing is."""
@@ -174,13 +174,13 @@ class FrameReader:
 
     def silent_status(self) -> str:
         """Return the name of a status message that has not come for too long; empty: none."""
-        now, all_heard = time.monotonic(), self.assembler.heard
-        oldest = min(all_heard.values(), default=0.0)
-        complete = len(all_heard) == len(self._profile.incoming)
+        now, all_received = time.monotonic(), self.assembler.received_at
+        oldest = min(all_received.values(), default=0.0)
+        complete = len(all_received) == len(self._profile.incoming)
         if complete and now - oldest <= self._profile.status_timeout:
             return ""
         for key, incoming in self._profile.incoming.items():
-            heard = self.assembler.heard.get(key)
-            if heard is None or now - heard > self._profile.status_timeout:
+            received_at = self.assembler.received_at.get(key)
+            if received_at is None or now - received_at > self._profile.status_timeout:
                 return incoming.name
         return ""

@@ -25,7 +25,7 @@ class Quantity(Section):
 
 
 class Feedback(Section):
-    """What the arm tells of its joints."""
+    """What the arm reports about its joints."""
 
     position: Quantity
     velocity: Quantity | None = Field(default=None, description="left out: from positions")
@@ -45,7 +45,7 @@ class SampleEntry(Section):
 
 
 class StatusEntry(Section):
-    """A signal that tells whether the arm may be used."""
+    """A signal that reports whether the arm may be used."""
 
     signal: str
     normal: list[int] = Field(min_length=1, description="values of an arm that is well")
@@ -55,7 +55,7 @@ class StatusEntry(Section):
 
 
 class EnabledEntry(Section):
-    """The signals that tell whether the motors are enabled, and the values that say yes."""
+    """The signals that report whether the motors are enabled, and the values that say yes."""
 
     signals: list[str] = Field(min_length=1)
     values: list[int] = Field(default=[1], min_length=1)
@@ -90,7 +90,7 @@ class Step(Section):
 
 
 class SetpointEntry(Section):
-    """How a joint setpoint is told to the arm."""
+    """How a joint setpoint is sent to the arm."""
 
     position: Quantity
     frames: list[FrameEntry] = Field(min_length=1, description="in the order they are sent")

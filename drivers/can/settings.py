@@ -18,7 +18,7 @@ class CanSettings(DriverSettings, BusSettings):
     """How to reach an arm on CAN, and which map of frames it has.
 
     ``profile`` is the name of a shipped one (``piper``, ``openarm``, ``odrive``) or a path ending
-    in .yaml, seen from the cell's folder.
+    in .yaml, relative to the cell's folder.
     """
 
     driver: Literal["can"] = "can"
@@ -74,7 +74,7 @@ class CanSettings(DriverSettings, BusSettings):
         read_profile(self.profile_path, self.installation)
 
     def located(self, folder: Path) -> Self:
-        """Return the settings with the profile's path seen from ``folder``; see DriverSettings."""
+        """Return the settings with the profile's path resolved; see DriverSettings."""
         if self.names_file:
             return self.model_copy(update={"profile": str((folder / self.profile).resolve())})
         if not self.profile_path.is_file():

@@ -21,13 +21,13 @@ Vector = NDArray[np.float64]
 
 @njit(**JIT)
 def _looked_at(table, bounds, before, step):  # type: ignore[no-untyped-def]
-    """Return which rows (bits) of a sample every joint has told; -1: it cannot be believed.
+    """Return which rows (bits) of a sample every joint has reported; -1: it cannot be believed.
 
     ``table`` (q, n): position first; ``bounds`` (q + 1, n): least and most position, then the
     largest magnitude of each other row. ``before`` (n,): positions that are at most ``step`` rad
     away; negative: not compared.
     """
-    told = 0
+    present = 0
     for i in range(table.shape[1]):
         angle = table[0, i]
         if not (bounds[0, i] <= angle <= bounds[1, i]):  # NaN is not either
@@ -41,8 +41,8 @@ def _looked_at(table, bounds, before, step):  # type: ignore[no-untyped-def]
                 return -1
             whole = whole and np.isfinite(table[k, i])
         if whole:
-            told |= 1 << k
-    return told
+            present |= 1 << k
+    return present
 
 
 class StateBuilder:
@@ -67,12 +67,12 @@ class StateBuilder:
     def build(self, sample: Sample, target: Vector | None, trouble: str, ready: bool) -> RobotState:
         """Return the state of a sample. Raises InvalidStateError.
 
-        ``target`` (n,) is what the arm was last told, where anyone told it.
+        ``target`` (n,) is what the arm was last commanded, where anyone commanded it.
         """
         q = sample.position
         before = self._before  # a refused sample does not replace it: the next is compared too
-        told = self._told(sample, before)
-        qd = told.get("velocity")
+        present = self._values(sample, before)
+        qd = present.get("velocity")
         if qd is None:
             qd = self._differences(sample, before)
         self._before = sample
@@ -84,23 +84,23 @@ class StateBuilder:
             actual_qd=qd,
             target_q=q if target is None else target,
             actual_TCP_force=np.zeros(6),
-            joint_temperatures=told.get("temperature"),
-            actual_current_as_torque=told.get("torque"),
+            joint_temperatures=present.get("temperature"),
+            actual_current_as_torque=present.get("torque"),
             robot_mode=modes.robot_mode,
             safety_mode=modes.safety_mode,
             safety_status_bits=modes.safety_status_bits,
         )
 
-    def _told(self, sample: Sample, before: Sample | None) -> dict[str, Vector]:
-        """Return the quantities that every joint has told. Raises InvalidStateError."""
+    def _values(self, sample: Sample, before: Sample | None) -> dict[str, Vector]:
+        """Return the quantities that every joint has reported. Raises InvalidStateError."""
         table, step, earlier = sample.table, np.inf, sample.position
         if before is not None:
             step = FASTEST * (sample.received - before.received) + JITTER
             earlier = before.position
-        told = _looked_at(table, self._bounds, earlier, step)
-        if told < 0:
+        present = _looked_at(table, self._bounds, earlier, step)
+        if present < 0:
             raise self._invalid(self._reason(sample, before))
-        return {name: table[k] for k, name in enumerate(self._names) if told >> k & 1}
+        return {name: table[k] for k, name in enumerate(self._names) if present >> k & 1}
 
     def _reason(self, sample: Sample, before: Sample | None) -> str:
         """Return why a sample cannot be believed."""
@@ -125,5 +125,5 @@ class StateBuilder:
                 self._qd = (sample.position - before.position) / gap
         return self._qd
 
-    def _invalid(self, words: str) -> InvalidStateError:
-        return InvalidStateError(f"{self._profile.name}: {words}")
+    def _invalid(self, message: str) -> InvalidStateError:
+        return InvalidStateError(f"{self._profile.name}: {message}")

@@ -24,11 +24,15 @@ class FrameWriter:
 
     def __init__(self, settings: CanSettings, profile: CanProfile) -> None:
         self._settings, self._profile = settings, profile
-        self.bus: Any = None
+        self._bus: Any = None
         self._plan = Writing(profile)
         self._last: Frames | None = None  # the setpoint that got out whole
         self.target: Vector | None = None  # rad, the same as joints
         self.mended = 0  # setpoints that had to be taken back
+
+    def use(self, bus: Any) -> None:
+        """Send over this bus from now on; None: there is none any more."""
+        self._bus = bus
 
     def forget(self) -> None:
         """Forget the last setpoint: it is no longer what the arm holds."""
@@ -46,14 +50,14 @@ class FrameWriter:
                 self._send(key, data)
             except WriteError as error:
                 done = self._mend() if sent else "nothing of it was sent"
-                words = f"{error} ({sent} of {len(frames)} frames out; {done})"
-                raise PartialWriteError(words) from None
+                message = f"{error} ({sent} of {len(frames)} frames out; {done})"
+                raise PartialWriteError(message) from None
         self._last, self.target = frames, q.copy()
 
     def _mend(self) -> str:
         """Take back a setpoint of which a part is out; returns what was done."""
         self.mended += 1
-        for frames, words in (
+        for frames, message in (
             (self._last, "the setpoint before was sent again"),
             (self._stop_frames(), "the stop sequence was sent"),
         ):
@@ -64,7 +68,7 @@ class FrameWriter:
                     self._send(key, data)
             except WriteError:
                 continue
-            return words
+            return message
         return "neither the setpoint before nor a stop could be sent"
 
     def _stop_frames(self) -> Frames:
@@ -132,11 +136,11 @@ class FrameWriter:
 
         if key not in self._profile.sends:
             raise WriteError(f"{self._profile.name}: {key[0]:#x} is not among the profile's sends")
-        if self.bus is None:
+        if self._bus is None:
             raise WriteError(f"{self._settings.where()}: found no bus, expected connect() first")
         frame = can.Message(arbitration_id=key[0], is_extended_id=key[1], data=data)
         try:
-            self.bus.send(frame, timeout=self._settings.send_timeout)
+            self._bus.send(frame, timeout=self._settings.send_timeout)
         except Exception as error:  # CanError, OSError, serial's
             raise WriteError(
                 f"{self._settings.where()}: frame {key[0]:#x} could not be sent: "

@@ -1,4 +1,4 @@
-"""python-can's socketcand bus, but the end of the connection is told.
+"""python-can's socketcand bus, but the end of the connection is reported.
 
 python-can 4.6's own spins at full load, without an exception, once the server is gone.
 """

@@ -52,10 +52,10 @@ def check_units(master: Master, profile: CanopenProfile, arm: Arm) -> None:
         high = master.read_where_present(node, HIGHEST)
         if low is None or high is None or low >= high or max(-low, high) >= UNLIMITED:
             continue
-        told = (high - low) / abs(profile.counts_per_radian[joint])
-        if not 1.0 / OTHER_SIZE <= told / span[joint] <= OTHER_SIZE:
+        reported = (high - low) / abs(profile.counts_per_radian[joint])
+        if not 1.0 / OTHER_SIZE <= reported / span[joint] <= OTHER_SIZE:
             raise LinkError(
-                f"{master.where}: node {node}: found software position limits {told:.4g} rad "
+                f"{master.where}: node {node}: found software position limits {reported:.4g} rad "
                 f"apart, and joint {joint + 1} can turn {span[joint]:.4g} rad: are counts_per_turn "
                 f"and gear of {profile.path.name} right?"
             )
@@ -120,16 +120,16 @@ def _check_pdo(master: Master, node: int, layout: PdoLayout) -> None:
     pdo = master.sdo(node, f"the mapping of {layout.name}", act)
     found = [(Address(v.index, v.subindex), v.length) for v in pdo.map]
     wanted = [(entry.address, entry.bits) for entry in layout.entries]
-    words = ""
+    message = ""
     if found != wanted:
-        words = f"maps {', '.join(str(a) for a, _ in found) or 'nothing'}"
+        message = f"maps {', '.join(str(a) for a, _ in found) or 'nothing'}"
     elif not pdo.enabled or pdo.cob_id != layout.cob_id(node):
-        words = f"is {'at' if pdo.enabled else 'off at'} 0x{pdo.cob_id:X}"
+        message = f"is {'at' if pdo.enabled else 'off at'} 0x{pdo.cob_id:X}"
     elif pdo.trans_type != SYNCHRONOUS:
-        words = f"has transmission type {pdo.trans_type}"
-    if words:
+        message = f"has transmission type {pdo.trans_type}"
+    if message:
         raise LinkError(
-            f"{master.where}: node {node}: {layout.name} {words}, expected "
+            f"{master.where}: node {node}: {layout.name} {message}, expected "
             f"{', '.join(str(a) for a, _ in wanted)} at 0x{layout.cob_id(node):X}, type 1"
         )
     # the listener reads TPDOs by itself; the library's copy would only cost time

@@ -28,6 +28,7 @@ from gapbridge.drivers.canopen.configure import (
 )
 from gapbridge.drivers.canopen.listening import OPERATIONAL, Emergency, Foreign
 from gapbridge.drivers.canopen.master import Master
+from gapbridge.drivers.canopen.objects import FAULTS
 from gapbridge.drivers.canopen.power import Power
 from gapbridge.drivers.canopen.profile import WINDOW, read_profile
 from gapbridge.drivers.canopen.rhythm import Rhythm
@@ -71,7 +72,7 @@ class CanopenDriver(Driver):
         self._connected_at = 0.0
         self._armed_at: float | None = None  # s, monotonic
         self._moved_at = 0.0  # s, monotonic: when the joints last changed, or were not sent away
-        self._told: Emergency | None = None  # that was written to the log last
+        self._reported: Emergency | None = None  # that was written to the log last
 
     # -- connecting -------------------------------------------------------------------------------
 
@@ -90,7 +91,7 @@ class CanopenDriver(Driver):
             check_units(master, self.profile, self._arm)
             assert master.life is not None
             master.life.started()
-            master.collector.stray = ""
+            master.collector.forget_stray()
             for node in self.profile.nodes:
                 master.command(node, "OPERATIONAL")
             self._first_sample()
@@ -122,7 +123,7 @@ class CanopenDriver(Driver):
     # -- reading ----------------------------------------------------------------------------------
 
     def read_state(self) -> RobotState:
-        """Send one SYNC and return what all drives told at it; see Driver.read_state.
+        """Send one SYNC and return what all drives reported at it; see Driver.read_state.
 
         Raises InvalidStateError where a set is torn, LinkError where a drive has restarted.
         """
@@ -146,9 +147,9 @@ class CanopenDriver(Driver):
         """Raise where a drive's heartbeat has ended, or where it has restarted."""
         life = self.master.life
         assert life is not None
-        if life.log and life.log[-1] is not self._told:
-            self._told = life.log[-1]
-            log.warning("%s: %s", self.master.where, self._told)
+        if life.log and life.log[-1] is not self._reported:
+            self._reported = life.log[-1]
+            log.warning("%s: %s", self.master.where, self._reported)
         node = life.not_operational()
         if node is not None:
             why = "has restarted" if node in life.restarted else f"NMT state {life.nmt[node]}"
@@ -199,11 +200,11 @@ class CanopenDriver(Driver):
             return
         try:
             found = self._quiet_sample()
-            for joint, told in enumerate(states(found)):
-                if told.startswith("FAULT") and not self.settings.clear_faults:
+            for joint, reported in enumerate(states(found)):
+                if reported in FAULTS and not self.settings.clear_faults:
                     node = self.profile.nodes[joint]
                     raise WriteError(
-                        f"{self.master.where}: node {node}: found {told}"
+                        f"{self.master.where}: node {node}: found {reported}"
                         f"{self.power.complaint(node)}, expected none; link.clear_faults resets it"
                     )
             self._enable(found)

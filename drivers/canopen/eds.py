@@ -68,7 +68,7 @@ def _import(path: Path, node: int) -> Any:
 
     try:
         text = io.StringIO(read_text(path))
-        text.name = str(path)  # the library tells the kind of file by it
+        text.name = str(path)  # the library takes the kind of file from it
         return canopen.import_od(text, node)
     except FileNotFoundError:
         raise ProfileError(f"{path}: file not found, expected an EDS") from None

@@ -73,7 +73,7 @@ class BusListener(MessageListener):
         super().on_message_received(msg)  # type: ignore[no-untyped-call]
 
     def on_error(self, exc: Exception) -> None:
-        """Keep the notifier's thread from a traceback; ``Network.check`` tells what ended the bus.
+        """Keep the notifier's thread from a traceback; ``Network.check`` says what ended the bus.
 
         The thread goes on until it is stopped, so that it must not spin.
         """
@@ -96,8 +96,8 @@ class Life:
 
     def __init__(self, network: Network, profile: CanopenProfile) -> None:
         self._profile = profile
-        self.heard: dict[int, float] = {}  # node -> s, monotonic
-        self.nmt: dict[int, int] = {}  # node -> NMT state that it told last
+        self.received_at: dict[int, float] = {}  # node -> s, monotonic
+        self.nmt: dict[int, int] = {}  # node -> NMT state that it reported last
         self.restarted: set[int] = set()
         self.active: dict[int, Emergency] = {}
         self.log: deque[Emergency] = deque(maxlen=KEPT)
@@ -108,7 +108,7 @@ class Life:
 
     def _heartbeat_of(self, node: int) -> Any:
         def note(state: int) -> None:
-            self.heard[node] = time.monotonic()
+            self.received_at[node] = time.monotonic()
             if state == 0:
                 self.restarted.add(node)
             self.nmt[node] = state
@@ -133,18 +133,18 @@ class Life:
         self.restarted.clear()
         self.nmt.clear()
         now = time.monotonic()
-        self.heard = dict.fromkeys(self._profile.nodes, now)
+        self.received_at = dict.fromkeys(self._profile.nodes, now)
 
     @property
     def all_operational(self) -> bool:
-        """Return whether every node's heartbeat has told that it is OPERATIONAL."""
+        """Return whether every node's heartbeat has reported that it is OPERATIONAL."""
         return all(self.nmt.get(node) == OPERATIONAL for node in self._profile.nodes)
 
     def lost(self) -> int | None:
         """Return a node whose heartbeats have ceased; None: none."""
         now = time.monotonic()
         for node in self._profile.nodes:
-            if now - self.heard.get(node, 0.0) > self._profile.heartbeat.lost_after:
+            if now - self.received_at.get(node, 0.0) > self._profile.heartbeat.lost_after:
                 return node
         return None
 

@@ -10,6 +10,7 @@ State = Literal[
     "NOT READY TO SWITCH ON", "SWITCH ON DISABLED", "READY TO SWITCH ON", "SWITCHED ON",
     "OPERATION ENABLED", "QUICK STOP ACTIVE", "FAULT REACTION ACTIVE", "FAULT",
 ]  # fmt: skip
+FAULTS: tuple[State, ...] = ("FAULT REACTION ACTIVE", "FAULT")
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +87,7 @@ TOWARDS_ENABLED: dict[State, int] = {
 
 
 def state_of(statusword: int) -> State:
-    """Return the state that a Statusword tells; what no state has counts as a fault."""
+    """Return the state that a Statusword reports; what no state has counts as a fault."""
     for state, (mask, bits) in _MASKS.items():
         if statusword & mask == bits:
             return state

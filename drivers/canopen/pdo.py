@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 
 from gapbridge.drivers.canopen.objects import PDO_STEP, RPDO_BASE, TPDO_BASE, Address
 
@@ -35,12 +36,11 @@ class PdoLayout:
     number: int  # from 1
     entries: tuple[Entry, ...]
     transmitted: bool  # True: a TPDO
-    length: int = field(init=False)  # bytes
 
-    def __post_init__(self) -> None:
-        """Reckon the length."""
-        bits = sum(entry.bits for entry in self.entries)
-        object.__setattr__(self, "length", (bits + 7) // 8)
+    @cached_property
+    def length(self) -> int:
+        """Return how many bytes it has."""
+        return (sum(entry.bits for entry in self.entries) + 7) // 8
 
     @property
     def name(self) -> str:

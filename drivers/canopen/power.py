@@ -94,8 +94,8 @@ class Power:
         resetting = False
         end = time.monotonic() + within
         while True:
-            told = states(found)
-            enabled = all(state == "OPERATION ENABLED" for state in told)
+            reported = states(found)
+            enabled = all(state == "OPERATION ENABLED" for state in reported)
             if hold is None and enabled:
                 hold = positions(self._profile, found)
             if hold is not None and enabled and not_following(self._profile, found) is None:
@@ -103,7 +103,7 @@ class Power:
             if time.monotonic() > end:
                 raise self._not_there(found)
             resetting = not resetting and clear_faults
-            words = [self._towards(state, enabled, resetting) for state in told]
+            words = [self._towards(state, enabled, resetting) for state in reported]
             self._writer.send(words, positions(self._profile, found) if hold is None else hold)
             found = self._exchange() or found
 
@@ -134,28 +134,28 @@ class Power:
     def disable(self) -> None:
         """Stop by quick stop, wait until the arm stands, and switch off. Raises LinkError.
 
-        Drives that answer no more are told so too; they have at least our last word.
+        Drives that answer no more get the message too; they have at least our last word.
         """
         profile, end = self._profile, time.monotonic() + STOPPING
-        told: list[State] = ["OPERATION ENABLED"] * profile.n
+        reported: list[State] = ["OPERATION ENABLED"] * profile.n
         q, still = self._writer.target, 0
         while True:
             if q is not None:
                 late = time.monotonic() > end - 0.5 * STOPPING
                 word = DISABLE_VOLTAGE if still >= STANDING or late else QUICK_STOP
                 moving = "OPERATION ENABLED"
-                words = [QUICK_STOP if s == moving and not late else word for s in told]
+                words = [QUICK_STOP if s == moving and not late else word for s in reported]
                 self._writer.send(words, q)
             found = self._exchange()
             if found is not None:
-                told, now = states(found), positions(profile, found)
+                reported, now = states(found), positions(profile, found)
                 still = still + 1 if q is not None and (now == q).all() else 0
                 q = now
-                if all(state in OFF for state in told):
+                if all(state in OFF for state in reported):
                     self._writer.forget()
                     return
             if time.monotonic() > end:
                 raise WriteError(
-                    f"{self._master.where}: not all drives have told that they are off "
+                    f"{self._master.where}: not all drives have reported that they are off "
                     f"{STOPPING:g} s after the quick stop"
                 )

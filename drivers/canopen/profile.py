@@ -55,7 +55,7 @@ class CanopenProfile:
 
     @property
     def heartbeat(self) -> Heartbeat:
-        """Return who tells whom that they live."""
+        """Return who sends heartbeats to whom."""
         return self.file.heartbeat
 
     @property

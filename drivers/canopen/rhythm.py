@@ -31,7 +31,7 @@ class Rhythm:
         self._wait_for_slot()
         self._writer.make_whole()
         collector = self._master.collector
-        collector.stray = ""
+        collector.forget_stray()
         found = collector.wait(self._master.sync() + self._window)
         self._torn = found is None
         if found is not None:

@@ -35,7 +35,7 @@ class Joint(Section):
 
 
 class Heartbeat(Section):
-    """Who tells whom that they live."""
+    """Who sends heartbeats to whom."""
 
     drives: Positive = Field(default=0.1, description="s between two heartbeats of a drive")
     lost_after: Positive = Field(default=0.3, description="s without one: the drive is lost")
@@ -51,7 +51,7 @@ class ProfileFile(Section):
     """The whole file."""
 
     name: str = Field(min_length=1, description="the arm")
-    eds: str = Field(min_length=1, description="the drives' EDS or DCF, seen from this file")
+    eds: str = Field(min_length=1, description="the drives' EDS or DCF, relative to this file")
     mode: Mode = Field(description="cyclic synchronous position, or interpolated position")
     sync_period: Positive = Field(default=0.01, description="s, the shortest between two SYNCs")
     sync_window: Positive | None = Field(
@@ -61,7 +61,7 @@ class ProfileFile(Section):
         default="write", description="check: the drives' PDOs are fixed and must be these"
     )
     confirms_mode: bool = Field(
-        default=True, strict=True, description="Statusword bit 12 tells that setpoints are followed"
+        default=True, strict=True, description="Statusword bit 12: setpoints are followed"
     )
     velocity_scale: Positive | None = Field(
         default=None,

@@ -18,8 +18,8 @@ SHIPPED = Path(__file__).with_name("profiles")
 class CanopenSettings(DriverSettings, BusSettings):
     """How to reach an arm of CiA 402 drives, and which profile describes it.
 
-    ``profile`` is the name of a shipped one (``lwa4p``, ``cia402``) or a path ending in .yaml, seen
-    from the cell's folder.
+    ``profile`` is the name of a shipped one (``lwa4p``, ``cia402``) or a path ending in .yaml,
+    relative to the cell's folder.
     """
 
     driver: Literal["canopen"] = "canopen"
@@ -68,7 +68,7 @@ class CanopenSettings(DriverSettings, BusSettings):
         read_bytes(read_profile(self.profile_path).eds.path)
 
     def located(self, folder: Path) -> Self:
-        """Return the settings with the profile's path seen from ``folder``; see DriverSettings."""
+        """Return the settings with the profile's path resolved; see DriverSettings."""
         if self.names_file:
             return self.model_copy(update={"profile": str((folder / self.profile).resolve())})
         if not self.profile_path.is_file():

@@ -17,7 +17,7 @@ from gapbridge.drivers.robot_modes import modes_of
 from gapbridge.drivers.state_check import JointCheck
 
 Vector = NDArray[np.float64]
-SPAN, OLDEST = 5, 0.1  # samples, s: what a velocity is reckoned from where drives tell none
+SPAN, OLDEST = 5, 0.1  # samples, s: what a velocity is reckoned from where drives report none
 
 
 def states(found: SyncSet) -> list[State]:
@@ -61,8 +61,8 @@ class StateBuilder:
     def build(self, found: SyncSet, target: Vector | None, armed: bool) -> RobotState:
         """Return the state. Raises InvalidStateError.
 
-        ``target`` (n,) is what the drives were last told, rad. The time of the sample is that of
-        its SYNC, at which all drives latched their positions.
+        ``target`` (n,) is what the drives were last commanded, rad. The time of the sample is that
+        of its SYNC, at which all drives latched their positions.
         """
         q = positions(self._profile, found)
         wrong = self._joints.outside(q)
@@ -90,24 +90,24 @@ class StateBuilder:
         )
 
     def _trouble(self, found: SyncSet, armed: bool) -> str:
-        told = states(found)
-        if "FAULT" in told or "FAULT REACTION ACTIVE" in told:
+        reported = states(found)
+        if "FAULT" in reported or "FAULT REACTION ACTIVE" in reported:
             return "fault"
         if not armed:
             return ""
-        if "QUICK STOP ACTIVE" in told:
+        if "QUICK STOP ACTIVE" in reported:
             return "protective_stop"
         return "" if not_following(self._profile, found) is None else "not_ready"
 
     def _velocity(self, found: SyncSet, q: Vector) -> Vector:
         """Return (n,) rad/s: the drives' own where the profile knows its unit.
 
-        Else out of the last samples: one step alone would tell the SYNC's jitter.
+        Else out of the last samples: one step alone would show the SYNC's jitter.
         """
         scale = self._profile.file.velocity_scale
-        told = [counts.get("Velocity actual value") for counts in found.counts]
-        if scale is not None and None not in told:
-            return np.array(told, float) * scale / self._profile.counts_per_radian
+        reported = [counts.get("Velocity actual value") for counts in found.counts]
+        if scale is not None and None not in reported:
+            return np.array(reported, float) * scale / self._profile.counts_per_radian
         while self._last and found.synced - self._last[0][0] > OLDEST:
             self._last.popleft()
         if not self._last:
@@ -119,8 +119,8 @@ class StateBuilder:
         """Return (n,) Nm: Torque actual value is in thousandths of the rated torque."""
         if self._rated is None:
             return None
-        told = np.array([counts["Torque actual value"] for counts in found.counts], float)
-        return told * 1e-3 * self._rated * self._profile.direction
+        reported = np.array([counts["Torque actual value"] for counts in found.counts], float)
+        return reported * 1e-3 * self._rated * self._profile.direction
 
-    def _invalid(self, words: str) -> InvalidStateError:
-        return InvalidStateError(f"{self._profile.name}: {words}")
+    def _invalid(self, message: str) -> InvalidStateError:
+        return InvalidStateError(f"{self._profile.name}: {message}")

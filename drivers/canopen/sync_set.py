@@ -12,7 +12,7 @@ from gapbridge.drivers.canopen.profile import CanopenProfile
 
 
 class SyncSet(NamedTuple):
-    """What all drives told at one SYNC. A tuple, because one is made in every cycle."""
+    """What all drives reported at one SYNC. A tuple, because one is made in every cycle."""
 
     counts: tuple[dict[str, int], ...]  # per joint: object name -> counts
     synced: float  # s, time.monotonic() when the SYNC left
@@ -37,6 +37,10 @@ class SyncCollector:
         self._owed: set[int] = set()  # COB-IDs that a torn set lacked, and that may still come
         self.dropped: Counter[str] = Counter()  # reason -> frames or sets
         self.stray = ""  # a TPDO that came to no SYNC since the last look; empty: none
+
+    def forget_stray(self) -> None:
+        """Take note that somebody has looked at ``stray``."""
+        self.stray = ""
 
     def begin(self, now: float) -> None:
         """Forget what was collected: a SYNC leaves at ``now`` (s, monotonic)."""
@@ -87,9 +91,9 @@ class SyncCollector:
         """Return whether TPDOs of a torn set may still come: they must not meet the next SYNC's."""
         return bool(self._owed)
 
-    def _refuse(self, reason: str, words: str) -> None:
+    def _refuse(self, reason: str, message: str) -> None:
         self.dropped[reason] += 1
-        self._trouble = self._trouble or words
+        self._trouble = self._trouble or message
         self._changed.notify_all()
 
     def wait(self, until: float) -> SyncSet | None:

@@ -213,8 +213,8 @@ class AtiNetCanOem(ForceTorqueSensor):
 
     def describe(self, status: int) -> str:
         """Return the bits of the status in words."""
-        words = [word for i, word in enumerate(STATUS) if status >> i & 1]
-        return f"status 0x{status & 0xFFFF:04X}: {', '.join(words)}"
+        faults = [word for i, word in enumerate(STATUS) if status >> i & 1]
+        return f"status 0x{status & 0xFFFF:04X}: {', '.join(faults)}"
 
     def close(self) -> None:
         """Leave the bus."""

@@ -10,7 +10,7 @@ class ClockOffset:
     """How far another clock lags this machine's monotonic one, by a minimum filter over arrivals.
 
     Every arrival comes late by some delay; the least delay seen is the offset. What is constant in
-    the delay cannot be told from an offset by arrivals alone.
+    the delay cannot be distinguished from an offset by arrivals alone.
     """
 
     def __init__(self) -> None:

@@ -73,7 +73,7 @@ class RobotiqFt300(ForceTorqueSensor):
         self._client: Any = None
         self._decoder = StreamDecoder()
         self._waiting: list[Reading] = []
-        self._heard = 0.0  # s, monotonic
+        self._last_received = 0.0  # s, monotonic
 
     def connect(self) -> None:
         """Open the line, end a stream that was left running, start ours. Raises LinkError."""
@@ -117,7 +117,7 @@ class RobotiqFt300(ForceTorqueSensor):
             raise self._broken(error) from None
         if answer.isError() or answer.function_code != 16:
             raise LinkError(f"{self.name}: the sensor refused to start its stream ({answer})")
-        self._decoder, self._heard = StreamDecoder(), time.monotonic()
+        self._decoder, self._last_received = StreamDecoder(), time.monotonic()
 
     def _line(self) -> Any:
         line = self._client and self._client.socket
@@ -126,8 +126,8 @@ class RobotiqFt300(ForceTorqueSensor):
         return line
 
     def _broken(self, error: Exception) -> LinkError:
-        words = str(error).strip().splitlines() or [type(error).__name__]
-        return LinkError(f"{self.name}: {words[0]}")
+        message = str(error).strip().splitlines() or [type(error).__name__]
+        return LinkError(f"{self.name}: {message[0]}")
 
     def read(self, timeout: float) -> Reading | None:
         """Return the next sample; see ForceTorqueSensor.read."""
@@ -137,7 +137,7 @@ class RobotiqFt300(ForceTorqueSensor):
         while not self._waiting:
             left = until - time.monotonic()
             if left <= 0.0:
-                if time.monotonic() - self._heard > SILENCE:
+                if time.monotonic() - self._last_received > SILENCE:
                     self._start_stream()  # it may have been switched off meanwhile
                 return None
             self._take_bytes(left)
@@ -160,7 +160,7 @@ class RobotiqFt300(ForceTorqueSensor):
             stamp = received - way - behind / STREAM_RATE
             self._waiting.insert(0, self._reading(stamp, received, counts))
         if samples:
-            self._heard = received
+            self._last_received = received
 
     def _ask(self) -> Reading | None:
         """Return the registers' sample; None where the answer is none."""

@@ -65,7 +65,7 @@ class RobotousRft(ForceTorqueSensor):
         self._bus: Any = None
         self._decoder = PairDecoder(settings.reply_ids, 0.5 / settings.rate)
         self._clock = ClockOffset()
-        self._heard = 0.0  # s, monotonic
+        self._last_received = 0.0  # s, monotonic
 
     def connect(self) -> None:
         """Open the bus and start the stream. Raises LinkError."""
@@ -84,7 +84,7 @@ class RobotousRft(ForceTorqueSensor):
             arbitration_id=self.settings.command_id, data=bytes([code]) + bytes(7),
             is_extended_id=False,
         )  # fmt: skip
-        self._heard = time.monotonic()
+        self._last_received = time.monotonic()
         try:
             self._bus.send(frame, timeout=0.1)
         except (can.CanError, OSError) as error:
@@ -111,10 +111,10 @@ class RobotousRft(ForceTorqueSensor):
             found = self._decoder.take(frame.arbitration_id, bytes(frame.data), stamp)
             self.dropped = self._decoder.dropped
             if found is not None:
-                self._heard = received
+                self._last_received = received
                 wrench = np.array(found[:6]) * self._unit
                 return Reading(self._clock.take(stamp, received), received, wrench, found[6])
-        if time.monotonic() - self._heard > SILENCE:
+        if time.monotonic() - self._last_received > SILENCE:
             self._command(START)  # it may have been switched off meanwhile
         return None
 

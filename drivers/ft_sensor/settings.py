@@ -70,7 +70,7 @@ class RobotousSettings(BusSettings, FtSensorSettings):
     @field_validator("reply_ids")
     @classmethod
     def _ids_differ(cls, value: tuple[int, int], info: ValidationInfo) -> tuple[int, int]:
-        """Refuse identifiers that cannot be told apart."""
+        """Refuse identifiers that cannot be distinguished."""
         ids = {info.data.get("command_id"), *value}
         if len(ids) < 3 or not all(0 <= i <= STANDARD_IDS for i in value):
             raise ValueError("expected two 11-bit ids, different from each other and command_id")

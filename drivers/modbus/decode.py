@@ -76,7 +76,7 @@ class Decoder:
         self._plan.compile()
         self._conditions = [(self._spot(c), c) for c in profile.status]
         self._looked = _getters(spot for spot, _ in self._conditions)
-        self._said: list[Any] = []  # bytes of the conditions, last time
+        self._last_bytes: list[Any] = []  # bytes of the conditions, last time
         self._troubles: tuple[tuple[Trouble, str], ...] = ()
         clock, write = profile.clock, profile.write
         self._motion: list[tuple[str, Spot, Condition]] = []
@@ -166,14 +166,14 @@ class Decoder:
 
     def _troubles_of(self, registers: Registers) -> tuple[tuple[Trouble, str], ...]:
         """Return the conditions that are not met; looked at anew where a register has changed."""
-        said = [bytes_of(registers[block]) for block, bytes_of in self._looked]
-        if said != self._said:
+        found = [bytes_of(registers[block]) for block, bytes_of in self._looked]
+        if found != self._last_bytes:
             self._troubles = tuple(
                 (condition.otherwise, _words(condition, count))
                 for spot, condition in self._conditions
                 if not condition.fine(count := int(_number(registers, spot)))
             )
-            self._said = said
+            self._last_bytes = found
         return self._troubles
 
     def _check_lengths(self, registers: Registers) -> None:

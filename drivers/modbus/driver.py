@@ -78,8 +78,8 @@ class ModbusDriver(Driver):
         except InvalidStateError as error:
             self.transport.close()
             name = self.transport.name
-            words = str(error).removeprefix(f"{name}: ")
-            raise LinkError(f"{name}: {words}") from None
+            problem = str(error).removeprefix(f"{name}: ")
+            raise LinkError(f"{name}: {problem}") from None
         except LinkError:
             self.transport.close()
             raise
@@ -139,14 +139,14 @@ class ModbusDriver(Driver):
             self._slow = [self.transport.read(block) for block in self.map.slow]
             self._slow_at = now
         first = self._first_block
-        words = self._writer.pending()
+        problem = self._writer.pending()
         if now - self._given > self._longest_answer:
-            words = None  # of a state that is old by now
-        if words is not None and first.table == "holding":
-            found = [self.transport.exchange(first, *words)]
+            problem = None  # of a state that is old by now
+        if problem is not None and first.table == "holding":
+            found = [self.transport.exchange(first, *problem)]
         else:
-            if words is not None:
-                self.transport.write("holding", *words)
+            if problem is not None:
+                self.transport.write("holding", *problem)
             found = [self.transport.read(first)]
         for block in self._other_blocks:
             found.append(self.transport.read(block))
@@ -212,8 +212,10 @@ class ModbusDriver(Driver):
         name = self.transport.name
         if self.profile.write.mode != "read_only":
             if state.robot_mode != RUNNING or state.safety_mode not in (NORMAL, REDUCED):
-                words = "; ".join(text for _, text in self._sample.troubles) if self._sample else ""
-                raise WriteError(f"{name}: the robot is not ready: {words}")
+                problem = (
+                    "; ".join(text for _, text in self._sample.troubles) if self._sample else ""
+                )
+                raise WriteError(f"{name}: the robot is not ready: {problem}")
             self._check_resolution(state.actual_q)
         self._writer.arm(state, self._look)
 

@@ -53,7 +53,7 @@ class Vector(Place):
 
 
 class State(Section):
-    """What the controller tells in each sample."""
+    """What the controller reports in each sample."""
 
     position: Vector = Field(description="the joint angles")
     velocity: Vector | None = None
@@ -140,7 +140,7 @@ class ProfileFile(Section):
     """The whole file."""
 
     name: str = Field(min_length=1, description="the controller")
-    joints: int = Field(ge=1, le=12, description="how many joints it tells")
+    joints: int = Field(ge=1, le=12, description="how many joints it reports")
     port: int = Field(default=502, gt=0, lt=65536)
     device_id: int = Field(default=1, ge=0, le=255)
     period: Positive = Field(default=0.01, description="s, how often registers are renewed")

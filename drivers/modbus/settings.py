@@ -16,8 +16,8 @@ SHIPPED = Path(__file__).with_name("profiles")
 class ModbusSettings(DriverSettings):
     """How to reach a Modbus controller, and which register map it has.
 
-    ``profile`` is the name of a shipped one (``ur``, ``igus``, ...) or a path ending in .yaml, seen
-    from the cell's folder.
+    ``profile`` is the name of a shipped one (``ur``, ``igus``, ...) or a path ending in .yaml,
+    relative to the cell's folder.
     """
 
     driver: Literal["modbus"] = "modbus"
@@ -116,7 +116,7 @@ class ModbusSettings(DriverSettings):
         read_profile(self.profile_path)
 
     def located(self, folder: Path) -> Self:
-        """Return the settings with paths seen from ``folder`` made whole; see DriverSettings."""
+        """Return the settings with paths made absolute from ``folder``; see DriverSettings."""
         update: dict[str, object] = {
             name: folder / path
             for name in ("authority", "certificate", "key")

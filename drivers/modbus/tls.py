@@ -21,6 +21,10 @@ class CheckedContext(ssl.SSLContext):
     pinned: bytes | None = None  # SHA-256 of the controller's certificate
     refused = ""  # why the last handshake failed: the library keeps it to itself
 
+    def note_refusal(self, words: str) -> None:
+        """Keep why the last handshake failed; empty: it did not."""
+        self.refused = words
+
     def wrap_socket(self, *arguments: Any, **keys: Any) -> ssl.SSLSocket:
         """Return a TLS socket that checks its peer as it connects."""
         keys["server_hostname"] = self.server_name
@@ -34,21 +38,22 @@ class _CheckedSocket(ssl.SSLSocket):
         """Shake hands. Raises SSLError where the certificate is another than the pinned one."""
         context = self.context
         assert isinstance(context, CheckedContext)
-        context.refused = ""
+        context.note_refusal("")
         try:
             super().do_handshake(block)
         except ssl.SSLCertVerificationError as error:
-            context.refused = f"its certificate is refused: {error.verify_message}"
+            context.note_refusal(f"its certificate is refused: {error.verify_message}")
             raise
         if context.pinned is None:
             return
         found = hashlib.sha256(self.getpeercert(binary_form=True) or b"").digest()
         if found != context.pinned:
-            context.refused = (
+            words = (
                 f"found a certificate with SHA-256 {found.hex()}, expected {context.pinned.hex()} "
                 "(link.fingerprint)"
             )
-            raise ssl.SSLError(1, context.refused)
+            context.note_refusal(words)
+            raise ssl.SSLError(1, words)
 
 
 def checked_context(settings: ModbusSettings) -> ssl.SSLContext:

@@ -27,7 +27,7 @@ from gapbridge.drivers.modbus.tls import CheckedContext, checked_context
 
 READ_FUNCTIONS: dict[Table, int] = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 
-logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # told by our own errors instead
+logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # reported by our own errors instead
 
 
 class Transport:

@@ -1,6 +1,6 @@
 """Writing: Setpoint -> registers, by mailbox, by target and trigger, or not at all.
 
-Knows nothing of reading: it is told the newest sample. What counts is what the controller says
+Knows nothing of reading: it is given the newest sample. What counts is what the controller says
 afterwards, not that a request was answered.
 """
 
@@ -125,7 +125,7 @@ class MailboxWriter:
         try:
             self._rates = encode.rate_counts(self._cell_rates())
         except ValueError as error:
-            raise WriteError(f"limits.{error}: what the robot's program can be told") from None
+            raise WriteError(f"limits.{error}: what the robot's program can be given") from None
         number, says = look().answer or (0, 0)
         if says == encode.ABSENT:
             raise WriteError(
@@ -163,7 +163,7 @@ class MailboxWriter:
                 raise WriteError(
                     f"{self._transport.name}: the robot's program still applies an offset of "
                     f"{1e3 * length:.3f} mm or mrad, expected none before arming: it takes it out "
-                    "by itself, at the rates it was last told"
+                    "by itself, at the rates it was last given"
                 )
             time.sleep(ANNOUNCE)
 
@@ -225,10 +225,10 @@ class MailboxWriter:
             raise IneffectiveWriteError(self._silence(number, says))
 
     def _silence(self, number: int, says: int) -> str:
-        said = {0: "absent", 1: "running", 2: "watchdog expired", 3: "checksum rejected"}
+        states = {0: "absent", 1: "running", 2: "watchdog expired", 3: "checksum rejected"}
         return (
             f"{self._transport.name}: offsets do not arrive: number {self._sequence} was sent, "
-            f"{number} came back last, the robot's program says {said.get(says, says)}"
+            f"{number} came back last, the robot's program says {states.get(says, says)}"
         )
 
     def pending(self) -> tuple[int, list[int]] | None:
@@ -239,7 +239,7 @@ class MailboxWriter:
     def release(self) -> None:
         """Send nothing more: without a heartbeat the program takes out what is left of an offset.
 
-        At the rates it was told; a zero from here would be a step.
+        At the rates it was given; a zero from here would be a step.
         """
         self._armed, pending, self._pending = False, self._pending, None
         if pending is not None and not any(self._counts):

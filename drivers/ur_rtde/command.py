@@ -112,8 +112,8 @@ class ServoWriter:
             send_at_once()
             return AllowedControl(settings.host, library)
         except Exception as error:
-            words = str(error).strip().splitlines() or [type(error).__name__]
-            raise WriteError(f"{settings.host}: {words[0].strip()}") from None
+            message = str(error).strip().splitlines() or [type(error).__name__]
+            raise WriteError(f"{settings.host}: {message[0].strip()}") from None
 
     def _wait_running(self) -> None:
         """Wait until an uploaded script runs: the library returns before it does."""
@@ -205,7 +205,7 @@ class OffsetWriter:
     """Offsets in RTDE input registers, applied by the robot's own program.
 
     One call sends one register, so an offset arrives in nine packets; the sequence number goes
-    last, and the checksum tells the program whether they belong together. ``rates`` (m/s, rad/s)
+    last, and the checksum shows the program whether they belong together. ``rates`` (m/s, rad/s)
     are the cell's: the program takes offsets in and out no faster, also when nobody sends any more.
     """
 
@@ -215,32 +215,36 @@ class OffsetWriter:
         self._sequence = self._rates = 0
         self._awaited = 0  # a sequence number that has not come back yet
         self._awaited_since = 0.0
-        self.echo = 0
-        self.program = 0
-        self.applied: Sequence[float] | np.ndarray = ()
+        self._echo = 0
+        self._program = 0
+        self._applied: Sequence[float] | np.ndarray = ()
+
+    def note_answer(self, echo: int, program: int, applied: Sequence[float] | np.ndarray) -> None:
+        """Take what the robot's program says: last number accepted, its state, offset (6,)."""
+        self._echo, self._program, self._applied = echo, program, applied
 
     def arm(self, state: RobotState, look: Callable[[], None]) -> None:
-        """Open the registers and tell the rates. Raises WriteError where the program is not there.
+        """Open the registers and send the rates. Raises WriteError where the program is not there.
 
         Waits until the program has taken out what was left of an offset, and sends one of zero.
         """
         host = self._settings.host
         check_ready(host, state)
-        if self.program == Program.ABSENT or state.runtime_state != PLAYING:
+        if self._program == Program.ABSENT or state.runtime_state != PLAYING:
             raise WriteError(
-                f"{host}: output_int_register_{registers.PROGRAM}: found {self.program} with "
+                f"{host}: output_int_register_{registers.PROGRAM}: found {self._program} with "
                 f"runtime_state {state.runtime_state}, expected a running robot program that holds "
                 "gapbridge_offset.script"
             )
         try:
             self._rates = registers.rates(*self._cell_rates())
         except ValueError as error:
-            raise WriteError(f"limits.{error}: what the robot's program can be told") from None
+            raise WriteError(f"limits.{error}: what the robot's program can be given") from None
         self._wait_bare(look)
         if self._io is None:
             self._io = self._open()
         # a number that the program cannot take for the one it has seen last
-        self._sequence = (self.echo + registers.LAST_SEQUENCE // 4) % registers.LAST_SEQUENCE
+        self._sequence = (self._echo + registers.LAST_SEQUENCE // 4) % registers.LAST_SEQUENCE
         self._awaited = 0
         self._announce(look)
 
@@ -252,8 +256,8 @@ class OffsetWriter:
             io = AllowedInputs(host, RTDEIOInterface(host))
             send_at_once()
         except Exception as error:
-            words = str(error).strip().splitlines() or [type(error).__name__]
-            raise WriteError(f"{host}: {words[0].strip()}") from None
+            message = str(error).strip().splitlines() or [type(error).__name__]
+            raise WriteError(f"{host}: {message[0].strip()}") from None
         return io
 
     def _wait_bare(self, look: Callable[[], None]) -> None:
@@ -262,12 +266,12 @@ class OffsetWriter:
         Raises WriteError.
         """
         until = time.monotonic() + 0.5 * self._settings.connect_timeout
-        while (length := float(np.abs(self.applied).max(initial=0.0))) > registers.UNIT:
+        while (length := float(np.abs(self._applied).max(initial=0.0))) > registers.UNIT:
             if time.monotonic() > until:
                 raise WriteError(
                     f"{self._settings.host}: the robot's program still applies an offset of "
                     f"{1e3 * length:.3f} mm or mrad, expected none before arming: it takes it out "
-                    "by itself, at the rates it was last told"
+                    "by itself, at the rates it was last given"
                 )
             look()
 
@@ -281,7 +285,7 @@ class OffsetWriter:
             self._send([0] * 6)
             for _ in range(LOOKS):
                 look()
-                if registers.reached(self.echo, first):
+                if registers.reached(self._echo, first):
                     return
             if time.monotonic() > until:
                 raise WriteError(
@@ -327,7 +331,7 @@ class OffsetWriter:
         """Raise WriteError where an offset sent has not been taken in time."""
         if not self._awaited:
             return
-        if registers.reached(self.echo, self._awaited):
+        if registers.reached(self._echo, self._awaited):
             self._awaited = 0
             return
         late = time.monotonic() - self._awaited_since
@@ -335,17 +339,17 @@ class OffsetWriter:
             raise WriteError(f"{self._silence()} (sent {late:.3f} s ago)")
 
     def _silence(self) -> str:
-        reason = Program(self.program).name if self.program in (0, 1, 2, 3) else self.program
+        reason = Program(self._program).name if self._program in (0, 1, 2, 3) else self._program
         return (
             f"{self._settings.host}: offsets do not arrive: number "
-            f"{self._awaited or self._sequence} was sent, {self.echo} came back last, the robot's "
+            f"{self._awaited or self._sequence} was sent, {self._echo} came back last, the robot's "
             f"program says {reason}"
         )
 
     def release(self) -> None:
         """Send nothing more: without a heartbeat the program takes out what is left of an offset.
 
-        At the rates it was told; a zero from here would be a step.
+        At the rates it was given; a zero from here would be a step.
         """
 
     def abandon(self) -> None:

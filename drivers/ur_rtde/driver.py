@@ -55,8 +55,7 @@ class UrRtdeDriver(Driver):
         """Return the next sample; see Driver.read_state."""
         self._state = self.reader.read()
         if isinstance(self._writer, OffsetWriter):
-            self._writer.echo, self._writer.program = self.reader.echo, self.reader.program
-            self._writer.applied = self.reader.applied
+            self._writer.note_answer(self.reader.echo, self.reader.program, self.reader.applied)
         return self._state
 
     def _rates(self) -> tuple[float, float]:
@@ -84,9 +83,9 @@ class UrRtdeDriver(Driver):
 
     def _make_ready(self, state: RobotState) -> None:
         """Make ready for writing: upload the control script, or claim the registers."""
-        words = self.mismatch()
-        if words is not None:
-            raise WriteError(f"{self.settings.host}: {words}")
+        message = self.mismatch()
+        if message is not None:
+            raise WriteError(f"{self.settings.host}: {message}")
         self._writer.arm(state, self._look)
 
     def round_trip(self) -> float | None:
@@ -101,10 +100,10 @@ class UrRtdeDriver(Driver):
         found = None if self.moves_arm else self.reader.joints_and_tcp()
         if found is None:
             return None
-        q, said = found
+        q, tcp = found
         wanted = wanted_pose(self._model, q[None])
-        apart = float(np.linalg.norm(said[:3] - wanted.position[0]))
-        cosine = 0.5 * (np.trace(one_rotation_matrix(said[3:]).T @ wanted.rotation[0]) - 1.0)
+        apart = float(np.linalg.norm(tcp[:3] - wanted.position[0]))
+        cosine = 0.5 * (np.trace(one_rotation_matrix(tcp[3:]).T @ wanted.rotation[0]) - 1.0)
         turned = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
         most = self.settings.tcp_tolerance
         if apart <= most and turned <= TCP_TURNED:  # NaN is not

@@ -51,10 +51,10 @@ def enquire(host: str, rtde_port: int = RTDE, primary_port: int = PRIMARY) -> Co
     LinkError where RTDE cannot.
     """
     try:
-        version, said = _rtde(host, rtde_port)
+        version, fields = _rtde(host, rtde_port)
     except (OSError, EOFError, struct.error) as error:
-        words = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        raise LinkError(f"{host}: found no answer on RTDE's port {rtde_port}: {words}") from None
+        message = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        raise LinkError(f"{host}: found no answer on RTDE's port {rtde_port}: {message}") from None
     try:
         primary = read_primary(host, primary_port)
     except (OSError, EOFError, struct.error):
@@ -65,7 +65,7 @@ def enquire(host: str, rtde_port: int = RTDE, primary_port: int = PRIMARY) -> Co
         apart = primary.calibrated - nominal_rows(model)
         deltas = {f"delta_{key}": apart[:, i].tolist()
                   for i, key in enumerate(("theta", "a", "d", "alpha"))}  # fmt: skip
-    limits, tcp = primary.limits, said.get("tcp_offset")
+    limits, tcp = primary.limits, fields.get("tcp_offset")
     return ControllerFacts(
         n=N,
         model=model,
@@ -73,14 +73,14 @@ def enquire(host: str, rtde_port: int = RTDE, primary_port: int = PRIMARY) -> Co
         arm=None if model is None else builtin_arm(model, deltas),
         calibration=deltas,
         tcp=None if tcp is None else transform(rotation_matrix(tcp[3:]), tcp[:3]),
-        payload=None if "payload" not in said else float(said["payload"][0]),
-        payload_cog=said.get("payload_cog"),
-        gravity=said.get("target_gravity"),
+        payload=None if "payload" not in fields else float(fields["payload"][0]),
+        payload_cog=fields.get("payload_cog"),
+        gravity=fields.get("target_gravity"),
         rate=500.0 if version[0] >= 5 else 125.0,
         lower=None if limits is None else limits[:, 0],
         upper=None if limits is None else limits[:, 1],
         velocity=None if limits is None else limits[:, 2],
-        q=said.get("actual_q"),
+        q=fields.get("actual_q"),
     )
 
 
@@ -125,11 +125,11 @@ def _rtde(host: str, port: int) -> tuple[tuple[int, ...], dict[str, Array]]:
     values = np.array(struct.unpack(f">{len(body) // 8}d", body[: 8 * (len(body) // 8)]))
     if len(values) != sum(_FIELDS[n] for n in names) or not np.isfinite(values).all():
         raise EOFError(f"found {len(values)} numbers in a sample of {', '.join(names)}")
-    said, start = {}, 0
+    fields, start = {}, 0
     for name in names:
-        said[name] = values[start : start + _FIELDS[name]]
+        fields[name] = values[start : start + _FIELDS[name]]
         start += _FIELDS[name]
-    return version, said
+    return version, fields
 
 
 def _answer(answers: Any, kind: str) -> bytes:

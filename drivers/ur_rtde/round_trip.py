@@ -1,6 +1,6 @@
 """How long a question to an RTDE server and its answer take: what bounds the age of its samples.
 
-RTDE's samples come by themselves, so that nothing in them tells how long they were under way. A
+RTDE's samples come by themselves, so that nothing in them says how long they were under way. A
 connection of its own asks for the protocol version (RTDE guide, RTDE_REQUEST_PROTOCOL_VERSION).
 """
 
@@ -29,8 +29,8 @@ def round_trip(host: str, timeout: float = LONGEST) -> float:
             with link.makefile("rb") as answers:
                 return min(_ask(link, answers.read) for _ in range(TRIES))
     except (OSError, EOFError) as error:
-        words = getattr(error, "strerror", None) or str(error)
-        raise WriteError(f"{host}: found no answer on RTDE's port {PORT}: {words}") from None
+        message = getattr(error, "strerror", None) or str(error)
+        raise WriteError(f"{host}: found no answer on RTDE's port {PORT}: {message}") from None
 
 
 def _ask(link: socket.socket, read: Callable[[int], bytes]) -> float:

@@ -94,8 +94,10 @@ class StateReader:
                 self._receive = RTDEReceiveInterface(settings.host, settings.rate, names)
                 break
             except Exception as error:  # the library raises RuntimeError and boost's own
-                told = set(re.findall(r"\w+", str(error)))
-                optional = [m for m in names if m in told and (m == "payload" or _is_optional(m))]
+                reported = set(re.findall(r"\w+", str(error)))
+                optional = [
+                    m for m in names if m in reported and (m == "payload" or _is_optional(m))
+                ]
                 if not optional:
                     raise LinkError(f"{settings.host}: {_first_line(error)}") from None
                 names = [name for name in names if name not in optional]
@@ -242,8 +244,8 @@ class StateReader:
                 f"actual_q_{joint}: found a step of {way[joint]:.4f} rad in {gap:.4f} s"
             )
 
-    def _invalid(self, words: str) -> InvalidStateError:
-        return InvalidStateError(f"{self._settings.host}: {words}")
+    def _invalid(self, message: str) -> InvalidStateError:
+        return InvalidStateError(f"{self._settings.host}: {message}")
 
     def tcp_pose(self) -> Vector | None:
         """Return the controller's own TCP pose (6,) in base, m and rotation vector, or None."""
@@ -253,7 +255,7 @@ class StateReader:
     def joints_and_tcp(self) -> tuple[Vector, Vector] | None:
         """Return joints (6,) and the controller's own TCP pose (6,) of one sample, or None.
 
-        The pose is in base, m and rotation vector. None where the controller does not tell it, or
+        The pose is in base, m and rotation vector. None where the controller does not report it, or
         a new sample came between the two each time.
         """
         receive = self._receive

@@ -1,4 +1,4 @@
-"""What a machine takes from everybody is told apart from what a program misses by itself."""
+"""What a machine takes from everybody is separated from what a program misses by itself."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def test_a_missed_cycle_belongs_to_the_stall_that_it_overlaps() -> None:
     assert missed_of(quiet, stalls_at((1.9955, 1.9985)), CYCLE).startswith("50.000 % missed (33.33")
 
 
-def test_without_real_time_priority_nothing_is_said_of_the_machine() -> None:
+def test_without_real_time_priority_nothing_is_reported_of_the_machine() -> None:
     unknown = MachineStalls()
     assert not unknown.during(0.0, 1e9)
     assert missed_of(Quiet(cycles=3, missed=[(1.0, 1)]), unknown, CYCLE) == "25.000 % missed"
 
 
-def test_watchers_end_with_the_block_and_tell_stalls_within_it() -> None:
+def test_watchers_end_with_the_block_and_show_stalls_within_it() -> None:
     begun = time.monotonic()
     with MachineStalls() as stalls:
         time.sleep(1.0)

@@ -120,9 +120,9 @@ class Run:
 
     def __init__(self, cell: Path, arm: bool = False, observe: bool = False,
                  duration: float | None = None) -> None:  # fmt: skip
-        self.said: list[str] = []
+        self.output: list[str] = []
         settings = settings_of(load_cell(cell))
-        self.daemon = Daemon(settings, may_write=not observe, say=self.said.append)
+        self.daemon = Daemon(settings, may_write=not observe, say=self.output.append)
         self.summary: RunSummary | None = None
         self.error: Exception | None = None
         self._thread = threading.Thread(target=self._run, args=(arm, duration))
@@ -154,7 +154,7 @@ class Run:
             assert self.error is None, self.error
             return self.daemon.state == state
 
-        return wait_for(there, limit, f"{state.name} ({self.said})")
+        return wait_for(there, limit, f"{state.name} ({self.output})")
 
     def compensate(self, limit: float = 60.0) -> None:
         """Arm, again as a person does where a busy machine ended the motion at once."""
@@ -162,7 +162,7 @@ class Run:
         while self.daemon.state != State.COMPENSATING:
             now = time.monotonic()
             assert self.error is None, self.error
-            assert now < until, f"{self.daemon.state} ({self.said}): not within {limit:g} s"
+            assert now < until, f"{self.daemon.state} ({self.output}): not within {limit:g} s"
             if self.daemon.state == State.OBSERVING and now - asked > 3.0:
                 self.daemon.arm()
                 asked = now
@@ -176,7 +176,7 @@ class Run:
     def join(self, limit: float = 30.0) -> RunSummary:
         """Wait for the run's own end."""
         self._thread.join(limit)
-        assert not self._thread.is_alive(), self.said
+        assert not self._thread.is_alive(), self.output
         assert self.error is None, self.error
         assert self.summary is not None
         return self.summary

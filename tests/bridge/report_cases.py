@@ -40,7 +40,7 @@ def diagnosed(name: str) -> Case:
 
 
 def _with_structure(case: Case) -> Case:
-    """Return the case as it would be with structure left over: a real one takes 300 poses."""
+    """Return the case as it would be with residual structure: a real one takes 300 poses."""
     channel = replace(
         case.diagnosis.channels[0], verdict="partly_explained", structured=True,
         unexplained_rms=6e-5, p_value=1e-3, depends_on=(("timestamp", 0.4), ("actual_q_2", 0.2)),

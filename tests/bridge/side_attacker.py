@@ -1,8 +1,8 @@
 """Runs in the place of a side process, with what such a process is given, and tries to arm.
 
 It tries every descriptor of its own and, through /proc, of every process of the run: memory is
-opened anew for writing and mapped, pipes are written to, forged events are told. What it managed
-is reported as events of each side's kind.
+opened anew for writing and mapped, pipes are written to, forged events are reported. What it
+managed is reported as events of each side's kind.
 """
 
 from __future__ import annotations
@@ -95,9 +95,9 @@ def main() -> None:
                     "loop": event["loop"]["pid"] in family(os.getppid()),
                 }
                 for event_ in FORGED:
-                    order.tell(event_)
+                    order.emit(event_)
                 for kind in ("recorder", "web", "metrics"):
-                    order.tell({"kind": kind, "attack": found})
+                    order.emit({"kind": kind, "attack": found})
         if time.monotonic() - begun > 120.0:
             return
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
-from gapbridge.bridge.ipc.shared_memory import Page, Phase
+from gapbridge.bridge.ipc.shared_memory import Phase, SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
 from gapbridge.bridge.loop.supervisor import State
 
@@ -59,7 +59,7 @@ class Feed:
         self.folder = folder
         scheme = "https" if keys.get("certificate") else "http"
         self.url = f"{scheme}://127.0.0.1:{self.port}/"
-        self.page = Page(N)
+        self.page = SharedMemory(N)
         self.state = State.OBSERVING
         self.restarts = 0
         self.counts: dict[str, int] = {"late": 1, "stale": 2, "overrun": 0}
@@ -104,17 +104,17 @@ class Feed:
             try:
                 return httpx.get(self.url + path, timeout=5, **keys)
             except httpx.TransportError:
-                words = (self.folder / f"{self.section}.log").read_text()
-                assert time.monotonic() < until, f"{self.section} does not answer: {words}"
+                phrase = (self.folder / f"{self.section}.log").read_text()
+                assert time.monotonic() < until, f"{self.section} does not answer: {phrase}"
                 time.sleep(0.05)
 
     # -- what a daemon does -----------------------------------------------------------------------
 
-    def tell(self, **event: Any) -> None:
+    def emit(self, **event: Any) -> None:
         with self._lock:
             self._sequence += 1
             assert self.side is not None
-            self.side.tell(
+            self.side.emit(
                 {
                     "time": time.time(), "monotonic": time.monotonic(),
                     "sequence": self._sequence, **event,
@@ -125,16 +125,16 @@ class Feed:
         """Go into a state as the loop does."""
         before, self.state = self.state, to
         self.page.tell_state(to)
-        self.tell(kind="transition", **{"from": before.name, "to": to.name}, cause=cause,
+        self.emit(kind="transition", **{"from": before.name, "to": to.name}, cause=cause,
                   detail=detail)  # fmt: skip
 
     def change_cell(self, keys: str, ok: bool = True) -> None:
-        """Write the cell file anew and tell that it was taken, or not."""
+        """Write the cell file anew and report that it was taken, or not."""
         text = CELL + keys
         self.settings.cell.write_text(text)
         hashed = hashlib.sha256(text.encode()).hexdigest()
         self.hash = hashed if ok else self.hash
-        self.tell(kind="configuration", ok=ok, hash=self.hash, detail="the cell was read again")
+        self.emit(kind="configuration", ok=ok, hash=self.hash, detail="the cell was read again")
 
     def status(self) -> dict[str, Any]:
         return {
@@ -155,17 +155,17 @@ class Feed:
 
     def _run(self) -> None:
         rng = np.random.default_rng(5)
-        told = 0.0
+        reported = 0.0
         begun = time.monotonic()
         due, number = begun, 0
         while not self._stop.is_set():
             self.row(number, due - begun, rng)
             number += 1
-            if due - told > 0.5:
-                told = due
+            if due - reported > 0.5:
+                reported = due
                 assert self.side is not None
                 with self._lock:
-                    self.side.tell({"time": time.time(), **self.status()})
+                    self.side.emit({"time": time.time(), **self.status()})
             due += 1.0 / RATE
             time.sleep(max(due - time.monotonic(), 0.0))
 

@@ -57,7 +57,7 @@ def test_the_older_urs_named_in_the_contract_are_there():
     assert set(PUBLISHED) <= set(builtin_names())
 
 
-def test_an_unknown_arm_is_told_with_the_nearest_one():
+def test_an_unknown_arm_is_reported_with_the_nearest_one():
     with pytest.raises(ArmError, match=r"robot.model: found 'ur10ee'.*did you mean 'ur10e'\?"):
         builtin_arm("ur10ee")
     with pytest.raises(ArmError, match="found 'fanuc', expected one of ur"):
@@ -124,8 +124,10 @@ def test_joints_of_a_calibrated_arm_bend_where_the_metal_is():
     np.testing.assert_allclose(found.cog, plain.cog, atol=2e-3)
     q = np.random.default_rng(1).uniform(-2, 2, (20, 6))
     bends = [
-        bent.predict(q).position - bent.rigid_pose(q).position
-        for bent in (Model(arm).with_compliance([1e-5] * 6, [5e-6] * 6) for arm in (plain, found))
+        deflected.predict(q).position - deflected.rigid_pose(q).position
+        for deflected in (
+            Model(arm).with_compliance([1e-5] * 6, [5e-6] * 6) for arm in (plain, found)
+        )
     ]
     assert np.abs(bends[0]).max() > 1e-4
     np.testing.assert_allclose(bends[1], bends[0], atol=1e-2 * np.abs(bends[0]).max())
@@ -176,8 +178,10 @@ def test_a_controllers_own_calibration_bends_like_the_arm_that_it_describes():
         np.testing.assert_allclose(centre, nominal @ np.append(plain.cog[k - 1], 1), atol=1e-9)
     q = np.random.default_rng(1).uniform(-2, 2, (20, 6))
     bends = [
-        bent.predict(q).position - bent.rigid_pose(q).position
-        for bent in (Model(arm).with_compliance([1e-5] * 6, [5e-6] * 6) for arm in (plain, found))
+        deflected.predict(q).position - deflected.rigid_pose(q).position
+        for deflected in (
+            Model(arm).with_compliance([1e-5] * 6, [5e-6] * 6) for arm in (plain, found)
+        )
     ]
     assert np.abs(bends[0]).max() > 1e-4
     np.testing.assert_allclose(bends[1], bends[0], atol=2e-2 * np.abs(bends[0]).max())
@@ -188,7 +192,7 @@ def transform_of(arm, joints):
     return np.linalg.multi_dot([np.eye(4), *arm.link_in_link[:joints]])
 
 
-def test_factory_calibration_of_another_length_is_told():
+def test_factory_calibration_of_another_length_is_reported():
     with pytest.raises(ArmError, match=r"delta_a: found 7 values, expected 6"):
         builtin_arm("ur5e", {"delta_a": [0.0] * 7})
 
@@ -214,7 +218,7 @@ def test_a_calibration_does_not_stick_to_the_built_in_arm():
         ([{"a": 0, "d": 0, "alpha": 0, "cog": [[1], 0, 0]}], "row 1: cog: found"),
     ],
 )  # fmt: skip
-def test_a_mistake_in_dh_rows_is_told_in_one_line(rows, message):
+def test_a_mistake_in_dh_rows_is_reported_in_one_line(rows, message):
     with pytest.raises(ArmError, match=message) as caught:
         arm_from_dh(rows)
     assert "\n" not in str(caught.value)

@@ -1,4 +1,4 @@
-"""The corrected setpoint's predicted real pose is the wanted one; what cannot be met is told."""
+"""The corrected setpoint's predicted real pose is the wanted one; unreachable ones are reported."""
 
 from dataclasses import replace
 
@@ -81,7 +81,7 @@ def test_the_residual_is_the_distance_that_is_really_left(n):
     np.testing.assert_allclose(found.residual, distance(model, found.q, q), atol=1e-10)
 
 
-def test_a_stretched_arm_cannot_reach_where_it_sags_from_and_says_how_much_is_left():
+def test_a_stretched_arm_cannot_reach_where_it_sags_from_and_reports_how_much_is_left():
     found = correct(SIX, np.zeros((1, 6)))
     assert 1e-4 < found.residual[0] < distance(SIX, np.zeros((1, 6)), np.zeros((1, 6)))[0]
 
@@ -206,7 +206,7 @@ def test_the_predicted_pose_of_a_reached_setpoint_is_the_wanted_one(n, seed):
     result = correct(model, q, loads)
     left = distance(model, result.q, q, loads)
     assert (left[result.residual < TOLERANCE] < 1e-8).all()
-    # honest: what is told is what is left, the rotation counted at a lever of half a metre
+    # honest: what is reported is what is left, the rotation counted at a lever of half a metre
     np.testing.assert_allclose(result.residual, left, atol=2e-9, rtol=1e-3)
     assert np.isfinite(result.q).all()
 

@@ -23,11 +23,11 @@ WITHOUT_UNIT = ("ft_gain", "link_inertia", "load_friction", "torque_constant")  
 @pytest.mark.parametrize("name", CATALOGUE)
 def test_name_file_class_and_identifier_are_one(name):
     member = CATALOGUE[name]
-    words = "".join(word.capitalize() for word in name.split("_"))
-    assert (member.identifier, type(member).__name__) == (name, words)
+    phrase = "".join(word.capitalize() for word in name.split("_"))
+    assert (member.identifier, type(member).__name__) == (name, phrase)
     assert type(member).__module__ == f"gapbridge.core.effects.{name}"
     module = importlib.import_module(f"gapbridge.core.effects.{name}")
-    assert getattr(module, words) is type(member)
+    assert getattr(module, phrase) is type(member)
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
@@ -66,12 +66,12 @@ def test_reported_values_carry_the_terms_and_their_spread(name):
     site = Site(site.joint, site.order or (3.0 if name == "transmission_error" else None))
     scale = np.array([p.scale for p in member.parameters(arm, site)])
     term = Term(name, site, tuple(scale))
-    for told in member.reported(arm, term, np.diag((0.1 * scale) ** 2)):
-        assert told.name.startswith(name)
-        assert np.isfinite(told.value)
-        assert told.std is not None
-        assert 0 < told.std < np.inf
-    assert all(told.std is None for told in member.reported(arm, term, None))
+    for shown in member.reported(arm, term, np.diag((0.1 * scale) ** 2)):
+        assert shown.name.startswith(name)
+        assert np.isfinite(shown.value)
+        assert shown.std is not None
+        assert 0 < shown.std < np.inf
+    assert all(shown.std is None for shown in member.reported(arm, term, None))
 
 
 def test_an_unknown_effect_names_the_nearest():

@@ -133,7 +133,7 @@ def test_effects_in_the_cell_and_new_ones_act_together(scene):
         assert np.allclose(predict(inside, rebuilt), predict(model, motion, [term]), atol=1e-12)
 
 
-def test_every_moving_effect_says_what_it_needs():
+def test_every_moving_effect_reports_what_it_needs():
     for effect in {*WRENCH, *TRACKING, *TORQUE}:
         member = CATALOGUE[effect]
         assert member.motion

@@ -154,9 +154,9 @@ def test_a_transmission_error_is_amplitude_times_sine_of_order_angle_plus_phase(
         return {"q": angles}
 
     agree(name, [term], waved)
-    told = CATALOGUE["transmission_error"].reported(arm_from_dh(DH[name]), term, None)
-    assert [t.value for t in told] == pytest.approx([amplitude, phase])
-    assert "order17" in told[0].name
+    shown = CATALOGUE["transmission_error"].reported(arm_from_dh(DH[name]), term, None)
+    assert [t.value for t in shown] == pytest.approx([amplitude, phase])
+    assert "order17" in shown[0].name
 
 
 @ARMS
@@ -196,15 +196,15 @@ def test_a_stiffening_joint_follows_its_curve(mass):
     expected = length * np.array([np.cos(angle) * np.cos(0.3), np.cos(angle) * np.sin(0.3),
                                   np.sin(angle)])  # fmt: skip
     np.testing.assert_allclose(model.predict(q).position[0], expected, atol=1e-12)
-    told = CATALOGUE["stiffness_nonlinearity"].reported(model.arm, term, None)
-    assert [t.value for t in told] == pytest.approx([c, knee])
+    shown = CATALOGUE["stiffness_nonlinearity"].reported(model.arm, term, None)
+    assert [t.value for t in shown] == pytest.approx([c, knee])
 
 
 def test_a_flexible_link_is_a_cantilever_loaded_at_its_far_end():
     length, beyond, flexibility = 0.8, 0.3, 1e-6
     rows = [{"a": length, "alpha": 0.0, "d": 0.0}, {"a": beyond, "alpha": 0.0, "d": 0.0}]
     model = Model(arm_from_dh(rows), gravity=np.zeros(3))
-    bent = model.with_terms([Term("link_flexibility", Site(1), (flexibility,))])
+    deflected = model.with_terms([Term("link_flexibility", Site(1), (flexibility,))])
     F, T = 20.0, -3.0
     for axis, sign in ((1, 1.0), (2, -1.0)):
         wrench = np.zeros((1, 6))
@@ -213,7 +213,7 @@ def test_a_flexible_link_is_a_cantilever_loaded_at_its_far_end():
         M = F * beyond + sign * T
         shift = flexibility * (F * length**3 / 3 + M * length**2 / 2)
         slope = flexibility * (F * length**2 / 2 + M * length)
-        moved = bent.predict(np.zeros((1, 2)), Loads(wrench=wrench))
+        moved = deflected.predict(np.zeros((1, 2)), Loads(wrench=wrench))
         tip = moved.position[0] - [length + beyond, 0, 0]
         assert tip[axis] == pytest.approx(shift + slope * beyond, rel=1e-4)
         assert moved.rotation[0, axis, 0] == pytest.approx(slope, rel=1e-4)
@@ -222,9 +222,9 @@ def test_a_flexible_link_is_a_cantilever_loaded_at_its_far_end():
 def test_a_flexible_link_neither_stretches_nor_twists():
     rows = [{"a": 0.8, "alpha": 0.0, "d": 0.0}, {"a": 0.3, "alpha": 0.0, "d": 0.0}]
     model = Model(arm_from_dh(rows), gravity=np.zeros(3))
-    bent = model.with_terms([Term("link_flexibility", Site(1), (1e-5,))])
+    deflected = model.with_terms([Term("link_flexibility", Site(1), (1e-5,))])
     pull = np.array([[100.0, 0, 0, 5.0, 0, 0]])
-    moved = bent.predict(np.zeros((1, 2)), Loads(wrench=pull))
+    moved = deflected.predict(np.zeros((1, 2)), Loads(wrench=pull))
     np.testing.assert_allclose(moved.position[0], [1.1, 0, 0], atol=1e-14)
     np.testing.assert_allclose(moved.rotation[0], np.eye(3), atol=1e-14)
 
@@ -240,13 +240,13 @@ def test_a_soft_base_tilts_the_whole_arm_under_its_moment(name):
         _, _, centres, (flange, point), tcp = oracle.place(here, np.zeros((len(q[r]), 3)))
         load = point + flange @ here.payload_cog
 
-        def left(tilt, here=here, centres=centres, load=load, tcp=tcp):
-            turn = Rotation.from_rotvec([*tilt, 0])
+        def left(base_rotation, here=here, centres=centres, load=load, tcp=tcp):
+            turn = Rotation.from_rotvec([*base_rotation, 0])
             M = here.wrench[3:] + np.cross(turn.apply(tcp), here.wrench[:3])
             M = M + np.cross(turn.apply(load), here.payload * GRAVITY)
             for centre, row in zip(centres, DH[name], strict=True):
                 M = M + np.cross(turn.apply(centre), row["mass"] * GRAVITY)
-            return 1e3 * (tilt - value * M[:2])
+            return 1e3 * (base_rotation - value * M[:2])
 
         turn = Rotation.from_rotvec([*root(left, np.zeros(2), tol=1e-14).x, 0])
         np.testing.assert_allclose(poses.position[r], turn.apply(tcp), atol=1e-10)
@@ -286,8 +286,8 @@ def test_thermal_drift_lengthens_a_and_d_by_the_joints_warmth(name):
 
 
 @pytest.mark.parametrize("effect", ["backlash", "thermal_drift"])
-def test_what_the_rows_do_not_tell_has_no_effect(effect):
+def test_what_the_rows_do_not_show_has_no_effect(effect):
     model = model_of("ur10e")
     q, _ = scene(6)
-    told = model.with_terms([term_of(effect, model.arm, 1.0)]).predict(q)
-    np.testing.assert_array_equal(told.position, model.predict(q).position)
+    shown = model.with_terms([term_of(effect, model.arm, 1.0)]).predict(q)
+    np.testing.assert_array_equal(shown.position, model.predict(q).position)

@@ -71,8 +71,8 @@ def test_the_linear_forms_error_falls_with_the_square_of_the_compliance(name):
         error = []
         for share in (1.0, 0.5):
             flexibility = share * np.concatenate([case.axial, case.radial])
-            bent = model.with_compliance(share * case.axial, share * case.radial)
-            exact = bent.predict(case.q[None], loads).position[0] - rigid
+            deflected = model.with_compliance(share * case.axial, share * case.radial)
+            exact = deflected.predict(case.q[None], loads).position[0] - rigid
             error.append(np.linalg.norm(exact - A @ flexibility))
             # the linear form is a first-order statement, not just any small number
             assert error[-1] < 0.05 * np.linalg.norm(exact)
@@ -89,8 +89,11 @@ def test_the_linear_forms_orientation_is_that_of_a_small_bend():
     model, loads = predicted(case)
     A = model.linear_form(case.q[None], loads).regressor[0, 3:]
     small = 1e-4
-    bent = model.with_compliance(small * case.axial, small * case.radial)
-    turn = bent.predict(case.q[None], loads).rotation[0] @ model.predict(case.q[None]).rotation[0].T
+    deflected = model.with_compliance(small * case.axial, small * case.radial)
+    turn = (
+        deflected.predict(case.q[None], loads).rotation[0]
+        @ model.predict(case.q[None]).rotation[0].T
+    )
     vector = np.array([turn[2, 1], turn[0, 2], turn[1, 0]]) - np.array(
         [turn[1, 2], turn[2, 0], turn[0, 1]]
     )

@@ -1,4 +1,4 @@
-"""The fleet's fit: what a session tells, what is borrowed, and whether intervals hold."""
+"""The fleet's fit: what a session determines, what is borrowed, and whether intervals hold."""
 
 from __future__ import annotations
 
@@ -56,28 +56,28 @@ def test_the_truth_solves_the_equations_of_a_session_without_noise(rotation: boo
     assert found.poses == 30
 
 
-def test_what_is_left_over_tells_the_noise() -> None:
+def test_what_is_left_over_shows_the_noise() -> None:
     given = [evidence(NOMINAL, session(20, seed, NOISE)) for seed in range(6)]
     variance = sum(e.squares for e in given) / sum(e.freedom for e in given)
     assert np.sqrt(variance) == pytest.approx(NOISE, rel=0.12)
 
 
-def test_a_wild_reading_is_set_aside() -> None:
+def test_a_outlier_reading_is_set_aside() -> None:
     log = session(25, 1, 1e-5)
     log.columns["measured_position"][7] += 0.05
     found = evidence(NOMINAL, log)
-    assert (found.wild, found.poses) == (1, 24)
+    assert (found.outliers, found.poses) == (1, 24)
     assert np.abs(found.matrix @ TRUTH - found.right).max() < 1e-3
 
 
-def test_a_session_of_too_few_poses_says_nothing() -> None:
+def test_a_session_of_too_few_poses_reports_nothing() -> None:
     with pytest.raises(ExcitationError, match=r"found 3 row\(s\).* expected at least 4"):
         evidence(NOMINAL, session(3, 0))
     assert evidence(NOMINAL, session(1, 0), Metrology(registered=True)).poses == 1
 
 
-def told(truth: Array, rng: Generator, rows: int = 6, gain: float = 1.0) -> Evidence:
-    """Return what a session of an arm tells, straight from the linear model."""
+def reported(truth: Array, rng: Generator, rows: int = 6, gain: float = 1.0) -> Evidence:
+    """Return what a session of an arm determines, straight from the linear model."""
     A = rng.normal(0, 1, (rows, 4)) * [40, 8, 25, 4] * gain * np.sqrt(8 / rows)  # m per rad/Nm
     y = A @ truth + rng.normal(0, NOISE, rows)
     R = np.linalg.qr(A, mode="r")
@@ -96,9 +96,9 @@ def fleet(arms: int, sessions: int, seed: int) -> tuple[TypeFit, Array, list[Evi
     rng = np.random.default_rng(seed)
     truths = np.array([scattered(MEAN, 0.25, rng) for _ in range(arms)])
     number = np.repeat(np.arange(arms), sessions)
-    # the only session of an arm is the arm: nobody can tell the two apart
+    # the only session of an arm is the arm: nobody can separate them
     within = 0.03 if sessions > 1 else 0.0
-    given = [told(scattered(truths[a], within, rng), rng) for a in number]
+    given = [reported(scattered(truths[a], within, rng), rng) for a in number]
     return fit_type(given, list(number), np.zeros(4), USUAL), truths, given
 
 
@@ -128,7 +128,7 @@ def test_scatter_between_arms_and_noise_are_found() -> None:
 def test_an_arm_keeps_what_its_data_say_and_takes_the_type_where_they_say_nothing() -> None:
     rng = np.random.default_rng(7)
     truths = [scattered(MEAN, 0.25, rng) for _ in range(20)]
-    given = [told(t, rng, gain=100 if i == 0 else 1) for i, t in enumerate(truths)]
+    given = [reported(t, rng, gain=100 if i == 0 else 1) for i, t in enumerate(truths)]
     given[1] = replace(given[1], matrix=np.zeros((4, 4)), right=np.zeros(4))
     fit = fit_type(given, list(range(20)), np.zeros(4), USUAL)
     assert fit.arms[0].flexibility == pytest.approx(truths[0], rel=0.02)
@@ -138,7 +138,7 @@ def test_an_arm_keeps_what_its_data_say_and_takes_the_type_where_they_say_nothin
     assert (fit.arms[1].std > fit.arms[0].std).all()
 
 
-def test_what_no_session_shows_stays_at_the_nominal_and_is_told() -> None:
+def test_what_no_session_shows_stays_at_the_nominal_and_is_reported() -> None:
     _, _, given = fleet(10, 1, 3)
     blind = []
     for one in given:
@@ -150,7 +150,7 @@ def test_what_no_session_shows_stays_at_the_nominal_and_is_told() -> None:
     assert fit.scatter.mean[1] == pytest.approx(MEAN[1], rel=1e-6)
 
 
-def test_the_drifting_arm_alone_is_told_to_drift() -> None:
+def test_the_drifting_arm_alone_is_found_to_drift() -> None:
     rng = np.random.default_rng(11)
     given, number = [], []
     for arm in range(20):
@@ -158,7 +158,7 @@ def test_the_drifting_arm_alone_is_told_to_drift() -> None:
         for step in range(4):
             now = scattered(truth, 0.02, rng)
             now[0] += 1.5e-6 * step * (arm == 4)
-            given.append(told(now, rng, 8))
+            given.append(reported(now, rng, 8))
             number.append(arm)
     fit = fit_type(given, number, np.zeros(4), USUAL)
     z = np.array([arm.drift / arm.drift_std for arm in fit.arms])
@@ -168,7 +168,7 @@ def test_the_drifting_arm_alone_is_told_to_drift() -> None:
     assert np.sqrt(np.mean(others**2)) == pytest.approx(1.0, abs=0.3)
 
 
-def test_two_sessions_tell_no_drift_and_a_session_is_foretold_without_itself() -> None:
+def test_two_sessions_show_no_drift_and_a_session_is_foretold_without_itself() -> None:
     _, _, given = fleet(12, 2, 13)
     number = list(np.repeat(np.arange(12), 2))
     fit = fit_type(given, number, np.zeros(4), USUAL)
@@ -184,7 +184,7 @@ def test_two_sessions_tell_no_drift_and_a_session_is_foretold_without_itself() -
 def test_the_order_of_arms_does_not_matter_to_large_fleets() -> None:
     rng = np.random.default_rng(2)
     truths = [scattered(MEAN, 0.25, rng) for _ in range(120)]
-    given = [told(t, rng, 8) for t in truths]
+    given = [reported(t, rng, 8) for t in truths]
     order = rng.permutation(120)
     fit = fit_type(given, list(range(120)), np.zeros(4), USUAL)
     other = fit_type([given[i] for i in order], list(range(120)), np.zeros(4), USUAL)

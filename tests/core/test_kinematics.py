@@ -38,7 +38,7 @@ def test_the_jacobian_is_pinocchios(name):
         np.testing.assert_allclose(J[r], rigid.tool_jacobian(peer, q[r], TCP), atol=1e-9)
 
 
-def test_the_jacobian_of_a_bent_arm_is_its_finite_difference_where_bending_stays():
+def test_the_jacobian_of_a_deflected_arm_is_its_finite_difference_where_bending_stays():
     # without gravity and masses the shape does not change along with the joints
     model = Model(arm_from_dh(SEVEN), gravity=np.zeros(3))
     q, step = np.full((1, 7), 0.4), 1e-6

@@ -41,7 +41,7 @@ joints = st.lists(st.floats(-3.0, 3.0), min_size=N, max_size=N).map(np.array)
 corrections = st.lists(st.floats(-0.3, 0.3), min_size=N, max_size=N).map(np.array)
 offsets = st.lists(st.floats(-0.1, 0.1), min_size=6, max_size=6).map(np.array)
 cycle = st.tuples(joints, corrections, offsets, st.floats(-0.5, 1.5), st.floats(1e-4, 0.1))
-wild = st.tuples(
+outlier = st.tuples(
     st.lists(anything, min_size=N, max_size=N).map(np.array),
     st.lists(anything, min_size=N, max_size=N).map(np.array),
     st.lists(anything, min_size=6, max_size=6).map(np.array),
@@ -84,7 +84,7 @@ def test_nothing_leaves_that_is_outside_envelope_rates_or_joint_limits(rows: lis
 
 
 @settings(max_examples=300, deadline=None)
-@given(st.lists(wild, min_size=1, max_size=6))
+@given(st.lists(outlier, min_size=1, max_size=6))
 def test_no_nan_no_infinity_and_no_huge_number_ever_leaves(rows: list[Any]) -> None:
     limiter = started(np.zeros(N))
     for q, corrected, offset, ramp, dt in rows:
@@ -256,7 +256,7 @@ def test_a_stream_cannot_start_where_the_arm_must_not_be(q: Array) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "output"),
     [
         ({"offset": np.nan}, "offset"),
         ({"offset_rate": 0.0}, "offset_rate"),
@@ -264,8 +264,8 @@ def test_a_stream_cannot_start_where_the_arm_must_not_be(q: Array) -> None:
         ({"lower": np.full(N, 3.0)}, "lower joint limit"),
     ],
 )
-def test_limits_that_make_no_sense_are_refused(changed: dict[str, Any], said: str) -> None:
-    with pytest.raises(LimitError, match=said):
+def test_limits_that_make_no_sense_are_refused(changed: dict[str, Any], output: str) -> None:
+    with pytest.raises(LimitError, match=output):
         limits(**changed)
 
 

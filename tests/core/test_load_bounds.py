@@ -31,13 +31,13 @@ def test_a_built_in_arm_has_bounds_from_its_rated_payload(name: str) -> None:
 
 
 @pytest.mark.parametrize("mass", [40.0, 400.0, -0.1, np.nan, np.inf])
-def test_what_a_ur5e_cannot_carry_is_doubted(mass: float) -> None:
+def test_what_a_ur5e_cannot_carry_is_rejected(mass: float) -> None:
     found = LoadBounds.of(Model(builtin_arm("ur5e"))).doubt_payload(mass, COG)
     assert found is not None
     assert "expected 0 to 7.5 kg (rated payload 5 kg)" in found
 
 
-def test_a_small_mass_far_out_is_doubted_as_a_moment() -> None:
+def test_a_small_mass_far_out_is_rejected_as_a_moment() -> None:
     bounds = LoadBounds.of(Model(builtin_arm("ur5e")))
     assert bounds.doubt_payload(2.0, np.array([0, 0, 1.0])) is None
     assert "kg m" in (bounds.doubt_payload(3.0, np.array([0, 0, 1.0])) or "")
@@ -45,7 +45,7 @@ def test_a_small_mass_far_out_is_doubted_as_a_moment() -> None:
 
 
 @pytest.mark.parametrize("value", [9000.0, np.nan])
-def test_nine_kilonewtons_are_doubted_on_every_arm(value: float) -> None:
+def test_nine_kilonewtons_are_rejected_on_every_arm(value: float) -> None:
     for name in builtin_names():
         bounds = LoadBounds.of(Model(builtin_arm(name)))
         assert bounds.doubt_wrench(np.array([0, 0, value, 0, 0, 0])) is not None
@@ -58,5 +58,5 @@ def test_an_arm_of_unknown_rating_gets_the_documented_default() -> None:
     light = arm_from_dh([{**row, "mass": 0.0} for row in rows])
     assert LoadBounds.of(Model(light)).rated == UNKNOWN
     assert LoadBounds.of(Model(light, payload_mass=30.0)).rated == 30.0
-    told = replace(light, payload=2.0)
-    assert LoadBounds.of(Model(told, payload_mass=2.5)).mass == pytest.approx(HEAVIEST * 2.0)
+    reported = replace(light, payload=2.0)
+    assert LoadBounds.of(Model(reported, payload_mass=2.5)).mass == pytest.approx(HEAVIEST * 2.0)

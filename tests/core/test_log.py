@@ -104,7 +104,7 @@ def test_parquet_is_the_same_log(tmp_path, suffix):
     np.testing.assert_array_equal(log.get("payload"), [1, 2, 3])
 
 
-def test_parquet_that_is_none_and_text_in_it_are_told(tmp_path):
+def test_parquet_that_is_none_and_text_in_it_are_reported(tmp_path):
     path = write(tmp_path, "not parquet", "log.parquet")
     with pytest.raises(LogError, match="found no readable Parquet file") as caught:
         read_log(path, 6)
@@ -158,18 +158,18 @@ UNUSABLE = {
 
 
 @pytest.mark.parametrize("case", UNUSABLE)
-def test_unusable_files_are_told_in_one_line(tmp_path, case):
+def test_unusable_files_are_reported_in_one_line(tmp_path, case):
     text, message = UNUSABLE[case]
     path = write(tmp_path, text)
     with pytest.raises(LogError) as caught:
         read_log(path, 6)
-    told = str(caught.value)
-    assert message in told
-    assert told.startswith(str(path))
-    assert "\n" not in told
+    reported = str(caught.value)
+    assert message in reported
+    assert reported.startswith(str(path))
+    assert "\n" not in reported
 
 
-def test_what_is_no_text_is_told(tmp_path):
+def test_what_is_no_text_is_reported(tmp_path):
     path = tmp_path / "log.csv"
     path.write_bytes(b"\xff\xfe\x00\x01" * 10)
     with pytest.raises(LogError, match="no text"):
@@ -239,11 +239,11 @@ def test_a_misspelt_column_is_named_where_the_right_one_is_missing(tmp_path, hea
 
 @pytest.mark.parametrize("value", ["inf", "-inf", "nan"])
 @pytest.mark.parametrize("name", ["actual_q", "target_q"])
-def test_an_angle_that_is_not_finite_is_told_with_its_row_not_as_degrees(tmp_path, value, name):
+def test_an_angle_that_is_not_finite_is_reported_with_its_row_not_as_degrees(tmp_path, value, name):
     rows = joints()
     rows[1][3] = value
     log = read_log(write(tmp_path, table([f"{name}_{i}" for i in range(6)], rows)), 6)
-    if value == "nan":  # an empty cell is told where it is needed, and only there
+    if value == "nan":  # an empty cell is reported where it is needed, and only there
         check_units(Model(builtin_arm("ur5e")), log)
     with pytest.raises(LogError) as caught:
         log.require(name) if value == "nan" else check_units(Model(builtin_arm("ur5e")), log)
@@ -251,7 +251,7 @@ def test_an_angle_that_is_not_finite_is_told_with_its_row_not_as_degrees(tmp_pat
     assert "degrees" not in str(caught.value)
 
 
-def test_loads_come_from_their_columns_and_a_negative_payload_is_told(tmp_path):
+def test_loads_come_from_their_columns_and_a_negative_payload_is_reported(tmp_path):
     names = [*JOINTS, "payload", *(f"payload_cog_{i}" for i in range(3)),
              *(f"actual_TCP_force_{i}" for i in range(6))]  # fmt: skip
     rows = [[*r, 2.5, 0.1, 0.2, 0.3, 1, 2, 3, 4, 5, 6] for r in joints()]

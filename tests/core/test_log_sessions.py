@@ -81,7 +81,7 @@ def test_no_motion_runs_from_one_session_into_the_next() -> None:
 
 
 @pytest.mark.parametrize(
-    ("logs", "words"),
+    ("logs", "phrase"),
     [
         ([poses(6, "a.csv", session=[1, 1, 2, 2, 1, 1])],
          ["a.csv", "row 6", "session", "found 1 again", "side by side"]),
@@ -94,11 +94,11 @@ def test_no_motion_runs_from_one_session_into_the_next() -> None:
         ([poses(3, "a.csv"), poses(3, "a.csv")], ["a.csv", "found twice"]),
     ],
 )  # fmt: skip
-def test_what_does_not_belong_together_is_said(logs: list[Log], words: list[str]) -> None:
+def test_what_does_not_belong_together_is_reported(logs: list[Log], phrase: list[str]) -> None:
     with pytest.raises(LogError) as error:
         join_sessions(logs, MODEL)
     assert "\n" not in str(error.value)
-    for word in words:
+    for word in phrase:
         assert word in str(error.value)
 
 
@@ -106,8 +106,8 @@ def test_rows_outside_what_was_fitted_are_named() -> None:
     fitted = range_of(poses(50, "a.csv", payload=np.linspace(0, 3, 50)))
     assert fitted["payload"] == (0.0, 3.0)
     assert outside(poses(20, "b.csv", payload=np.full(20, 2.0)), fitted) == []
-    (told,) = outside(poses(2, "b.csv", payload=[1.0, 9.0]), fitted)
+    (reported,) = outside(poses(2, "b.csv", payload=[1.0, 9.0]), fitted)
     for word in ("payload", "1 of 2 rows", "0 to 3 kg", "row 3", "9"):
-        assert word in told
+        assert word in reported
     whole = merged([fitted, {"payload": (2.0, 10.0)}])
     assert outside(poses(2, "b.csv", payload=[1.0, 9.0]), whole) == []

@@ -162,7 +162,7 @@ TWO = (link("b"), link("l1"), joint("j1", "revolute", "b", "l1"))
          r"joint 'j': found no parent or child link"),
     ],
 )  # fmt: skip
-def test_a_mistake_is_told_in_one_line(tmp_path, parts, tip, message):
+def test_a_mistake_is_reported_in_one_line(tmp_path, parts, tip, message):
     path = write(tmp_path, *parts)
     with pytest.raises(ArmError, match=message) as caught:
         arm_from_urdf(path, tip)
@@ -170,7 +170,7 @@ def test_a_mistake_is_told_in_one_line(tmp_path, parts, tip, message):
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_no_urdf_is_told(tmp_path):
+def test_what_is_no_urdf_is_reported(tmp_path):
     with pytest.raises(ArmError, match="file not found"):
         arm_from_urdf(tmp_path / "none.urdf")
     with pytest.raises(ArmError, match="cannot be read"):
@@ -197,6 +197,6 @@ def test_what_is_no_urdf_is_told(tmp_path):
          "joint 'j1': limit: velocity: found 'nan', expected 1 finite number"),
     ],
 )  # fmt: skip
-def test_a_zero_axis_a_missing_link_and_a_bad_limit_are_told(tmp_path, parts, message):
+def test_a_zero_axis_a_missing_link_and_a_bad_limit_are_reported(tmp_path, parts, message):
     with pytest.raises(ArmError, match=message):
         arm_from_urdf(write(tmp_path, *parts))

@@ -63,7 +63,7 @@ def test_reading_before_connecting_is_refused(name: str, model: Model) -> None:
         driver.read_state()
 
 
-def test_an_unknown_driver_is_told_with_those_that_exist(model: Model) -> None:
+def test_an_unknown_driver_is_reported_with_those_that_exist(model: Model) -> None:
     class Other(DriverSettings):
         driver: str = "telepathy"
 
@@ -71,7 +71,9 @@ def test_an_unknown_driver_is_told_with_those_that_exist(model: Model) -> None:
         make_driver(Other(), model)
 
 
-def test_a_library_that_is_missing_is_told(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_library_that_is_missing_is_reported(
+    model: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(DRIVERS, "ur_rtde", "gapbridge.drivers.nowhere:Nothing")
     with pytest.raises(LinkError, match="its library cannot be imported"):
         make_driver(link(), model)

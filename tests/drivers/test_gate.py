@@ -39,7 +39,7 @@ class Clock:
 
 def opened(moves_arm: bool, bounds: GateBounds | None = None) -> tuple[Gate, Clock]:
     found, clock = Gate(RATE, MODEL, moves_arm), Clock()
-    found.clock = clock
+    found.count_by(clock)
     found.hold_to(bounds or GateBounds())
     found.begin(Q, Q)
     return found, clock

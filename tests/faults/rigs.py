@@ -7,12 +7,12 @@ from pathlib import Path
 from benchmarks.faults.links import LINKS, Link
 from benchmarks.faults.rig import Rig
 
-CALM = 125.0  # Hz of the UR links: what a busy machine still keeps up with
+INLIER = 125.0  # Hz of the UR links: what a busy machine still keeps up with
 
 
-def calm_link(name: str) -> Link:
+def quiet_link(name: str) -> Link:
     """Return a link at a rate that a small machine keeps up with."""
-    return LINKS[name](CALM if name.startswith("ur_") else None)
+    return LINKS[name](INLIER if name.startswith("ur_") else None)
 
 
 class Rigs:
@@ -27,7 +27,7 @@ class Rigs:
         """Return a rig of a link whose daemon runs."""
         if self._rig is None or self._name != name or not self._rig.run.alive:
             self.close()
-            self._rig, self._name = Rig(calm_link(name), self._folder / name), name
+            self._rig, self._name = Rig(quiet_link(name), self._folder / name), name
             self._rig.__enter__()
         return self._rig
 

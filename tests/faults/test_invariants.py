@@ -95,7 +95,7 @@ def test_a_write_in_a_state_that_forbids_it_is_found(checker: Checker) -> None:
 
 
 def test_a_write_that_was_only_seen_late_is_judged_by_when_it_arrived(checker: Checker) -> None:
-    state(checker, 28, supervisor=5)  # the tap slept; what came before it is told after it
+    state(checker, 28, supervisor=5)  # the tap slept; what came before it is reported after it
     late = Write(20 * CYCLE, "offset", (21 * STEP, *[0.0] * 5), "registers", 5)
     checker.take([late])
     checker.settle([(0.0, 20 * CYCLE + 0.001)])
@@ -232,7 +232,7 @@ def test_a_motion_command_of_the_library_other_than_servoj_is_forbidden() -> Non
     assert found.kind == "forbidden"
 
 
-def test_the_kernel_says_when_bytes_arrived_however_late_they_are_read() -> None:
+def test_the_kernel_reports_when_bytes_arrived_however_late_they_are_read() -> None:
     with (
         socket.create_server(("127.0.0.1", 0)) as server,
         socket.create_connection(server.getsockname()) as client,

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
-from rigs import Rigs, calm_link
+from rigs import Rigs, quiet_link
 
 from benchmarks.faults.injection import make_fault
 from benchmarks.faults.links import LINKS
@@ -59,7 +59,7 @@ APART = [(name, row) for name in LINKS for row in rows_of(name, shared=False)]
 def test_a_fault_that_needs_a_daemon_of_its_own_is_answered_as_the_table_says(
     tmp_path: Path, name: str, row: Row
 ) -> None:
-    assert run_alone(row, calm_link(name), tmp_path).wrong == ()
+    assert run_alone(row, quiet_link(name), tmp_path).wrong == ()
 
 
 def test_every_row_has_a_name_of_its_own_and_links_that_exist() -> None:

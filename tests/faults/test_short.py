@@ -10,7 +10,7 @@ import random
 from pathlib import Path
 
 import pytest
-from rigs import Rigs, calm_link
+from rigs import Rigs, quiet_link
 
 from benchmarks.faults.injection import make_fault
 from benchmarks.faults.links import LINKS
@@ -33,7 +33,7 @@ TRIES = 3
 def judge(result: Result, is_last: bool) -> bool:
     """Return whether a result stands; one of a machine that was late does not count for much."""
     assert not result.violated, result.wrong
-    wrong = [words for words in result.wrong if not words.startswith("detected after")]
+    wrong = [message for message in result.wrong if not message.startswith("detected after")]
     if wrong and not (result.disturbed and is_last):
         assert not is_last, wrong
         return False
@@ -63,7 +63,7 @@ def test_a_fault_is_detected_and_answered(rigs: Rigs, name: str, key: str) -> No
 @pytest.mark.parametrize(("name", "key"), ALONE, ids=[f"{n}-{k}" for n, k in ALONE])
 def test_a_fault_with_a_rig_of_its_own_is_answered(tmp_path: Path, name: str, key: str) -> None:
     for i in range(TRIES):
-        result = run_alone(ROW[key], calm_link(name), tmp_path / str(i))
+        result = run_alone(ROW[key], quiet_link(name), tmp_path / str(i))
         if judge(result, i == TRIES - 1):
             return
 

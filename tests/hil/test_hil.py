@@ -24,14 +24,14 @@ from gapbridge.drivers.driver import Driver
 SHIFT = 2e-4  # m, along base z
 TURN = np.radians(0.5)  # of the last joint
 PACE = np.radians(1.0)  # per s
-COARSE = 2e-3  # rad: joints at rest tell the same angle within this
+COARSE = 2e-3  # rad: joints at rest report the same angle within this
 
 
 def test_states_are_complete_and_time_goes_on(cell: Cell, driver: Driver) -> None:
     check_reads(driver, cell.model, 50)
 
 
-def test_the_arm_at_rest_tells_the_same_joints_again(driver: Driver) -> None:
+def test_the_arm_at_rest_shows_the_same_joints_again(driver: Driver) -> None:
     states = [next_state(driver) for _ in range(50)]
     speed = np.abs([s.actual_qd for s in states]).max()
     if speed > 0.01:

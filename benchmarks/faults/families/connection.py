@@ -7,7 +7,7 @@ from benchmarks.faults.row import Row, seconds
 
 
 def _kill(rig: Rig) -> None:
-    rig.peer.kill()
+    rig.controller.kill()
     rig.proxy.refuse()
 
 

@@ -1,4 +1,4 @@
-"""The daemon itself: told to end, killed, or given a cell that does not fit its controller."""
+"""The daemon itself: asked to end, killed, or given a cell that does not fit its controller."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ProcessRig(Rig):
 
     def start_daemon(self) -> None:
         """Start one and wait until it compensates."""
-        self.link.prepare(self.peer, self.back)
+        self.link.prepare(self.controller, self.back)
         self.ended = ProcessRun(self.cell)
         self._runs.append(self.ended)  # type: ignore[arg-type]
         self.ended.start()
@@ -56,7 +56,7 @@ def ended_by(number: signal.Signals) -> Apart:
                 wrong.append(f"its processes ended after {gone} s")
             _wait(rig, lambda: run.exit_code is not None, END_LIMIT, moment)
             if number == signal.SIGTERM and run.exit_code != 0:
-                wrong.append(f"it ended with {run.exit_code}: {run.said[-200:]}")
+                wrong.append(f"it ended with {run.exit_code}: {run.output[-200:]}")
             rig.pass_time(ON_THE_WIRE)
             found = rig.found
             left = math.hypot(*rig.checker.last_offset[:3])
@@ -64,7 +64,7 @@ def ended_by(number: signal.Signals) -> Apart:
             if left > 5.0 * rig.checker.bounds.grain and not link.moves_arm:
                 wrong.append(f"an offset of {1e6 * left:.1f} um was left behind")
             step = found.largest_step
-            rig.link.prepare(rig.peer, rig.back)
+            rig.link.prepare(rig.controller, rig.back)
             rig.start_daemon()  # with what the former has left behind: nothing is cleaned
             rig.pass_time(AFTER)
             wrong += rig.found.violations

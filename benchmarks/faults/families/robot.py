@@ -10,7 +10,7 @@ LATCHED = ("fault",)
 
 def _bench(line: str):  # type: ignore[no-untyped-def]
     def inject(rig: Rig) -> None:
-        rig.peer.bench(line)
+        rig.controller.bench(line)
 
     return inject
 

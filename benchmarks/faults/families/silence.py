@@ -21,7 +21,7 @@ def _stall(duration: float):  # type: ignore[no-untyped-def]
 
 
 def _freeze_clock(rig: Rig) -> None:
-    rig.peer.bench("freeze")
+    rig.controller.bench("freeze")
 
 
 def _freeze_in_packets(rig: Rig) -> None:
@@ -80,7 +80,7 @@ ROWS = (
     Row("half-open link", "half-open (cable pulled)", "proxy hands nothing on for 4 s",
         _stall(4.0), lasting=4.0, slow=True),
     Row("peer stands still", "controller stands still", "SIGSTOP of the controller for 0.4 s",
-        lambda rig: rig.peer.stand_still(), lasting=0.35, end=SILENT),
+        lambda rig: rig.controller.stand_still(), lasting=0.35, end=SILENT),
     Row("frozen clock", "stale link, socket alive", "the controller's clock stops, packets go on",
         _freeze_clock, links=UR, lasting=0.3, end=SILENT),
     Row("frozen timestamp", "stale link, socket alive", "proxy writes the same timestamp",

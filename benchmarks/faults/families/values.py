@@ -61,7 +61,7 @@ def _tear(rig: Rig) -> None:
 
 
 def _tear_registers(rig: Rig) -> None:
-    rig.peer.bench("tear 4")  # images of the controller; a reading comes every third or so
+    rig.controller.bench("tear 4")  # images of the controller; a reading comes every third or so
 
 
 AT_ONCE = cycles(8, 0.25)

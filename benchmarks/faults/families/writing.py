@@ -31,7 +31,7 @@ def _lose_requests(rig: Rig) -> None:
 
 def _stop_program(rig: Rig) -> None:
     if rig.link.main == "modbus":
-        rig.peer.bench("program 0")
+        rig.controller.bench("program 0")
     else:
         dashboard(rig.back, "stop")
 

@@ -68,7 +68,7 @@ class Decoder(ABC):
     def feed(
         self, time: float, connection: int, port: str, up: bool, message: bytes, state: int
     ) -> list[Fresh | Write]:
-        """Return what a message tells; nothing for most."""
+        """Return what a message reports; nothing for most."""
 
     @abstractmethod
     def patch(self, message: bytes, what: str, change: Change) -> bytes:

@@ -41,16 +41,16 @@ def _turned(vector: Array) -> Array:
 def solve(chain: Chain, rows: Rows) -> Plain:
     """Return poses and linear form at the equilibrium of every row."""
     count, n = rows.q.shape
-    bend, tilt = np.zeros((count, n, 3)), np.zeros((count, 3))
+    bend, base_rotation = np.zeros((count, n, 3)), np.zeros((count, 3))
     for _ in range(ROUNDS):
-        frames = _placed(chain, rows, bend, tilt)
+        frames = _placed(chain, rows, bend, base_rotation)
         moment, base_moment = _loaded(chain, rows, frames)
         local = np.einsum("nikc,nik->nic", frames["rotation"], moment)
         new = chain.compliance * local
         new[:, :, 2] /= np.sqrt(1 + chain.softening * local[:, :, 2] ** 2)
-        new_tilt = chain.base_compliance * base_moment
-        change = max(np.abs(new - bend).max(), np.abs(new_tilt - tilt).max())
-        bend, tilt = new, new_tilt
+        new_base_rotation = chain.base_compliance * base_moment
+        change = max(np.abs(new - bend).max(), np.abs(new_base_rotation - base_rotation).max())
+        bend, base_rotation = new, new_base_rotation
         if change < 1e-15:
             break
     tcp, z = frames["tcp"], frames["rotation"][:, :, :, 2]
@@ -67,9 +67,9 @@ def solve(chain: Chain, rows: Rows) -> Plain:
     )  # fmt: skip
 
 
-def _placed(chain: Chain, rows: Rows, bend: Array, tilt: Array) -> dict[str, Array]:
+def _placed(chain: Chain, rows: Rows, bend: Array, base_rotation: Array) -> dict[str, Array]:
     count, n = rows.q.shape
-    R, o = _turned(tilt), np.zeros((count, 3))
+    R, o = _turned(base_rotation), np.zeros((count, 3))
     origin, rotation, axis = np.empty((count, n, 3)), np.empty((count, n, 3, 3)), []
     for i in range(n):
         length = rows.growth[:, i - 1, None] if i else 1.0

@@ -18,9 +18,9 @@ _SETTINGS: TypeAdapter[InstrumentSettings] = TypeAdapter(InstrumentSettings)
 
 
 def instrument_settings(cell: Cell, given: str | None) -> InstrumentSettings:
-    """Return the settings of an instrument told as ``KIND[,KEY=VALUE...]``; None: the cell's.
+    """Return the settings of an instrument given as ``KIND[,KEY=VALUE...]``; None: the cell's.
 
-    Keys that are left out come from the cell where it has the same kind. Paths are seen from the
+    Keys that are left out come from the cell where it has the same kind. Paths are relative to the
     working folder. Raises InputError.
     """
     own = cell.calibration.instrument
@@ -41,5 +41,7 @@ def instrument_settings(cell: Cell, given: str | None) -> InstrumentSettings:
     except ValidationError as error:
         worst = error.errors()[0]
         name = ".".join(str(part) for part in worst["loc"][1:])
-        words = str(worst["msg"]).removeprefix("Value error, ")
-        raise InputError(f"--instrument {kind}: {name}: {words[:1].lower()}{words[1:]}") from None
+        message = str(worst["msg"]).removeprefix("Value error, ")
+        raise InputError(
+            f"--instrument {kind}: {name}: {message[:1].lower()}{message[1:]}"
+        ) from None

@@ -1,4 +1,4 @@
-"""The force sensor in the flange: the controller tells its reading together with the joints."""
+"""The force sensor in the flange: the controller reports its reading together with the joints."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class Instrument(ABC, Generic[S]):
 
     manual = False  # a person reads it: mistakes of typing happen
     waits = False  # for the person, or for what is exported: nobody need say when to read
-    needs_wrench = False  # the controller must tell the raw reading of a flange sensor
+    needs_wrench = False  # the controller must report the raw reading of a flange sensor
     stands = "the instrument"  # what has a place in the cell, in words
     seats = False  # the tool is brought onto something by hand: the joints are read afterwards
 

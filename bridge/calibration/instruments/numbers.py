@@ -27,13 +27,13 @@ def numbers(text: str, count: int, unit: str = "") -> list[float]:
     """
     plain = _NAME.sub(" ", text.strip())
     for written in _UNIT.findall(plain):
-        told = {"µm": "um", "°": "deg"}.get(written, written)
-        if unit and told != unit and told not in RADIANS:
+        reported = {"µm": "um", "°": "deg"}.get(written, written)
+        if unit and reported != unit and reported not in RADIANS:
             raise ReadingError(f"found {written}, expected {unit}: the unit declared for it")
     plain = _UNIT.sub(" ", plain)
-    words = _words(plain, count)
+    message = _words(plain, count)
     found = []
-    for word in words:
+    for word in message:
         try:
             found.append(float(word))
         except ValueError:

@@ -11,12 +11,12 @@ from gapbridge.bridge.calibration.instruments.instrument import ReadingError
 from gapbridge.bridge.calibration.instruments.numbers import numbers
 from gapbridge.core.errors import InputError
 
-STOP = "stop"  # name of the column that tells which stop of the plan a row belongs to
+STOP = "stop"  # name of the column that says which stop of the plan a row belongs to
 
 
 @dataclass(frozen=True)
 class Row:
-    """One row: its line in the file, from 1, its cells, and its stop where it tells one."""
+    """One row: its line in the file, from 1, its cells, and its stop where it reports one."""
 
     line: int
     cells: tuple[str, ...]

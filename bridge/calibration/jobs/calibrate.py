@@ -17,7 +17,7 @@ from gapbridge.bridge.calibration.jobs.fitting import (
 from gapbridge.bridge.calibration.jobs.job import Job, write_document
 from gapbridge.bridge.calibration.jobs.log_of import write_log
 from gapbridge.bridge.calibration.planning import metrology_of, planned
-from gapbridge.bridge.calibration.session.pace import seconds_left
+from gapbridge.bridge.calibration.session.progress import seconds_left
 from gapbridge.bridge.document.provenance import fitted as fitted_on
 from gapbridge.bridge.document.provenance import provenance
 from gapbridge.core.calibration.fit import SessionFit
@@ -43,35 +43,36 @@ class WholeJob(Job):
     """Plan, measure, fit, verify, report, and a new cell."""
 
     def plan(self, begin: Array | None, tell: Callable[[str, float], None]) -> Plan:
-        """Return the poses that tell most."""
-        return planned(self.cell, self.order, tell)
+        """Return the most informative poses."""
+        return planned(self.cell, self.options, tell)
 
     def tell_plan(self, plan: Plan) -> None:
         """Say how many stops there are, and what n poses buy."""
-        talk, minutes = self.talk, self.cell.calibration.minutes_per_load
+        prompt, minutes = self.prompt, self.cell.calibration.minutes_per_load
         fit = sum(not p.held_out and not p.repeat for p in plan.poses)
         held = sum(p.held_out for p in plan.poses)
         again = sum(p.repeat > 0 for p in plan.poses)
-        talk.say(
+        prompt.say(
             f"plan: {fit} poses to fit, {held} to verify, {again} once more for the repeatability: "
-            f"{len(plan.poses)} stops, {duration(seconds_left(self.book, minutes) + plan.travel)}"
+            f"{len(plan.poses)} stops, "
+            f"{duration(seconds_left(self.session, minutes) + plan.travel)}"
         )
         self._tell_places(plan)
         used = {p.load for p in plan.poses}
         for i, load in enumerate(plan.loads):
-            needless = "" if i in used else " (not needed: it would tell nothing more)"
-            talk.say(f"  load {i + 1}: {load_text(load)}{needless}")
-        talk.say(
+            needless = "" if i in used else " (not needed: it would add nothing)"
+            prompt.say(f"  load {i + 1}: {load_text(load)}{needless}")
+        prompt.say(
             f"expected: the predicted TCP known to {millimetres(plan.expected.tcp_std)} (1 sigma "
             f"over workspace and loads; {millimetres(plan.expected.tcp_std_worst)} at worst)"
         )
         told = ", ".join(f"{n}: {millimetres(s)}" for n, s in plan.bought)
-        talk.say(f"  what n poses buy: {told}")
+        prompt.say(f"  what n poses buy: {told}")
         weak = _hardly_told(plan)
         if weak:
-            talk.say(f"  these poses hardly tell: {', '.join(weak)}")
+            prompt.say(f"  these poses hardly determine: {', '.join(weak)}")
         for note in plan.notes:
-            talk.say(f"  note: {note}")
+            prompt.say(f"  note: {note}")
 
     def _tell_places(self, plan: Plan) -> None:
         """Say where the instrument stands in turn, where it is carried about."""
@@ -82,17 +83,17 @@ class WholeJob(Job):
             count = sum(p.station == i for p in plan.poses)
             place = ", ".join(f"{v:g}" for v in at or ())
             needless = "" if count else " (not needed: nothing more is seen from there)"
-            self.talk.say(f"  place {i + 1}: ({place}) m in base, {count} stops{needless}")
+            self.prompt.say(f"  place {i + 1}: ({place}) m in base, {count} stops{needless}")
 
     def _wanted(self, lacks: tuple[Lack, ...]) -> bool:
         """Return whether effects that the fitted poses support are to be fitted as well."""
         shares = ", ".join(f"{lack.name} {100 * lack.share:.0f} %" for lack in lacks)
         names = ", ".join(lack.name for lack in lacks)
-        self.talk.say(
+        self.prompt.say(
             f"on poses left out of its fit in turn, this takes off what is left: {shares}"
         )
         question = f"The fitted poses ask for {names} as well. Fit again with it?"
-        return self.order.yes or self.talk.confirm(question)
+        return self.options.yes or self.prompt.confirm(question)
 
     def _chosen(self, fit: SessionFit) -> tuple[SessionFit, tuple[str, ...]]:
         """Return the fit with what the fitted poses support and a person wants; and what fell.
@@ -106,7 +107,7 @@ class WholeJob(Job):
             if not new or not self._wanted(new):
                 break
             names = (*asked, *(lack.name for lack in new))
-            further = fitted(self.cell, self.order, self.talk, self.book, names)
+            further = fitted(self.cell, self.options, self.prompt, self.session, names)
             while unfit := unsupported(further.estimates(), names):
                 for name in unfit:
                     self._tell_fallen(name, further)
@@ -115,7 +116,7 @@ class WholeJob(Job):
                 if names == asked:
                     further = fit
                     break
-                further = fitted(self.cell, self.order, self.talk, self.book, names)
+                further = fitted(self.cell, self.options, self.prompt, self.session, names)
             if names == asked:
                 break
             fit, asked = further, names
@@ -125,16 +126,16 @@ class WholeJob(Job):
         own = [e for e in fit.estimates() if e.name == name or e.name.startswith(f"{name}_")]
         values = ", ".join(f"{e.name} = {parameter(e.value, e.unit)} ± {parameter(e.std, e.unit)}"
                            for e in own)  # fmt: skip
-        self.talk.warn(f"not fitted: {values} is not three of its sigmas from zero")
+        self.prompt.warn(f"not fitted: {values} is not three of its sigmas from zero")
 
     def finish(self) -> None:
-        """Fit, tell, report, and write the new cell once a person says yes."""
-        talk, folder, order = self.talk, self.folder, self.order
-        talk.say()
-        fit, fallen = self._chosen(fitted(self.cell, order, talk, self.book))
-        found = calibration_of(self.cell, order, talk, self.book, fit, fallen)
-        tell_calibration(talk, found)
-        metrology = metrology_of(self.cell, order.instrument, self.book.places)
+        """Fit, show, report, and write the new cell once a person says yes."""
+        prompt, folder, options = self.prompt, self.folder, self.options
+        prompt.say()
+        fit, fallen = self._chosen(fitted(self.cell, options, prompt, self.session))
+        found = calibration_of(self.cell, options, prompt, self.session, fit, fallen)
+        tell_calibration(prompt, found)
+        metrology = metrology_of(self.cell, options.instrument, self.session.places)
         write_log(found.readings, metrology.registered, folder / "readings.csv")
         promise = document_of(found, sigma=metrology.sigma)
         write_document(folder / "promise.json", promise)
@@ -143,14 +144,14 @@ class WholeJob(Job):
         )
         from gapbridge.bridge.calibration.report import write_report
 
-        facts = session_facts(self.cell, order, self.book)
-        for file in write_report(found, self.book.plan, facts, folder):
-            talk.say(f"{file}: written")
+        facts = session_facts(self.cell, options, self.session)
+        for file in write_report(found, self.session.plan, facts, folder):
+            prompt.say(f"{file}: written")
         if not found.complete:
-            talk.warn(f"not complete: {found.remaining}")
+            prompt.warn(f"not complete: {found.remaining}")
         if (why := worse_than_before(found.held_out_before, found.held_out_after)) is not None:
-            self.book.add("ended", applied=None)
-            talk.warn(why)
+            self.session.add("ended", applied=None)
+            prompt.warn(why)
             return
         log = read_log(folder / "readings.csv", self.cell.arm.n)
         spread = Spread(tuple(e.name for e in found.estimates), found.whole_covariance)
@@ -159,7 +160,7 @@ class WholeJob(Job):
         target = self.hand_over(found.model, "the calibrated cell", sections)
         if target is not None:
             write_document(promise_beside(target), promise)
-            talk.say(f"  months later: gapbridge calibrate {target} --verify")
+            prompt.say(f"  months later: gapbridge calibrate {target} --verify")
 
 
 def worse_than_before(before: Errors, after: Errors) -> str | None:

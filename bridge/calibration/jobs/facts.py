@@ -1,4 +1,4 @@
-"""What the report tells of a session beside its figures."""
+"""What the report says about a session beside its figures."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from datetime import datetime
 
 import numpy as np
 
-from gapbridge.bridge.calibration.options import Order
+from gapbridge.bridge.calibration.options import SessionOptions
 from gapbridge.bridge.calibration.report import InstrumentFacts, SessionFacts
-from gapbridge.bridge.calibration.session.session import Book
+from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.document.provenance import digest, installed_version
 
@@ -26,18 +26,18 @@ NAMES = {
 
 
 def session_facts(
-    cell: Cell, order: Order, book: Book, what: tuple[str, str] | None = None
+    cell: Cell, options: SessionOptions, session: Session, what: tuple[str, str] | None = None
 ) -> SessionFacts:
     """Return who, where, when and with what.
 
     ``what`` is name and kind of what measured, where it is not the ordered instrument.
     """
-    given, instrument = cell.calibration, order.instrument
+    given, instrument = cell.calibration, options.instrument
     name, kind = what or (NAMES[instrument.kind], instrument.measures)
-    times = [t.time for t in book.taken] or [float(book.begun["time"])]
+    times = [t.time for t in session.taken] or [float(session.begun["time"])]
     wide = {"position": 3, "pose": 3, "distance": 1}.get(kind, 0)  # the others look from nowhere
-    distances = [np.linalg.norm(t.value[:wide]) for t in book.taken if wide]
-    started = datetime.fromtimestamp(float(book.begun["time"]))
+    distances = [np.linalg.norm(t.value[:wide]) for t in session.taken if wide]
+    started = datetime.fromtimestamp(float(session.begun["time"]))
     return SessionFacts(
         cell=cell.path.stem,
         arm=cell.arm.name,
@@ -51,36 +51,36 @@ def session_facts(
             sigma=instrument.sigma or cell.metrology.sigma,
             distance=float(np.median(distances)) if distances else 0.0,
         ),
-        folder=book.journal.path.parent,
+        folder=session.journal.path.parent,
         started=started,
         ended=datetime.fromtimestamp(max(times)),
-        readings=len(book.taken),
-        undone=book.undone,
-        number=_number(started, book),
+        readings=len(session.taken),
+        undone=session.undone,
+        number=_number(started, session),
         version=installed_version(),
         cell_sha256=digest(cell.path) or "",
         accuracy=given.accuracy,
-        remarks=tuple(_remarks(book)),
+        remarks=tuple(_remarks(session)),
     )  # fmt: skip
 
 
-def _number(started: datetime, book: Book) -> str:
+def _number(started: datetime, session: Session) -> str:
     """Return the report's number: when the session began, and a digest of its journal so far."""
-    content = digest(book.journal.path) or ""
+    content = digest(session.journal.path) or ""
     return f"GB-{started:%Y%m%d-%H%M}-{content[:8]}"
 
 
-def _remarks(book: Book) -> list[str]:
+def _remarks(session: Session) -> list[str]:
     """Return what happened on the way, in words."""
-    found = list(book.notes)
-    if book.places > 1:
-        found.append(f"the instrument stood at {book.places} places")
-    if book.target:
-        found.append(f"the target had {book.target + 1} places on the tool")
-    if book.skipped:
-        stops = ", ".join(str(s + 1) for s in sorted(book.skipped))
+    found = list(session.notes)
+    if session.places > 1:
+        found.append(f"the instrument stood at {session.places} places")
+    if session.target:
+        found.append(f"the target had {session.target + 1} places on the tool")
+    if session.skipped:
+        stops = ", ".join(str(s + 1) for s in sorted(session.skipped))
         found.append(f"left out: stop {stops}")
-    doubted = [t.stop + 1 for t in book.taken if t.doubted]
+    doubted = [t.stop + 1 for t in session.taken if t.doubted]
     if doubted:
         found.append(f"kept though doubtful: stop {', '.join(map(str, doubted))}")
     return found

@@ -1,4 +1,4 @@
-"""What a session's readings come to: the fit, and how it is told."""
+"""What a session's readings come to: the fit, and how it is reported."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from gapbridge.bridge.calibration.format import TOLD_IN, figure, millimetres
-from gapbridge.bridge.calibration.options import Order
+from gapbridge.bridge.calibration.options import SessionOptions
 from gapbridge.bridge.calibration.planning import effects_of, metrology_of, observable_of
-from gapbridge.bridge.calibration.session.prompt import Talk
-from gapbridge.bridge.calibration.session.session import Book
+from gapbridge.bridge.calibration.session.prompt import Prompt
+from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell
 from gapbridge.core.calibration.fit import SessionFit, fit_session, judged
 from gapbridge.core.calibration.parameters import Parameters
@@ -21,63 +21,72 @@ DIAGNOSED = ("position", "pose")  # kinds whose remainder the diagnosis can judg
 
 
 def fitted(
-    cell: Cell, order: Order, talk: Talk, book: Book, more: tuple[str, ...] = ()
+    cell: Cell,
+    options: SessionOptions,
+    prompt: Prompt,
+    session: Session,
+    more: tuple[str, ...] = (),
 ) -> SessionFit:
     """Return the fit of a session's readings, with ``more`` effects than the cell names.
 
     Nothing of the held-out poses is looked at. Raises InputError where the readings are too few.
     """
-    kind, places = order.instrument.measures, book.places
-    observable = observable_of(cell, order.instrument, places)
-    metrology = metrology_of(cell, order.instrument, places)
-    with talk.waiting("fitting") as tell:
+    kind, places = options.instrument.measures, session.places
+    observable = observable_of(cell, options.instrument, places)
+    metrology = metrology_of(cell, options.instrument, places)
+    with prompt.waiting("fitting") as tell:
         parameters = Parameters.of(cell.model, (*effects_of(cell), *more), observable=observable)
         return fit_session(
-            book.all_readings(kind), parameters, metrology, observable=observable,
+            session.all_readings(kind), parameters, metrology, observable=observable,
             progress=lambda text: tell(f"fitting: {text}"),
         )  # fmt: skip
 
 
 def calibration_of(
-    cell: Cell, order: Order, talk: Talk, book: Book, fit: SessionFit, declined: tuple[str, ...]
+    cell: Cell,
+    options: SessionOptions,
+    prompt: Prompt,
+    session: Session,
+    fit: SessionFit,
+    declined: tuple[str, ...],
 ) -> Calibration:
     """Return the fit judged on the held-out poses: the one look at them."""
-    assert book.plan is not None
-    with talk.waiting("verifying") as tell:
+    assert session.plan is not None
+    with prompt.waiting("verifying") as tell:
         return judged(
-            cell.model, fit, declined=declined, expected=book.plan.expected,
-            diagnose=order.instrument.measures in DIAGNOSED,
+            cell.model, fit, declined=declined, expected=session.plan.expected,
+            diagnose=options.instrument.measures in DIAGNOSED,
             progress=lambda text: tell(f"verifying: {text}"),
         )  # fmt: skip
 
 
-def tell_calibration(talk: Talk, found: Calibration) -> None:
+def tell_calibration(prompt: Prompt, found: Calibration) -> None:
     """Say what a fit has found, how far it carries, and what stays unknown."""
-    talk.say(found.verdict, "bold green" if found.complete else "bold yellow")
+    prompt.say(found.verdict, "bold green" if found.complete else "bold yellow")
     pairs = (
         ("fitted poses", found.before, found.after),
         ("poses to verify", found.held_out_before, found.held_out_after),
     )
     for name, before, after in pairs:
         if len(after.vector):
-            talk.say(f"  {name}: {_errors(before)} before, {_errors(after)} after")
+            prompt.say(f"  {name}: {_errors(before)} before, {_errors(after)} after")
     noise = f"  the fit leaves {millimetres(found.noise)} a coordinate"
     if np.isfinite(found.noise_floor):
         noise += f", instrument and arm alone {millimetres(found.noise_floor)}"
     if np.isfinite(found.repeatability):
         small = found.repeatability < LEAST_TOLD
         noise += ", the arm repeats " + (
-            "better than the instrument tells" if small
+            "better than the instrument reports" if small
             else f"to {millimetres(found.repeatability)}"
         )  # fmt: skip
-    talk.say(noise)
-    talk.console.print(_table(found))
+    prompt.say(noise)
+    prompt.console.print(_table(found))
     for row in found.outliers:
-        talk.say(f"  weighed down as wild: reading {int(row) + 1}")
+        prompt.say(f"  down-weighted as outlier: reading {int(row) + 1}")
     for line in found.notes:
-        talk.say(f"  note: {line}")
+        prompt.say(f"  note: {line}")
     if found.combinations:
-        talk.say(f"  {len(found.combinations)} parameters cannot be told from others; the report "
+        prompt.say(f"  {len(found.combinations)} parameters cannot be separated; the report "
                  "names them")  # fmt: skip
 
 

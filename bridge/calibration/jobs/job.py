@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.instruments import make_instrument
 from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
-from gapbridge.bridge.calibration.options import Order
+from gapbridge.bridge.calibration.options import SessionOptions
 from gapbridge.bridge.calibration.planning import effects_of, loads_of, metrology_of
-from gapbridge.bridge.calibration.session.prompt import Talk
-from gapbridge.bridge.calibration.session.reading_check import Foresight
-from gapbridge.bridge.calibration.session.session import Book
+from gapbridge.bridge.calibration.session.prompt import Prompt
+from gapbridge.bridge.calibration.session.reading_check import ReadingCheck
+from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell, save_cell
 from gapbridge.bridge.document.output_file import require_writable, write_text
 from gapbridge.bridge.document.provenance import provenance
@@ -35,13 +35,15 @@ class Job(ABC):
     from_here = False  # the plan begins where the arm stands now
     suffix = "calibrated"  # of the new cell's name, where none is given
 
-    def __init__(self, cell: Cell, order: Order, talk: Talk, book: Book) -> None:
-        self.cell, self.order, self.talk, self.book = cell, order, talk, book
+    def __init__(
+        self, cell: Cell, options: SessionOptions, prompt: Prompt, session: Session
+    ) -> None:
+        self.cell, self.options, self.prompt, self.session = cell, options, prompt, session
 
     @property
     def folder(self) -> Path:
         """Return the session's folder."""
-        return self.book.journal.path.parent
+        return self.session.journal.path.parent
 
     @abstractmethod
     def plan(self, begin: Array | None, tell: Callable[[str, float], None]) -> Plan:
@@ -49,47 +51,47 @@ class Job(ABC):
 
     @abstractmethod
     def tell_plan(self, plan: Plan) -> None:
-        """Say what is planned, and what it will tell."""
+        """Say what is planned, and what it will determine."""
 
     def instrument(self, around: Surroundings) -> AnyInstrument:
         """Return what measures, not yet open."""
-        return make_instrument(self.order.instrument, around)
+        return make_instrument(self.options.instrument, around)
 
-    def foresight(self) -> Foresight | None:
+    def reading_check(self) -> ReadingCheck | None:
         """Return who judges the readings; None: nobody can."""
-        metrology = metrology_of(self.cell, self.order.instrument)
-        return Foresight(
-            self.cell.model, metrology, self.order.instrument.measures, metrology.sigma,
-            effects_of(self.cell), loads_of(self.cell), self.order.instrument.options,
+        metrology = metrology_of(self.cell, self.options.instrument)
+        return ReadingCheck(
+            self.cell.model, metrology, self.options.instrument.measures, metrology.sigma,
+            effects_of(self.cell), loads_of(self.cell), self.options.instrument.options,
         )  # fmt: skip
 
     @abstractmethod
     def finish(self) -> None:
-        """Work out what the readings tell, report it, and apply it where a person says so."""
+        """Work out what the readings determine, report it, and apply it where a person says so."""
 
     def hand_over(
         self, model: Model, what: str, sections: dict[str, Any] | None = None
     ) -> Path | None:
         """Ask, and write the new cell; the old one stays. Returns where it was written."""
-        cell, talk = self.cell, self.talk
+        cell, prompt = self.cell, self.prompt
         stem = cell.path.with_name(f"{cell.path.stem}_{self.suffix}{cell.path.suffix}")
-        target = self.order.new_cell or _free(stem)
+        target = self.options.new_cell or _free(stem)
         known = f", replacing the one there of {_since(target)}" if target.exists() else ""
-        talk.say()
+        prompt.say()
         question = f"Write {what} to {target}{known}? {cell.path} stays as it is."
-        if not self.order.yes and not talk.confirm(question):
-            self.book.add("ended", applied=None)
-            talk.say(f"nothing is applied; fit and report stay in {self.folder}")
+        if not self.options.yes and not prompt.confirm(question):
+            self.session.add("ended", applied=None)
+            prompt.say(f"nothing is applied; fit and report stay in {self.folder}")
             return None
         require_writable(target, cell.path)
-        origin = provenance({"log": [self.book.journal.path], "cell": [cell.path]})
+        origin = provenance({"log": [self.session.journal.path], "cell": [cell.path]})
         kept = cell.file.provenance
         if kept is not None:  # what was fitted of the arm stays as it was
             kept_keys = {"fitted", "parameters", "covariance"}
             origin |= kept.model_dump(mode="json", include=kept_keys)
         save_cell(cell, target, model, {"provenance": origin} | (sections or {}))
-        self.book.add("ended", applied=str(target.resolve()))
-        talk.say(f"{target}: written", "bold")
+        self.session.add("ended", applied=str(target.resolve()))
+        prompt.say(f"{target}: written", "bold")
         return target
 
 

@@ -11,10 +11,10 @@ from gapbridge.bridge.calibration.format import figure
 from gapbridge.bridge.calibration.instruments.flange_sensor import FlangeSensor
 from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
 from gapbridge.bridge.calibration.jobs.job import Job, bare_plan
-from gapbridge.bridge.calibration.options import Order
-from gapbridge.bridge.calibration.session.prompt import Talk
-from gapbridge.bridge.calibration.session.reading_check import Foresight
-from gapbridge.bridge.calibration.session.session import Book
+from gapbridge.bridge.calibration.options import SessionOptions
+from gapbridge.bridge.calibration.session.prompt import Prompt
+from gapbridge.bridge.calibration.session.reading_check import ReadingCheck
+from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell
 from gapbridge.core.calibration.payload_session import calibrate_payload
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
@@ -30,20 +30,24 @@ class PayloadJob(Job):
     from_here = True
     suffix = "loaded"
 
-    def __init__(self, cell: Cell, order: Order, talk: Talk, book: Book) -> None:
+    def __init__(
+        self, cell: Cell, options: SessionOptions, prompt: Prompt, session: Session
+    ) -> None:
         if cell.link is None or cell.calibration.joints not in (None, "link"):
             raise CellError(
                 f"{cell.path}: link: found nothing to read ft_raw_wrench from, expected a "
                 "controller, and calibration.joints: link"
             )
-        super().__init__(cell, order, talk, book)
+        super().__init__(cell, options, prompt, session)
 
     def plan(self, begin: Array | None, tell: Callable[[str, float], None]) -> Plan:
         """Return orientations of the flange around where the arm stands."""
         assert begin is not None
         own = self.cell.file.payload
         load = Payload(own.mass, (own.cog[0], own.cog[1], own.cog[2]), "to be weighed; so far")
-        found = plan_payload(self.cell.model, begin, poses=self.order.poses, seed=self.order.seed)
+        found = plan_payload(
+            self.cell.model, begin, poses=self.options.poses, seed=self.options.seed
+        )
         free = np.zeros(len(begin))
         poses = [PlannedPose(i, q, 0, free) for i, q in enumerate(found.poses)]
         expected = Expectation(
@@ -52,43 +56,43 @@ class PayloadJob(Job):
         return bare_plan((load,), poses, expected=expected)
 
     def tell_plan(self, plan: Plan) -> None:
-        """Say how many orientations there are, and how well they will tell the load."""
+        """Say how many orientations there are, and how well they will determine the load."""
         rows = zip(plan.expected.names, plan.expected.units, plan.expected.std, strict=True)
         told = ", ".join(f"{n} ±{figure(s)} {u}" for n, u, s in list(rows)[:4])
-        self.talk.say(f"plan: {len(plan.poses)} orientations; expected {told}")
+        self.prompt.say(f"plan: {len(plan.poses)} orientations; expected {told}")
 
     def instrument(self, around: Surroundings) -> AnyInstrument:
         """Return the flange's own sensor."""
         return FlangeSensor.here(around)
 
-    def foresight(self) -> Foresight | None:
+    def reading_check(self) -> ReadingCheck | None:
         """Return nobody: ten unknowns of a few orientations are judged at the end."""
         return None
 
     def finish(self) -> None:
-        """Tell mass, centre of gravity and bias, and write them into a new cell after a yes."""
-        talk, taken = self.talk, self.book.taken
+        """Report mass, centre of gravity and bias, and write them into a new cell after a yes."""
+        prompt, taken = self.prompt, self.session.taken
         q = np.array([t.q for t in taken])
         wrench = np.array([t.raw_wrench for t in taken])
         found = calibrate_payload(self.cell.model, q, wrench)
-        talk.say()
-        talk.say(found.verdict, "bold")
+        prompt.say()
+        prompt.say(found.verdict, "bold")
         for e in found.estimates:
             low, high = e.interval
-            talk.say(
+            prompt.say(
                 f"  {e.name:<14} {figure(e.value)} {e.unit}  "
                 f"(95 %: {figure(low)} to {figure(high)})"
             )
         for note in found.notes:
-            talk.say(f"  note: {note}")
+            prompt.say(f"  note: {note}")
         from gapbridge.bridge.calibration.jobs.facts import session_facts
         from gapbridge.bridge.calibration.report import write_payload
 
         facts = session_facts(
-            self.cell, self.order, self.book, ("the force sensor of the flange", "wrench")
+            self.cell, self.options, self.session, ("the force sensor of the flange", "wrench")
         )
         for file in write_payload(found, facts, self.folder, self.cell.model):
-            talk.say(f"{file}: written")
+            prompt.say(f"{file}: written")
         payload = {"mass": found.mass, "cog": [float(v) for v in found.cog]}
         self.hand_over(
             found.applied(self.cell.model), "the cell with this load", {"payload": payload}

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
     from gapbridge.bridge.calibration.jobs.job import Job
-    from gapbridge.bridge.calibration.options import Order
-    from gapbridge.bridge.calibration.session.prompt import Talk
-    from gapbridge.bridge.calibration.session.session import Book
+    from gapbridge.bridge.calibration.options import SessionOptions
+    from gapbridge.bridge.calibration.session.prompt import Prompt
+    from gapbridge.bridge.calibration.session.session import Session
     from gapbridge.bridge.cell import Cell
 
 JOBS: dict[str, str] = {
@@ -21,8 +21,8 @@ JOBS: dict[str, str] = {
 """Order.kind -> ``module:Class``, imported on use."""
 
 
-def make_job(cell: Cell, order: Order, talk: Talk, book: Book) -> Job:
+def make_job(cell: Cell, options: SessionOptions, prompt: Prompt, session: Session) -> Job:
     """Return the job that was ordered. Raises InputError where the cell does not allow it."""
-    module, kind = JOBS[order.kind].split(":")
+    module, kind = JOBS[options.kind].split(":")
     found = getattr(importlib.import_module(module), kind)
-    return cast("Job", found(cell, order, talk, book))
+    return cast("Job", found(cell, options, prompt, session))

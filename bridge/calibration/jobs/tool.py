@@ -12,11 +12,11 @@ from gapbridge.bridge.calibration.format import millimetres
 from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
 from gapbridge.bridge.calibration.instruments.point import TipOnPoint
 from gapbridge.bridge.calibration.jobs.job import Job, bare_plan
-from gapbridge.bridge.calibration.options import Order
+from gapbridge.bridge.calibration.options import SessionOptions
 from gapbridge.bridge.calibration.planning import loads_of
-from gapbridge.bridge.calibration.session.prompt import Talk
-from gapbridge.bridge.calibration.session.reading_check import Foresight
-from gapbridge.bridge.calibration.session.session import Book
+from gapbridge.bridge.calibration.session.prompt import Prompt
+from gapbridge.bridge.calibration.session.reading_check import ReadingCheck
+from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.settings.instruments import PointSettings
 from gapbridge.core.calibration.plan import Plan, PlannedPose
@@ -34,58 +34,62 @@ class ToolJob(Job):
     from_here = True
     suffix = "tool"
 
-    def __init__(self, cell: Cell, order: Order, talk: Talk, book: Book) -> None:
+    def __init__(
+        self, cell: Cell, options: SessionOptions, prompt: Prompt, session: Session
+    ) -> None:
         if cell.calibration.joints == "planned":
             raise CellError(
                 f"{cell.path}: calibration.joints: found 'planned', expected 'link' or 'typed': "
                 "the tip is brought onto the point by hand"
             )
-        super().__init__(cell, order, talk, book)
+        super().__init__(cell, options, prompt, session)
 
     def plan(self, begin: Array | None, tell: Callable[[str, float], None]) -> Plan:
         """Return orientations about where the tip is now."""
         assert begin is not None
         found = plan_tool(
-            self.cell.model, begin, poses=self.order.poses or POSES, seed=self.order.seed
+            self.cell.model, begin, poses=self.options.poses or POSES, seed=self.options.seed
         )
         free = np.zeros(len(begin))
         poses = [PlannedPose(i, q, 0, free) for i, q in enumerate(found.poses)]
         return bare_plan(loads_of(self.cell)[:1], poses, found.bought)
 
     def tell_plan(self, plan: Plan) -> None:
-        """Say how many touches there are, and how well they will tell the tip."""
+        """Say how many touches there are, and how well they will determine the tip."""
         told = f"; expected ±{millimetres(plan.bought[-1][1])}" if plan.bought else ""
-        self.talk.say(f"plan: the tip onto one fixed point {len(plan.poses)} times{told}")
+        self.prompt.say(f"plan: the tip onto one fixed point {len(plan.poses)} times{told}")
 
     def instrument(self, around: Surroundings) -> AnyInstrument:
         """Return the fixed point."""
         return TipOnPoint(PointSettings(kind="point"), around)
 
-    def foresight(self) -> Foresight | None:
+    def reading_check(self) -> ReadingCheck | None:
         """Return nobody: the touches are judged at the end."""
         return None
 
     def finish(self) -> None:
-        """Tell where the tip is, and write it into a new cell after a yes."""
-        talk, model = self.talk, self.cell.model
-        readings = self.book.readings("point")
+        """Report where the tip is, and write it into a new cell after a yes."""
+        prompt, model = self.prompt, self.cell.model
+        readings = self.session.readings("point")
         found = calibrate_tool(model, readings.q, readings.loads)
-        talk.say()
-        talk.say(found.verdict, "bold")
+        prompt.say()
+        prompt.say(found.verdict, "bold")
         for e in found.estimates:
             low, high = e.interval
-            talk.say(
+            prompt.say(
                 f"  {e.name:<11} {millimetres(e.value)}  "
                 f"(95 %: {millimetres(low)} to {millimetres(high)})"
             )
         for note in found.notes:
-            talk.say(f"  note: {note}")
+            prompt.say(f"  note: {note}")
         from gapbridge.bridge.calibration.jobs.facts import session_facts
         from gapbridge.bridge.calibration.report import write_tool
 
-        facts = session_facts(self.cell, self.order, self.book, ("tip on a fixed point", "touch"))
+        facts = session_facts(
+            self.cell, self.options, self.session, ("tip on a fixed point", "touch")
+        )
         for file in write_tool(found, facts, self.folder, model):
-            talk.say(f"{file}: written")
+            prompt.say(f"{file}: written")
         applied = found.applied(model)
         tcp = {
             "xyz": [float(v) for v in applied.tool_in_flange[:3, 3]],

@@ -1,4 +1,4 @@
-"""Months later: a few poses measured again tell whether the calibration still holds."""
+"""Months later: a few poses measured again show whether the calibration still holds."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gapbridge.bridge.calibration.planning import (
     space_of,
     with_loads,
 )
-from gapbridge.bridge.calibration.session.pace import seconds_left
+from gapbridge.bridge.calibration.session.progress import seconds_left
 from gapbridge.core.calibration.plan import Plan, PlannedPose
 from gapbridge.core.calibration.promise import promise_in
 from gapbridge.core.calibration.verify import Verification, verify
@@ -56,20 +56,20 @@ class VerifyJob(Job):
     def plan(self, begin: Array | None, tell: Callable[[str, float], None]) -> Plan:
         """Return poses far from each other."""
         promise = promise_in(self._promise())
-        if promise.kind != self.order.instrument.measures:
+        if promise.kind != self.options.instrument.measures:
             raise InputError(
                 f"{promise_beside(self.cell.path)}: found a calibration by {promise.kind}, "
-                f"expected one by {self.order.instrument.measures}: verify it as it was made"
+                f"expected one by {self.options.instrument.measures}: verify it as it was made"
             )
         loads = tuple(sorted(loads_of(self.cell), key=lambda load: load.mass))
         space = with_loads(space_of(self.cell, promise.kind), loads)
         space = replace(space, places=space.places[:1])  # a few poses from one place
-        observable = observable_of(self.cell, self.order.instrument)
+        observable = observable_of(self.cell, self.options.instrument)
         tell("looking for poses", 0.2)
         found = candidates_of(
-            promise.parameters(self.cell.model), observable, loads, space, self.order.seed
+            promise.parameters(self.cell.model), observable, loads, space, self.options.seed
         )
-        count = min(self.order.poses or POSES, len(found.q))
+        count = min(self.options.poses or POSES, len(found.q))
         chosen = _far_apart(self.cell.model.rigid_pose(found.q).position, count)
         speed = joint_speed(self.cell.arm.limits.velocity)
         poses: list[PlannedPose] = []
@@ -85,45 +85,45 @@ class VerifyJob(Job):
 
     def tell_plan(self, plan: Plan) -> None:
         """Say how many stops there are."""
-        left = seconds_left(self.book, self.cell.calibration.minutes_per_load)
-        self.talk.say(f"plan: {len(plan.poses)} poses, {duration(left)}")
+        left = seconds_left(self.session, self.cell.calibration.minutes_per_load)
+        self.prompt.say(f"plan: {len(plan.poses)} poses, {duration(left)}")
 
     def finish(self) -> None:
         """Say whether the calibration holds, and report it."""
-        talk, order, folder = self.talk, self.order, self.folder
-        places = self.book.places
-        metrology = metrology_of(self.cell, order.instrument, places)
-        readings = self.book.all_readings(order.instrument.measures)
-        with talk.waiting("comparing"):
+        prompt, options, folder = self.prompt, self.options, self.folder
+        places = self.session.places
+        metrology = metrology_of(self.cell, options.instrument, places)
+        readings = self.session.all_readings(options.instrument.measures)
+        with prompt.waiting("comparing"):
             found = verify(
                 self.cell.model, readings, self._promise(), metrology,
-                observable=observable_of(self.cell, order.instrument, places),
+                observable=observable_of(self.cell, options.instrument, places),
             )  # fmt: skip
-        talk.say()
+        prompt.say()
         self._tell(found)
         write_log(readings, metrology.registered, folder / "readings.csv")
         from gapbridge.bridge.calibration.jobs.facts import session_facts
         from gapbridge.bridge.calibration.report import write_verification
 
-        facts = session_facts(self.cell, order, self.book)
+        facts = session_facts(self.cell, options, self.session)
         for file in write_verification(found, facts, folder, readings):
-            talk.say(f"{file}: written")
-        self.book.add("ended", holds=found.holds)
+            prompt.say(f"{file}: written")
+        self.session.add("ended", holds=found.holds)
 
     def _tell(self, found: Verification) -> None:
-        talk = self.talk
-        talk.say(found.verdict, "bold green" if found.holds else "bold red")
-        talk.say(
+        prompt = self.prompt
+        prompt.say(found.verdict, "bold green" if found.holds else "bold red")
+        prompt.say(
             f"  errors {millimetres(found.errors.mean)} in the mean, "
             f"{millimetres(found.errors.max)} at most; {found.ratio:.2f} times what was promised"
         )
         for estimate in () if found.moved is None else found.moved.estimates:
-            talk.say(
+            prompt.say(
                 f"  {estimate.name} {parameter(estimate.value, estimate.unit)} "
                 f"± {parameter(estimate.std, estimate.unit)}"
             )
         for note in found.notes:
-            talk.say(f"  note: {note}")
+            prompt.say(f"  note: {note}")
 
 
 def _far_apart(position: Array, count: int) -> NDArray[np.int64]:

@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Stand:
-    """The arm at rest; a field that nobody tells is None."""
+class JointSample:
+    """The arm at rest; a field that nobody reports is None."""
 
     q: Array  # (n,) rad
     temperature: Array | None = None  # (n,) °C
@@ -32,10 +32,10 @@ class Stand:
 
 
 class JointSource(ABC):
-    """Tells where the arm stands. The constructor opens nothing."""
+    """Reports where the arm stands. The constructor opens nothing."""
 
     drives = False  # whether ``drive`` works
-    watches = False  # whether ``arrived`` can tell of itself
+    watches = False  # whether ``arrived`` can decide by itself
 
     def open(self) -> None:
         """Get ready. Raises InputError or LinkError."""
@@ -43,7 +43,7 @@ class JointSource(ABC):
     def close(self) -> None:
         """Let go. Never raises."""
 
-    def arrived(self, pose: PlannedPose) -> Stand | None:
+    def arrived(self, pose: PlannedPose) -> JointSample | None:
         """Return where the arm rests, once it does so near the pose; None before."""
         return None
 
@@ -52,10 +52,10 @@ class JointSource(ABC):
         return None
 
     @abstractmethod
-    def stand(self, pose: PlannedPose) -> Stand:
+    def stand(self, pose: PlannedPose) -> JointSample:
         """Return where the arm stands, at rest. Raises ReadingError where it does not."""
 
-    def still(self, stand: Stand) -> bool:
+    def still(self, stand: JointSample) -> bool:
         """Return whether the arm has not moved since."""
         return True
 
@@ -79,9 +79,9 @@ class JointSource(ABC):
 class PlannedJoints(JointSource):
     """The arm's own program brings it exactly to the planned poses."""
 
-    def stand(self, pose: PlannedPose) -> Stand:
+    def stand(self, pose: PlannedPose) -> JointSample:
         """Return the planned joints."""
-        return Stand(pose.q)
+        return JointSample(pose.q)
 
 
 class TypedJoints(JointSource):
@@ -90,10 +90,10 @@ class TypedJoints(JointSource):
     def __init__(self, ask: Ask, seated: bool = False) -> None:
         self._ask, self._seated = ask, seated
 
-    def stand(self, pose: PlannedPose) -> Stand:
+    def stand(self, pose: PlannedPose) -> JointSample:
         """Return what is typed; Enter alone: exactly as planned. Raises ReadingError.
 
-        Where the tool is ``seated`` by hand the joints are the reading, and Enter tells none.
+        Where the tool is ``seated`` by hand the joints are the reading, and Enter reports none.
         """
         n = len(pose.q)
         exactly = "" if self._seated else " (Enter: exactly as planned)"
@@ -101,10 +101,10 @@ class TypedJoints(JointSource):
         if not line and self._seated:
             raise ReadingError("found nothing, expected where the arm stands now, in degrees")
         if not line:
-            return Stand(pose.q)
+            return JointSample(pose.q)
         given = np.array(numbers(line, n, "deg"))
         if np.abs(given).max() > 720.0:
             raise ReadingError(f"found {np.abs(given).max():g} deg, expected at most two turns")
         if np.abs(given).max() < 2.0 * np.pi and np.abs(given - pose.q).max() < 0.1:
             raise ReadingError("found what look like radians, expected degrees")
-        return Stand(np.radians(given))
+        return JointSample(np.radians(given))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.instruments.instrument import ReadingError
-from gapbridge.bridge.calibration.joints.joint_source import JointSource, Stand
+from gapbridge.bridge.calibration.joints.joint_source import JointSample, JointSource
 from gapbridge.bridge.calibration.joints.move import write_move
 from gapbridge.bridge.calibration.joints.watched_run import WatchedRun
 from gapbridge.bridge.cell import Cell, load_cell
@@ -77,14 +77,14 @@ class LinkedJoints(JointSource):
         rows = self._rows(0.1)
         return None if not len(rows) else np.asarray(rows[-1, self._part("actual_q")])
 
-    def arrived(self, pose: PlannedPose) -> Stand | None:
+    def arrived(self, pose: PlannedPose) -> JointSample | None:
         """Return where the arm rests, once it does so near the pose."""
         now = self.now()
         if now is None or np.abs(now - pose.q).max() > NEAR or not self._rests():
             return None
         return self._standing()
 
-    def stand(self, pose: PlannedPose) -> Stand:
+    def stand(self, pose: PlannedPose) -> JointSample:
         """Return where the arm rests. Raises ReadingError where it moves or is pulled at."""
         until = time.monotonic() + max(5.0, 4.0 * self._settle)
         while time.monotonic() < until:
@@ -94,7 +94,7 @@ class LinkedJoints(JointSource):
         why = "the force at the tool is not steady" if self._rests() else "the arm moves"
         raise ReadingError(f"{why}, expected it at rest for {self._settle:g} s")
 
-    def still(self, stand: Stand) -> bool:
+    def still(self, stand: JointSample) -> bool:
         """Return whether the arm stands where it stood."""
         rows = self._rows(0.1)
         here = rows[:, self._part("actual_q")].mean(axis=0)
@@ -106,7 +106,7 @@ class LinkedJoints(JointSource):
             return super().drive(pose, via)
         begin = self.now()
         if begin is None:
-            raise LinkError("the arm tells no joints, expected where it stands before a move")
+            raise LinkError("the arm reports no joints, expected where it stands before a move")
         file = self._folder / "move.csv"
         length = write_move(file, [begin, *via, pose.q], self._speed)
         moving = SetpointSettings(source="trajectory", file=file.resolve())
@@ -124,7 +124,7 @@ class LinkedJoints(JointSource):
             state = run.daemon.state
             begun |= state == State.COMPENSATING
             if begun and not state.writes:
-                raise RunError(f"the move broke off: {run.words() or state.name.lower()}")
+                raise RunError(f"the move broke off: {run.message() or state.name.lower()}")
             now = self.now()
             there = now is not None and np.abs(now - pose.q).max() < NEAR / 10
             if begun and there and run.daemon.page.ended and self._rests():
@@ -148,7 +148,7 @@ class LinkedJoints(JointSource):
             if run.daemon.phase == Phase.STARTING and time.monotonic() < begun + STARTING:
                 until = time.monotonic() + limit  # imports, on a busy machine
             if time.monotonic() > until:
-                raise LinkError("the arm tells nothing, expected its joints")
+                raise LinkError("the arm reports nothing, expected its joints")
             time.sleep(0.02)
         run.ready = True
 
@@ -189,7 +189,7 @@ class LinkedJoints(JointSource):
         drift = np.abs(last.mean(axis=0) - first.mean(axis=0))
         return bool((drift < STEADY + 3.0 * noise).all())
 
-    def _standing(self) -> Stand:
+    def _standing(self) -> JointSample:
         rows, run = self._rows(self._settle), self._require()
 
         def mean(name: str) -> Array | None:
@@ -198,7 +198,7 @@ class LinkedJoints(JointSource):
 
         q, payload = mean("actual_q"), mean("payload")
         assert q is not None
-        return Stand(
+        return JointSample(
             q=q,
             temperature=mean("joint_temperatures"),
             wrench=mean("actual_TCP_force"),

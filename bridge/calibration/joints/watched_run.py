@@ -29,13 +29,13 @@ class WatchedRun:
         self.ready = False
         self._turned_at: Array | None = None
         self._reader: PageReader | None = self.daemon.page.reader()
-        self._said: list[str] = []
+        self._messages: list[str] = []
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._main, args=(write,), daemon=True)
         self._thread.start()
 
     def _say(self, text: str) -> None:
-        self._said.append(text)
+        self._messages.append(text)
 
     def _main(self, write: bool) -> None:
         try:
@@ -43,9 +43,9 @@ class WatchedRun:
         except BaseException as error:
             self._error = error
 
-    def words(self) -> str:
+    def message(self) -> str:
         """Return what the daemon said last."""
-        return self._said[-1] if self._said else ""
+        return self._messages[-1] if self._messages else ""
 
     def check(self) -> None:
         """Raise what ended the run."""
@@ -53,7 +53,9 @@ class WatchedRun:
             return
         if isinstance(self._error, GapbridgeError):
             raise self._error
-        raise LinkError(f"the link to the arm ended: {self._error or self.words() or 'no reason'}")
+        raise LinkError(
+            f"the link to the arm ended: {self._error or self.message() or 'no reason'}"
+        )
 
     def take(self) -> None:
         """Take the cycles over that came since the last call."""

@@ -1,4 +1,4 @@
-"""Figures as a certificate tells them: lengths in mm, angles in mrad, no more digits than known."""
+"""Figures as a certificate has them: lengths in mm, angles in mrad, no more digits than known."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class Material:
 
     @cached_property
     def calm(self) -> tuple[Errors, Errors]:
-        """Return the errors before and after of all readings but the wild ones."""
+        """Return the errors before and after of all readings but the outliers."""
         before, after = self.both
         kept = np.array([int(r) not in self.wild for r in before.rows], dtype=bool)
         return (

@@ -47,7 +47,7 @@ def write_verification(
 ) -> tuple[Path, Path]:
     """Write ``verification.html`` and ``verification.pdf`` into folder ``out``; return their paths.
 
-    ``readings`` are those that were verified: they tell the poses. Raises RunError where a file
+    ``readings`` are those that were verified: they give the poses. Raises RunError where a file
     cannot be written.
     """
     material = VerificationMaterial(verification, session, readings)

@@ -6,7 +6,7 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from gapbridge.bridge.calibration.options import Order
+from gapbridge.bridge.calibration.options import SessionOptions
 from gapbridge.bridge.calibration.session.journal import FILE, VERSION, Entry, read_entries
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.settings.instruments import InstrumentSettings
@@ -17,15 +17,15 @@ SAME = (
 )  # keys of a cell that may not change during a session  # fmt: skip
 
 
-def session_folder(cell: Cell, order: Order) -> Path:
+def session_folder(cell: Cell, options: SessionOptions) -> Path:
     """Return the folder of the session to go on with, or of a new one."""
-    if order.folder is not None:
-        return order.folder
+    if options.folder is not None:
+        return options.folder
     base = cell.calibration.folder
-    stem = f"{cell.path.stem}-{order.kind}" if order.kind != "whole" else cell.path.stem
+    stem = f"{cell.path.stem}-{options.kind}" if options.kind != "whole" else cell.path.stem
     found = sorted(base.glob(f"*/{FILE}"), key=lambda p: p.stat().st_mtime, reverse=True)
     for journal in found:
-        if _goes_on(journal, cell, order.kind):
+        if _goes_on(journal, cell, options.kind):
             return journal.parent
     today = f"{stem}-{date.today().isoformat()}"
     names = [today, *(f"{today}-{i}" for i in range(2, 1000))]
@@ -44,16 +44,16 @@ def _goes_on(journal: Path, cell: Cell, kind: str) -> bool:
     return same and not any(e["kind"] == "ended" for e in entries)
 
 
-def begun_entry(cell: Cell, order: Order) -> dict[str, Any]:
+def begun_entry(cell: Cell, options: SessionOptions) -> dict[str, Any]:
     """Return what a session's journal begins with."""
     return {
         "version": VERSION,
-        "job": order.kind,
+        "job": options.kind,
         "cell": str(cell.path.resolve()),
         "arm": cell.arm.name,
         "model": _model_keys(cell),
-        "instrument": order.instrument.model_dump(mode="json"),
-        "seed": order.seed,
+        "instrument": options.instrument.model_dump(mode="json"),
+        "seed": options.seed,
     }
 
 
@@ -62,15 +62,15 @@ def _model_keys(cell: Cell) -> dict[str, Any]:
     return {key: given[key] for key in SAME}
 
 
-def check_begun(begun: Entry, cell: Cell, order: Order, folder: Path) -> None:
+def check_begun(begun: Entry, cell: Cell, options: SessionOptions, folder: Path) -> None:
     """Raise InputError where a session was begun for something else than is asked for now."""
     if begun.get("version") != VERSION:
         raise InputError(
             f"{folder}: found a session of version {begun.get('version')}, expected {VERSION}"
         )
-    if begun.get("job") != order.kind:
+    if begun.get("job") != options.kind:
         raise InputError(
-            f"{folder}: found a session of kind {begun.get('job')!r}, expected {order.kind!r}: "
+            f"{folder}: found a session of kind {begun.get('job')!r}, expected {options.kind!r}: "
             "give another --session"
         )
     before, now = begun.get("model", {}), _model_keys(cell)
@@ -81,10 +81,10 @@ def check_begun(begun: Entry, cell: Cell, order: Order, folder: Path) -> None:
             "expected the same; for the changed cell begin another with --session"
         )
     measured = _measures(begun.get("instrument", {}))
-    if measured != order.instrument.measures:
+    if measured != options.instrument.measures:
         raise InputError(
-            f"{folder}: found readings of kind {measured}, expected {order.instrument.measures} "
-            f"of --instrument {order.instrument.kind}: one session has one kind"
+            f"{folder}: found readings of kind {measured}, expected {options.instrument.measures} "
+            f"of --instrument {options.instrument.kind}: one session has one kind"
         )
 
 

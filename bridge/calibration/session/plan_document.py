@@ -18,7 +18,7 @@ def plan_entry(plan: Plan) -> dict[str, Any]:
 
 
 def plan_of(entry: dict[str, Any]) -> Plan:
-    """Return the plan that an entry of the journal tells."""
+    """Return the plan of an entry of the journal."""
     expected = entry["expected"]
     return Plan(
         loads=tuple(

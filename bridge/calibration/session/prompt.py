@@ -15,7 +15,7 @@ from rich.status import Status
 
 T = TypeVar("T")
 LOOK = 0.1  # s between two looks at what is waited for
-WORDS = {
+COMMANDS = {
     "undo": "take the last reading back and measure that pose again",
     "back": "measure an earlier pose again: has the instrument or the target moved?",
     "moved": "the instrument stands elsewhere from the next reading on",
@@ -27,7 +27,7 @@ WORDS = {
 _SHORT = {"u": "undo", "b": "back", "q": "quit", "exit": "quit", "h": "?", "help": "?"}
 
 
-class Word(Exception):  # noqa: N818 - an answer, no failure
+class SessionCommand(Exception):  # noqa: N818 - an answer, no failure
     """A person typed one of WORDS instead of an answer."""
 
     def __init__(self, word: str, rest: str = "") -> None:
@@ -39,8 +39,8 @@ class InputEnded(Exception):  # noqa: N818
     """Nobody is there to answer: the input has come to its end."""
 
 
-class Talk:
-    """One terminal. ``note`` is told every note that a person writes."""
+class Prompt:
+    """One terminal. ``note`` gets every note that a person writes."""
 
     def __init__(self, note: Callable[[str], None] = lambda _: None) -> None:
         self.console = Console(highlight=False, soft_wrap=True)
@@ -130,7 +130,7 @@ class Talk:
         word = _SHORT.get(word.lower(), word.lower())
         if word == "?":
             self.say("  Enter    go on")
-            for name, text in WORDS.items():
+            for name, text in COMMANDS.items():
                 self.say(f"  {name:<8} {text}")
             return True
         if word == "note":
@@ -143,8 +143,8 @@ class Talk:
     def _answer(self, line: str) -> str:
         word, _, rest = line.partition(" ")
         name = _SHORT.get(word.lower(), word.lower())
-        if name in WORDS:
-            raise Word(name, rest.strip())
+        if name in COMMANDS:
+            raise SessionCommand(name, rest.strip())
         return line
 
 

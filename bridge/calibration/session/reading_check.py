@@ -8,19 +8,22 @@ wrong is tried: another unit, exchanged axes, one mistyped coordinate, another l
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from gapbridge.bridge.calibration.session.first_readings import first_doubt
-from gapbridge.bridge.calibration.session.fitted_so_far import AXES, FittedSoFar, here
 from gapbridge.core.calibration.observables import make_observable
+from gapbridge.core.calibration.observables.nuisance import Nuisance
+from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.plan import Payload
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.errors import GapbridgeError
+from gapbridge.core.loads import Loads
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model, Poses
 
@@ -34,8 +37,15 @@ UNITS = {
     25.4: "25.4 times too small: inches taken for millimetres?",
 }
 SPARE = {"distance": 4, "relative": 9}
-"""Numbers beyond the unknowns, by kind: with fewer the instrument may be told in a wrong place."""
+"""Numbers beyond the unknowns, by kind: with fewer the instrument may be found in a wrong place."""
 EXCHANGED = ((1, 0, 2), (2, 1, 0), (0, 2, 1), (1, 2, 0), (2, 0, 1))
+RARE = 1e-5  # chance with which a good reading is doubted
+USUAL = 3.0  # usual sizes: 1 sigma at which parameters are held
+ROUNDS = 3
+CALM = 4.0  # noises: a reading that is off by more counts the less
+STEP = 1e-5  # rad
+DOUBT = 12.0  # degrees of freedom by which the noise is held at what was thought of it
+AXES = "xyz"
 
 
 @dataclass(frozen=True)
@@ -52,7 +62,147 @@ class Verdict:
 NOTHING = Verdict(float("nan"), float("nan"), False)
 
 
-class Foresight:
+@dataclass(frozen=True)
+class FittedSoFar:
+    """Parameters and instrument, fitted to the readings so far."""
+
+    model: Model
+    observable: Observable
+    nuisance: Nuisance
+    spread: Array  # (k, k) covariance of the reading that is judged
+
+    @classmethod
+    def to(
+        cls, before: Readings, new: Readings, parameters: Parameters, observable: Observable,
+        sigma: float,
+    ) -> FittedSoFar:  # fmt: skip
+        """Fit to the readings ``before``, outliers down-weighted, to judge ``new`` (one row).
+
+        Derivatives by the parameters are taken once, at the nominal model: all are small.
+        """
+        held, p = USUAL * parameters.scales, len(parameters)
+        values, count = np.zeros(p), len(before)
+        first = count > 0 and observable.layout(before).size > 0
+        nuisance = observable.start(parameters.nominal, before) if first else Nuisance.zero()
+        both = joined(before, new)
+        every, frames = observable.columns(parameters, values, both, nuisance)
+        J, k = every[: count * observable.equations], observable.equations
+        layout = observable.layout(both)
+        prior = np.concatenate([1 / held**2, np.zeros(layout.size)])
+        covariance = np.diag(np.concatenate([held**2, np.zeros(layout.size)]))
+        for _ in range(ROUNDS if count else 0):
+            scale = np.tile(observable.sigmas, count) * sigma
+            poses = parameters.model(values).predict(before.q, before.loads)
+            left = observable.gap(poses, before, nuisance).ravel() / scale
+            F = observable.nuisance_columns(poses, before, nuisance)
+            root = np.repeat(_calm(left.reshape(count, k)), k)
+            A, left = np.hstack([J, F]) / scale[:, None] * root[:, None], left * root
+            covariance = _inverse(A, prior, held)
+            pull = A.T @ left - prior * np.concatenate([values, np.zeros(layout.size)])
+            step = covariance @ pull
+            values = values + step[:p]
+            nuisance = nuisance.moved(step[p:], layout)
+            sigma *= _quieter(left - A @ step, A, covariance)
+        last = np.hstack([every[-k:], frames[-k:]])
+        spread = last @ covariance @ last.T + np.diag((sigma * observable.sigmas) ** 2)
+        return cls(parameters.model(values), observable, nuisance, spread)
+
+    def gap(self, new: Readings) -> Array:
+        """Return measured minus expected (k,) of one reading."""
+        return np.asarray(self.observable.residual(self.model, here(new), self.nuisance)[0])
+
+    def compare(self, new: Readings) -> tuple[float, float, bool]:
+        """Return how far a reading is off, how far it may be (m), and whether it is too far."""
+        left = self.gap(new)
+        distance = float(left @ np.linalg.solve(self.spread, left))
+        limit = float(chdtri(len(left), RARE))
+        off = float(np.linalg.norm(left[:3]))
+        allowed = float(np.sqrt(limit * np.linalg.eigvalsh(self.spread[:3, :3])[-1]))
+        return off, allowed, distance > limit
+
+    def alone(self, new: Readings) -> list[str]:
+        """Return which single coordinate is off, the others being right."""
+        observable = self.observable
+        new = here(new)
+        if new.value.shape[1] < 3:
+            return []
+        expected = observable.predict(self.model, new, self.nuisance)[0]
+        found = []
+        for i in range(3):
+            value = new.value[0].copy()
+            value[i] = expected[i]
+            if not self.compare(replace(new, value=value[None]))[2]:
+                found.append(
+                    f"{AXES[i]} alone is off: {new.value[0, i] * 1e3:.3f} mm where about "
+                    f"{expected[i] * 1e3:.1f} mm was expected; mistyped?"
+                )
+        return found
+
+    def one_joint(self, new: Readings) -> list[str]:
+        """Return which single joint angle, put right, explains the reading."""
+        observable = self.observable
+        new, model = here(new), self.model
+        found = []
+        for i in range(new.q.shape[1]):
+            q = new.q.copy()
+            for _ in range(6):  # Newton on one joint
+                left = observable.residual(model, replace(new, q=q), self.nuisance)[0]
+                turned = q.copy()
+                turned[0, i] += STEP
+                right = observable.residual(model, replace(new, q=turned), self.nuisance)[0]
+                slope = (right - left) / STEP
+                q[0, i] -= float(slope @ left) / max(float(slope @ slope), 1e-12)
+            if not self.compare(replace(new, q=q))[2]:
+                found.append(
+                    f"it fits if joint {i + 1} stands at {np.degrees(q[0, i]):.2f}° instead of "
+                    f"{np.degrees(new.q[0, i]):.2f}°"
+                )
+        return found
+
+
+def here(readings: Readings) -> Readings:
+    """Return readings as if there were one place of the instrument, and one target."""
+    zero = np.zeros(len(readings), dtype=np.int64)
+    return replace(readings, station=zero, target=zero)
+
+
+def joined(first: Readings, second: Readings) -> Readings:
+    """Return the rows of both."""
+    given: dict[str, Any] = {}
+    for field in fields(Readings):
+        a, b = getattr(first, field.name), getattr(second, field.name)
+        if isinstance(a, Loads):
+            pairs = [(getattr(a, f.name), getattr(b, f.name), f.name) for f in fields(Loads)]
+            given[field.name] = Loads(
+                **{n: None if u is None or v is None else np.concatenate([u, v])
+                   for u, v, n in pairs}
+            )  # fmt: skip
+        else:
+            given[field.name] = a if isinstance(a, str) else np.concatenate([a, b])
+    return Readings(**given)
+
+
+def _inverse(A: Array, prior: Array, held: Array) -> Array:
+    """Return the covariance of parameters, held by ``prior``, and of free nuisances."""
+    free = np.maximum(np.linalg.norm(A[:, len(held) :], axis=0), 1e-12)
+    size = np.concatenate([held, 1 / free])
+    inner = (A * size).T @ (A * size) + np.diag(prior * size**2)
+    return np.asarray(np.linalg.pinv(inner, rcond=1e-13, hermitian=True) * np.outer(size, size))
+
+
+def _quieter(left: Array, A: Array, covariance: Array) -> float:
+    """Return by which share the noise is other than thought; with few readings, hardly."""
+    freedom = len(left) - float(np.einsum("ij,jk,ik->", A, covariance, A))
+    square = (float(left @ left) + DOUBT) / (max(freedom, 0.0) + DOUBT)
+    return float(np.clip(np.sqrt(square), 0.5, 2.0))
+
+
+def _calm(left: Array) -> Array:
+    """Return weights' roots (N,) for residuals (N, k) in units of the noise."""
+    return np.asarray(1 / np.sqrt(1 + (np.linalg.norm(left, axis=1) / CALM) ** 2))
+
+
+class ReadingCheck:
     """Judges readings of one session; cheap enough to be asked after each."""
 
     def __init__(

@@ -1,8 +1,9 @@
-"""Where a session stands: what its journal tells, entry by entry."""
+"""Where a session stands: what its journal holds, entry by entry."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -10,22 +11,58 @@ from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.session.journal import Entry, Journal
 from gapbridge.bridge.calibration.session.plan_document import plan_entry, plan_of
-from gapbridge.bridge.calibration.session.reading import Taken
 from gapbridge.core.calibration.plan import Plan, PlannedPose
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.loads import Loads
 
 Array = NDArray[np.float64]
+_VECTORS = ("q", "value", "approach", "temperature", "wrench", "raw_wrench")
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What was measured at one stop."""
+
+    stop: int  # number in the plan's poses, from 0
+    q: Array  # (n,) rad
+    value: Array  # (k,) SI, mean of the samples
+    scatter: float  # m, 1 sigma of one coordinate of the mean; nan: not known
+    samples: int  # averaged
+    load: int
+    station: int
+    target: int
+    approach: Array  # (n,) sign of each joint's last motion
+    time: float = 0.0  # s, time.time()
+    source: str = ""  # row or file of the instrument
+    temperature: Array | None = None  # (n,) °C
+    wrench: Array | None = None  # (6,) N, Nm: actual_TCP_force
+    raw_wrench: Array | None = None  # (6,) N, Nm: ft_raw_wrench
+    again: bool = False  # an earlier stop, measured once more
+    doubted: bool = False  # kept by the person though it did not fit
+
+    def entry(self) -> dict[str, Any]:
+        """Return it for the journal, which gives it its time."""
+        return {k: v for k, v in asdict(self).items() if v is not None and k != "time"}
+
+    @classmethod
+    def of(cls, entry: dict[str, Any]) -> Reading:
+        """Return what an entry of the journal holds."""
+        known = {k: v for k, v in entry.items() if k in cls.__dataclass_fields__}
+        for name in _VECTORS:
+            if name in known:
+                known[name] = np.array([float(v) for v in known[name]])
+        known["scatter"] = float(known["scatter"])
+        return cls(**known)
 
 
 @dataclass
-class Book:
+class Session:
     """A session in memory; everything that changes it goes through its journal first."""
 
     journal: Journal
     begun: Entry = field(default_factory=dict)  # the first entry
     plan: Plan | None = None
-    taken: list[Taken] = field(default_factory=list)
+    taken: list[Reading] = field(default_factory=list)
     undone: int = 0
     skipped: set[int] = field(default_factory=set)
     mounted: int | None = None  # load that hangs on the flange
@@ -38,12 +75,12 @@ class Book:
     seconds: list[float] = field(default_factory=list)  # between a reading and the one before
 
     @classmethod
-    def of(cls, journal: Journal) -> Book:
+    def of(cls, journal: Journal) -> Session:
         """Return where the session of an open journal stands."""
-        book = cls(journal)
+        session = cls(journal)
         for entry in journal.entries:
-            book.apply(entry)
-        return book
+            session.apply(entry)
+        return session
 
     def add(self, kind: str, **told: Any) -> None:
         """Write an entry, then act on it."""
@@ -51,9 +88,9 @@ class Book:
 
     def apply(self, entry: Entry) -> None:
         """Act on an entry of the journal; one of a kind that is not known means nothing here."""
-        action = getattr(self, f"_{entry['kind']}", None)
+        action = _ACTIONS.get(entry["kind"])
         if action is not None:
-            action(entry)
+            action(self, entry)
 
     # -- entries, by their kind -------------------------------------------------------------------
 
@@ -64,7 +101,7 @@ class Book:
         self.plan = plan_of(entry["plan"])
 
     def _reading(self, entry: Entry) -> None:
-        found = Taken.of(entry)
+        found = Reading.of(entry)
         if self.taken and found.time - self.taken[-1].time > 0.0:
             self.seconds.append(found.time - self.taken[-1].time)
         self.taken.append(found)
@@ -129,7 +166,7 @@ class Book:
         found = self.readings(kind)
         return replace(found, station=np.unique(found.station, return_inverse=True)[1])
 
-    def readings(self, kind: str, taken: list[Taken] | None = None) -> Readings:
+    def readings(self, kind: str, taken: list[Reading] | None = None) -> Readings:
         """Return readings (default: all that stand) as the calibration takes them."""
         assert self.plan is not None
         rows = self.taken if taken is None else taken
@@ -160,3 +197,18 @@ class Book:
     def keep_plan(self, plan: Plan) -> None:
         """Write the plan that the session follows."""
         self.add("plan", plan=plan_entry(plan))
+
+
+_ACTIONS: dict[str, Callable[[Session, Entry], None]] = {
+    "begun": Session._begun,
+    "plan": Session._plan,
+    "reading": Session._reading,
+    "rejected": Session._rejected,
+    "undo": Session._undo,
+    "skip": Session._skip,
+    "mounted": Session._mounted,
+    "moved": Session._moved,
+    "note": Session._note,
+    "ended": Session._ended,
+}
+"""Kind of an entry -> what it does to the session."""

@@ -42,17 +42,17 @@ class Base(BaseModel):
         return {}
 
     def located(self, folder: Path) -> Base:
-        """Return the settings with relative paths, which are seen from ``folder``, made whole."""
+        """Return the settings with paths relative to ``folder`` made absolute."""
         return self
 
 
 class Coordinates(Base):
-    """An instrument that tells a point, or a pose, as numbers in a text."""
+    """An instrument that gives a point, or a pose, as numbers in a text."""
 
     unit: LengthUnit = Field(description="of lengths: m, mm, um or in")
     pose: bool = Field(default=False, strict=True, description="true: rotation as well")
     rotation: Literal["rotation_vector", "rpy", "quaternion"] = Field(
-        default="rotation_vector", description="how a pose tells its rotation; quaternion: x y z w"
+        default="rotation_vector", description="how a pose gives its rotation; quaternion: x y z w"
     )
     angle_unit: AngleUnit = Field(default="deg", description="of rotation angles: rad or deg")
 
@@ -79,14 +79,14 @@ class FileSettings(Coordinates):
     """A CSV file in which the readings stand, row by row, in the order of the plan."""
 
     kind: Literal["file"]
-    file: Path = Field(description="the CSV, seen from the cell's folder")
+    file: Path = Field(description="the CSV, relative to the cell's folder")
     columns: tuple[str, ...] | None = Field(
         default=None, description="names of its columns; default: the last ones of each row"
     )
     timeout: Positive = Field(default=600.0, description="s to wait for the next row")
 
     def located(self, folder: Path) -> FileSettings:
-        """Return the settings with the file seen from here."""
+        """Return the settings with the file made absolute."""
         return self.model_copy(update={"file": folder / self.file})
 
 
@@ -94,7 +94,7 @@ class FolderSettings(Coordinates):
     """A folder into which the tracker's software exports one file a reading."""
 
     kind: Literal["folder"]
-    folder: Path = Field(description="seen from the cell's folder")
+    folder: Path = Field(description="relative to the cell's folder")
     pattern: str = Field(default="*.csv", description="which files count")
     columns: tuple[str, ...] | None = Field(
         default=None, description="names of the columns; default: the last ones of each row"
@@ -102,7 +102,7 @@ class FolderSettings(Coordinates):
     timeout: Positive = Field(default=600.0, description="s to wait for the next file")
 
     def located(self, folder: Path) -> FolderSettings:
-        """Return the settings with the folder seen from here."""
+        """Return the settings with the folder made absolute."""
         return self.model_copy(update={"folder": folder / self.folder})
 
 

@@ -37,9 +37,9 @@ def diff(before: Path, after: Path, log: Path | None, seed: int, as_json: bool) 
     q = None if rows is None else rows.require("actual_q", "target_q")
     shift = moved(one, other, q, None if rows is None else rows.loads(), seed)
     if as_json:
-        told = {"changes": [vars(change) for change in found],
+        reported = {"changes": [vars(change) for change in found],
                 "moved": None if shift is None else shift.to_json()}  # fmt: skip
-        click.echo(json.dumps(told, indent=1))
+        click.echo(json.dumps(reported, indent=1))
         return
     if not found:
         click.echo("no key differs")

@@ -64,7 +64,7 @@ def init(
     text = first_cell(facts, Asked(link, model, None if urdf is None else _beside(urdf, out)))
     _check(text, out)
     write_text(out, text)
-    click.echo(f"{out}: written, {_said(facts)}")
+    click.echo(f"{out}: written, {_known_text(facts)}")
     click.echo(f"next: gapbridge check {out} --live; gapbridge run {out} --observe")
 
 
@@ -130,16 +130,16 @@ def _check(text: str, out: Path) -> None:
             raise type(error)(str(error).replace(trial.name, str(out))) from None
 
 
-def _said(facts: ControllerFacts) -> str:
+def _known_text(facts: ControllerFacts) -> str:
     """Return in words what the controller has said."""
     names = {
         "model": facts.model, "factory calibration": facts.calibration or None, "TCP": facts.tcp,
         "payload": facts.payload, "joint limits": facts.lower, "rate": facts.rate,
     }  # fmt: skip
-    said = [name for name, value in names.items() if value is not None]
+    known = [name for name, value in names.items() if value is not None]
     missing = [name for name, value in names.items() if value is None]
     joints = f"{facts.n} joints" if facts.q is None else f"{facts.n} joints at {_degrees(facts.q)}"
-    return f"{joints}; said: {', '.join(said) or 'nothing else'}" + (
+    return f"{joints}; said: {', '.join(known) or 'nothing else'}" + (
         f"; not said: {', '.join(missing)}" if missing else ""
     )
 

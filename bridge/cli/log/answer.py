@@ -12,10 +12,10 @@ from gapbridge.core.effects import Reported
 VERDICTS = {
     "no_gap": "no gap: nothing stands above the noise",
     "explained": "explained: causes were found, what is left has no structure",
-    "partly_explained": "partly explained: causes were found, but structure is left over",
+    "partly_explained": "partly explained: causes were found, but residual structure remains",
     "unexplained": "unexplained: there is a gap that no effect of the catalogue accounts for",
 }
-SMALL = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}  # gaps are told in units that people read
+SMALL = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}  # gaps are reported in units that people read
 SHOWN = 6  # next measurements
 CHANGED = 3  # parameters of a cause that changed between sessions
 
@@ -129,7 +129,8 @@ def _cause(cause: Cause, unit: str) -> list[str]:
         )
     lines += [f"  {_parameter(parameter)}" for parameter in cause.parameters]
     if cause.indistinguishable_from:
-        lines.append(f"  these data cannot tell it from {', '.join(cause.indistinguishable_from)}")
+        ties = ", ".join(cause.indistinguishable_from)
+        lines.append(f"  these data cannot separate it from {ties}")
     return lines
 
 

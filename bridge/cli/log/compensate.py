@@ -22,7 +22,7 @@ from gapbridge.core.errors import InputError
 from gapbridge.core.model import Array
 
 CHUNK = 500  # rows between two looks of the progress bar
-MISSED = 1e-6  # m: a corrected setpoint that leaves more than this is told
+MISSED = 1e-6  # m: a corrected setpoint that leaves more than this is reported
 
 
 @click.command()

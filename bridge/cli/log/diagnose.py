@@ -111,13 +111,13 @@ def diagnose(
             require_writable(file, *inputs)
     if out is not None:
         _folder(out)
-    with status("diagnosing") as tell:
+    with status("diagnosing") as emit:
         metrology = replace(given.metrology, remounted=remounted)
-        found = _diagnose(given, rows, metrology, withhold, simulated, tell)
+        found = _diagnose(given, rows, metrology, withhold, simulated, emit)
     click.echo(answer(found))
     origin = provenance({"log": logs, "cell": [cell], "sim": [sim] if sim else []})
-    told = document(found) | {"provenance": origin}
-    text = json.dumps(told, indent=1, allow_nan=False) + "\n"
+    reported = document(found) | {"provenance": origin}
+    text = json.dumps(reported, indent=1, allow_nan=False) + "\n"
     if json_file is not None:
         write_text(json_file, text)
     if new_cell is not None:
@@ -132,11 +132,11 @@ def diagnose(
 
 def _diagnose(
     cell: Cell, log: Log, metrology: Metrology, withhold: tuple[str, ...], simulated: Log | None,
-    tell: Callable[[str], None],
+    emit: Callable[[str], None],
 ) -> Diagnosis:  # fmt: skip
     extra: dict[str, Any] = {} if simulated is None else {"simulated": simulated}
     try:
-        return diagnose_log(cell.model, log, metrology, withhold=withhold, progress=tell, **extra)
+        return diagnose_log(cell.model, log, metrology, withhold=withhold, progress=emit, **extra)
     except InputError as error:
         text = str(error)
         raise type(error)(text if text.startswith(log.path) else f"{log.path}: {text}") from None

@@ -50,7 +50,7 @@ def export_recording(
     if cell_out is not None:
         require_writable(cell_out, *files)
         write_text(cell_out, str(read_configuration(recording).get("text", "")))
-    _tell(out, export(recording, out, span))
+    _emit(out, export(recording, out, span))
 
 
 def _moment(option: str, text: str | None) -> float | datetime | None:
@@ -60,7 +60,7 @@ def _moment(option: str, text: str | None) -> float | datetime | None:
         raise InputError(f"{option}: {error}") from None
 
 
-def _tell(out: Path, exported: Exported) -> None:
+def _emit(out: Path, exported: Exported) -> None:
     lasted = (exported.last or 0.0) - (exported.first or 0.0)
     states = ", ".join(f"{count} {state}" for state, count in exported.states.items())
     click.echo(f"{out}: {exported.rows} cycles over {lasted:.3f} s ({states})")

@@ -44,7 +44,7 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     Least squares on measured TCP poses (measured_position, and measured_rotation where the log has
     it) under different payloads or pulls. Effects that are in the cell stay in it. Writes NEW_CELL:
     the same cell with the flexibilities found; what the log does not show stays as it is in the
-    cell, and is told. Where the metrology is not registered, its frame and the tool point are
+    cell, and is reported. Where the metrology is not registered, its frame and the tool point are
     estimated along, before as well as after, and not written. Declines, with the reason, where
     nothing in the log excites the compliance. A log of more than 20,000 rows is read in pieces,
     so that memory does not grow with it; so is a recording of the daemon (.mcap). Several logs (or
@@ -65,7 +65,7 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     # frame and tool point that were estimated along stay out of the cell
     model = given.model.with_compliance(found.axial, found.radial)
     save_cell(given, out, model, {"provenance": origin})
-    tell(found)
+    print_identification(found)
     click.echo(f"{out}: written")
 
 
@@ -87,7 +87,7 @@ def _identified(
         return identify_compliance(cell.model, rows, metrology), range_of(rows)
 
 
-def tell(found: Identification) -> None:
+def print_identification(found: Identification) -> None:
     """Print flexibilities with their spread, how far they carry, and what stays unknown."""
     table = Table(title="joint flexibility, 1e-6 rad/Nm", title_justify="left")
     for column in ("joint", "axial", "±", "radial", "±"):

@@ -74,8 +74,8 @@ def diagnose(withhold: tuple[str, ...], **given: Any) -> None:
     """Diagnose every log: which effects recur, which arms drift, what stands out.
 
     Writes results.parquet (a row per session and parameter), sessions.parquet and report.html. A
-    log that cannot be used is told and skipped. Sessions are kept as they are done: a run that was
-    broken off goes on where it stood.
+    log that cannot be used is reported and skipped. Sessions are kept as they are done: a run that
+    was broken off goes on where it stood.
 
     Example: gapbridge fleet diagnose 'logs/*/2026-*.csv' --cell arms.csv --workers 8
     """
@@ -84,7 +84,7 @@ def diagnose(withhold: tuple[str, ...], **given: Any) -> None:
     done, found = _run("diagnose", diagnosing.work, {"withhold": list(withhold)}, **given)
     from gapbridge.bridge.fleet.output import write_diagnosed
 
-    _told(done, found, *write_diagnosed(done, found, given["out"]))
+    _reported(done, found, *write_diagnosed(done, found, given["out"]))
 
 
 @fleet.command()
@@ -106,7 +106,7 @@ def fit(cells: Path | None, **given: Any) -> None:
     done, found = _run("fit", fitting.work, {}, **given)
     from gapbridge.bridge.fleet.output import write_fitted
 
-    _told(done, found, *write_fitted(done, found, given["out"], cells))
+    _reported(done, found, *write_fitted(done, found, given["out"], cells))
 
 
 def _run(
@@ -130,11 +130,11 @@ def _run(
         progress(f"{name}: sessions", len(tasks)) as advance,
     ):
 
-        def tell(outcome: Outcome) -> None:
+        def emit(outcome: Outcome) -> None:
             _skipped(outcome)
             advance(1)
 
-        done = run(tasks, bad, chosen, journal, tell)
+        done = run(tasks, bad, chosen, journal, emit)
     _require_usable(done)
     return done, found
 
@@ -154,7 +154,7 @@ def _require_usable(done: Done) -> None:
     raise RunError(f"{text}; the first: {first}")
 
 
-def _told(done: Done, found: Found, lines: list[str], files: list[Path]) -> None:
+def _reported(done: Done, found: Found, lines: list[str], files: list[Path]) -> None:
     for line in (*ending(done, found), *lines):
         click.echo(line)
     for file in files:

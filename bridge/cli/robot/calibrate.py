@@ -100,12 +100,12 @@ def calibrate(
     if new_cell is not None:
         require_writable(new_cell, cell)
     chosen = instrument_settings(given, instrument)
-    from gapbridge.bridge.calibration.options import Order
+    from gapbridge.bridge.calibration.options import SessionOptions
     from gapbridge.bridge.calibration.run import run_session  # takes the numerical libraries along
 
     kind = "verify" if verify else "payload" if payload_only else "tool" if tool_only else "whole"
-    order = Order(
+    options = SessionOptions(
         kind=kind, folder=folder, instrument=chosen, poses=poses, plan_only=plan_only, move=move,
         new_cell=new_cell, yes=yes, seed=seed,
     )  # fmt: skip
-    run_session(given, order)
+    run_session(given, options)

@@ -46,7 +46,7 @@ def run(cell: Path, observe: bool, arm: bool, duration: float | None, log: str) 
         observe=observe,
         arm=arm,
         duration=duration,
-        log=JsonLines(sys.stderr).tell if log == "json" else None,
+        log=JsonLines(sys.stderr).emit if log == "json" else None,
     )
     if isinstance(result, int) and not isinstance(result, bool) and result:
         raise click.exceptions.Exit(result)

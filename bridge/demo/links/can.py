@@ -1,4 +1,4 @@
-"""CAN: a soft AgileX PiPER; setpoints move the arm, its frames tell the joints alone."""
+"""CAN: a soft AgileX PiPER; setpoints move the arm, its frames report the joints alone."""
 
 from __future__ import annotations
 

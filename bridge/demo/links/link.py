@@ -27,7 +27,7 @@ LAST_HOST = 60  # 127.0.0.2 to this are tried
 
 
 class DemoLink(ABC):
-    """The demo on one link: which arm, how it is served, who moves it, what it can tell."""
+    """The demo on one link: which arm, how it is served, who moves it, what it can report."""
 
     name: ClassVar[str]
     template: ClassVar[str]  # the cell, a file of this package's parent
@@ -69,7 +69,7 @@ class DemoLink(ABC):
         """Return what one count of what is written and read comes to at the TCP."""
 
     def declared(self, cell: Cell, load: Load) -> Cell:
-        """Return the cell of a run with a load, where the controller is not told of it."""
+        """Return the cell of a run with a load, where the controller is not informed of it."""
         return cell
 
     @abstractmethod

@@ -25,7 +25,7 @@ PAYLOAD = re.compile(r"^payload:.*$", re.MULTILINE)
 
 
 class PeerLink(DemoLink):
-    """An arm whose controller is told nothing of its payload: the cell file says it."""
+    """An arm whose controller is not informed of its payload: the cell file says it."""
 
     @property
     def home(self) -> Array:

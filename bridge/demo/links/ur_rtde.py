@@ -1,4 +1,4 @@
-"""UR over RTDE: setpoints move the arm; the controller tells payload and force."""
+"""UR over RTDE: setpoints move the arm; the controller reports payload and force."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ from gapbridge.bridge.report.fragment import (
 )
 from gapbridge.bridge.report.words import number, percent, told
 
-SESSION_HEADS = ("poses", "gap with the cell", "with the fit", "foretold by the others")
+SESSION_HEADS = ("poses", "gap with the cell", "with the fit", "fopredicted by the others")
 MICRO = 1e6
 DRAWN = 80  # arms in the picture
 
@@ -48,8 +48,8 @@ def answer(together: Fitted) -> str:
             f"{type_words(kind.name)}: {counted(len(kind.arms), 'arm')}, "
             f"{counted(len(sessions), 'session')}. With the flexibilities of the cells the gap is "
             f"{told(before, 'm')} a coordinate; with those found {told(after, 'm')}; a session is "
-            f"foretold by the others, which did not see it, to {told(held, 'm')}. The noise of one "
-            f"coordinate is {told(kind.scatter.noise, 'm')}."
+            f"predicted by the others, which did not see it, to {told(held, 'm')}. The noise of "
+            f"one coordinate is {told(kind.scatter.noise, 'm')}."
             + (f" Arms of the type scatter by {percent(float(np.median(spread)))}." if len(spread)
                else " No session shows any flexibility."), "lead",
         ))  # fmt: skip
@@ -72,7 +72,7 @@ def types(together: Fitted) -> str:
 def _parameter(kind: FittedType, j: int) -> list[Cell]:
     scatter = kind.scatter
     if not scatter.shown[j]:
-        return [parameter_words(kind.parameters[j]), "not shown by any session", "–", "–"]
+        return [parameter_words(kind.parameters[j]), "not identifiable from any session", "–", "–"]
     mean, std = scatter.mean[j] * MICRO, np.sqrt(scatter.covariance[j, j]) * MICRO
     share = [float(s[j] / max(scatter.mean[j], 1e-12))
              for s in (scatter.between_arms, scatter.between_sessions)]  # fmt: skip

@@ -47,7 +47,7 @@ class DaskWorkers(Workers):
                 f"--scheduler: found no package {error.name} in this installation, expected the "
                 "extra 'fleet': pip install 'gapbridge[fleet]'"
             ) from None
-        # its workers come and go: what matters of that is told by the outcomes
+        # its workers come and go: what matters of that is in the outcomes
         logging.getLogger("distributed").setLevel(logging.CRITICAL)
         try:
             self._client = Client(self.address, timeout=self.reach, set_as_default=False)

@@ -1,6 +1,6 @@
 """Local workers: spawned processes that do one session at a time.
 
-A pool of the standard library breaks as a whole when one of its processes dies and cannot tell
+A pool of the standard library breaks as a whole when one of its processes dies and cannot say
 over which task; here every process has its own pipe, so that the task in it is known.
 """
 

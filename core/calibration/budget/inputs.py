@@ -13,7 +13,7 @@ from gapbridge.core.calibration.result import Calibration
 
 Array = NDArray[np.float64]
 ALUMINIUM = 23e-6  # 1/K; steel grows half as much
-ENOUGH = 12  # degrees of freedom from which repeats alone tell the arm's scatter
+ENOUGH = 12  # degrees of freedom from which repeats alone determine the arm's scatter
 FAR = 8.0  # times the median error: a held-out reading beyond is a blunder
 FEW = 0.05  # share of the held-out readings that may be blunders
 
@@ -49,7 +49,7 @@ class Input:
 def wild_readings(calibration: Calibration) -> NDArray[np.int64]:
     """Return the rows of readings that no budget can speak for: blunders, not uncertainty.
 
-    Those that the fit weighed down, and single held-out ones far beyond all others.
+    Those that the fit down-weighted, and single held-out ones far beyond all others.
     """
     held = calibration.held_out_after
     usual = float(np.median(held.norm)) if len(held.rows) else 0.0
@@ -116,7 +116,7 @@ def model_remainder(calibration: Calibration, parameters: float, noise: float) -
     where = "held-out poses" if held_out else "fitted poses (none were held out)"
     if len(wild):
         rows = ", ".join(str(int(r) + 1) for r in wild)
-        where += f", without wild ones (reading {rows})"
+        where += f", without outliers (reading {rows})"
     told = "nothing found beyond the lines above" if std == 0 else "what is beyond the lines above"
     return Input(
         "what the model does not explain", "A", "normal", std, "m", 1.0, float(errors.size),

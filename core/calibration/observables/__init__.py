@@ -1,4 +1,4 @@
-"""What an instrument tells of the TCP: one base, one file a kind, one table."""
+"""What an instrument says about the TCP: one base, one file a kind, one table."""
 
 from __future__ import annotations
 

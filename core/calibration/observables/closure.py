@@ -32,7 +32,7 @@ class Closure(Observable):
 
     @abstractmethod
     def directions(self, apart: Array) -> Array:
-        """Return the directions (N, k, 3) along which the gap is told; ``apart`` (N, 3) is seen."""
+        """Return the directions (N, k, 3) that measure the gap; ``apart`` (N, 3) is seen."""
 
     def apart(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
         """Return the way from the place's fixed point to the target (N, 3), base."""

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 class Distance(Observable):
     """Distance (m) from a fixed point, which nobody knows, to a target; each place has its own."""
 
-    registered: bool = False  # tells nothing here: the fixed point is always found along
+    registered: bool = False  # is no use here: the fixed point is always found along
     zeroed: bool = False  # True: readings count from an unknown zero of the place (a dial gauge)
     kind: ClassVar[str] = "distance"
     width: ClassVar[int] = 1

@@ -72,7 +72,7 @@ class Observable(ABC):
         )
 
     def targets_of(self, readings: Readings) -> int:
-        """Return how many targets the readings tell of."""
+        """Return how many targets the readings have."""
         return int(readings.target.max(initial=0)) + 1
 
     def predict(self, model: Model, readings: Readings, nuisance: Nuisance) -> Array:
@@ -96,11 +96,11 @@ class Observable(ABC):
         ``layout`` of all readings, where these are a part of them.
         """
         moved = moved_poses(parameters, values, readings)
-        slopes = self.slopes(moved.poses, readings, nuisance)
-        J = -np.matmul(slopes, moved.slopes.transpose(2, 0, 1)).reshape(-1, len(values))
+        jacobian = self.jacobian(moved.poses, readings, nuisance)
+        J = -np.matmul(jacobian, moved.jacobian.transpose(2, 0, 1)).reshape(-1, len(values))
         return J, self.nuisance_columns(moved.poses, readings, nuisance, layout)
 
-    def slopes(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
+    def jacobian(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
         """Return how the gap changes (N, k, 6) with the TCP's shift and turn, base axes.
 
         By differences, which cost no prediction; members whose slopes are plain say them.
@@ -140,7 +140,7 @@ class Observable(ABC):
         return F
 
     def start(self, model: Model, readings: Readings) -> Nuisance:
-        """Return the nuisance that fits best to the model as it stands, wild readings or not.
+        """Return the nuisance that fits best to the model as it stands, outliers or not.
 
         Raises ExcitationError where there are too few readings to know where the instrument is.
         """

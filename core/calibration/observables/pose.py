@@ -75,7 +75,7 @@ class Pose(Observable):
 
 
 def _turned(poses: Poses, readings: Readings, own: NDArray[np.bool_]) -> Registration:
-    """Return the frame that the measured rotations of some readings tell."""
+    """Return the frame that the measured rotations of some readings determine."""
     if not own.any():
         return Registration(np.eye(3), np.zeros(3))
     turns = rotation_matrix(readings.value[own, 3:]) @ np.swapaxes(poses.rotation[own], 1, 2)

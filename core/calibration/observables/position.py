@@ -33,7 +33,7 @@ class Position(Observable):
         """Return measured minus predicted position (N, 3), base axes."""
         return measured_in_base(readings, nuisance) - self.seen(poses, readings, nuisance)
 
-    def slopes(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
+    def jacobian(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
         """Return how the gap changes (N, 3, 6) with the TCP's shift and turn."""
         lever = np.einsum("nij,nj->ni", poses.rotation, nuisance.targets[readings.target])
         shift = np.broadcast_to(-np.eye(3), (len(lever), 3, 3))

@@ -53,7 +53,7 @@ def conditions(motion: Motion) -> Index:
 
 
 def quantities(log: Log, motion: Motion) -> dict[str, Array]:
-    """Return what a leftover may depend on: columns of the log, and speeds, where they vary."""
+    """Return what a residual may depend on: columns of the log, and speeds, where they vary."""
     found: dict[str, Array] = {}
     columns: dict[str, Array | None] = {
         "timestamp": motion.t,

@@ -1,4 +1,4 @@
-"""The tracking channel: where the encoders stand against where they were told to be."""
+"""The tracking channel: where the encoders stand against where they were commanded to be."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def _following(model: Model, motion: Motion, rows: Index) -> Predict:
 
 
 def encoder_step(q: Array) -> float:
-    """Return the step (rad) in which encoder angles (N, n) are told; 0 where they have none."""
+    """Return the quantisation step (rad) of encoder angles (N, n); 0 where they have none."""
     steps = []
     for angles in q.T:
         gaps = np.diff(np.unique(angles))

@@ -27,7 +27,7 @@ from gapbridge.core.sessions import session_of
 
 Array = NDArray[np.float64]
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")
-USUAL_WEIGHT = 10.0  # N/Nm between force and torque where the log does not tell
+USUAL_WEIGHT = 10.0  # N/Nm between force and torque where the log does not show it
 WEIGHTS = (1.0, 1000.0)  # N/Nm, the range that a sensor can have
 
 

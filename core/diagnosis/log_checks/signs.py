@@ -24,7 +24,7 @@ from gapbridge.core.motion import Motion
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 MOST = 200  # rows looked at
-FEWEST = 6  # pulled rows from which a sign can be told
+FEWEST = 6  # pulled rows from which a sign is judged
 LEAST = 1.0  # N, Nm: less is no pull
 HALF = 0.5  # what must be left, at most, of what the column as it stands leaves
 ROUNDS = 4

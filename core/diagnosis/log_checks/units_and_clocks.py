@@ -1,4 +1,4 @@
-"""Suspicions: mistakes of units, names and clocks, told by name before anything is fitted.
+"""Log checks: mistakes of units, names and clocks, reported by name before anything is fitted.
 
 Frames and signs need the model's prediction: ``frame_suspicion``, ``sign_suspicion``.
 """
@@ -34,7 +34,8 @@ def check_units(model: Model, log: Log) -> None:
     """Raise LogError where a column's values can only be of another unit than a log's.
 
     Joints or rotations in degrees, positions or centres of gravity in millimetres, payloads in
-    grams, temperatures in kelvin. An endless angle is no degrees: it is told as such, with its row.
+    grams, temperatures in kelvin. An endless angle is no degrees: it is reported as such, with its
+    row.
     """
     for name in ("actual_q", "target_q"):
         _check_angles(model, log, name)
@@ -208,5 +209,5 @@ def _poses(log: Log) -> list[str]:
         return []
     return [
         f"{count} different pose(s) are few: what is found may be one of several explanations; "
-        "30 or more that use the joints' whole range tell causes apart"
+        "30 or more that use the joints' whole range separate causes"
     ]

@@ -1,4 +1,4 @@
-"""Stiffness curves: whether they are bent at all, and the straight ones told as what they are."""
+"""Stiffness curves: whether they are bent at all, and the straight ones as what they are."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def straightened(
     terms: Sequence[Term],
     covariance: Sequence[Array],
 ) -> tuple[int, ...] | None:
-    """Return the set with straight curves told as axial compliance, or None if there is none.
+    """Return the set with straight curves as axial compliance, or None if there is none.
 
     ``index`` gives the candidate of each term. Where axial compliance is no candidate, the curve
     stays.

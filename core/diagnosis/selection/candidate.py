@@ -41,6 +41,7 @@ class Candidate:
     tried: int = 1  # hypotheses that this one was picked from
     quantity: str = ""  # what a smooth candidate depends on
     target: str = ""  # and what it moves
+    beside: str = ""  # family without which it shows nothing
 
     @property
     def named(self) -> bool:
@@ -189,6 +190,14 @@ def named_columns(observation: Observation, candidate: Candidate, base: Sequence
 def shows_alone(observation: Observation, candidate: Candidate) -> bool:
     """Return whether an effect changes predictions where no other is in the model."""
     return bool(_differences(observation, candidate, ()).any())
+
+
+def with_what_it_needs(observation: Observation, candidate: Candidate) -> Candidate:
+    """Return the candidate with the family beside which alone it shows: no load, no centre."""
+    needed = candidate.effect.shown_by
+    if needed is None or shows_alone(observation, candidate):
+        return candidate
+    return replace(candidate, beside=needed.effect)
 
 
 def _differences(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> Array:

@@ -62,7 +62,7 @@ def _alike(term: Term, candidate: Candidate) -> bool:
 
 
 def one_delay(space: Space, found: Found) -> Found:
-    """Return the set with all joints that answer late told as one effect of the controller.
+    """Return the set with all joints that answer late as one effect of the controller.
 
     Latency or lag, whichever fits all of these joints better: each joint by itself decides little.
     """

@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 BEAM = 6
 DEPTH = 9
 PATIENCE = 2  # depths without a better set before the beam stops
-SMOOTH_TERMS = 2  # more unnamed functions than that tell nothing more
+SMOOTH_TERMS = 2  # more unnamed functions than that add nothing
 LINES = 4  # periodic lines a joint may have: more are the Fourier series of something else
 DEPENDENT = 1e-5  # share of a block below which a direction counts as given by its others
 
@@ -35,6 +35,8 @@ def clash(space: Space, chosen: Sequence[int], new: int) -> bool:
     b = space.candidates[new]
     lines = 0
     if not b.named and sum(not space.candidates[c].named for c in chosen) >= SMOOTH_TERMS:
+        return True
+    if b.beside and b.beside not in {space.candidates[c].family for c in chosen}:
         return True
     for c in chosen:
         a = space.candidates[c]

@@ -1,4 +1,4 @@
-"""Sets near a set: terms dropped, swapped, merged, or told as one unknown."""
+"""Sets near a set: terms dropped, swapped, merged, or taken as one unknown."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def gathered(space: Space, found: Found) -> Found:
 
 
 def unpack(space: Space, found: Found) -> Found:
-    """Return the set with smooth functions of a joint's own angle told as periodic lines.
+    """Return the set with smooth functions of a joint's own angle as periodic lines.
 
     A few lines together look smooth, and each alone is dearer than one smooth function.
     """
@@ -161,7 +161,7 @@ def unpack(space: Space, found: Found) -> Found:
 
 
 def packed(space: Space, found: Found) -> list[Found]:
-    """Return sets with all that a joint does by its own angle told as one smooth function."""
+    """Return sets with all that a joint does by its own angle as one smooth function."""
     sets = []
     joints = {space.candidates[c].site.joint for c in found.chosen}
     for joint in joints - {None}:

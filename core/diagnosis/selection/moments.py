@@ -162,7 +162,7 @@ def slips(terms: Sequence[Term], times: Array | None) -> list[tuple[Term, float,
 def slip_sentences(terms: Sequence[Term], observation: Observation, whole: bool) -> list[str]:
     """Return a sentence on each term that steps: what moved, how far, and between which rows.
 
-    ``whole``: nothing else is left over, so that the model holds on both sides.
+    ``whole``: nothing else remains, so that the model holds on both sides.
     """
     told = []
     for term, before, after in slips(terms, observation.times):

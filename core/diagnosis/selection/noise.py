@@ -1,4 +1,4 @@
-"""Noise: how the leftovers of a fit scatter, and the whitening that makes them alike.
+"""Noise: how the residuals of a fit scatter, and the whitening that makes them alike.
 
 The instrument's own noise is the same in every coordinate; the arm's repeatability comes through
 its joints, so it grows with the lever and is shared between coordinates. Both sizes are estimated
@@ -42,7 +42,7 @@ def estimate_noise(
 ) -> Noise:
     """Return the noise under which ``residual`` (N, k) of the kept samples is most likely.
 
-    ``shrink`` is the share of the degrees of freedom that the fit left over.
+    ``shrink`` is the share of the degrees of freedom that the fit left.
     """
     block = blocks(observation)
     count = int(block.max()) + 1

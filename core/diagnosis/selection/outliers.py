@@ -1,4 +1,4 @@
-"""Wild readings: which samples are set aside, and when they are taken back in."""
+"""Outliers: which samples are excluded, and when they are taken back in."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from gapbridge.core.effects import Term
 Array = NDArray[np.float64]
 WILD_SHARE = 0.1  # of the samples: more of them is structure, not bad luck
 WILD_SIGMA = 5.0
-FORETOLD = 0.5  # share of a wild reading that may be left where something else explains it
-RIDGE = 5.0  # usual sizes of a parameter: prior of the fit that only looks for wild readings
+FORETOLD = 0.5  # share of an outlier that may be left where something else explains it
+RIDGE = 5.0  # usual sizes of a parameter: prior of the fit that only looks for outliers
 
 
 def look_for_wild(work: Work, columns: list[Array]) -> None:
-    """Mark wild readings before anything is searched: by a fit that can explain nearly anything."""
+    """Mark outliers before anything is searched: by a fit that can explain nearly anything."""
     observation = work.observation
     gap = observation.measured - observation.predict(())
     N, k = gap.shape
@@ -89,9 +89,9 @@ def with_wild_explained(
     smooth: list[tuple[Candidate, Array]],
     known: tuple[Space, Raw, Found],
 ) -> tuple[Space, Raw, Found]:
-    """Take wild readings back in where one local or smooth function makes them ordinary.
+    """Take outliers back in where one local or smooth function makes them ordinary.
 
-    A chipped tooth or a knocked instrument looks like a few wild readings; bad luck has no place.
+    A chipped tooth or a knocked instrument looks like a few outliers; bad luck has no place.
     """
     kept, found = work.kept, known[-1]
     work.kept = np.ones_like(kept)
@@ -115,10 +115,10 @@ def with_wild_explained(
 
 
 def _foretold(A: Array, target: Array, wild: NDArray[np.int64], k: int, d: int) -> bool:
-    """Return whether each wild reading is mostly what the last ``d`` columns say without it.
+    """Return whether each outlier is mostly what the last ``d`` columns say without it.
 
     A flexible function can bend to any single reading; it is believed only where the others,
-    wild and ordinary, tell of it beforehand.
+    outliers and inliers, indicate it beforehand.
     """
     for sample in wild:
         out = np.arange(k * sample, k * sample + k)
@@ -133,7 +133,7 @@ def _foretold(A: Array, target: Array, wild: NDArray[np.int64], k: int, d: int) 
 
 
 def look_again(work: Work, residual: Array, free: float) -> bool:
-    """Judge noise and wild readings by the best explanation; returns whether those changed."""
+    """Judge noise and outliers by the best explanation; returns whether those changed."""
     kept = _keep(work, residual)
     changed = bool((kept != work.kept).any())
     work.kept = kept

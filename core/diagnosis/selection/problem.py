@@ -162,7 +162,10 @@ def fit(space: Space, chosen: Sequence[int]) -> Found:
     ends = np.cumsum([0, *(len(space.candidates[c].parameters) for c in chosen)]).tolist()
     own = [slice(begin, end) for begin, end in pairwise(ends)]
     parts, spread = [values[o] for o in own], [deviation[o] for o in own]
+    families = {"", *(space.candidates[c].family for c in chosen)}
     for c, x, s in zip(chosen, parts, spread, strict=True):
+        if space.candidates[c].beside not in families:
+            score = np.inf
         if not _plausible(space.candidates[c], x, s):
             score = np.inf
     return Found(tuple(chosen), score, rss, tuple(parts), tuple(spread))

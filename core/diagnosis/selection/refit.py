@@ -85,11 +85,11 @@ def refit(
     return terms, index, tuple(covariance), gap
 
 
-def may_be_none(term: Term, spread: Array) -> bool:
-    """Return whether a term's fitted values, of covariance (d, d), may as well be zero."""
+def worth(term: Term, spread: Array) -> float:
+    """Return a term's value, of covariance (d, d), over what makes it a finding (1: just)."""
     value = np.array(term.values[: len(spread)])
     least = len(value) * OWN_SIGMAS**2
-    return bool(value @ np.linalg.pinv(spread, hermitian=True) @ value < least)
+    return float(value @ np.linalg.pinv(spread, hermitian=True) @ value) / least
 
 
 def _step(

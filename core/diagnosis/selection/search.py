@@ -78,7 +78,7 @@ def _counted(found: Found, named: Found) -> float:
 
 
 def _deep_search(space: Space, base: Sequence[int]) -> Found:
-    """Return the best set of a large log: many causes at once, each cheap to tell apart.
+    """Return the best set of a large log: many causes at once, each cheap to separate.
 
     Terms are added one by one and dropped again where later ones make them needless; an unnamed
     function joins at the end, where one still pays.

@@ -1,7 +1,7 @@
 """Selection: from an observation to the terms that explain it.
 
 Rounds of: columns at the model found so far, search, exact refit (Gauss-Newton on the whole
-prediction, frames and all), wild readings looked at again; until the set stays the same.
+prediction, frames and all), outliers looked at again; until the set stays the same.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from gapbridge.core.diagnosis.selection.candidate import (
     Candidate,
     joint_quantity,
     named_candidates,
+    with_what_it_needs,
 )
 from gapbridge.core.diagnosis.selection.following import exact_columns, one_delay
 from gapbridge.core.diagnosis.selection.geometry import Links, links_of, with_links
@@ -33,17 +34,17 @@ from gapbridge.core.diagnosis.selection.outliers import (
     with_wild_explained,
 )
 from gapbridge.core.diagnosis.selection.problem import Found, Space, fit
-from gapbridge.core.diagnosis.selection.refit import refit
+from gapbridge.core.diagnosis.selection.refit import refit, worth
 from gapbridge.core.diagnosis.selection.search import LARGE, screened_search
 from gapbridge.core.diagnosis.selection.smooth import smooth_candidates
 from gapbridge.core.diagnosis.selection.state import Raw, Work, flat, locate, sample_space
-from gapbridge.core.effects import Term
+from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import InputError
 from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
-ROUNDS = 5
+ROUNDS = 8
 FORBIDDEN = 1e9  # a price that no fit is worth
 
 
@@ -57,7 +58,7 @@ class Selection:
     terms: tuple[Term, ...]  # the named part, refitted exactly
     term_index: tuple[int, ...]  # candidate index of each term
     covariance: tuple[Array, ...]  # per term (d, d) of its fitted parameters
-    kept: NDArray[np.bool_]  # (N,) samples that are not wild
+    kept: NDArray[np.bool_]  # (N,) samples that are no outliers
     noise: Noise
     residual: Array  # (N, k) measured - predicted by the named terms, frame estimated along
     base: tuple[Term, ...]
@@ -154,13 +155,14 @@ def select(
     near: Space | None = None  # the same, beside the links where their geometry is a cause
     columns: list[Array] = []
     smooth = smooth_candidates(observation)
+    none: set[tuple[str, Site]] = set()  # what the exact refit takes back: its place is free
     for turn in range(ROUNDS):
         if progress:
             progress(f"{observation.channel}: round {turn + 1}")
         work.candidates = [
-            _bounded(c, model, observation)
+            with_what_it_needs(observation, _bounded(c, model, observation))
             for c in named_candidates(arm, observation.channel, withheld, rotation, base, turns)
-            if _has_what_it_needs(c, observation)
+            if _has_what_it_needs(c, observation) and (c.family, c.site) not in none
         ]
         space, near, columns = (
             None,
@@ -198,7 +200,14 @@ def select(
         free = 1 - used / space.freedom
         changed = look_again(work, _less_smooth(work, space, best, smooth, residual), free)
         if same and not changed:
-            break
+            single = [p for p, c in enumerate(index) if c not in links]
+            share = [worth(terms[p], covariance[p]) for p in single]
+            # beside an unnamed function a value is not yet what it comes to without
+            if min(share, default=1.0) >= 1 or len(best.chosen) > len(single):
+                break
+            weakest = single[int(np.argmin(share))]
+            none.add((terms[weakest].effect, terms[weakest].site))
+            terms = terms[:weakest] + terms[weakest + 1 :]
         base = terms
     assert space is not None and near is not None and found is not None
     if len(space.y) >= LARGE and any(not space.candidates[c].named for c in found.chosen):
@@ -313,7 +322,7 @@ def _has_what_it_needs(candidate: Candidate, observation: Observation) -> bool:
     return all(
         any(q == need or q.startswith(f"{need}_") for q in observation.quantities)
         for need in candidate.effect.needs
-        if need != "approach"  # without reversals play is an offset: a tie to be told
+        if need != "approach"  # without reversals play is an offset: a tie to be reported
     )
 
 

@@ -52,7 +52,7 @@ class LeRobot(Source):
         episodes = len(np.unique(table["episode_index"]))
         notes = [
             f"timestamp is the frame's number over {fps:g} Hz, not measured: a latency below "
-            f"{1e3 / fps:.0f} ms cannot be told",
+            f"{1e3 / fps:.0f} ms cannot be given",
             f"{episodes} episodes in a row, {PAUSE:g} s between two",
         ]
         if options.calibration is not None:

@@ -14,7 +14,7 @@ from gapbridge.drivers.can.loading import read_profile
 from gapbridge.drivers.can.profile import Incoming, Outgoing
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.simulated.can.nodes import CanNodes
-from gapbridge.drivers.simulated.peer.peer import Peer
+from gapbridge.drivers.simulated.server.arm_controller import ArmController
 
 HEALTHY_EVERY = 5  # cycles between messages that are no part of a sample
 
@@ -22,13 +22,13 @@ HEALTHY_EVERY = 5  # cycles between messages that are no part of a sample
 class MappedNodes(CanNodes):
     """Every message that the profile reads is sent; its setpoint frames move the arm."""
 
-    def __init__(self, link: CanSettings, host: str, peer: Peer) -> None:
-        super().__init__(link, host, peer)
+    def __init__(self, link: CanSettings, host: str, controller: ArmController) -> None:
+        super().__init__(link, host, controller)
         self._profile = read_profile(link.profile_path, link.installation)
         self._enabled = False
         self._cycles = self._samples = 0
         self._wire = (
-            self._profile.joints.to_wire(np.array(peer.q)) if self._profile.writes else None
+            self._profile.joints.to_wire(np.array(controller.q)) if self._profile.writes else None
         )
         self._enabling = self._sequence(self._profile.enable)
         self._setpoint = {f.key[0]: f for f in self._profile.setpoint}
@@ -38,17 +38,17 @@ class MappedNodes(CanNodes):
     def _sequence(actions: Any) -> set[tuple[int, bytes]]:
         return {(f.key[0], f.encode()) for action in actions for f in action.frames}
 
-    def take(self, identifier: int, data: bytes, peer: Peer) -> None:
+    def take(self, identifier: int, data: bytes, controller: ArmController) -> None:
         """Obey the enable sequence and setpoints; answer requests."""
         if (identifier, data) in self._asked:
             if (identifier, data) == max(self._asked):
-                self._send_sample(peer)
+                self._send_sample(controller)
         elif (identifier, data) in self._enabling:
             self._enabled = True
         elif identifier in self._setpoint:
-            self._aim(self._setpoint[identifier], data, peer)
+            self._aim(self._setpoint[identifier], data, controller)
 
-    def _aim(self, frame: Outgoing, data: bytes, peer: Peer) -> None:
+    def _aim(self, frame: Outgoing, data: bytes, controller: ArmController) -> None:
         if self._wire is None or len(data) != frame.message.length:
             return
         if self._enabling and not self._enabled:
@@ -58,39 +58,39 @@ class MappedNodes(CanNodes):
             self._wire[joint] = values[signal]
         joints = self._profile.joints
         if frame.joints and joints.setpoint_scale is not None:
-            peer.command(tuple(self._wire * joints.setpoint_scale + joints.zero))
+            controller.command(tuple(self._wire * joints.setpoint_scale + joints.zero))
 
-    def publish(self, peer: Peer) -> None:
+    def publish(self, controller: ArmController) -> None:
         """Send the sample, unless it must be asked for, and more seldom everything else."""
         if not self._asked:
-            self._send_sample(peer)
+            self._send_sample(controller)
         if self._cycles % HEALTHY_EVERY == 0:
             for key, incoming in self._profile.incoming.items():
                 if key not in self._profile.sample:
-                    self.send(key[0], self._encode(incoming, peer))
+                    self.send(key[0], self._encode(incoming, controller))
         self._cycles += 1
 
-    def _send_sample(self, peer: Peer) -> None:
+    def _send_sample(self, controller: ArmController) -> None:
         self.begin_sample()
         self._samples += 1
         for key in self._profile.sample:
-            self.send(key[0], self._encode(self._profile.incoming[key], peer))
+            self.send(key[0], self._encode(self._profile.incoming[key], controller))
 
-    def _encode(self, incoming: Incoming, peer: Peer) -> bytes:
+    def _encode(self, incoming: Incoming, controller: ArmController) -> bytes:
         """Return a message of a healthy arm: its joints where they are, everything else normal."""
         profile, values = self._profile, {s.name: 0.0 for s in incoming.message.signals}
-        told = {
+        reported = {
             "position": np.array(self._kept) + self._shift - profile.joints.zero,
-            "velocity": np.array(peer.qd),
-            "torque": np.array(peer.joint_torque),
-            "temperature": np.array(peer.temperatures),
+            "velocity": np.array(controller.qd),
+            "torque": np.array(controller.joint_torque),
+            "temperature": np.array(controller.temperatures),
         }
         for reading in incoming.readings:
             scale = profile.joints.scale[reading.quantity][reading.joint]
-            values[reading.signal] = told[reading.quantity][reading.joint] / scale
+            values[reading.signal] = reported[reading.quantity][reading.joint] / scale
         for check in incoming.checks:
             bad = [v for v, trouble in check.values.items() if trouble == "emergency_stop"]
-            values[check.signal] = (bad or [1])[0] if not peer.can_move else min(check.normal)
+            values[check.signal] = (bad or [1])[0] if not controller.can_move else min(check.normal)
         for signal in incoming.enabled:
             yes = min(profile.enabled_values)
             values[signal] = yes if self._enabled else (0 if yes else 1)

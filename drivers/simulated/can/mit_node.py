@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.simulated.can.nodes import CanNodes
-from gapbridge.drivers.simulated.peer.peer import Peer
+from gapbridge.drivers.simulated.server.arm_controller import ArmController
 
 
 class Ranges(NamedTuple):
@@ -31,52 +31,52 @@ ENABLE, DISABLE = b"\xff" * 7 + b"\xfc", b"\xff" * 7 + b"\xfd"
 class MitNodes(CanNodes):
     """Seven actuators at most, in a chain."""
 
-    def __init__(self, link: CanSettings, host: str, peer: Peer) -> None:
-        super().__init__(link, host, peer)
-        self.enabled = [False] * peer.n
-        self._target = list(peer.target_q)
+    def __init__(self, link: CanSettings, host: str, controller: ArmController) -> None:
+        super().__init__(link, host, controller)
+        self.enabled = [False] * controller.n
+        self._target = list(controller.target_q)
 
-    def take(self, identifier: int, data: bytes, peer: Peer) -> None:
+    def take(self, identifier: int, data: bytes, controller: ArmController) -> None:
         """Obey enable, disable and MIT commands; answer these and queries."""
         motor = identifier - 1
         if identifier == QUERY and len(data) >= 3 and data[2] == REFRESH:
             motor = int.from_bytes(data[:2], "little") - 1
-        elif not (0 <= motor < peer.n and len(data) == 8):
+        elif not (0 <= motor < controller.n and len(data) == 8):
             return
         elif data == ENABLE:
             self.enabled[motor] = True
-            self._target[motor] = peer.target_q[motor]
+            self._target[motor] = controller.target_q[motor]
         elif data == DISABLE:
             self.enabled[motor] = False
-            peer.let_go()
+            controller.let_go()
         else:
-            self._aim(motor, data, peer)
-        if 0 <= motor < peer.n:
-            self._answer(motor, peer)
+            self._aim(motor, data, controller)
+        if 0 <= motor < controller.n:
+            self._answer(motor, controller)
 
-    def _aim(self, motor: int, data: bytes, peer: Peer) -> None:
+    def _aim(self, motor: int, data: bytes, controller: ArmController) -> None:
         stiffness = ((data[3] & 0xF) << 8) | data[4]
         if not self.enabled[motor] or not stiffness:
             return
         count = int.from_bytes(data[:2], "big")
         self._target[motor] = self.joint(motor, 2 * POSITION * count / 0xFFFF - POSITION, 1.0)
         if all(self.enabled):
-            peer.command(self._target)
+            controller.command(self._target)
 
-    def _answer(self, motor: int, peer: Peer) -> None:
+    def _answer(self, motor: int, controller: ArmController) -> None:
         if motor == 0:
             self.begin_sample()
         ranges = MOTORS[motor % len(MOTORS)]
         q = _count(self.wire(1.0)[motor], POSITION, 16)
-        dq = _count(self.speeds(peer, 1.0)[motor], ranges.velocity, 12)
-        torque = _count(peer.joint_torque[motor] * self._sign[motor], ranges.torque, 12)
-        state = 0xA if not peer.can_move else int(self.enabled[motor])
+        dq = _count(self.speeds(controller, 1.0)[motor], ranges.velocity, 12)
+        torque = _count(controller.joint_torque[motor] * self._sign[motor], ranges.torque, 12)
+        state = 0xA if not controller.can_move else int(self.enabled[motor])
         packed = q << 24 | dq << 12 | torque
-        warm = max(0, min(255, round(peer.temperatures[motor])))
+        warm = max(0, min(255, round(controller.temperatures[motor])))
         head = bytes([state << 4 | (motor + 1) & 0xF])
         self.send(0x11 + motor, head + packed.to_bytes(5, "big") + bytes([warm, warm]))
 
-    def publish(self, peer: Peer) -> None:
+    def publish(self, controller: ArmController) -> None:
         """Say nothing: an actuator speaks when it is spoken to."""
 
 

@@ -17,26 +17,26 @@ from gapbridge.drivers.can_bus.bus import BusSettings, close_bus, open_bus
 from gapbridge.drivers.simulated.can.frame import Frame
 from gapbridge.drivers.simulated.can.hub import Hub
 from gapbridge.drivers.simulated.can.port import InnerPort
-from gapbridge.drivers.simulated.peer.bench import Command
-from gapbridge.drivers.simulated.peer.peer import Peer
-from gapbridge.drivers.simulated.peer.peer_server import PeerServer
 from gapbridge.drivers.simulated.plant.kinematics import Joints
+from gapbridge.drivers.simulated.server.arm_controller import ArmController
+from gapbridge.drivers.simulated.server.bench import Command
+from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
 
 BACKLOG = 500  # frames taken in one cycle at most
 TORN = 0.05  # rad that the joints of a torn sample are off
 
 
-class CanNodes(PeerServer):
+class CanNodes(ProtocolServer):
     """An arm's nodes on one bus.
 
     With socketcand the bus is served here, with slcan its serial line (a link to it is put at
     ``channel``); on virtual and socketcan the nodes join the bus that is there.
     """
 
-    def __init__(self, link: CanSettings, host: str, peer: Peer) -> None:
+    def __init__(self, link: CanSettings, host: str, controller: ArmController) -> None:
         self.name = f"CAN ({link.profile})"
         self._link = link.model_copy(update={"host": host})
-        n = peer.n
+        n = controller.n
         self._sign: Sequence[float] = link.direction or (1,) * n
         self._zero: Sequence[float] = link.zero or (0.0,) * n
         self._gear: Sequence[float] = link.gear or (1.0,) * n
@@ -45,14 +45,14 @@ class CanNodes(PeerServer):
         self._inner = InnerPort()
         self._symbol: Path | None = None
         self.withheld: set[int] = set()  # identifiers that are not sent now
-        self._kept: Joints = peer.q
+        self._kept: Joints = controller.q
         self._tears: deque[frozenset[int]] = deque()
         self._lost: frozenset[int] = frozenset()  # identifiers lost out of this sample
         self._shift = 0.0  # rad, of a torn sample: who takes it for one is found out
 
     # -- the bus ----------------------------------------------------------------------------------
 
-    def open(self, peer: Peer) -> None:
+    def open(self, controller: ArmController) -> None:
         """Serve or join the bus. Raises LinkError, OSError, InputError."""
         link: BusSettings = self._link
         if link.interface in ("socketcand", "slcan"):
@@ -99,7 +99,7 @@ class CanNodes(PeerServer):
         if symbol is not None:
             symbol.unlink(missing_ok=True)
 
-    def cycle(self, peer: Peer) -> None:
+    def cycle(self, controller: ArmController) -> None:
         """Take the frames that have come, then send the arm's own."""
         if self._bus is None and self._hub is None:
             return
@@ -107,12 +107,12 @@ class CanNodes(PeerServer):
             frame = self._receive()
             if frame is None:
                 break
-            if not peer.stalled:
-                self.take(frame.id, frame.data, peer)
-        if not peer.stalled:
-            if not peer.frozen:
-                self._kept = peer.q
-            self.publish(peer)
+            if not controller.stalled:
+                self.take(frame.id, frame.data, controller)
+        if not controller.stalled:
+            if not controller.frozen:
+                self._kept = controller.q
+            self.publish(controller)
 
     def _receive(self) -> Frame | None:
         """Return the next data frame that has come. Raises LinkError where the bus has gone."""
@@ -155,7 +155,7 @@ class CanNodes(PeerServer):
         with contextlib.suppress(can.CanError, OSError):
             self._bus.send(frame)
 
-    def commands(self, peer: Peer) -> Mapping[str, Command]:
+    def commands(self, controller: ArmController) -> Mapping[str, Command]:
         """Return the bench commands of a bus: frames that get lost."""
 
         def withhold(numbers: list[float]) -> str:
@@ -178,9 +178,9 @@ class CanNodes(PeerServer):
         rows = zip(self._kept, self._zero, self._sign, self._gear, strict=True)
         return [(q + self._shift - zero) * sign * gear / unit for q, zero, sign, gear in rows]
 
-    def speeds(self, peer: Peer, unit: float) -> list[float]:
+    def speeds(self, controller: ArmController, unit: float) -> list[float]:
         """Return the joint velocities on the wire, in ``unit`` (rad/s)."""
-        rows = zip(peer.qd, self._sign, self._gear, strict=True)
+        rows = zip(controller.qd, self._sign, self._gear, strict=True)
         return [qd * sign * gear / unit for qd, sign, gear in rows]
 
     def joint(self, i: int, value: float, unit: float) -> float:
@@ -190,9 +190,9 @@ class CanNodes(PeerServer):
     # -- what one protocol adds -------------------------------------------------------------------
 
     @abstractmethod
-    def take(self, identifier: int, data: bytes, peer: Peer) -> None:
+    def take(self, identifier: int, data: bytes, controller: ArmController) -> None:
         """Take one frame that somebody sent."""
 
     @abstractmethod
-    def publish(self, peer: Peer) -> None:
+    def publish(self, controller: ArmController) -> None:
         """Send what the arm sends in this cycle."""

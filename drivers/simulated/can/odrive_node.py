@@ -7,7 +7,7 @@ import struct
 
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.simulated.can.nodes import CanNodes
-from gapbridge.drivers.simulated.peer.peer import Peer
+from gapbridge.drivers.simulated.server.arm_controller import ArmController
 
 TURN = 2.0 * math.pi
 IDLE, CLOSED_LOOP = 1, 8
@@ -20,53 +20,53 @@ ESTOP_REQUESTED = 0x2000_0000
 class OdriveNodes(CanNodes):
     """One node per joint, from 0."""
 
-    def __init__(self, link: CanSettings, host: str, peer: Peer) -> None:
-        super().__init__(link, host, peer)
-        self.state = [IDLE] * peer.n
-        self.mode = [(0, 0)] * peer.n
-        self._target = list(peer.target_q)
+    def __init__(self, link: CanSettings, host: str, controller: ArmController) -> None:
+        super().__init__(link, host, controller)
+        self.state = [IDLE] * controller.n
+        self.mode = [(0, 0)] * controller.n
+        self._target = list(controller.target_q)
         self._count = 0
 
-    def take(self, identifier: int, data: bytes, peer: Peer) -> None:
+    def take(self, identifier: int, data: bytes, controller: ArmController) -> None:
         """Obey state, mode, position, e-stop and clear."""
         node, command = identifier >> 5, identifier & 0x1F
-        if node >= peer.n:
+        if node >= controller.n:
             return
         if command == SET_STATE and len(data) >= 4:
-            self._set_state(node, int.from_bytes(data[:4], "little"), peer)
+            self._set_state(node, int.from_bytes(data[:4], "little"), controller)
         elif command == SET_MODE and len(data) == 8:
             self.mode[node] = struct.unpack("<II", data)
         elif command == INPUT_POSITION and len(data) == 8:
-            self._aim(node, struct.unpack("<f", data[:4])[0], peer)
+            self._aim(node, struct.unpack("<f", data[:4])[0], controller)
         elif command == ESTOP:
-            peer.emergency_stop()
+            controller.emergency_stop()
         elif command == CLEAR:
-            peer.release_emergency_stop()
-            peer.unlock()
+            controller.release_emergency_stop()
+            controller.unlock()
 
-    def _set_state(self, node: int, state: int, peer: Peer) -> None:
+    def _set_state(self, node: int, state: int, controller: ArmController) -> None:
         if state == CLOSED_LOOP and self.state[node] != CLOSED_LOOP:
-            self._target[node] = peer.target_q[node]
+            self._target[node] = controller.target_q[node]
         if state != CLOSED_LOOP:
-            peer.let_go()
+            controller.let_go()
         self.state[node] = state
 
-    def _aim(self, node: int, turns: float, peer: Peer) -> None:
+    def _aim(self, node: int, turns: float, controller: ArmController) -> None:
         if self.state[node] != CLOSED_LOOP or self.mode[node] != (POSITION_CONTROL, PASSTHROUGH):
             return
         self._target[node] = self.joint(node, turns, TURN)
         if all(state == CLOSED_LOOP for state in self.state):
-            peer.command(self._target)
+            controller.command(self._target)
 
-    def publish(self, peer: Peer) -> None:
+    def publish(self, controller: ArmController) -> None:
         """Send encoder estimates and, more seldom, heartbeats."""
         if self._count % ENCODER_EVERY == 0:
             self.begin_sample()
-            rows = zip(self.wire(TURN), self.speeds(peer, TURN), strict=True)
+            rows = zip(self.wire(TURN), self.speeds(controller, TURN), strict=True)
             for node, (turns, speed) in enumerate(rows):
                 self.send(node << 5 | ENCODER, struct.pack("<ff", turns, speed))
         if self._count % HEARTBEAT_EVERY == 0:
-            error = 0 if peer.can_move else ESTOP_REQUESTED
+            error = 0 if controller.can_move else ESTOP_REQUESTED
             for node, state in enumerate(self.state):
                 self.send(node << 5 | HEARTBEAT, struct.pack("<IBxxx", error, state))
         self._count += 1

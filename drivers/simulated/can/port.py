@@ -92,8 +92,8 @@ class SocketcandPort(Port):
             raise OSError(errno.EPROTO, "no end of a message")
         return frames
 
-    def _obey(self, words: list[str], frames: list[Frame]) -> None:
-        match words:
+    def _obey(self, arguments: list[str], frames: list[Frame]) -> None:
+        match arguments:
             case ["open", _]:
                 self._write(b"< ok >")
             case ["rawmode"]:

@@ -6,8 +6,8 @@ import importlib
 
 from gapbridge.core.errors import InputError
 from gapbridge.drivers.can.settings import CanSettings
-from gapbridge.drivers.simulated.peer.peer import Peer
-from gapbridge.drivers.simulated.peer.peer_server import PeerServer
+from gapbridge.drivers.simulated.server.arm_controller import ArmController
+from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
 
 NODES: dict[str, str] = {
     "piper": "gapbridge.drivers.simulated.can.piper_node:PiperNode",
@@ -18,11 +18,11 @@ NODES: dict[str, str] = {
 MAPPED = "gapbridge.drivers.simulated.can.mapped_node:MappedNodes"
 
 
-def make_servers(link: CanSettings, host: str, peer: Peer) -> list[PeerServer]:
+def make_servers(link: CanSettings, host: str, controller: ArmController) -> list[ProtocolServer]:
     """Return the nodes of an arm, not yet on a bus. Raises InputError where they do not fit."""
     module, name = NODES.get(link.profile, MAPPED).split(":")
     nodes = getattr(importlib.import_module(module), name)
-    if link.profile == "piper" and peer.n != 6:
-        raise InputError(f"link.profile: found piper, 6 joints, the cell's arm has {peer.n}")
-    found: PeerServer = nodes(link, host, peer)
+    if link.profile == "piper" and controller.n != 6:
+        raise InputError(f"link.profile: found piper, 6 joints, the cell's arm has {controller.n}")
+    found: ProtocolServer = nodes(link, host, controller)
     return [found]

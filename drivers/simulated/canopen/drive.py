@@ -228,7 +228,7 @@ class Drive(canopen.LocalNode):
         return frames
 
     def fail(self, code: int, register: int = 1) -> None:
-        """Go to FAULT with an error code, and tell it by EMCY."""
+        """Go to FAULT with an error code, and report it by EMCY."""
         self.error_code = code
         self.axis.machine.fault()
         self.emcy.send(code, register)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Protocol
 
 from gapbridge.drivers.canopen.profile import CanopenProfile
-from gapbridge.drivers.simulated.peer.bench import BenchError, Command
+from gapbridge.drivers.simulated.server.bench import BenchError, Command
 
 
 class Faulty(Protocol):

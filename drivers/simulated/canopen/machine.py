@@ -6,7 +6,7 @@ from enum import Enum
 
 
 class Phase(Enum):
-    """State -> the bits of the Statusword that tell it."""
+    """State -> the bits of the Statusword that report it."""
 
     NOT_READY = 0x0000
     SWITCH_ON_DISABLED = 0x0040

@@ -19,9 +19,9 @@ from gapbridge.drivers.simulated.can.hub import Hub
 from gapbridge.drivers.simulated.canopen.drive import COMMUNICATION, Drive, Units
 from gapbridge.drivers.simulated.canopen.faults import bench_commands
 from gapbridge.drivers.simulated.canopen.machine import Phase
-from gapbridge.drivers.simulated.peer.bench import Command
-from gapbridge.drivers.simulated.peer.peer import Peer
-from gapbridge.drivers.simulated.peer.peer_server import PeerServer
+from gapbridge.drivers.simulated.server.arm_controller import ArmController
+from gapbridge.drivers.simulated.server.bench import Command
+from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
 
 SYNC = 0x80
 HEARTBEAT = 0x700
@@ -43,7 +43,7 @@ class _Network(canopen.Network):
 
     def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:
         if not self.mute and can_id & 0x7F not in self.silent:
-            with contextlib.suppress(Exception):  # the bus has gone: the server's cycle tells
+            with contextlib.suppress(Exception):  # the bus has gone: the server's cycle notices
                 super().send_message(can_id, data, remote)
 
 
@@ -62,31 +62,31 @@ class _Listener(MessageListener):
             self._server.heard(int(msg.arbitration_id), bytes(msg.data))
 
     def on_error(self, exc: Exception) -> None:
-        time.sleep(PAUSE)  # the bus has gone: the server's cycle tells
+        time.sleep(PAUSE)  # the bus has gone: the server's cycle notices
 
 
-class CanopenServer(PeerServer):
+class CanopenServer(ProtocolServer):
     """All drives of one arm.
 
     With socketcand the bus is served here; on virtual and socketcan the drives join what is there.
     """
 
-    def __init__(self, link: CanopenSettings, host: str, peer: Peer) -> None:
-        self.profile: CanopenProfile = read_profile(link.profile_path, peer.n)
+    def __init__(self, link: CanopenSettings, host: str, controller: ArmController) -> None:
+        self.profile: CanopenProfile = read_profile(link.profile_path, controller.n)
         self.name = f"CANopen ({self.profile.name})"
         self._link: BusSettings = link.model_copy(update={"host": host})
         self.lock = threading.RLock()
         self._hub: Hub | None = None
         self._network: Any = None
-        self._peer = peer
+        self._controller = controller
         self._late: dict[int, tuple[int, float]] = {}  # node -> SYNCs still, s of delay
         self._held: list[tuple[float, int, bytes]] = []  # s (monotonic), COB-ID, data
         self._beaten: dict[int, float] = {}  # node -> s, of its last heartbeat
         self._was_able = True
-        self.drives = tuple(self._drive(joint) for joint in range(peer.n))
+        self.drives = tuple(self._drive(joint) for joint in range(controller.n))
 
     def _drive(self, joint: int) -> Drive:
-        profile, peer = self.profile, self._peer
+        profile, controller = self.profile, self._controller
         per_radian = float(profile.counts_per_radian[joint])
         rated = profile.file.joints[joint].rated_torque
         sign = 1.0 if per_radian > 0.0 else -1.0
@@ -95,11 +95,11 @@ class CanopenServer(PeerServer):
             0.0 if rated is None else 1000.0 * sign / rated,
         )  # fmt: skip
         node = profile.nodes[joint]
-        return Drive(node, profile.eds.dictionary(node), units, peer.q[joint])
+        return Drive(node, profile.eds.dictionary(node), units, controller.q[joint])
 
     # -- the bus ----------------------------------------------------------------------------------
 
-    def open(self, peer: Peer) -> None:
+    def open(self, controller: ArmController) -> None:
         """Serve or join the bus, and start the drives. Raises LinkError, OSError, InputError."""
         link = self._link
         if link.interface == "socketcand":
@@ -118,13 +118,13 @@ class CanopenServer(PeerServer):
             for drive in self.drives:
                 network.add_node(drive)
             network.connect()
-            for joint in range(peer.n):
+            for joint in range(controller.n):
                 self._boot(joint)
 
     def _boot(self, joint: int) -> None:
-        arm = self._peer.plant.arm
+        arm = self._controller.plant.arm
         drive = self.drives[joint]
-        drive.q = self._peer.q[joint]
+        drive.q = self._controller.q[joint]
         drive.boot(arm.lower[joint], arm.upper[joint])
 
     @property
@@ -151,7 +151,7 @@ class CanopenServer(PeerServer):
 
     def heard(self, cob_id: int, data: bytes) -> None:
         """Act on one frame, after the library has; from the notifier's thread."""
-        if self._network is None or self._peer.stalled:
+        if self._network is None or self._controller.stalled:
             return
         if cob_id == 0:
             for joint, drive in enumerate(self.drives):
@@ -162,7 +162,7 @@ class CanopenServer(PeerServer):
         elif cob_id & 0x780 == HEARTBEAT:
             for drive in self.drives:
                 if drive.number(0x1016, 1) >> 16 & 0x7F == cob_id & 0x7F:
-                    drive.watched[cob_id & 0x7F] = self._peer.running
+                    drive.watched[cob_id & 0x7F] = self._controller.running
         else:
             for drive in self.drives:
                 if drive.operational and drive.node not in self._network.silent:
@@ -205,41 +205,41 @@ class CanopenServer(PeerServer):
 
     # -- the cycle --------------------------------------------------------------------------------
 
-    def cycle(self, peer: Peer) -> None:
+    def cycle(self, controller: ArmController) -> None:
         """Move the axes, watch and send heartbeats."""
         with self.lock:
             if self._network is None:
                 return
-            self._network.mute = peer.stalled
-            self._follow_stops(peer)
+            self._network.mute = controller.stalled
+            self._follow_stops(controller)
             self._send_held(time.monotonic())
-            self._watch_heartbeats(peer)
-            self._move(peer)
-            if not peer.frozen:
-                self._feel(peer)
-            self._beat(peer)
+            self._watch_heartbeats(controller)
+            self._move(controller)
+            if not controller.frozen:
+                self._feel(controller)
+            self._beat(controller)
             try:
                 self._network.check()
             except Exception as error:
                 raise LinkError(f"simulated drives: {error}") from None
 
-    def _follow_stops(self, peer: Peer) -> None:
+    def _follow_stops(self, controller: ArmController) -> None:
         """Fail every drive at a stop of the arm; a fault that is reset ends a protective stop."""
-        able, self._was_able = self._was_able, peer.can_move
+        able, self._was_able = self._was_able, controller.can_move
         for drive in self.drives:
             healthy = drive.axis.machine.phase not in (Phase.FAULT, Phase.REACTION)
-            if not peer.can_move and able and healthy:
-                drive.fail(EMERGENCY if peer.emergency else BLOCKED)
-            elif peer.emergency and healthy:
+            if not controller.can_move and able and healthy:
+                drive.fail(EMERGENCY if controller.emergency else BLOCKED)
+            elif controller.emergency and healthy:
                 drive.fail(EMERGENCY)
-            elif peer.protective and healthy:
-                peer.unlock()
+            elif controller.protective and healthy:
+                controller.unlock()
 
-    def _watch_heartbeats(self, peer: Peer) -> None:
+    def _watch_heartbeats(self, controller: ArmController) -> None:
         for drive in self.drives:
             limit = 1e-3 * (drive.number(0x1016, 1) & 0xFFFF)
             for node, heard in list(drive.watched.items()):
-                if limit and peer.running - heard > limit:
+                if limit and controller.running - heard > limit:
                     del drive.watched[node]
                     drive.emcy.send(HEARTBEAT_ERROR, COMMUNICATION)
                     self._abort_connection(drive)
@@ -253,29 +253,33 @@ class CanopenServer(PeerServer):
         elif option in (2, 3):
             drive.axis.machine.control(0x00 if option == 2 else 0x02)
 
-    def _move(self, peer: Peer) -> None:
-        goal = list(peer.target_q)
+    def _move(self, controller: ArmController) -> None:
+        goal = list(controller.target_q)
         holding = False
         for joint, drive in enumerate(self.drives):
             axis = drive.axis
-            axis.step(peer.period, drive.interpolation_period, goal[joint])
+            axis.step(controller.period, drive.interpolation_period, goal[joint])
             if axis.holds:
                 holding, goal[joint] = True, axis.demand
         if holding:
-            peer.command(goal)
-        elif peer.commanded:
-            peer.let_go()
+            controller.command(goal)
+        elif controller.commanded:
+            controller.let_go()
 
-    def _feel(self, peer: Peer) -> None:
-        torque = peer.joint_torque
+    def _feel(self, controller: ArmController) -> None:
+        torque = controller.joint_torque
         for joint, drive in enumerate(self.drives):
-            drive.q, drive.qd, drive.torque = peer.q[joint], peer.qd[joint], torque[joint]
+            drive.q, drive.qd, drive.torque = (
+                controller.q[joint],
+                controller.qd[joint],
+                torque[joint],
+            )
 
-    def _beat(self, peer: Peer) -> None:
+    def _beat(self, controller: ArmController) -> None:
         for drive in self.drives:
             period = drive.nmt.period
-            if period and peer.running - self._beaten.get(drive.node, -1.0) >= period:
-                self._beaten[drive.node] = peer.running
+            if period and controller.running - self._beaten.get(drive.node, -1.0) >= period:
+                self._beaten[drive.node] = controller.running
                 state = {"OPERATIONAL": 5, "STOPPED": 4}.get(drive.nmt.state, 127)
                 self._network.send_message(HEARTBEAT + drive.node, [state])
 
@@ -301,11 +305,13 @@ class CanopenServer(PeerServer):
         with self.lock:
             self.drives[self.profile.nodes.index(node)].fail(code)
 
-    def commands(self, peer: Peer) -> Mapping[str, Command]:
+    def commands(self, controller: ArmController) -> Mapping[str, Command]:
         """Return the bench commands of drives."""
         return bench_commands(self)
 
 
-def make_servers(link: CanopenSettings, host: str, peer: Peer) -> list[PeerServer]:
+def make_servers(
+    link: CanopenSettings, host: str, controller: ArmController
+) -> list[ProtocolServer]:
     """Return the drives of an arm, not yet on a bus. Raises InputError where they do not fit."""
-    return [CanopenServer(link, host, peer)]
+    return [CanopenServer(link, host, controller)]

@@ -9,7 +9,7 @@ import can
 import numpy as np
 
 from gapbridge.drivers.can_bus.bus import BusSettings, close_bus, open_bus
-from gapbridge.drivers.simulated.ft_sensor.mounting import Felt
+from gapbridge.drivers.simulated.ft_sensor.mounting import Reaction
 from gapbridge.drivers.simulated.ft_sensor.node import SimulatedSensor
 
 RANGE = np.array((600.0, 600.0, 600.0, 60.0, 60.0, 60.0))  # N, Nm at about full gauges
@@ -24,13 +24,13 @@ class AtiNode(SimulatedSensor):
 
     def __init__(
         self,
-        felt: Felt,
+        reaction: Reaction,
         bus: BusSettings,
         base_id: int = 0x20,
         seed: int = 0,
         units: tuple[tuple[int, float], tuple[int, float]] = ((2, 1.0), (3, 1.0)),
     ) -> None:
-        super().__init__(felt)
+        super().__init__(reaction)
         self._settings, self._base = bus, base_id << 4
         self._bus: Any = None
         (self._force_code, newton), (self._torque_code, newton_metre) = units
@@ -51,7 +51,7 @@ class AtiNode(SimulatedSensor):
 
     def gauges(self) -> list[int]:
         """Return the gauges (6,), held at the ends of their range."""
-        found = np.rint(self._inverse @ np.array(self.felt()))
+        found = np.rint(self._inverse @ np.array(self.reaction()))
         return [int(v) for v in np.clip(found, -32768, 32767)]
 
     def answer(self, operation: int, data: bytes) -> list[bytes]:

@@ -17,7 +17,7 @@ from pymodbus.server import ModbusSerialServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from gapbridge.core.errors import LinkError
-from gapbridge.drivers.simulated.ft_sensor.mounting import Felt
+from gapbridge.drivers.simulated.ft_sensor.mounting import Reaction
 from gapbridge.drivers.simulated.ft_sensor.node import SimulatedSensor
 
 REGISTERS, STREAM_REGISTER, STREAM = 180, 410, 0x0200
@@ -33,8 +33,8 @@ class Ft300Device(SimulatedSensor):
     and puts the stream on the line, so that the wire carries what the device's would.
     """
 
-    def __init__(self, felt: Felt, link: Path | None = None, device_id: int = 9) -> None:
-        super().__init__(felt)
+    def __init__(self, reaction: Reaction, link: Path | None = None, device_id: int = 9) -> None:
+        super().__init__(reaction)
         self.path = ""
         self.streaming = False
         self.sent = 0  # samples streamed

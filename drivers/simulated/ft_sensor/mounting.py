@@ -14,13 +14,13 @@ from gapbridge.drivers.simulated.plant.rotations import (
     unrotate,
 )
 
-Felt = Callable[[], Vector6]
+Reaction = Callable[[], Vector6]
 """Returns the wrench that a sensor feels now, N and Nm, in its own axes, about its origin."""
 
 
-def felt_by(
+def reaction_at(
     in_flange: Callable[[], Sequence[float]], xyz: Vector3, rpy: Vector3, sign: int = 1
-) -> Felt:
+) -> Reaction:
     """Return what a sensor mounted at ``xyz``, ``rpy`` feels of the flange's wrench (6,).
 
     ``sign`` -1: it reports the reaction.
@@ -31,7 +31,7 @@ def felt_by(
     )
     rotation = compose(yaw, compose(pitch, roll))
 
-    def felt() -> Vector6:
+    def reaction() -> Vector6:
         a, b, c, d, e, f = in_flange()
         force = (a, b, c)
         torque = subtract((d, e, f), cross(xyz, force))
@@ -39,4 +39,4 @@ def felt_by(
         u, v, w, x, y, z = (sign * value for value in found)
         return (u, v, w, x, y, z)
 
-    return felt
+    return reaction

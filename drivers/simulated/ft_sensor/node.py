@@ -9,14 +9,14 @@ from typing import Self
 
 import numpy as np
 
-from gapbridge.drivers.simulated.ft_sensor.mounting import Felt
+from gapbridge.drivers.simulated.ft_sensor.mounting import Reaction
 
 
 class SimulatedSensor(ABC):
     """What the simulated sensors share: what they feel, faults, start and stop."""
 
-    def __init__(self, felt: Felt) -> None:
-        self.felt = felt
+    def __init__(self, reaction: Reaction) -> None:
+        self.reaction = reaction
         self.silent = False  # fault: answers and sends nothing
         self.status = 0  # fault: its status or overload bits
         self._ended = threading.Event()
@@ -52,7 +52,7 @@ class SimulatedSensor(ABC):
     def counts(self, per_newton: float, per_newton_metre: float) -> list[int]:
         """Return what is felt as int16 counts (6,), held at the end of the range."""
         scale = 3 * (per_newton,) + 3 * (per_newton_metre,)
-        found = [round(v * k) for v, k in zip(self.felt(), scale, strict=True)]
+        found = [round(v * k) for v, k in zip(self.reaction(), scale, strict=True)]
         return [int(v) for v in np.clip(found, -32768, 32767)]
 
     def __enter__(self) -> Self:

@@ -8,22 +8,22 @@ from typing import Any
 import can
 
 from gapbridge.drivers.can_bus.bus import BusSettings, close_bus, open_bus
-from gapbridge.drivers.simulated.ft_sensor.mounting import Felt
+from gapbridge.drivers.simulated.ft_sensor.mounting import Reaction
 from gapbridge.drivers.simulated.ft_sensor.node import SimulatedSensor
 
 
 class RobotousNode(SimulatedSensor):
-    """Streams two frames a sample once it has been told to (0x0B), until told to stop (0x0C)."""
+    """Streams two frames a sample once it has been asked to (0x0B), until asked to stop (0x0C)."""
 
     def __init__(
         self,
-        felt: Felt,
+        reaction: Reaction,
         bus: BusSettings,
         command_id: int = 0x64,
         reply_ids: tuple[int, int] = (0x01, 0x02),
         rate: float = 200.0,
     ) -> None:
-        super().__init__(felt)
+        super().__init__(reaction)
         self._settings = bus
         self._command_id, self._reply_ids, self._period = command_id, reply_ids, 1.0 / rate
         self._bus: Any = None

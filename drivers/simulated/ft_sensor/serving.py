@@ -19,7 +19,7 @@ from gapbridge.drivers.ft_sensor.settings import (
 from gapbridge.drivers.simulated.can.hub import Hub
 from gapbridge.drivers.simulated.ft_sensor.ati_node import AtiNode
 from gapbridge.drivers.simulated.ft_sensor.ft300_device import Ft300Device
-from gapbridge.drivers.simulated.ft_sensor.mounting import Felt, felt_by
+from gapbridge.drivers.simulated.ft_sensor.mounting import Reaction, reaction_at
 from gapbridge.drivers.simulated.ft_sensor.node import SimulatedSensor
 from gapbridge.drivers.simulated.ft_sensor.robotous_node import RobotousNode
 
@@ -41,7 +41,7 @@ def served_sensor(
         yield
         return
     frame = settings.sensor_in_flange
-    sensor = _device(settings, felt_by(in_flange, frame.xyz, frame.rpy, settings.sign))
+    sensor = _device(settings, reaction_at(in_flange, frame.xyz, frame.rpy, settings.sign))
     with contextlib.ExitStack() as stack:
         if isinstance(settings, BusSettings) and settings.interface == "socketcand":
             if _same_bus(settings, link):
@@ -53,7 +53,7 @@ def served_sensor(
         yield
 
 
-def _device(settings: FtSensorSettings, felt: Felt) -> SimulatedSensor:
+def _device(settings: FtSensorSettings, reaction: Reaction) -> SimulatedSensor:
     if isinstance(settings, RobotiqSettings):
         port = Path(settings.port)
         if (port.exists() and not port.is_symlink()) or not port.parent.is_dir():
@@ -61,16 +61,18 @@ def _device(settings: FtSensorSettings, felt: Felt) -> SimulatedSensor:
                 f"ft_sensor.port: found {settings.port}, expected a name that is free, as "
                 "/tmp/ft300, where a link to the simulated line can be put"
             )
-        return Ft300Device(felt, port, settings.device_id)
+        return Ft300Device(reaction, port, settings.device_id)
     if isinstance(settings, BusSettings) and settings.interface not in BETWEEN_PROCESSES:
         raise InputError(
             f"ft_sensor.interface: found {settings.interface!r}, expected socketcand or socketcan: "
             "a simulated sensor is reached from another process"
         )
     if isinstance(settings, RobotousSettings):
-        return RobotousNode(felt, settings, settings.command_id, settings.reply_ids, settings.rate)
+        return RobotousNode(
+            reaction, settings, settings.command_id, settings.reply_ids, settings.rate
+        )
     if isinstance(settings, AtiSettings):
-        return AtiNode(felt, settings, settings.base_id)
+        return AtiNode(reaction, settings, settings.base_id)
     raise InputError(f"ft_sensor.driver: found {settings.driver!r}, which cannot be simulated")
 
 

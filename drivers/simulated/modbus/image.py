@@ -8,7 +8,7 @@ from gapbridge.drivers.modbus.encode import vector_registers
 from gapbridge.drivers.modbus.profile import addresses, spans, turns_of
 from gapbridge.drivers.modbus.registers import BIT_TABLES, UNITS, Table
 from gapbridge.drivers.modbus.schema import Clock, Condition, Place, ProfileFile, Trouble, Vector
-from gapbridge.drivers.simulated.peer.peer import Peer
+from gapbridge.drivers.simulated.server.arm_controller import ArmController
 
 Image = dict[Table, dict[int, int]]
 TABLES: tuple[Table, ...] = ("coil", "discrete", "holding", "input")
@@ -25,12 +25,12 @@ def blank(profile: ProfileFile) -> Image:
     return found
 
 
-def readings(peer: Peer) -> dict[str, Sequence[float]]:
+def readings(controller: ArmController) -> dict[str, Sequence[float]]:
     """Return the state by the profile's names, SI."""
     return {
-        "position": peer.q, "velocity": peer.qd, "target": peer.target_q,
-        "joint_torque": peer.joint_torque, "temperature": peer.temperatures,
-        "force": peer.tcp_force[:3], "moment": peer.tcp_force[3:],
+        "position": controller.q, "velocity": controller.qd, "target": controller.target_q,
+        "joint_torque": controller.joint_torque, "temperature": controller.temperatures,
+        "force": controller.tcp_force[:3], "moment": controller.tcp_force[3:],
     }  # fmt: skip
 
 

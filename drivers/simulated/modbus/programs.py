@@ -11,11 +11,11 @@ from gapbridge.drivers.modbus.profile import ECHO_WORDS, MAILBOX_WORDS, addresse
 from gapbridge.drivers.modbus.registers import UNITS, Table
 from gapbridge.drivers.modbus.schema import Condition, Mailbox, ProfileFile, TargetTrigger
 from gapbridge.drivers.simulated.modbus.image import bad
-from gapbridge.drivers.simulated.peer.bench import BenchError
-from gapbridge.drivers.simulated.peer.peer import BRAKING, HOLD, Peer
 from gapbridge.drivers.simulated.plant.kinematics import Joints, offset_frame, solve, tcp_in_base
 from gapbridge.drivers.simulated.plant.motion import Hold, Stop
 from gapbridge.drivers.simulated.plant.plant_settings import Vector6
+from gapbridge.drivers.simulated.server.arm_controller import BRAKING, HOLD, ArmController
+from gapbridge.drivers.simulated.server.bench import BenchError
 from gapbridge.drivers.simulated.ur.programs.offset_program import (
     NOTHING,
     SHIFT_STEP,
@@ -32,13 +32,15 @@ Read = Callable[[Table, int, int], list[int]]
 class RobotProgram(Protocol):
     """What runs on the robot beside its own motion; stepped once per cycle."""
 
-    def wrote(self, peer: Peer, table: Table, address: int, values: Sequence[int]) -> None:
+    def wrote(
+        self, controller: ArmController, table: Table, address: int, values: Sequence[int]
+    ) -> None:
         """Take note of a client's write."""
 
-    def cycle(self, peer: Peer, read: Read) -> None:
+    def cycle(self, controller: ArmController, read: Read) -> None:
         """Act on what has been written."""
 
-    def registers(self, peer: Peer) -> list[tuple[Table, int, int]]:
+    def registers(self, controller: ArmController) -> list[tuple[Table, int, int]]:
         """Return table, address and register of the program's answers."""
         ...
 
@@ -46,13 +48,15 @@ class RobotProgram(Protocol):
 class NoProgram:
     """Nothing is ever applied."""
 
-    def wrote(self, peer: Peer, table: Table, address: int, values: Sequence[int]) -> None:
+    def wrote(
+        self, controller: ArmController, table: Table, address: int, values: Sequence[int]
+    ) -> None:
         """Do nothing."""
 
-    def cycle(self, peer: Peer, read: Read) -> None:
+    def cycle(self, controller: ArmController, read: Read) -> None:
         """Do nothing."""
 
-    def registers(self, peer: Peer) -> list[tuple[Table, int, int]]:
+    def registers(self, controller: ArmController) -> list[tuple[Table, int, int]]:
         """Return nothing."""
         return []
 
@@ -80,27 +84,29 @@ class MailboxProgram:
         self._state = encode.EXPIRED
         self._solved: tuple[Joints, Vector6] | None = None  # what joint offsets were found for
 
-    def wrote(self, peer: Peer, table: Table, address: int, values: Sequence[int]) -> None:
+    def wrote(
+        self, controller: ArmController, table: Table, address: int, values: Sequence[int]
+    ) -> None:
         """Do nothing: the program polls its registers."""
 
-    def cycle(self, peer: Peer, read: Read) -> None:
+    def cycle(self, controller: ArmController, read: Read) -> None:
         """Read the mailbox, and move the applied offset towards the one wanted."""
-        if not peer.can_move:  # a stop ends the program's part: the arm stays where it is
+        if not controller.can_move:  # a stop ends the program's part: the arm stays where it is
             self._wanted = self.applied = NOTHING
         elif self.running:
-            self._take(read(self._box.table, self._box.address, MAILBOX_WORDS), peer.period)
+            self._take(read(self._box.table, self._box.address, MAILBOX_WORDS), controller.period)
         else:
             self._wanted, self._alive, self._heartbeat = NOTHING, False, None
         shift, turn = self._rates
         self.applied = approach(
             self.applied, self._wanted,
-            (min(shift * peer.period, SHIFT_STEP), min(turn * peer.period, TURN_STEP)),
+            (min(shift * controller.period, SHIFT_STEP), min(turn * controller.period, TURN_STEP)),
         )  # fmt: skip
-        self._apply(peer)
+        self._apply(controller)
 
     def _take(self, words: list[int], dt: float) -> None:
-        *body, said = words
-        if encode.checksum(body) != said:
+        *body, reported_value = words
+        if encode.checksum(body) != reported_value:
             self._state = encode.REJECTED if any(words) else encode.EXPIRED
             self._silent += dt
         else:
@@ -122,26 +128,26 @@ class MailboxProgram:
             self._state, self._wanted, self._sequence = encode.EXPIRED, NOTHING, 0
             self._alive = False
 
-    def _apply(self, peer: Peer) -> None:
+    def _apply(self, controller: ArmController) -> None:
         if self.applied == NOTHING:
-            if any(peer.joint_offset):
-                peer.offset_by((0.0,) * peer.n)
+            if any(controller.joint_offset):
+                controller.offset_by((0.0,) * controller.n)
             self._solved = None
             return
-        if (peer.own_q, self.applied) == self._solved:
+        if (controller.own_q, self.applied) == self._solved:
             return
-        arm, tool = peer.plant.arm, peer.declared.tool
-        self._solved = (peer.own_q, self.applied)
-        wanted = offset_frame(tcp_in_base(arm, peer.own_q, tool), self.applied)
-        near = tuple(a + b for a, b in zip(peer.own_q, peer.joint_offset, strict=True))
+        arm, tool = controller.plant.arm, controller.declared.tool
+        self._solved = (controller.own_q, self.applied)
+        wanted = offset_frame(tcp_in_base(arm, controller.own_q, tool), self.applied)
+        near = tuple(a + b for a, b in zip(controller.own_q, controller.joint_offset, strict=True))
         found = solve(arm, wanted, near, tool, steps=20)
         if found is None:
             log.warning("no joints for the offset pose")
-            peer.protective_stop()
+            controller.protective_stop()
             return
-        peer.offset_by([a - b for a, b in zip(found, peer.own_q, strict=True)])
+        controller.offset_by([a - b for a, b in zip(found, controller.own_q, strict=True)])
 
-    def registers(self, peer: Peer) -> list[tuple[Table, int, int]]:
+    def registers(self, controller: ArmController) -> list[tuple[Table, int, int]]:
         """Return the eight registers of the answer."""
         box = self._box
         words = [0] * ECHO_WORDS
@@ -161,7 +167,9 @@ class TargetProgram:
         self._refused = False
         self._done = 0
 
-    def wrote(self, peer: Peer, table: Table, address: int, values: Sequence[int]) -> None:
+    def wrote(
+        self, controller: ArmController, table: Table, address: int, values: Sequence[int]
+    ) -> None:
         """Follow the orders of the trigger, in turn; a stop brakes."""
         trigger, stop = self._entry.trigger, self._entry.stop
         for i, value in enumerate(values):
@@ -173,9 +181,9 @@ class TargetProgram:
             if stop and (table, address + i, value) == (
                 stop[-1].table, stop[-1].address, int(stop[-1].value),
             ):  # fmt: skip
-                self._due, peer.motion = False, Stop(peer.target_qd, BRAKING)
+                self._due, controller.motion = False, Stop(controller.target_qd, BRAKING)
 
-    def cycle(self, peer: Peer, read: Read) -> None:
+    def cycle(self, controller: ArmController, read: Read) -> None:
         """Start the motion that was triggered."""
         if not self._due:
             return
@@ -188,16 +196,16 @@ class TargetProgram:
             for a in addresses(entry, self._profile.joints)
         ]
         try:
-            peer.move_own(tuple(count * size for count in counts))
+            controller.move_own(tuple(count * size for count in counts))
             self._refused = False
             self._done += 1
         except BenchError as error:
             log.warning("target refused: %s", error)
             self._refused = True
 
-    def registers(self, peer: Peer) -> list[tuple[Table, int, int]]:
+    def registers(self, controller: ArmController) -> list[tuple[Table, int, int]]:
         """Return whether a motion runs, and what the last one came to."""
-        moving = not (isinstance(peer.motion, Hold) or peer.motion is HOLD)
+        moving = not (isinstance(controller.motion, Hold) or controller.motion is HOLD)
         found: list[tuple[Table, int, int]] = []
         busy, result = self._entry.busy, self._entry.result
         if busy is not None:

@@ -1,6 +1,6 @@
-"""A Modbus server for any profile, with a Peer behind it: pymodbus's own server in a thread.
+"""A Modbus server for any profile, before an ArmController: pymodbus's own server in a thread.
 
-The peer's loop lays out an image of all registers each time the controller would renew them; a
+The server loop lays out an image of all registers each time the controller would renew them; a
 request is answered from one whole image. What clients write is kept in order and acted on in the
 peer's next cycle, as a controller's scan does.
 """
@@ -27,9 +27,9 @@ from gapbridge.drivers.modbus.settings import ModbusSettings
 from gapbridge.drivers.simulated.modbus import image
 from gapbridge.drivers.simulated.modbus.image import Image
 from gapbridge.drivers.simulated.modbus.programs import MailboxProgram, make_program
-from gapbridge.drivers.simulated.peer.bench import Command
-from gapbridge.drivers.simulated.peer.peer import Peer
-from gapbridge.drivers.simulated.peer.peer_server import PeerServer
+from gapbridge.drivers.simulated.server.arm_controller import ArmController
+from gapbridge.drivers.simulated.server.bench import Command
+from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
 
 FUNCTIONS: dict[int, Table] = {
     1: "coil", 5: "coil", 15: "coil", 2: "discrete", 4: "input",
@@ -41,7 +41,7 @@ TORN_APART = 2.0  # rad between the two moments that a torn image mixes
 MOST_WRITES = 10000  # kept between two cycles
 
 
-class ModbusServer(PeerServer):
+class ModbusServer(ProtocolServer):
     """One device with a profile's map, over TCP, TLS or a serial port."""
 
     def __init__(
@@ -63,7 +63,7 @@ class ModbusServer(PeerServer):
         self._queue: deque[tuple[Table, int, list[int]]] = deque(maxlen=MOST_WRITES)
         self._due = 0.0
         self._torn = 0  # images still to be torn
-        self._peer: Peer | None = None
+        self._controller: ArmController | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._server: Any = None
         self._thread: threading.Thread | None = None
@@ -72,10 +72,10 @@ class ModbusServer(PeerServer):
 
     # -- the thread -------------------------------------------------------------------------------
 
-    def open(self, peer: Peer) -> None:
+    def open(self, controller: ArmController) -> None:
         """Start serving. Raises LinkError where the port is taken."""
-        self._peer, self._failure = peer, None
-        self._publish(peer)
+        self._controller, self._failure = controller, None
+        self._publish(controller)
         listening = threading.Event()
         self._thread = threading.Thread(
             target=self._run, args=(listening,), daemon=True, name="simulated Modbus"
@@ -132,8 +132,8 @@ class ModbusServer(PeerServer):
         values: list[int] | list[bool] | None,
     ) -> None:  # fmt: skip
         """Fill the library's registers from the image for a reading; queue what is written."""
-        peer = self._peer
-        while peer is not None and peer.stalled:
+        controller = self._controller
+        while controller is not None and controller.stalled:
             await asyncio.sleep(0.005)
         table = FUNCTIONS[function]
         if values is not None and function in WRITES:
@@ -180,36 +180,38 @@ class ModbusServer(PeerServer):
 
     # -- the controller's scan --------------------------------------------------------------------
 
-    def cycle(self, peer: Peer) -> None:
+    def cycle(self, controller: ArmController) -> None:
         """Take what was written, step the robot's program, renew the image where it is time."""
         while self._queue:
             table, address, values = self._queue.popleft()
             allowed = {a: v for a, v in enumerate(values, address) if (table, a) in self._writable}
             self._written[table].update(allowed)
-            self.program.wrote(peer, table, address, values)
-        self.program.cycle(peer, self._read_written)
-        if peer.running >= self._due:
-            self._due = max(self._due + self.profile.period, peer.running)
-            self._publish(peer)
+            self.program.wrote(controller, table, address, values)
+        self.program.cycle(controller, self._read_written)
+        if controller.running >= self._due:
+            self._due = max(self._due + self.profile.period, controller.running)
+            self._publish(controller)
 
     def _read_written(self, table: Table, address: int, count: int) -> list[int]:
         return [self._written[table].get(a, 0) for a in range(address, address + count)]
 
-    def _publish(self, peer: Peer) -> None:
+    def _publish(self, controller: ArmController) -> None:
         """Lay out a new image in one step."""
         profile = self.profile
         new: Image = {table: dict(registers) for table, registers in self._written.items()}
-        values = image.readings(peer)
+        values = image.readings(controller)
         for table, registers in image.state_registers(profile, values).items():
             new[table].update(registers)
-        found = image.condition_registers([*profile.identity, *profile.status], _troubles(peer))
-        found += image.clock_registers(profile, peer.clock)
-        found += self.program.registers(peer)
+        found = image.condition_registers(
+            [*profile.identity, *profile.status], _troubles(controller)
+        )
+        found += image.clock_registers(profile, controller.clock)
+        found += self.program.registers(controller)
         for table, address, register in found:
             new[table][address] = register
         if self._torn > 0:
             self._torn -= 1
-            apart = tuple(q + TORN_APART for q in peer.q)
+            apart = tuple(q + TORN_APART for q in controller.q)
             image.tear(profile, new, image.state_registers(profile, {"position": apart}))
         self._image = new
 
@@ -219,7 +221,7 @@ class ModbusServer(PeerServer):
 
     # -- the bench --------------------------------------------------------------------------------
 
-    def commands(self, peer: Peer) -> Mapping[str, Command]:
+    def commands(self, controller: ArmController) -> Mapping[str, Command]:
         """Return bench commands for faults of this protocol."""
 
         def tear(numbers: list[float]) -> str:
@@ -237,21 +239,23 @@ class ModbusServer(PeerServer):
         }
 
 
-def _troubles(peer: Peer) -> frozenset[Trouble]:
+def _troubles(controller: ArmController) -> frozenset[Trouble]:
     found: set[Trouble] = set()
-    if peer.protective:
+    if controller.protective:
         found |= {"protective_stop", "fault"}
-    if peer.emergency:
+    if controller.emergency:
         found |= {"emergency_stop", "not_ready"}
     return frozenset(found)
 
 
-def make_servers(settings: ModbusSettings, host: str, peer: Peer) -> list[PeerServer]:
+def make_servers(
+    settings: ModbusSettings, host: str, controller: ArmController
+) -> list[ProtocolServer]:
     """Return the server of a cell's link. Raises InputError where its profile cannot be used.
 
     A link over TLS is served by plain TCP nowhere: it needs the server's key, which a cell has not.
     """
-    profile = read_profile(settings.profile_path, peer.n)
+    profile = read_profile(settings.profile_path, controller.n)
     if settings.transport == "tls":
         raise LinkError(
             "link.transport: found tls, expected tcp or rtu: a cell holds no server key"

@@ -1,4 +1,4 @@
-"""What the controller has been told: tool, payload, gravity. The plant may be another thing."""
+"""What the controller has been given: tool, payload, gravity. The plant may be another thing."""
 
 from __future__ import annotations
 

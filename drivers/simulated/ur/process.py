@@ -82,11 +82,11 @@ class SimulatedController:
         except queue.Empty:
             line = ""
         if not line.startswith("ready"):
-            words = self.log().strip().splitlines()
+            message = self.log().strip().splitlines()
             self.stop()
             raise LinkError(
                 f"the simulated controller on {self.host} did not start: "
-                f"{words[-1] if words else 'no message'}"
+                f"{message[-1] if message else 'no message'}"
             )
 
     def stop(self) -> int:

@@ -29,7 +29,7 @@ class ServerSettings:
     """One simulated controller.
 
     start_q: joints at power-on (6,), rad.
-    declare: whether the controller is told the plant's true TCP and payload at the start.
+    declare: whether the controller is given the plant's true TCP and payload at the start.
     version: announced to clients: major, minor, bugfix.
     nominal, calibrated: DH rows (theta, a, d, alpha) that the primary interface announces; empty:
     none.

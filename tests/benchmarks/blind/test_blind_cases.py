@@ -21,7 +21,7 @@ def read(folder):
 
 
 @pytest.mark.parametrize("kind", ALL)
-def test_every_kind_can_be_drawn_and_its_folder_tells_nothing(kind, tmp_path):
+def test_every_kind_can_be_drawn_and_its_folder_shows_nothing(kind, tmp_path):
     label = make_case(kind, 11, tmp_path)
     names = {p.name for p in tmp_path.iterdir()}
     assert {"log.csv", "cell.yaml"} <= names <= {"log.csv", "cell.yaml", "robot.urdf"}
@@ -92,7 +92,7 @@ def test_the_noise_of_clean_data_is_the_floor_of_the_label(tmp_path):
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.04)
 
 
-def test_hard_data_hold_wild_readings(tmp_path):
+def test_hard_data_hold_outlier_readings(tmp_path):
     from benchmarks.blind.cases import draw_case, generator_of
     from benchmarks.blind.special_cases import wild_readings
 

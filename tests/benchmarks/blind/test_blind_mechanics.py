@@ -47,7 +47,7 @@ def test_one_soft_joint_hangs_where_moment_and_spring_agree():
 
 def test_a_stiffening_joint_follows_its_curve():
     length, mass, soft, knee = 0.5, 20.0, 1e-3, 40.0
-    arm = planar([length], bent={0: (soft, knee)})
+    arm = planar([length], deflected={0: (soft, knee)})
 
     def off(t):
         moment = -mass * G * length * np.cos(t)

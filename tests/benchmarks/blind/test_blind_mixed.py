@@ -53,10 +53,10 @@ def test_the_first_order_of_the_remainder_may_be_accused(label):
 def test_the_remainder_of_a_region_not_shown_is_what_the_model_leaves_there(label):
     none, known = true_beyond(label, []), true_beyond(label, true_causes(label))
     assert none > known > label.floor_rms
-    told = answer(label, true_causes(label), structured=True)
-    told["channels"][0]["remaining_rms_new_region"] = known
-    s = score(label, told)
-    assert s.told_beyond == pytest.approx(s.true_beyond)
+    reported = answer(label, true_causes(label), structured=True)
+    reported["channels"][0]["remaining_rms_new_region"] = known
+    s = score(label, reported)
+    assert s.reported_beyond == pytest.approx(s.true_beyond)
 
 
 def test_whole_regions_of_joint_space_are_kept_back(label):

@@ -58,7 +58,7 @@ def test_the_tables_say_what_is_reached():
     assert "joint_offset 0.5" in text
 
 
-def test_the_page_needs_nothing_else_and_escapes_what_was_said(tmp_path):
+def test_the_page_needs_nothing_else_and_escapes_what_was_reported(tmp_path):
     scores = [*SCORES, a_score(outcome="failed", named=(), message="<script>alert(1)</script>")]
     write_page(tmp_path / "blind.html", scores, "A run")
     text = (tmp_path / "blind.html").read_text(encoding="utf-8")

@@ -18,7 +18,7 @@ def test_the_true_cause_with_its_joints_and_values_is_right(case):
     assert got.remainder == pytest.approx(1.0)
 
 
-def test_the_right_effect_at_the_wrong_joint_is_told_apart(case):
+def test_the_right_effect_at_the_wrong_joint_is_separated(case):
     label = case("joint_offset", 2)
     joint = label.causes[0].joints[0]
     other = joint - 1 if joint > 2 else joint + 1
@@ -56,7 +56,7 @@ def isotropic_base(case):
     raise AssertionError("no isotropic base in 60 draws")
 
 
-def test_a_true_twin_with_the_tie_told_is_right(case):
+def test_a_true_twin_with_the_tie_reported_is_right(case):
     label = isotropic_base(case)
     twin = cause("radial_compliance", [1], ties=["base_compliance"])
     assert score(label, answer(label, [twin])).outcome == "right_tie"
@@ -102,25 +102,25 @@ def test_an_effect_outside_the_catalogue_must_be_owned_up(case):
 
 def test_what_it_depends_on_counts_among_the_first_three_only(case):
     label = case("outside:tool_plate")
-    told = ["actual_q_0", "actual_q_1", "actual_q_2", "payload"]
-    assert score(label, answer(label, structured=True, depends=told)).depends_right is False
+    reported = ["actual_q_0", "actual_q_1", "actual_q_2", "payload"]
+    assert score(label, answer(label, structured=True, depends=reported)).depends_right is False
 
 
 def test_a_withheld_effect_must_be_owned_up_too(case):
     label = case("withheld:backlash")
     assert label.withhold == ("backlash",)
     joint = label.causes[0].joints[0]
-    told = [f"approach_{joint - 1}"]
-    got = score(label, answer(label, structured=True, depends=told))
+    reported = [f"approach_{joint - 1}"]
+    got = score(label, answer(label, structured=True, depends=reported))
     assert (got.outcome, got.depends_right) == ("right", True)
 
 
 def test_what_a_withheld_effect_depends_on_is_found_by_shuffling(case):
     label = case("withheld:axial_compliance", 2)
-    told = answer(label, structured=True, depends=["joint_temperatures_1", "approach_2"])
-    assert score(label, told).depends_right is False
-    told = answer(label, structured=True, depends=["approach_2", "actual_q_1", "actual_q_2"])
-    assert score(label, told).depends_right is True
+    reported = answer(label, structured=True, depends=["joint_temperatures_1", "approach_2"])
+    assert score(label, reported).depends_right is False
+    reported = answer(label, structured=True, depends=["approach_2", "actual_q_1", "actual_q_2"])
+    assert score(label, reported).depends_right is True
 
 
 def test_a_twin_may_be_named_for_a_withheld_effect(tmp_path):
@@ -133,11 +133,11 @@ def test_a_twin_may_be_named_for_a_withheld_effect(tmp_path):
     assert got.outcome == "right_tie"
 
 
-def test_play_that_is_never_reversed_is_an_offset_as_long_as_the_tie_is_told(case):
+def test_play_that_is_never_reversed_is_an_offset_as_long_as_the_tie_is_reported(case):
     label = case("bad:no_reversals")
     joints = label.causes[0].joints
-    told = cause("joint_offset", joints, ties=["backlash"])
-    assert score(label, answer(label, [told])).outcome == "right_tie"
+    reported = cause("joint_offset", joints, ties=["backlash"])
+    assert score(label, answer(label, [reported])).outcome == "right_tie"
     assert score(label, answer(label)).outcome == "abstained"
 
 
@@ -156,7 +156,7 @@ def test_other_channels_are_scored_alike(case, kind):
         assert blamed.outcome == "wrong"
 
 
-def test_a_delay_of_the_whole_arm_may_be_told_joint_by_joint_or_of_the_arm(tmp_path):
+def test_a_delay_of_the_whole_arm_may_be_reported_joint_by_joint_or_of_the_arm(tmp_path):
     for seed in range(10):
         label = make_case("tracking:latency", seed, tmp_path)
         if len(label.causes[0].joints) >= 6:

@@ -39,12 +39,14 @@ def test_the_compliance_of_a_real_arm_brings_unseen_poses_nearer():
     assert rms(after) < 0.95 * rms(before)
 
 
-def test_the_page_tells_the_reason_where_fit_declines(capsys):
+def test_the_page_shows_the_reason_where_fit_declines(capsys):
     cell, log = opened("barrett_wam_grid")
     measured.compare(cell.model, *measured.split(log), cell.metrology)
-    told = capsys.readouterr().out
-    assert told.count("fit declines: nothing in the log excites the compliance") == 2
-    assert "the arm's links have no mass in the cell, and no payload or pull is in the log" in told
+    reported = capsys.readouterr().out
+    assert reported.count("fit declines: nothing in the log excites the compliance") == 2
+    assert (
+        "the arm's links have no mass in the cell, and no payload or pull is in the log" in reported
+    )
 
 
 def test_published_figures_stand_beside():

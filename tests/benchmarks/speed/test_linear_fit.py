@@ -45,13 +45,13 @@ def test_the_fit_is_that_of_the_stored_rows(factored):
     assert found.note == ""
 
 
-def test_rows_that_hardly_differ_are_factored_and_told():
+def test_rows_that_hardly_differ_are_factored_and_reported():
     q, loads, gap = rows_of(800, spread=2e-4)
     assert loads.wrench is not None
     loads = Loads(wrench=1e-3 * loads.wrench)
     found = fit_linear(model_of(), q, loads, gap)
     assert found.factored
-    assert "hardly tell" in found.note
+    assert "hardly determine" in found.note
     stored = model_of().linear_form(q, loads).regressor[:, :3].reshape(-1, 12)
     unit = 1 / np.linalg.norm(stored, axis=0)
     expected = unit * lstsq(stored * unit, gap.ravel())[0]
@@ -77,9 +77,9 @@ def test_memory_does_not_grow_with_the_rows():
 
 def test_links_that_bend_are_refused():
     q, loads, gap = rows_of(10)
-    bent = model_of().with_terms([Term("link_flexibility", Site(2), (1e-6,))])
+    deflected = model_of().with_terms([Term("link_flexibility", Site(2), (1e-6,))])
     with pytest.raises(InputError, match="link that bends itself"):
-        fit_linear(bent, q, loads, gap)
+        fit_linear(deflected, q, loads, gap)
 
 
 def test_first_order_is_the_linear_form_and_near_the_exact_correction():

@@ -62,11 +62,11 @@ def test_the_examples_of_the_page_run(desk: Path, monkeypatch: pytest.MonkeyPatc
     assert len(blocks) == 5
     for block in blocks:
         exec(compile(block, str(PAGE), "exec"), names)
-    found, told = names["found"], names["told"]
+    found, reported = names["found"], names["reported"]
     assert isinstance(found, api.Fitted)
-    assert isinstance(told, api.Diagnosed)
+    assert isinstance(reported, api.Diagnosed)
     assert found.remaining_rms < 0.1 * found.gap_rms
-    json.dumps([found.to_json(), told.to_json()], allow_nan=False)
+    json.dumps([found.to_json(), reported.to_json()], allow_nan=False)
     assert (desk / "diagnosed.yaml").exists()
     driver, wanted = names["driver"], names["wanted"]
     assert 1e-5 < np.abs(driver.q - wanted).max() < 0.01  # type: ignore[attr-defined]

@@ -47,12 +47,12 @@ class Hands:
             link.sendall(program.encode())
             time.sleep(0.1)
 
-    def hang(self, mass: float, cog: tuple[float, float, float], tell: bool = True) -> None:
+    def hang(self, mass: float, cog: tuple[float, float, float], emit: bool = True) -> None:
         numbers = " ".join(f"{v:.6g}" for v in (mass, *cog))
         self.bench(f"payload {numbers}")
-        if tell:
-            told = ",".join(f"{v:.6g}" for v in cog)
-            self.pendant(f"def hang():\n  set_payload({mass:.6g}, [{told}])\nend\n")
+        if emit:
+            reported = ",".join(f"{v:.6g}" for v in cog)
+            self.pendant(f"def hang():\n  set_payload({mass:.6g}, [{reported}])\nend\n")
 
     def jog(self, q: Array) -> None:
         numbers = ",".join(f"{v:.9g}" for v in q)
@@ -145,6 +145,6 @@ class Terminal:
 
 
 def last_pose(shown: str) -> Array:
-    """Return the joints (n,), rad, that were told last."""
+    """Return the joints (n,), rad, that were commanded last."""
     line = next(part for part in reversed(shown.splitlines()) if "J1 " in part)
     return np.radians([float(v) for v in JOINT.findall(line)])

@@ -1,4 +1,4 @@
-"""A session that ends with the fit that its readings ask for: told, asked, fitted, written."""
+"""A session that ends with the fit that its readings ask for: reported, asked, fitted, written."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def waving() -> Model:
     return truth().with_terms([WAVE])
 
 
-def told(plan: Plan) -> list[str]:
+def reported(plan: Plan) -> list[str]:
     """Return what a tracker reads at each stop, as a person types it."""
     found = there(plan) + np.random.default_rng(4).normal(0, 2e-5, (len(plan.poses), 3))
     return [typed(v) for v in found @ FRAME.rotation.T + FRAME.position]
@@ -45,14 +45,14 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Played]:
     cell = write_cell(folder, poses=18)
     assert play(cell, "--plan-only", "--session", folder / "s").code == 0
     plan = plan_in(folder / "s")
-    lines = [*script(plan, told(plan)), "yes", "yes"]
+    lines = [*script(plan, reported(plan)), "yes", "yes"]
     return folder, play(
         cell, "--session", folder / "s", "--apply", folder / "new.yaml", lines=lines
     )
 
 
 @pytest.mark.slow
-def test_what_is_lacking_is_offered_and_fitted_on_a_yes(ended: tuple[Path, Played]) -> None:
+def test_what_is_missing_is_offered_and_fitted_on_a_yes(ended: tuple[Path, Played]) -> None:
     folder, played = ended
     assert played.code == 0, played.err
     assert "poses ask for transmission_error_2 as well. Fit again with it?" in played.out
@@ -68,8 +68,8 @@ def test_what_is_lacking_is_offered_and_fitted_on_a_yes(ended: tuple[Path, Playe
 def test_the_cell_that_comes_of_it_predicts_the_arm(ended: tuple[Path, Played]) -> None:
     folder, _ = ended
     plan = plan_in(folder / "s")
-    said = there(plan, load_cell(folder / "new.yaml").model)
-    off = np.linalg.norm(register(there(plan), said).in_base(there(plan)) - said, axis=1)
+    predicted = there(plan, load_cell(folder / "new.yaml").model)
+    off = np.linalg.norm(register(there(plan), predicted).in_base(there(plan)) - predicted, axis=1)
     assert off.max() < 1e-4
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from played import FRAME, plan_in, play, positions, typed, write_cell
 
-from gapbridge.bridge.calibration.options import Order
+from gapbridge.bridge.calibration.options import SessionOptions
 from gapbridge.bridge.calibration.planning import planned, space_of
 from gapbridge.bridge.calibration.session.journal import FILE, read_entries
 from gapbridge.bridge.cell import load_cell
@@ -27,8 +27,8 @@ def cell_with(folder: Path, *lines: str, **changed: object) -> Path:
 
 def plan_with(folder: Path, *lines: str, **changed: object) -> tuple[Plan, Model]:
     cell = load_cell(cell_with(folder, *lines, **changed))
-    order = Order("whole", None, cell.calibration.instrument)
-    return planned(cell, order, lambda text, share: None), cell.model
+    options = SessionOptions("whole", None, cell.calibration.instrument)
+    return planned(cell, options, lambda text, share: None), cell.model
 
 
 def test_poses_that_turn_the_reflector_away_are_not_planned(tmp_path: Path) -> None:
@@ -105,7 +105,7 @@ def test_a_tip_on_one_point_is_planned_and_needs_its_place(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("lines", "changed", "words"),
+    ("lines", "changed", "phrase"),
     [
         ([], {"instrument": "{kind: point}"}, "expected where the point is"),
         (["further_places: [[1, 2, 3]]"], {}, "found nothing beside further_places"),
@@ -127,13 +127,13 @@ def test_a_tip_on_one_point_is_planned_and_needs_its_place(tmp_path: Path) -> No
     ],
 )  # fmt: skip
 def test_what_cannot_be_meant_is_refused_in_one_line(
-    tmp_path: Path, lines: list[str], changed: dict[str, object], words: str
+    tmp_path: Path, lines: list[str], changed: dict[str, object], phrase: str
 ) -> None:
     played = play(
         cell_with(tmp_path, *lines, **changed), "--plan-only", "--session", tmp_path / "s"
     )
     assert played.code == 2
-    assert words in played.err
+    assert phrase in played.err
     assert played.err.count("\n") == 1
 
 

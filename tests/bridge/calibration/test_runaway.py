@@ -13,9 +13,9 @@ def errors(size: float, count: int = 4) -> Errors:
 
 
 def test_a_fit_that_is_worse_on_unseen_poses_is_refused_with_both_figures() -> None:
-    said = worse_than_before(errors(1e-3), errors(2e-2))
-    assert said is not None
-    assert "from 1.732 to 34.641 mm rms: nothing is applied" in said
+    reason = worse_than_before(errors(1e-3), errors(2e-2))
+    assert reason is not None
+    assert "from 1.732 to 34.641 mm rms: nothing is applied" in reason
 
 
 def test_a_better_fit_is_not_refused_nor_one_without_held_out_poses() -> None:

@@ -49,8 +49,8 @@ def remaining(cell: Path, plan_folder: Path) -> np.ndarray:
 
     loads = Loads(payload_mass=mass, payload_cog=cog)
     there = truth().predict(q, loads).position
-    said = load_cell(cell).model.predict(q, loads).position
-    return np.linalg.norm(register(there, said).in_base(there) - said, axis=1)
+    predicted = load_cell(cell).model.predict(q, loads).position
+    return np.linalg.norm(register(there, predicted).in_base(there) - predicted, axis=1)
 
 
 def test_a_session_ends_with_a_cell_that_knows_the_arm(clean: tuple[Path, Played]) -> None:
@@ -146,7 +146,7 @@ def _same_within_intervals(one: Path, other: Path) -> None:
     assert (np.abs(a.values - b.values) < 3.5 * spread).all()
 
 
-def test_an_ended_input_and_quit_end_in_order_and_tell_how_to_go_on(tmp_path: Path) -> None:
+def test_an_ended_input_and_quit_end_in_order_and_show_how_to_go_on(tmp_path: Path) -> None:
     cell = write_cell(tmp_path)
     play(cell, "--plan-only", "--session", tmp_path / "s")
     value = typed(positions(plan_in(tmp_path / "s"))[0])
@@ -160,7 +160,7 @@ def test_an_ended_input_and_quit_end_in_order_and_tell_how_to_go_on(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("arguments", "changed", "words"),
+    ("arguments", "changed", "phrase"),
     [
         (["--instrument", "typd"], {}, "--instrument: found 'typd', expected one of typed"),
         (["--instrument", "typed,unit=km"], {}, "--instrument typed: unit"),
@@ -175,12 +175,12 @@ def test_an_ended_input_and_quit_end_in_order_and_tell_how_to_go_on(tmp_path: Pa
     ],
 )
 def test_unusable_input_is_refused_in_one_line(
-    tmp_path: Path, arguments: list[str], changed: dict[str, object], words: str
+    tmp_path: Path, arguments: list[str], changed: dict[str, object], phrase: str
 ) -> None:
     cell = write_cell(tmp_path, **{"poses": 12, **changed})
     played = play(cell, "--session", tmp_path / "s", *arguments)
     assert played.code == 2, played
-    assert words in played.err
+    assert phrase in played.err
     assert played.err.count("\n") == 1
     assert "Traceback" not in played.err
 
@@ -201,11 +201,11 @@ def test_a_session_goes_on_only_with_the_cell_it_was_begun_for(
     assert "found readings of kind position, expected distance" in played.err
 
 
-def test_months_later_the_calibration_holds_and_a_bent_tool_is_seen(
+def test_months_later_the_calibration_holds_and_a_deflected_tool_is_seen(
     clean: tuple[Path, Played], tmp_path: Path
 ) -> None:
     cell = clean[0] / "new.yaml"
-    for bend, words in ((0.0, "holds"), (0.004, "tool")):
+    for bend, phrase in ((0.0, "holds"), (0.004, "tool")):
         session = tmp_path / f"v{bend:g}"
         assert play(cell, "--verify", "--plan-only", "--session", session).code == 0
         plan = plan_in(session)
@@ -215,7 +215,7 @@ def test_months_later_the_calibration_holds_and_a_bent_tool_is_seen(
         played = play(cell, "--verify", "--session", session, lines=lines)
         assert played.code == 0, played.err + played.out[-1500:]
         assert (session / "verification.html").exists()
-        assert words in played.out.lower()
+        assert phrase in played.out.lower()
         holds = next(e for e in read_entries(session / FILE) if e["kind"] == "ended")["holds"]
         assert holds is (bend == 0.0)
 

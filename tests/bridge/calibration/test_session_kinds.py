@@ -95,8 +95,8 @@ def finds_the_arm(session: Session, played: Played, of: str = "") -> None:
     assert load_cell(session.folder / "new.yaml").model.terms
     assert (session.folder / "s" / "calibration.html").exists()
     assert "kept" in played.out
-    told = json.loads((session.folder / "s" / "promise.json").read_text())
-    promise = promise_in(told)
+    reported = json.loads((session.folder / "s" / "promise.json").read_text())
+    promise = promise_in(reported)
     true = {**OFFSETS, **{f"axial_compliance_{i + 1}": c for i, c in enumerate(AXIAL)}}
     apart = promise.values - [true.get(name, 0.0) for name in promise.names]
     own = np.array([name.startswith(of) for name in promise.names])
@@ -162,7 +162,7 @@ def test_files_that_the_trackers_software_exports(tmp_path: Path) -> None:
 
 @pytest.fixture
 def feed() -> Iterator[tuple[int, list[np.ndarray]]]:
-    """Serve lines: a connection that asks is told the next of the readings, as often as it asks."""
+    """Serve lines: a connection that asks gets the next of the readings, as often as it asks."""
     values: list[np.ndarray] = []
     with socket.create_server(("127.0.0.1", 0)) as server:
         thread = threading.Thread(target=_serve, args=(server, values), daemon=True)
@@ -202,7 +202,7 @@ def test_lines_that_the_trackers_software_sends_on_demand(
     finds_the_arm(session, played)
 
 
-def test_what_touches_is_told_by_joints_that_somebody_read(tmp_path: Path) -> None:
+def test_what_touches_is_reported_by_joints_that_somebody_read(tmp_path: Path) -> None:
     session = begun(tmp_path, "{kind: point}", 12, at_the_point(), joints="typed")
     lines = ["", "", "", in_degrees(session.readings.q[0])]  # hung, seated, Enter for the joints
     played = play(session.cell, "--session", tmp_path / "s", lines=lines)

@@ -52,7 +52,7 @@ def test_payload_only_weighs_what_hangs_there(served: BenchHand, tmp_path: Path)
     cell = write_cell(tmp_path, "cell.yaml", served.hands.host, TRUE_TCP)
     new = tmp_path / "new.yaml"
     served.jog(BEGIN)
-    served.hands.hang(*LOAD, tell=False)  # the controller believes in nothing of the kind
+    served.hands.hang(*LOAD, emit=False)  # the controller believes in nothing of the kind
     with Terminal(cell, "--payload-only", "--session", tmp_path / "s", "--apply", new) as terminal:
         shown = lead(terminal, {
             "hangs there": "",
@@ -85,5 +85,5 @@ def test_tool_only_finds_the_tip_by_touching_one_point(served: BenchHand, tmp_pa
         })  # fmt: skip
         assert terminal.code == 0, shown[-2000:]
     found = load_cell(new).model.tool_in_flange[:3, 3]
-    np.testing.assert_allclose(found, TRUE_TCP, atol=2e-3)  # the arm bends, which is not told
+    np.testing.assert_allclose(found, TRUE_TCP, atol=2e-3)  # the arm bends, which no reading shows
     assert list((tmp_path / "s").glob("*.html"))

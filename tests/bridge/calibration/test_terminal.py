@@ -71,12 +71,12 @@ class Person:
         if question.startswith("x y z"):
             return self._reading()
         if question.startswith("what now"):
-            told = terminal.shown[terminal.shown.rfind("a good reading is within") :]
+            reported = terminal.shown[terminal.shown.rfind("a good reading is within") :]
             if "instrument and target stand where they stood" in terminal.shown[-1500:]:
                 return "keep"  # the arm has effects that this session does not fit
-            if "it is no slip" in told:
+            if "it is no slip" in reported:
                 return "back"
-            return "" if "alone is off" in told else "back"
+            return "" if "alone is off" in reported else "back"
         if question.startswith("which"):
             return ""
         assert "[yes/no]" in question, question
@@ -141,7 +141,7 @@ def test_a_person_with_mistakes_and_a_power_cut_ends_with_a_valid_cell(tmp_path:
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_the_arm_is_driven_after_a_yes_and_ctrl_c_tells_how_to_go_on(tmp_path: Path) -> None:
+def test_the_arm_is_driven_after_a_yes_and_ctrl_c_shows_how_to_go_on(tmp_path: Path) -> None:
     cell, host = write_cell(tmp_path, "{kind: simulated_tracker}", 8)
     # where the arm begins it hangs low: above a near floor no straight way would be free
     cell.write_text(cell.read_text().replace("floor: 0.1", "floor: -1.0"), encoding="utf-8")

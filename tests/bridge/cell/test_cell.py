@@ -22,7 +22,7 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def told(folder: Path, text: str) -> str:
+def reported(folder: Path, text: str) -> str:
     """The one line that a cell is refused with."""
     with pytest.raises((CellError, ArmError)) as caught:
         load_cell(written(folder, text))
@@ -101,7 +101,7 @@ def test_keys_with_nothing_behind_them_count_as_left_out(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "phrase"),
     [
         ("robot: {modle: ur10e}", "'modle' 'model'"),
         (ARM + "efects: []", "'efects' 'effects'"),
@@ -114,11 +114,11 @@ def test_keys_with_nothing_behind_them_count_as_left_out(tmp_path: Path) -> None
     ],
 )
 def test_an_unknown_key_is_named_with_the_nearest_known(
-    tmp_path: Path, text: str, words: str
+    tmp_path: Path, text: str, phrase: str
 ) -> None:
-    line = told(tmp_path, text)
+    line = reported(tmp_path, text)
     assert "unknown key" in line
-    for word in words.split():
+    for word in phrase.split():
         assert word in line
 
 
@@ -167,16 +167,16 @@ def test_an_unknown_key_is_named_with_the_nearest_known(
         ("5: 6\nrobot: {model: ur10e}", "a key 5", "a word"),
     ],
 )  # fmt: skip
-def test_a_wrong_value_is_told_with_what_was_expected(
+def test_a_wrong_value_is_reported_with_what_was_expected(
     tmp_path: Path, text: str, found: str, expected: str
 ) -> None:
-    line = told(tmp_path, text)
+    line = reported(tmp_path, text)
     assert found in line
     assert expected in line
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "phrase"),
     [
         ("robot: [1, 2", "line 1"),
         (ARM + "tool:\n\txyz: 1", "line 3"),
@@ -187,18 +187,18 @@ def test_a_wrong_value_is_told_with_what_was_expected(
         ("robot: &a [*a]", "robot"),
     ],
 )
-def test_broken_yaml_is_told_with_its_line(tmp_path: Path, text: str, words: str) -> None:
-    assert words in told(tmp_path, text)
+def test_broken_yaml_is_reported_with_its_line(tmp_path: Path, text: str, phrase: str) -> None:
+    assert phrase in reported(tmp_path, text)
 
 
-def test_a_missing_file_a_folder_and_bytes_are_told(tmp_path: Path) -> None:
+def test_a_missing_file_a_folder_and_bytes_are_reported(tmp_path: Path) -> None:
     (tmp_path / "bytes.yaml").write_bytes(b"\xff\xfe\x00\x81")
-    for path, words in (
+    for path, phrase in (
         (tmp_path / "none.yaml", "file not found"),
         (tmp_path, "found a folder"),
         (tmp_path / "bytes.yaml", "no text"),
     ):
-        with pytest.raises(CellError, match=words):
+        with pytest.raises(CellError, match=phrase):
             load_cell(path)
 
 
@@ -244,9 +244,11 @@ def test_a_factory_calibration_moves_the_arm_as_its_deltas_say(tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "phrase"),
     [("no ini", "cannot be read"), ("[a]\nb = 1", "none of"), ("[a]\ndelta_a = x", "a list")],
 )
-def test_a_calibration_that_cannot_be_used_is_told(tmp_path: Path, text: str, words: str) -> None:
+def test_a_calibration_that_cannot_be_used_is_reported(
+    tmp_path: Path, text: str, phrase: str
+) -> None:
     (tmp_path / "c.conf").write_text(text)
-    assert words in told(tmp_path, "robot: {model: ur10e, calibration: c.conf}")
+    assert phrase in reported(tmp_path, "robot: {model: ur10e, calibration: c.conf}")

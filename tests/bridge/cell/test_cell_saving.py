@@ -72,14 +72,14 @@ def test_comments_order_and_other_keys_stay(tmp_path: Path) -> None:
     cell = load_cell(cell_in(tmp_path))
     save_cell(cell, tmp_path / "new.yaml", cell.model.with_compliance([2e-6] * 7, [0] * 7))
     text = (tmp_path / "new.yaml").read_text()
-    for words in (
+    for phrase in (
         "# our cell, by the window",
         "urdf: arm.urdf  # as delivered",
         "{mass: 3.0, cog: [0, 0, 0.05]}  # weighed in May",
         "# a remark about the effects",
         "# the end",
     ):
-        assert words in text
+        assert phrase in text
     assert text.index("payload") < text.index("compliance") < text.index("effects")
     assert text.count("compliance:") == 1
 
@@ -144,8 +144,8 @@ def test_every_number_reads_back_exactly(value: float) -> None:
 def test_a_model_with_a_stiffening_joint_keeps_its_linear_part_apart(tmp_path: Path) -> None:
     cell = load_cell(cell_in(tmp_path))
     site = CATALOGUE["stiffness_nonlinearity"].sites(builtin_arm("ur10e"))[2]
-    bent = Term("stiffness_nonlinearity", site, (5e-6, 1e-4))
-    model = cell.model.without_terms().with_compliance([1e-6] * 7, [0] * 7).with_terms([bent])
+    deflected = Term("stiffness_nonlinearity", site, (5e-6, 1e-4))
+    model = cell.model.without_terms().with_compliance([1e-6] * 7, [0] * 7).with_terms([deflected])
     save_cell(cell, tmp_path / "new.yaml", model)
     again = load_cell(tmp_path / "new.yaml")
     assert again.file.compliance.axial == [1e-6] * 7

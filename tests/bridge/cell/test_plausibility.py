@@ -64,17 +64,17 @@ def test_what_cannot_be_meant_is_refused_with_its_line(
     path = written(tmp_path, text)
     with pytest.raises(CellError) as caught:
         load_cell(path)
-    told = str(caught.value)
-    assert told.startswith(f"{path}, line {line}: ")
-    assert "\n" not in told
-    said, wanted = told.split(", expected ")
-    assert key in said
-    assert found in said.split("found ")[1]
+    reported = str(caught.value)
+    assert reported.startswith(f"{path}, line {line}: ")
+    assert "\n" not in reported
+    output, wanted = reported.split(", expected ")
+    assert key in output
+    assert found in output.split("found ")[1]
     assert expected in wanted
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "phrase"),
     [
         (ARM + "gravity: [0, 0, 0]", "gravity"),
         (ARM + "gravity: [0, 0, -10]", "gravity"),
@@ -85,14 +85,14 @@ def test_what_cannot_be_meant_is_refused_with_its_line(
         (dh(mass=0.0), "without masses"),
     ],
 )
-def test_what_is_only_odd_is_a_warning(tmp_path: Path, text: str, words: str) -> None:
+def test_what_is_only_odd_is_a_warning(tmp_path: Path, text: str, phrase: str) -> None:
     (warning,) = load_cell(written(tmp_path, text)).warnings
     assert "cell.yaml, line " in warning
-    assert words in warning
+    assert phrase in warning
 
 
 @pytest.mark.parametrize(
-    ("changed", "words"),
+    ("changed", "phrase"),
     [
         ({"xyz": "0 0 612.7"}, "line 6: joint 'j2': found origin xyz 612.7"),
         ({"rpy": "0 90 0"}, "line 6: joint 'j2': found origin rpy 90"),
@@ -102,14 +102,14 @@ def test_what_is_only_odd_is_a_warning(tmp_path: Path, text: str, words: str) ->
     ],
 )
 def test_a_urdf_in_other_units_is_refused_with_its_line_too(
-    tmp_path: Path, changed: dict[str, str], words: str
+    tmp_path: Path, changed: dict[str, str], phrase: str
 ) -> None:
     given = {"xyz": "0 0 0.5", "rpy": "0 0 0", "lower": "-2", "more": "", "mass": "4"}
     (tmp_path / "arm.urdf").write_text(URDF.format(**(given | changed)), encoding="utf-8")
     path = written(tmp_path, "robot:\n  urdf: arm.urdf\n")
     with pytest.raises(CellError, match=r"cell\.yaml, line 2: robot\.urdf: ") as caught:
         load_cell(path)
-    assert words in str(caught.value)
+    assert phrase in str(caught.value)
 
 
 def test_a_sane_urdf_passes_and_one_without_a_mass_warns(tmp_path: Path) -> None:

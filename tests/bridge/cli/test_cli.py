@@ -55,17 +55,17 @@ class Desk:
         path.write_text(text, encoding="utf-8")
         return path
 
-    def run(self, *words: str) -> Ran:
-        arguments = [str(self.folder / w[1:]) if w.startswith("@") else w for w in words]
+    def run(self, *given: str) -> Ran:
+        arguments = [str(self.folder / w[1:]) if w.startswith("@") else w for w in given]
         with pytest.raises(SystemExit) as left:
             main(arguments)
         out, err = self._capsys.readouterr()
         code = left.value.code
         return Ran(code if isinstance(code, int) else 0, out, err)
 
-    def refuses(self, *words: str) -> str:
+    def refuses(self, *given: str) -> str:
         """Run what must be refused; returns the one line on stderr."""
-        ran = self.run(*words)
+        ran = self.run(*given)
         assert ran.code == 2, ran
         assert "Traceback" not in ran.err
         assert ran.err.count("\n") == 1
@@ -139,12 +139,12 @@ def test_the_line_of_a_command_is_the_first_of_its_help(name: str) -> None:
     module, attribute = COMMANDS[name][0].split(":")
     command = getattr(importlib.import_module(module), attribute)
     assert command.name == name
-    line, told = COMMANDS[name][1].rstrip("."), " ".join(command.help.split())
-    assert told.startswith(line) or name in ("diagnose", "blind")
+    line, reported = COMMANDS[name][1].rstrip("."), " ".join(command.help.split())
+    assert reported.startswith(line) or name in ("diagnose", "blind")
 
 
 @pytest.mark.parametrize(
-    ("words", "hint"),
+    ("given", "hint"),
     [
         (["predct", "x"], "'predict'"),
         (["fit"], "Missing argument 'LOG...'"),
@@ -152,13 +152,13 @@ def test_the_line_of_a_command_is_the_first_of_its_help(name: str) -> None:
         (["predict", "@log.csv", "--cell", "@cell.yaml"], "--out"),
     ],
 )
-def test_a_slip_on_the_command_line_is_told_in_one_line(
-    desk: Desk, words: list[str], hint: str
+def test_a_slip_on_the_command_line_is_reported_in_one_line(
+    desk: Desk, given: list[str], hint: str
 ) -> None:
-    assert hint in desk.refuses(*words)
+    assert hint in desk.refuses(*given)
 
 
-def test_version_is_told(desk: Desk) -> None:
+def test_version_is_reported(desk: Desk) -> None:
     ran = desk.run("--version")
     assert ran.code == 0
     assert ran.out.startswith("gapbridge")
@@ -222,7 +222,7 @@ def test_a_rigid_cell_corrects_nothing(desk: Desk) -> None:
     np.testing.assert_array_equal(np.loadtxt(desk.folder / "o.csv", delimiter=",", skiprows=1), q)
 
 
-def test_a_pose_out_of_reach_is_told_and_the_rest_written(desk: Desk) -> None:
+def test_a_pose_out_of_reach_is_reported_and_the_rest_written(desk: Desk) -> None:
     stretched = np.zeros((1, 6))
     q = np.vstack([poses(2), stretched])
     desk.write("log.csv", csv(target_q=q, payload=np.full(3, 12.0)))
@@ -241,7 +241,7 @@ BAD_Q2 = "0,0,0,0.1,0.1,{},0.1,0.1,0.1"
 
 
 @pytest.mark.parametrize(
-    ("log", "words"),
+    ("log", "given"),
     [
         ("", ["log.csv", "empty"]),
         (f"{Q1}\n", ["log.csv", "no data rows"]),
@@ -261,11 +261,11 @@ BAD_Q2 = "0,0,0,0.1,0.1,{},0.1,0.1,0.1"
 )
 @pytest.mark.parametrize("command", ["predict", "compensate", "fit"])
 def test_an_unusable_log_is_refused_in_one_line(
-    desk: Desk, command: str, log: str, words: list[str]
+    desk: Desk, command: str, log: str, given: list[str]
 ) -> None:
     desk.write("log.csv", log)
     line = desk.refuses(command, "@log.csv", "--cell", "@cell.yaml", "--out", "@out.csv")
-    for word in words:
+    for word in given:
         assert word in line
     assert not (desk.folder / "out.csv").exists()
 
@@ -273,7 +273,7 @@ def test_an_unusable_log_is_refused_in_one_line(
 @pytest.mark.parametrize("command", ["predict", "compensate", "fit"])
 def test_unusable_paths_are_refused_in_one_line(desk: Desk, command: str) -> None:
     desk.write("log.csv", f"{Q1}\n{ROW}\n")
-    for words, told in (
+    for given, reported in (
         (("@none.csv", "--cell", "@cell.yaml", "--out", "@o.csv"), "none.csv: file not found"),
         (("@log.csv", "--cell", "@none.yaml", "--out", "@o.csv"), "none.yaml: file not found"),
         (("@log.csv", "--cell", "@cell.yaml", "--out", "@none/o.csv"), "found no folder"),
@@ -281,10 +281,10 @@ def test_unusable_paths_are_refused_in_one_line(desk: Desk, command: str) -> Non
         (("@log.csv", "--cell", "@cell.yaml", "--out", "@cell.yaml"), "output to be the input"),
         (("@log.csv", "--cell", "@cell.yaml", "--out", "@"), "found a folder"),
     ):
-        assert told in desk.refuses(command, *words)
+        assert reported in desk.refuses(command, *given)
 
 
-def test_an_unknown_key_of_a_cell_is_told_by_the_real_command(desk: Desk) -> None:
+def test_an_unknown_key_of_a_cell_is_reported_by_the_real_command(desk: Desk) -> None:
     desk.write("cell.yaml", CELL + "payloda: {mass: 5}\n")
     desk.write("log.csv", f"{Q1}\n{ROW}\n")
     command = [sys.executable, "-m", "gapbridge", "predict", "log.csv", "--cell", "cell.yaml"]
@@ -360,13 +360,13 @@ def test_explain_lists_the_catalogue_and_names_the_nearest(desk: Desk) -> None:
     assert "'backlash'" in desk.refuses("explain", "backlsh")
 
 
-def test_simulate_serves_until_it_is_told_to_stop(desk: Desk) -> None:
+def test_simulate_serves_until_it_is_asked_to_stop(desk: Desk) -> None:
     host = f"127.{1 + os.getpid() // 250 % 250}.{os.getpid() % 250}.77"
     desk.write("cell.yaml", SOFT + f"simulation: {{host: {host}, seed: 3}}\n")
     command = [sys.executable, "-m", "gapbridge", "simulate", str(desk.folder / "cell.yaml")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
-        told = [server.stdout.readline() for _ in range(2)]
+        reported = [server.stdout.readline() for _ in range(2)]
         with socket.create_connection((host, 30100), timeout=5) as bench:
             bench.sendall(b"measure\n")
             assert len(bench.recv(4096).split(b",")) == 7
@@ -374,8 +374,8 @@ def test_simulate_serves_until_it_is_told_to_stop(desk: Desk) -> None:
         server.send_signal(signal.SIGTERM)
         assert server.wait(10) == 0
     assert time.monotonic() - start < 3
-    assert host in told[0]
-    assert told[1] == f"ready {host}\n"
+    assert host in reported[0]
+    assert reported[1] == f"ready {host}\n"
 
 
 def test_simulate_is_never_served_to_others(desk: Desk) -> None:

@@ -71,7 +71,7 @@ def test_every_command_refuses_it_in_one_line(tmp_path: Path) -> None:
         assert f"{path}, line 2: tool.tcp.xyz: found 180 m" in refused(*command, path)
 
 
-def test_the_controller_says_what_it_is(host: str) -> None:
+def test_the_controller_reports_what_it_is(host: str) -> None:
     facts = enquire(host)
     assert (facts.n, facts.model, facts.version, facts.rate) == (6, "ur10e", "5.15.0", 500.0)
     assert facts.payload == 5.0
@@ -88,7 +88,7 @@ def test_the_controller_says_what_it_is(host: str) -> None:
     np.testing.assert_allclose(facts.velocity, arm.limits.velocity)
 
 
-def test_live_says_where_the_controller_differs(host: str, tmp_path: Path) -> None:
+def test_live_reports_where_the_controller_differs(host: str, tmp_path: Path) -> None:
     answer = gapbridge("check", cell(tmp_path, host, "0.25"), "--live")
     assert answer.code == 2
     assert "line 2: tool.tcp: found a TCP 70 mm" in answer.err

@@ -16,9 +16,9 @@ metrology: {registered: true, sigma: 2.0e-5}
 """
 
 
-def gapbridge(*words: object) -> subprocess.CompletedProcess[str]:
+def gapbridge(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "gapbridge", *map(str, words)], capture_output=True, text=True,
+        [sys.executable, "-m", "gapbridge", *map(str, arguments)], capture_output=True, text=True,
         timeout=120, check=False,
     )  # fmt: skip
 
@@ -66,7 +66,7 @@ def test_predictions_under_a_parquet_name_are_parquet(recording: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("arguments", "output"),
     [
         (["nowhere.bag", "--out", "log.csv"], "nowhere.bag: not found"),
         (["cell.yaml", "--out", "log.csv"], "found no known kind of recording"),
@@ -75,11 +75,13 @@ def test_predictions_under_a_parquet_name_are_parquet(recording: Path) -> None:
         (["robot.csv", "--out", "robot.csv"], "found the output to be the input"),
     ],
 )
-def test_what_cannot_be_converted_is_one_line(recording: Path, words: list[str], said: str) -> None:
+def test_what_cannot_be_converted_is_one_line(
+    recording: Path, arguments: list[str], output: str
+) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "gapbridge", "convert", *words], capture_output=True, text=True,
+        [sys.executable, "-m", "gapbridge", "convert", *arguments], capture_output=True, text=True,
         timeout=120, check=False, cwd=recording.parent,
     )  # fmt: skip
     assert done.returncode == 2
-    assert said in done.stderr
+    assert output in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1

@@ -37,7 +37,7 @@ def soft_log(folder: Path, model: Model = SOFT) -> Path:
     return log_in(folder, columns_of(q, loads) | measured(model, q, loads, noise=2e-5))
 
 
-def test_what_is_found_is_told_written_and_predicts(tmp_path: Path) -> None:
+def test_what_is_found_is_reported_written_and_predicts(tmp_path: Path) -> None:
     folder, new, file = tmp_path / "out", tmp_path / "new.yaml", tmp_path / "d.json"
     log = soft_log(tmp_path)
     answer = gapbridge(
@@ -45,11 +45,11 @@ def test_what_is_found_is_told_written_and_predicts(tmp_path: Path) -> None:
         "--out", folder, "--json", file, "--apply", new,
     )  # fmt: skip
     assert (answer.code, answer.err) == (0, "")
-    told = json.loads(file.read_text(encoding="utf-8"))
-    assert told == json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
+    reported = json.loads(file.read_text(encoding="utf-8"))
+    assert reported == json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
     assert "axial_compliance" in (folder / "report.html").read_text(encoding="utf-8")
-    assert told["schema"] == "gapbridge.diagnosis/1"
-    (cause,) = told["channels"][0]["causes"]
+    assert reported["schema"] == "gapbridge.diagnosis/1"
+    (cause,) = reported["channels"][0]["causes"]
     assert (cause["effect"], cause["joints"]) == ("axial_compliance", [2])
     for words in ("verdict: explained", "axial_compliance of joint 2", "rad/Nm", "±", "shrinks"):
         assert words in answer.out
@@ -143,7 +143,7 @@ def test_degrees_are_called_degrees(tmp_path: Path, name: str) -> None:
     assert "look like degrees, expected rad" in line
 
 
-def test_a_log_without_a_channel_says_what_each_needs(tmp_path: Path) -> None:
+def test_a_log_without_a_channel_reports_what_each_needs(tmp_path: Path) -> None:
     q, loads = poses_and_loads(30)
     line = refused("diagnose", log_in(tmp_path, columns_of(q, loads)), "--cell", cell_in(tmp_path))
     for word in ("log.csv", "measured_position", "ft_raw_wrench", "target_q"):
@@ -248,7 +248,7 @@ def test_a_measured_axis_that_is_missing_is_named(tmp_path: Path) -> None:
     assert "column measured_position_2: not found" in line
 
 
-def test_odd_rows_and_names_are_told_where_work_is_still_possible(tmp_path: Path) -> None:
+def test_odd_rows_and_names_are_reported_where_work_is_still_possible(tmp_path: Path) -> None:
     table = full_table()
     spoilt(table, "measured_position", hole)
     table = {k.replace("joint_temperatures", "joint_temperature"): v for k, v in table.items()}

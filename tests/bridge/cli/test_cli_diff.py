@@ -33,12 +33,12 @@ def test_an_effect_and_a_flexibility_are_named(tmp_path: Path) -> None:
         "effects: [{effect: joint_offset, joint: 1, parameters: {value: 0.001}}]\n"
     )
     answer = gapbridge("diff", *cells(tmp_path, BEFORE + more), "--json")
-    told = json.loads(answer.out)
-    assert {c["key"] for c in told["changes"]} == {
+    reported = json.loads(answer.out)
+    assert {c["key"] for c in reported["changes"]} == {
         "effect joint_offset of joint 1", "compliance.axial"
     }  # fmt: skip
-    assert 1e-4 < told["moved"]["rms"] < told["moved"]["largest"] < 0.02
-    assert told["moved"]["poses"] == 200
+    assert 1e-4 < reported["moved"]["rms"] < reported["moved"]["largest"] < 0.02
+    assert reported["moved"]["poses"] == 200
 
 
 def test_over_a_log_only_its_poses_count(tmp_path: Path) -> None:
@@ -48,9 +48,9 @@ def test_over_a_log_only_its_poses_count(tmp_path: Path) -> None:
     q = np.tile([0.0, -1.2, 1.5, -1.8, -1.5, 0.0], (3, 1)) + np.arange(3)[:, None] * 1e-4
     names = ",".join(f"actual_q_{i}" for i in range(6))
     np.savetxt(log, q, delimiter=",", header=names, comments="")
-    told = json.loads(gapbridge("diff", *paths, "--log", log, "--json").out)["moved"]
-    assert told["poses"] == 3
-    assert told["rms"] == pytest.approx(told["largest"], rel=1e-2)  # one place, one radius
+    reported = json.loads(gapbridge("diff", *paths, "--log", log, "--json").out)["moved"]
+    assert reported["poses"] == 3
+    assert reported["rms"] == pytest.approx(reported["largest"], rel=1e-2)  # one place, one radius
 
 
 def test_cells_that_agree_and_cells_of_other_joints(tmp_path: Path) -> None:

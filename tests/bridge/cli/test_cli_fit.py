@@ -30,7 +30,7 @@ def bent_cell(folder: Path) -> Path:
     return folder / "bent.yaml"
 
 
-def test_predict_writes_the_poses_of_the_bent_arm_to_the_last_digit(tmp_path: Path) -> None:
+def test_predict_writes_the_poses_of_the_deflected_arm_to_the_last_digit(tmp_path: Path) -> None:
     q, loads = poses_and_loads(7)
     log = log_in(tmp_path, columns_of(q, loads))
     answer = gapbridge("predict", log, "--cell", bent_cell(tmp_path), "--out", tmp_path / "p.csv")
@@ -80,8 +80,8 @@ def test_a_fit_writes_no_tool_point_no_frame_and_exact_zeros(tmp_path: Path) -> 
     loose = CELL.replace("registered: true", "registered: false")
     cell.write_text(loose, encoding="utf-8")
     q, loads = poses_and_loads(60)
-    bent = bent_model()
-    poses = bent.predict(q, loads)
+    deflected = bent_model()
+    poses = deflected.predict(q, loads)
     target = poses.position + poses.rotation @ np.array([0.02, 0.01, 0.05])
     seen = target @ rotation_matrix(np.array([0.3, 1.0, -2.0])).T + 2.0
     seen += 2e-5 * np.random.default_rng(1).normal(size=seen.shape)
@@ -91,10 +91,12 @@ def test_a_fit_writes_no_tool_point_no_frame_and_exact_zeros(tmp_path: Path) -> 
     assert answer.code == 0, answer.err
     assert new.read_text(encoding="utf-8").startswith(loose)
     fitted = load_cell(new).model
-    np.testing.assert_array_equal(fitted.tool_in_flange, bent.tool_in_flange)
+    np.testing.assert_array_equal(fitted.tool_in_flange, deflected.tool_in_flange)
     axial, radial = fitted.compliance()
-    told = re.findall(r"note: axial_compliance_(\d): not shown by these data, stays", answer.out)
-    assert all(axial[int(joint) - 1] == 0.0 for joint in told)
+    reported = re.findall(
+        r"note: axial_compliance_(\d): not identifiable from these data, stays", answer.out
+    )
+    assert all(axial[int(joint) - 1] == 0.0 for joint in reported)
     assert all(v == 0 or v > 1e-9 for v in (*axial, *radial))
     assert "e-30" not in new.read_text(encoding="utf-8")
     assert "-0.0" not in answer.out

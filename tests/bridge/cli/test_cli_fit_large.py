@@ -57,12 +57,12 @@ def test_a_log_is_large_from_its_number_of_rows_on(tmp_path, rows, large):
 
 def test_a_recording_that_holds_no_measured_poses_says_so(tmp_path):
     from gapbridge.bridge.cell.settings.recording import RecordingSettings
-    from gapbridge.bridge.ipc.shared_memory import Page
+    from gapbridge.bridge.ipc.shared_memory import SharedMemory
     from gapbridge.bridge.recording.recorder import Recorder
 
-    page = Page(6)
+    page = SharedMemory(6)
     settings = RecordingSettings(folder=tmp_path, keep_free=0.0)
-    recorder = Recorder(settings, "run-20260101-000000", page, {"joints": 6}, lambda told: None)
+    recorder = Recorder(settings, "run-20260101-000000", page, {"joints": 6}, lambda reported: None)
     for number in range(40):
         row = page.next_row()
         row[1:] = 0.1

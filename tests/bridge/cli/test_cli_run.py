@@ -70,7 +70,7 @@ def test_demo_wants_a_folder(tmp_path: Path) -> None:
     assert "expected a folder" in refused("demo", "--out", path)
 
 
-def test_a_missing_part_is_told_by_name_and_a_broken_one_is_not_taken_for_missing(
+def test_a_missing_part_is_reported_by_name_and_a_broken_one_is_not_taken_for_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(RunError, match=r"demo: found no module bridge\.nowhere"):

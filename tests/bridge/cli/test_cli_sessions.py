@@ -61,9 +61,9 @@ def answered(tmp_path_factory: pytest.TempPathFactory):
 
 
 def test_two_logs_are_one_diagnosis(answered) -> None:
-    folder, _, answer, told = answered
-    assert told["sessions"] == ["a.csv", "b.csv"]
-    (channel,) = told["channels"]
+    folder, _, answer, reported = answered
+    assert reported["sessions"] == ["a.csv", "b.csv"]
+    (channel,) = reported["channels"]
     assert [c["effect"] for c in channel["causes"]] == ["axial_compliance"]
     for figure in (
         "remaining_rms_held_out",
@@ -73,16 +73,16 @@ def test_two_logs_are_one_diagnosis(answered) -> None:
         assert channel[figure] == pytest.approx(2e-5, rel=0.3)
     assert [s["session"] for s in channel["sessions"]] == ["a.csv", "b.csv"]
     assert channel["causes"][0]["across_sessions"]["carries"] is True
-    for words in ("new region of joint space", "in a new session 0.0", "carries"):
-        assert words in answer.out
+    for arguments in ("new region of joint space", "in a new session 0.0", "carries"):
+        assert arguments in answer.out
     report = (folder / "out" / "report.html").read_text(encoding="utf-8")
-    for words in ("in a new region", "in a new session", "left under a fit of the others"):
-        assert words in report
+    for arguments in ("in a new region", "in a new session", "left under a fit of the others"):
+        assert arguments in report
 
 
 def test_provenance_stands_in_the_json_and_in_the_cell(answered) -> None:
-    folder, logs, _, told = answered
-    origin = told["provenance"]
+    folder, logs, _, reported = answered
+    origin = reported["provenance"]
     assert set(origin) == {"version", "time", "command", "arguments", "files"}
     assert origin["command"] == "diagnose"
     assert origin["arguments"]["logs"] == [str(log) for log in logs]
@@ -127,8 +127,8 @@ def test_two_logs_are_one_fit(tmp_path: Path) -> None:
     logs = [session(tmp_path, "a.csv", 0), session(tmp_path, "b.csv", 1)]
     answer = gapbridge("fit", *logs, "--cell", cell_in(tmp_path), "--out", tmp_path / "f.yaml")
     assert answer.code == 0, answer.err
-    for words in ("over 80 poses", "to expect in a new session", "to expect in a new region"):
-        assert words in answer.out
+    for arguments in ("over 80 poses", "to expect in a new session", "to expect in a new region"):
+        assert arguments in answer.out
     cell = load_cell(tmp_path / "f.yaml")
     assert cell.model.compliance()[0][1] == pytest.approx(2e-5, rel=0.05)
     assert cell.file.provenance is not None

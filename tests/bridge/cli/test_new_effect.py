@@ -133,8 +133,8 @@ def test_it_is_explained_found_applied_and_predicted(channel: str, tmp_path: Pat
     log = log_of(channel, truth, tmp_path)
     answer = gapbridge("diagnose", log, "--cell", cell, "--json", file, "--apply", new)
     assert answer.code == 0, answer.err
-    told = json.loads(file.read_text(encoding="utf-8"))
-    (own,) = [c for c in told["channels"] if c["channel"] == channel]
+    reported = json.loads(file.read_text(encoding="utf-8"))
+    (own,) = [c for c in reported["channels"] if c["channel"] == channel]
     (cause,) = [c for c in own["causes"] if c["effect"] == term.effect]
     assert cause["joints"] == [3]
     (value,) = cause["parameters"]

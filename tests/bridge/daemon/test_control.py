@@ -154,11 +154,11 @@ def test_a_person_arms_and_disarms_a_running_daemon(robot: Robot) -> None:
         assert ask(cell, "disarm") == "observing"
         assert ask(cell, "status")["armed_by"] == ""
 
-        def told() -> list[dict[str, Any]]:
+        def reported() -> list[dict[str, Any]]:
             return [e for e in run.daemon.events_since(0) if e["kind"] == "control"]
 
-        wait_for(lambda: len(told()) == 4, 2.0, "the last request's event")
-        events = told()
+        wait_for(lambda: len(reported()) == 4, 2.0, "the last request's event")
+        events = reported()
     assert [(e["command"], e["uid"], e["ok"]) for e in events] == [
         (command, os.getuid(), True) for command in ("disarm", "arm", "arm", "disarm")
     ]
@@ -205,26 +205,26 @@ def test_a_daemon_that_only_observes_cannot_be_armed(robot: Robot) -> None:
 
 
 @pytest.mark.slow
-def test_the_commands_tell_in_a_line_and_as_json(robot: Robot) -> None:
+def test_the_commands_show_in_a_line_and_as_json(robot: Robot) -> None:
     cell = robot.cell(PATIENT)
     with Run(cell) as run:
         run.wait(State.OBSERVING)
 
-        def told(*words: object) -> tuple[int, str, str]:
-            done = gapbridge(*words, folder=robot.folder)
+        def reported(*arguments: object) -> tuple[int, str, str]:
+            done = gapbridge(*arguments, folder=robot.folder)
             out, err = done.communicate(timeout=60)
             return done.returncode, out, err
 
-        code, out, err = told("status", cell)
+        code, out, err = reported("status", cell)
         assert (code, err) == (0, "")
         assert f"{cell}: observing since" in out
         assert "Hz" in out
-        assert json.loads(told("status", cell, "--json")[1])["schema"] == "gapbridge.status/1"
-        every = json.loads(told("status", "--json")[1])
+        assert json.loads(reported("status", cell, "--json")[1])["schema"] == "gapbridge.status/1"
+        every = json.loads(reported("status", "--json")[1])
         assert str(cell) in [each["cell"] for each in every]
-        assert told("arm", cell) == (0, "compensating\n", "")
-        assert told("disarm", cell) == (0, "observing\n", ""), run.said
-    code, out, err = told("arm", cell)
+        assert reported("arm", cell) == (0, "compensating\n", "")
+        assert reported("disarm", cell) == (0, "observing\n", ""), run.output
+    code, out, err = reported("arm", cell)
     assert (code, out) == (2, "")
     assert err.startswith("error: ")
     assert err.count("\n") == 1

@@ -38,7 +38,7 @@ def test_an_offset_that_stands_at_its_limit_ends_the_compensation(robot: Robot) 
         def saturated() -> bool:
             if run.daemon.state == State.OBSERVING:
                 run.daemon.arm()  # a busy machine was late, and the loop held before its second
-            return "offset saturated" in " ".join(run.said)
+            return "offset saturated" in " ".join(run.output)
 
         wait_for(saturated, 30.0, "the saturation")
         run.wait(State.OBSERVING, 5.0)
@@ -73,12 +73,12 @@ def test_a_loop_that_was_suspended_begins_anew_and_observes(robot: Robot) -> Non
 
 def refusal(run: Run) -> str:
     """Arm and return why that was refused."""
-    before = len(run.said)
+    before = len(run.output)
     run.daemon.arm()
-    wait_for(lambda: len(run.said) > before, 10.0, "a word on arming")
+    wait_for(lambda: len(run.output) > before, 10.0, "a word on arming")
     time.sleep(0.2)
-    assert not run.daemon.state.writes, run.said
-    return " ".join(run.said[before:])
+    assert not run.daemon.state.writes, run.output
+    return " ".join(run.output[before:])
 
 
 def changed(cell: Path, old: str, new: str) -> None:
@@ -93,7 +93,7 @@ def nothing_left(run: Run) -> None:
 
 
 @pytest.mark.parametrize("times", [1000.0, 0.0])
-def test_a_model_that_is_no_use_is_said_so_and_does_not_arm(robot: Robot, times: float) -> None:
+def test_a_model_that_is_no_use_is_reported_and_does_not_arm(robot: Robot, times: float) -> None:
     cell = robot.cell(PATIENT)
     axial, radial = (
         [times * value for value in values]
@@ -104,15 +104,15 @@ def test_a_model_that_is_no_use_is_said_so_and_does_not_arm(robot: Robot, times:
     with Run(cell) as run:
         run.wait(State.OBSERVING)
         time.sleep(0.5)
-        said = refusal(run)
+        output = refusal(run)
         status = run.daemon.status()
         nothing_left(run)
     assert status["correction"]["solved"] == (times == 0.0)
     if times:
-        assert "the correction cannot be solved at the present pose: " in said
+        assert "the correction cannot be solved at the present pose: " in output
         assert "no correction at the present pose" in "\n".join(lines(status))
     else:
-        assert "the model corrects nothing at any pose" in said
+        assert "the model corrects nothing at any pose" in output
         assert "the model corrects nothing" in "\n".join(lines(status))
 
 
@@ -133,7 +133,7 @@ def script(robot: Robot, line: str) -> None:
         ("set_tcp(p[0.0, 0.0, 0.18, 0.0, 0.1, 0.0])", "0.0 mm and 0.100 rad from the cell's"),
     ],
 )
-def test_what_a_person_changes_in_the_controller_during_a_run_is_held_and_not_bent_for(
+def test_what_a_person_changes_in_the_controller_during_a_run_is_held_and_not_corrected_for(
     robot: Robot, line: str, cause: str
 ) -> None:
     program = robot.start_offset_program()
@@ -141,7 +141,7 @@ def test_what_a_person_changes_in_the_controller_during_a_run_is_held_and_not_be
         run.compensate()
         time.sleep(0.8)
         script(robot, line)
-        wait_for(lambda: cause in " ".join(run.said), 3.0, f"{cause} ({run.said})")
+        wait_for(lambda: cause in " ".join(run.output), 3.0, f"{cause} ({run.output})")
         run.wait(State.OBSERVING, 5.0)
         assert cause.split(": ")[-1] in refusal(run)
         run.end()
@@ -157,10 +157,10 @@ def test_what_a_person_changes_in_the_controller_during_a_run_is_held_and_not_be
 
 def test_a_rate_above_the_controllers_is_refused_by_name(robot: Robot) -> None:
     with Run(robot.cell(", rate: 1000"), arm=True) as run:
-        wait_for(lambda: any("link.rate" in line for line in run.said), 30.0, "a refusal")
-        said = " ".join(run.said)
+        wait_for(lambda: any("link.rate" in line for line in run.output), 30.0, "a refusal")
+        output = " ".join(run.output)
         nothing_left(run)
-    assert "link.rate: found 1000 Hz, expected at most 500 Hz" in said
+    assert "link.rate: found 1000 Hz, expected at most 500 Hz" in output
 
 
 def test_a_hiccup_while_observing_leaves_no_fault_and_arming_works(robot: Robot) -> None:
@@ -170,7 +170,7 @@ def test_a_hiccup_while_observing_leaves_no_fault_and_arming_works(robot: Robot)
         robot.bench("stall 0.5")
         time.sleep(1.5)
         assert run.daemon.latched == ""
-        assert run.daemon.state == State.OBSERVING, run.said
+        assert run.daemon.state == State.OBSERVING, run.output
         assert run.daemon.status()["counts"]["silence"] == 1
         run.compensate()
         run.end()

@@ -81,7 +81,7 @@ def test_a_controller_that_stands_still_is_a_fault(robot: Robot) -> None:
         finally:
             os.kill(robot.controller.pid, signal.SIGCONT)
         assert_came_back_observing(run, robot)
-    assert any("clock has stood still" in line for line in run.said)
+    assert any("clock has stood still" in line for line in run.output)
 
 
 def test_a_clock_that_stands_still_is_seen_though_packets_flow(robot: Robot) -> None:
@@ -101,8 +101,8 @@ def test_a_clock_that_stands_still_ends_compensating(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.wait(State.COMPENSATING)
         robot.bench("freeze")
-        wait_for(lambda: "holding" in " ".join(run.said), 2.0, "holding")
-        assert "state stale" in " ".join(run.said)
+        wait_for(lambda: "holding" in " ".join(run.output), 2.0, "holding")
+        assert "state stale" in " ".join(run.output)
         robot.bench("thaw")
         run.end()
 

@@ -88,14 +88,14 @@ def test_limits_that_held_setpoints_back_are_counted_by_name() -> None:
     assert any("rate 2, velocity 1" in line for line in found.lines())
 
 
-def test_a_summary_is_json_and_says_the_figures_in_words() -> None:
+def test_a_summary_is_json_and_reports_the_figures_in_text() -> None:
     tally = Tally(N, RATE_HZ)
     tally.add(rows([0.0, 0.002], age=1e-3, duration=4e-4, written=1))
     found = summary(tally)
-    told = json.loads(json.dumps(found.to_json()))
-    assert told["setpoints_written"] == 2
-    assert told["loop_us"]["p99"] == pytest.approx(400, abs=2)
-    assert told["missed_share"] == 0.0
+    reported = json.loads(json.dumps(found.to_json()))
+    assert reported["setpoints_written"] == 2
+    assert reported["loop_us"]["p99"] == pytest.approx(400, abs=2)
+    assert reported["missed_share"] == 0.0
     text = "\n".join(found.lines())
     assert "cycles 2, missed 0 (0.000 %)" in text
     assert "p99 1.00 ms" in text

@@ -126,13 +126,13 @@ def test_a_recording_is_exported_as_a_log_and_has_the_events(robot: Robot) -> No
     assert log.require("payload")[0] == 5.0
     assert (np.diff(log.require("timestamp")) > 0.001).all()
     assert not log.has("actual_current_as_torque")  # the library does not deliver it
-    told = read_documents(path)
-    assert [e["to"] for e in told if "to" in e] == [
+    reported = read_documents(path)
+    assert [e["to"] for e in reported if "to" in e] == [
         "OBSERVING", "ARMED", "COMPENSATING", "HOLDING", "OBSERVING",
     ]  # fmt: skip
-    (summary,) = [e["summary"] for e in told if e["kind"] == "summary"]
+    (summary,) = [e["summary"] for e in reported if e["kind"] == "summary"]
     assert summary["setpoints_written"] > 100
-    assert told[-1]["kind"] == "ended"
+    assert reported[-1]["kind"] == "ended"
     assert read_configuration(path)["text"] == cell.read_text(encoding="utf-8")
 
 
@@ -162,7 +162,7 @@ def test_offset_mode_corrects_under_the_robots_own_program(robot: Robot) -> None
         summary = run.end()
     assert without > 4e-4
     assert with_compensation < 1e-4
-    assert summary.exit_code == 0, run.said
+    assert summary.exit_code == 0, run.output
     cycles = run.cycles()
     written = cycles["written"] > 0
     # the nominal is the robot's own motion, and the offset is not in it

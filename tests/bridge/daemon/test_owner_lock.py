@@ -48,12 +48,12 @@ def test_a_second_owner_is_refused_in_one_line_and_the_kernel_frees_the_lock() -
     holder = subprocess.Popen([sys.executable, "-c", HOLD], stdout=subprocess.PIPE, text=True)
     assert holder.stdout is not None
     assert holder.stdout.readline() == "held\n"
-    with pytest.raises(InputError) as told:
+    with pytest.raises(InputError) as reported:
         OwnerLock("host 192.0.2.7", CELL).acquire()
-    words = str(told.value)
-    assert "\n" not in words
-    assert "cell.yaml: link: host 192.0.2.7 is in use by another daemon" in words
-    assert f"process {holder.pid}, first.yaml" in words
+    arguments = str(reported.value)
+    assert "\n" not in arguments
+    assert "cell.yaml: link: host 192.0.2.7 is in use by another daemon" in arguments
+    assert f"process {holder.pid}, first.yaml" in arguments
     OwnerLock("host 192.0.2.8", CELL).acquire()
     holder.kill()
     holder.wait()
@@ -143,7 +143,7 @@ def alive(pid: int) -> bool:
         return False
 
 
-def test_the_lock_tells_who_holds_it(tmp_path: Path) -> None:
+def test_the_lock_shows_who_holds_it(tmp_path: Path) -> None:
     with OwnerLock("host 192.0.2.9", CELL):
         (path,) = (tmp_path / "gapbridge").glob("*.lock")
         assert json.loads(path.read_text())["cell"] == "cell.yaml"

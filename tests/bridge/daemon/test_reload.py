@@ -34,7 +34,7 @@ def configured(run: Run) -> dict[str, Any]:
     return found
 
 
-def test_a_wrong_cell_changes_nothing_and_everything_wrong_is_told(robot: Robot) -> None:
+def test_a_wrong_cell_changes_nothing_and_everything_wrong_is_reported(robot: Robot) -> None:
     cell = robot.cell(PATIENT)
     with Run(cell, arm=True) as run:
         run.wait(State.COMPENSATING)
@@ -84,7 +84,7 @@ def test_a_changed_cell_is_ramped_out_of_and_into(robot: Robot, arms: bool) -> N
         summary = run.end()
         cycles = run.cycles()
     assert summary.restarts == 0
-    assert not [line for line in run.said if "state stale" in line]
+    assert not [line for line in run.output if "state stale" in line]
     moved = np.linalg.norm(offsets(cycles)[:, :3], axis=1)
     assert moved.max() > 4e-4
     assert np.abs(np.diff(moved)).max() <= 0.05 * 0.002 * 5.001

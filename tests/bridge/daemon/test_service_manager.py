@@ -1,4 +1,4 @@
-"""What the service manager is told, and the unit that it runs."""
+"""What the service manager is notified of, and the unit that it runs."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_an_abstract_socket_is_reached_too(monkeypatch: pytest.MonkeyPatch) -> N
     listener.socket.close()
 
 
-def test_the_daemon_says_ready_alive_reloading_and_stopping_in_this_order(
+def test_the_daemon_reports_ready_alive_reloading_and_stopping_in_this_order(
     listener: Listener, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
@@ -95,10 +95,10 @@ def test_the_daemon_says_ready_alive_reloading_and_stopping_in_this_order(
         run.send_signal(signal.SIGTERM)
         out, err = run.communicate(timeout=20)
     assert (run.returncode, err) == (0, "")
-    told = [
+    reported = [
         line for line in listener.take() if line.split("=")[0] in ("READY", "RELOADING", "STOPPING")
     ]
-    assert told == ["READY=1", "RELOADING=1", "READY=1", "STOPPING=1"]
+    assert reported == ["READY=1", "RELOADING=1", "READY=1", "STOPPING=1"]
     assert "the cell file was read again" in out
 
 

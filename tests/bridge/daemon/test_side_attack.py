@@ -52,7 +52,7 @@ def test_a_side_process_cannot_arm(
             assert found["sockets"] == []
             events = run.daemon.events_since(0)
             assert {e["kind"] for e in attacks()} == {side}  # and of the others' kind: none
-            assert any("not its to tell of" in str(e.get("detail")) for e in events)
+            assert any("not its own" in str(e.get("detail")) for e in events)
             assert not armings(events)
             assert not [e for e in events if e["kind"] in ("request", "control")]
             assert run.daemon.state == State.OBSERVING
@@ -61,7 +61,7 @@ def test_a_side_process_cannot_arm(
             assert status["armed_by"] == ""
 
 
-def test_every_arming_stands_behind_the_event_that_says_who_asked(
+def test_every_arming_follows_the_event_that_names_who_asked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))

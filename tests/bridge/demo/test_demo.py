@@ -19,7 +19,7 @@ from gapbridge.core.log.log import read_log
 ROOT = Path(__file__).parents[3]
 
 
-def test_an_unknown_link_is_told_with_the_known_ones(tmp_path: Path) -> None:
+def test_an_unknown_link_is_reported_with_the_known_ones(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="found 'modbus_tpc', expected one of ur_rtde"):
         run_demo(1, tmp_path, "modbus_tpc")
     assert not list(tmp_path.iterdir())
@@ -35,7 +35,7 @@ def test_an_address_that_is_taken_is_passed_over() -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_the_demo_shows_what_it_promises(tmp_path: Path) -> None:
+def test_the_demo_shows_what_it_states(tmp_path: Path) -> None:
     out = tmp_path / "out" / "demo"
     command = [sys.executable, "-m", "gapbridge", "demo", "--seed", "5", "--out", str(out)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}

@@ -22,10 +22,10 @@ from gapbridge.bridge.demo.rests import rests, write_log
 from gapbridge.bridge.demo.result import reach
 from gapbridge.core.errors import LinkError
 from gapbridge.core.log.log import read_log
-from gapbridge.drivers.simulated.peer.peer import OWN_ACCELERATION, OWN_SPEED
 from gapbridge.drivers.simulated.plant.kinematics import within_limits
 from gapbridge.drivers.simulated.plant.motion import MoveJoints
 from gapbridge.drivers.simulated.plant.plant_arm import plant_arm
+from gapbridge.drivers.simulated.server.arm_controller import OWN_ACCELERATION, OWN_SPEED
 from gapbridge.drivers.simulated.ur.settings import BENCH_PORT
 
 ROOT = Path(__file__).parents[3]
@@ -76,7 +76,7 @@ def test_another_seed_hides_another_piper_and_the_same_seed_the_same(tmp_path: P
     assert first == again != other
 
 
-def test_what_one_count_comes_to_is_told(tmp_path: Path) -> None:
+def test_what_one_count_comes_to_is_reported(tmp_path: Path) -> None:
     can, modbus = (LINKS[name](tmp_path, 1) for name in PEERS)
     wire = np.radians(0.001)
     assert can.resolution().written == pytest.approx(wire * reach(can.cell.model))
@@ -105,14 +105,14 @@ def test_the_bench_moves_the_arm_and_stamps_with_this_machines_clock(tmp_path: P
         reading = bench.measure()
         assert before <= reading[0] <= time.monotonic()
         wanted = link.cell.model.rigid_pose(goal[None]).position[0]
-        bent = np.linalg.norm(reading[1:4] - wanted)
-        assert 2e-4 < bent < 4e-3
+        deflected = np.linalg.norm(reading[1:4] - wanted)
+        assert 2e-4 < deflected < 4e-3
         with pytest.raises(LinkError, match="move: outside the joint limits"):
             bench.go(goal + 20.0)
         bench.close()
 
 
-def test_a_load_that_no_controller_tells_goes_into_the_log(tmp_path: Path) -> None:
+def test_a_load_that_no_controller_reports_goes_into_the_log(tmp_path: Path) -> None:
     load = LINKS["can"].scene.calibration_loads[2]
     t, q = np.arange(0, 2, 0.01), np.full((200, 6), 0.4)
     recording = {"timestamp": t, "actual_q": q, "actual_qd": 0 * q}
@@ -133,7 +133,7 @@ class Shown(NamedTuple):
 
     out: Path
     code: int
-    told: str
+    reported: str
 
 
 @pytest.fixture(scope="module")
@@ -142,15 +142,15 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Shown]:
     folder = tmp_path_factory.mktemp("demos")
     running = []
     for name in PEERS:
-        told = folder / f"{name}.txt"
+        reported = folder / f"{name}.txt"
         command = [sys.executable, "-m", "gapbridge", "demo", "--link", name, "--seed", "3"]
-        with told.open("w") as output:
+        with reported.open("w") as output:
             running.append(subprocess.Popen(
                 [*command, "--out", str(folder / name)], stdout=output, stderr=output, cwd=folder,
                 env={**os.environ, "PYTHONPATH": str(ROOT)},
             ))  # fmt: skip
         until = time.monotonic() + 60  # both would take the same address before one serves there
-        while "measuring" not in told.read_text() and time.monotonic() < until:
+        while "measuring" not in reported.read_text() and time.monotonic() < until:
             time.sleep(0.2)
     codes = [demo.wait(600) for demo in running]
     return {
@@ -162,20 +162,20 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Shown]:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("name", PEERS)
-def test_the_demo_shows_on_every_link_what_it_promises(name: str, shown: dict[str, Shown]) -> None:
-    out, code, told = shown[name]
-    assert code == 0, told
+def test_the_demo_shows_on_every_link_what_it_states(name: str, shown: dict[str, Shown]) -> None:
+    out, code, reported = shown[name]
+    assert code == 0, reported
     summary = json.loads((out / "summary.json").read_text())
     error, repeats = summary["tcp_error_mm"], summary["repeatability_mm"]
     assert summary["link"] == name
     assert error["without"]["rms"] > 20 * error["with"]["rms"]
-    # both floors are the link's and the arm's own; a few visits tell repeatability to a third
+    # both floors are the link's and the arm's own; a few visits determine repeatability to a third
     floor = np.hypot(repeats, summary["resolution_mm"])
     assert error["with"]["rms"] < 2.0 * floor
     assert 0.01 < repeats < 0.1
     assert 0.0 < summary["resolution_mm"] < 0.02
-    assert "one count written is" in " ".join(told.split())
-    slower = 2 ** " ".join(told.split()).count("which this machine may keep")
+    assert "one count written is" in " ".join(reported.split())
+    slower = 2 ** " ".join(reported.split()).count("which this machine may keep")
     assert summary["setpoints_written"] > 4_000 / slower
     assert summary["loop"]["rate_hz"] > 40 / slower
     assert load_cell(out / "cell.yaml").model.terms == ()

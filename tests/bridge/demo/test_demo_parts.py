@@ -123,7 +123,7 @@ def test_rests_take_what_was_measured_after_settling_and_nothing_else() -> None:
     readings = np.zeros((len(t), 7))
     readings[:, 0] = t
     readings[:, 1:4] = given["actual_q"][::5, :3]
-    flips = np.where(np.arange(len(t)) % 2, 1, -1)[:, None]  # one rotation, near pi, told two ways
+    flips = np.where(np.arange(len(t)) % 2, 1, -1)[:, None]  # one rotation, written two ways
     readings[:, 4:] = flips * [np.pi - 1e-9, 0, 0]
     found = rests(given, readings, poses)
     np.testing.assert_allclose(found.actual_q, poses, atol=1e-7)
@@ -131,7 +131,7 @@ def test_rests_take_what_was_measured_after_settling_and_nothing_else() -> None:
     np.testing.assert_allclose(np.abs(found.rotation), np.tile([np.pi, 0, 0], (3, 1)), atol=1e-6)
 
 
-def test_a_visit_that_never_happened_is_told() -> None:
+def test_a_visit_that_never_happened_is_reported() -> None:
     given = recording(visits(HOME, HOME + np.array([[0.3, 0, 0, 0, 0, 0]])))
     readings = np.zeros((10, 7))
     with pytest.raises(RunError, match="visit 1 of 1: the arm never rested there"):
@@ -192,8 +192,8 @@ def test_bars_grow_with_their_share() -> None:
 class Slow(Session):
     """A machine that keeps a quarter of the rate only."""
 
-    def __init__(self, kept: float, tell) -> None:
-        super().__init__(None, Path(), tell)
+    def __init__(self, kept: float, emit) -> None:
+        super().__init__(None, Path(), emit)
         self.rates: list[float] = []
         self.kept = kept
 
@@ -229,17 +229,17 @@ class Hall:
 @pytest.mark.parametrize(("kept", "rates"), [(500, [500]), (125, [500, 250, 125])])
 def test_a_machine_that_misses_deadlines_goes_on_at_a_lower_rate(kept, rates):
     cell = load_cell(Path(__file__).parents[3] / "config" / "ur10e_simulated.yaml")
-    told: list[str] = []
-    session = Slow(kept, told.append)
+    reported: list[str] = []
+    session = Slow(kept, reported.append)
     session._link = Hall()
     for expected in (rates, rates[-1:]):  # the second visit begins where the first ended
         session.rates.clear()
         assert session.visit(cell, TEST_LOADS[0], HOME[None]) == "measured"
         assert session.rates == expected
-    assert len(told) == len(rates) - 1
+    assert len(reported) == len(rates) - 1
 
 
-def test_a_machine_that_cannot_keep_a_fourth_of_the_rate_is_told():
+def test_a_machine_that_cannot_keep_a_fourth_of_the_rate_is_reported():
     cell = load_cell(Path(__file__).parents[3] / "config" / "ur10e_simulated.yaml")
     session = Slow(50, lambda text: None)
     session._link = Hall()

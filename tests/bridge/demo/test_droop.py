@@ -56,10 +56,10 @@ def test_droop_is_found_and_setpoints_bring_the_joints_where_they_were_wanted() 
     (channel,) = [c for c in diagnose(nominal, log).channels if c.channel == "tracking"]
     (cause,) = channel.causes
     assert (cause.effect, cause.joints) == ("servo_droop", (2, 3, 4, 5))
-    for told in cause.parameters:
-        true = DROOP[int(told.name.rpartition("_")[2]) - 1]
-        assert told.std is not None
-        assert abs(told.value - true) < max(4 * told.std, 0.01 * true)
+    for reported in cause.parameters:
+        true = DROOP[int(reported.name.rpartition("_")[2]) - 1]
+        assert reported.std is not None
+        assert abs(reported.value - true) < max(4 * reported.std, 0.01 * true)
     live = Compensator(nominal.with_terms(cause.terms))
     wanted = poses(15, 2)
     plain = np.abs(rests(plant(), wanted) - wanted)

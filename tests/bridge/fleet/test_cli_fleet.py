@@ -54,7 +54,7 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
     return folder, answer
 
 
-def test_a_bad_log_is_told_in_one_line_and_the_others_are_fitted(fitted: Any) -> None:
+def test_a_bad_log_is_reported_in_one_line_and_the_others_are_fitted(fitted: Any) -> None:
     folder, answer = fitted
     assert answer.code == 0
     [line] = [line for line in answer.err.splitlines() if line.startswith("skipped: ")]
@@ -121,7 +121,7 @@ def test_the_report_needs_nothing_else_and_names_the_skipped_log(fitted: Any) ->
     assert "http" not in head.replace("http-equiv", "")
 
 
-def test_diagnose_tells_the_effect_that_recurs(tmp_path: Path) -> None:
+def test_diagnose_shows_the_effect_that_recurs(tmp_path: Path) -> None:
     for seed in range(3):
         q, loads = poses_and_loads(14, seed)
         shifted = q.copy()
@@ -170,14 +170,14 @@ def test_a_run_that_is_killed_loses_nothing(tmp_path: Path) -> None:
 def test_no_usable_log_is_refused(tmp_path: Path) -> None:
     logs = logs_in(tmp_path, ["a/s"])
     (logs / "a" / "s.csv").write_text("nothing\n1\n")
-    told = gapbridge("fleet", "fit", logs, "--cell", cell_in(tmp_path), "--workers", 1,
+    reported = gapbridge("fleet", "fit", logs, "--cell", cell_in(tmp_path), "--workers", 1,
                      "--out", tmp_path / "out")  # fmt: skip
-    assert told.code == 2
-    assert told.err.splitlines()[-1].startswith("error: found no usable session among 1")
+    assert reported.code == 2
+    assert reported.err.splitlines()[-1].startswith("error: found no usable session among 1")
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "reported"),
     [
         (["nowhere"], "nowhere: not found"),
         (["logs", "--workers", "1", "--scheduler", "tcp://127.0.0.1:9"], "beside --scheduler"),
@@ -186,13 +186,13 @@ def test_no_usable_log_is_refused(tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_used_is_refused_in_one_line(
-    arguments: list[str], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    arguments: list[str], reported: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     logs_in(tmp_path, ["a/s"])
     cell_in(tmp_path)
     monkeypatch.chdir(tmp_path)
     given = arguments if "--cell" in arguments else [*arguments, "--cell", "cell.yaml"]
-    assert told in refused("fleet", "fit", *given)
+    assert reported in refused("fleet", "fit", *given)
 
 
 def test_without_the_extra_a_scheduler_is_refused_in_one_line(

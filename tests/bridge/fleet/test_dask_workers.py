@@ -66,7 +66,7 @@ def test_a_bad_log_is_one_outcome_among_others(address: str, tmp_path: Path) -> 
     assert outcomes["b/s"].state == DONE
 
 
-def test_an_address_without_a_scheduler_is_told_in_one_line() -> None:
+def test_an_address_without_a_scheduler_is_reported_in_one_line() -> None:
     with pytest.raises(RunError, match="found no Dask scheduler there") as error:
         DaskWorkers("tcp://127.0.0.1:9", reach=1.0).start()
     assert "\n" not in str(error.value)

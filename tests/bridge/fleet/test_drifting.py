@@ -35,7 +35,7 @@ def test_a_drift_is_found_with_its_size_among_arms_that_only_scatter() -> None:
     assert abs(found[0].change - 10.0) < 15 * found[0].std
 
 
-def test_two_sessions_tell_no_drift() -> None:
+def test_two_sessions_show_no_drift() -> None:
     at = np.array([0.0, 1.0])
     two = Series("a", "x", "m", "g", at, "session", at * 100, np.ones(2), ("s", "t"))
     assert drifts([two]) == []
@@ -50,7 +50,7 @@ def test_sessions_stand_at_their_days_where_all_have_a_date() -> None:
     assert at.tolist() == [0.0, 1.0, 2.0]
 
 
-def test_a_value_far_from_the_median_is_told_with_the_usual_one() -> None:
+def test_a_value_far_from_the_median_is_reported_with_the_usual_one() -> None:
     values = [*np.random.default_rng(2).lognormal(0, 0.2, 40), 9.0]
     [(index, usual, deviations)] = far_from_median(values, ratios=True)
     assert index == 40

@@ -24,7 +24,7 @@ def arms_of(found: Found) -> dict[str, str]:
     return {s.name: s.arm for s in found.sessions}
 
 
-def test_the_first_folder_says_the_arm_and_names_sort_by_their_numbers(tmp_path: Path) -> None:
+def test_the_first_folder_reports_the_arm_and_names_sort_by_their_numbers(tmp_path: Path) -> None:
     files_in(tmp_path, "b/s10.csv", "b/s9.parquet", "a/2026/s1.CSV", "a/notes.txt")
     found = find_sessions([str(tmp_path)])
     assert list(arms_of(found).items()) == [("a/2026/s1", "a"), ("b/s9", "b"), ("b/s10", "b")]
@@ -32,7 +32,7 @@ def test_the_first_folder_says_the_arm_and_names_sort_by_their_numbers(tmp_path:
     assert "folder" in found.rule
 
 
-def test_of_logs_in_one_folder_the_name_says_the_arm(tmp_path: Path) -> None:
+def test_of_logs_in_one_folder_the_name_reports_the_arm(tmp_path: Path) -> None:
     files_in(tmp_path, "ur7_monday.csv", "ur7_friday.csv", "ur8.csv")
     assert set(arms_of(find_sessions([str(tmp_path)])).values()) == {"ur7", "ur8"}
 
@@ -60,14 +60,14 @@ def test_results_are_no_logs(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("where", "told"),
+    ("where", "reported"),
     [("nowhere", "not found"), ("*.csv", "no log that fits"), (".", "no log in this folder")],
 )
-def test_no_logs_are_told(
-    where: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_no_logs_are_reported(
+    where: str, reported: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=reported):
         find_sessions([where])
 
 
@@ -104,17 +104,17 @@ def test_a_table_maps_arms_to_cells_seen_from_its_folder(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "reported"),
     [
         ("arm;cell\n", "header: found arm;cell, expected columns arm and cell"),
         ("arm,cell\na,x\na,y\n", "row 3: found arm 'a' twice"),
         ("arm,cell\na,\n", "row 2: found no cell"),
     ],
 )
-def test_a_table_that_cannot_be_used_is_told(text: str, told: str, tmp_path: Path) -> None:
+def test_a_table_that_cannot_be_used_is_reported(text: str, reported: str, tmp_path: Path) -> None:
     table = tmp_path / "arms.csv"
     table.write_text(text)
-    with pytest.raises(InputError, match=re.escape(told)):
+    with pytest.raises(InputError, match=re.escape(reported)):
         cell_source(str(table), tmp_path)
 
 

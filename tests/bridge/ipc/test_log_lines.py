@@ -12,7 +12,7 @@ from gapbridge.bridge.ipc.log_lines import JsonLines, log_line
 TEXTS = st.dictionaries(st.text(max_size=8), st.text(max_size=20) | st.floats() | st.none())
 
 
-def test_a_transition_says_what_led_where():
+def test_a_transition_reports_what_led_where():
     found = json.loads(
         log_line(
             {
@@ -64,7 +64,7 @@ def test_any_event_is_one_line_that_reads_back(event):
 def test_a_stream_that_is_gone_stops_nothing():
     stream = io.StringIO()
     lines = JsonLines(stream)
-    lines.tell({"kind": "note", "detail": "a\nb"})
+    lines.emit({"kind": "note", "detail": "a\nb"})
     assert json.loads(stream.getvalue())["message"] == "a\nb"
     stream.close()
-    lines.tell({"kind": "note"})
+    lines.emit({"kind": "note"})

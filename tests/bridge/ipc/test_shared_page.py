@@ -12,22 +12,22 @@ import numpy as np
 import pytest
 
 from gapbridge.bridge.ipc.counts import Count
-from gapbridge.bridge.ipc.shared_memory import ROWS, FollowedPage, Page, Phase, RunPage
+from gapbridge.bridge.ipc.shared_memory import ROWS, FollowedPage, Phase, RunPage, SharedMemory
 
 
 @pytest.fixture
-def page() -> Iterator[Page]:
-    found = Page(2)
+def page() -> Iterator[SharedMemory]:
+    found = SharedMemory(2)
     yield found
     found.close()
 
 
-def put(page: Page, timestamp: float) -> None:
+def put(page: SharedMemory, timestamp: float) -> None:
     page.next_row()[1:] = timestamp
     page.publish()
 
 
-def test_each_reader_has_its_own_place(page: Page) -> None:
+def test_each_reader_has_its_own_place(page: SharedMemory) -> None:
     early = page.reader()
     put(page, 0.0)
     assert early.drain()[:, 1].tolist() == [0]
@@ -38,10 +38,10 @@ def test_each_reader_has_its_own_place(page: Page) -> None:
     assert early.lost == late.lost == 0
 
 
-def loop_of(run: RunPage) -> Page:
+def loop_of(run: RunPage) -> SharedMemory:
     """Return the page as the next process of the loop joins it."""
     run.renew()
-    return Page(2, os.dup(run.fd))
+    return SharedMemory(2, os.dup(run.fd))
 
 
 @pytest.fixture
@@ -70,7 +70,7 @@ def test_a_new_process_of_the_loop_goes_on_counting_and_nothing_else_stays(run: 
     put(loop, 1.0)
     assert reader.drain()[:, 1].tolist() == [0, 1]
     assert run.written == 2
-    assert run.counts()[Count.LATE.words] == 5
+    assert run.counts()[Count.LATE.label] == 5
     loop.close()
 
 
@@ -80,12 +80,12 @@ def test_a_page_is_shown_once_its_loop_alone_can_write_to_it(run: RunPage) -> No
     run.renew()
     assert not run.promote()  # its loop is still starting
     assert os.path.sameopenfile(first, run.open_for_reading())
-    loop = Page(2, os.dup(run.fd))
+    loop = SharedMemory(2, os.dup(run.fd))
     assert run.promote()
     assert not run.promote()
     assert os.path.sameopenfile(run.fd, run.open_for_reading())
     with pytest.raises(PermissionError):
-        Page(2, os.dup(run.fd))
+        SharedMemory(2, os.dup(run.fd))
     loop.close()
 
 
@@ -113,7 +113,7 @@ def test_who_reads_along_changes_over_and_misses_nothing(run: RunPage) -> None:
     side.close()
 
 
-def test_a_reader_that_starts_late_counts_what_is_gone(page: Page) -> None:
+def test_a_reader_that_starts_late_counts_what_is_gone(page: SharedMemory) -> None:
     for k in range(ROWS + 10):
         put(page, float(k))
     reader = page.reader(first=5)
@@ -122,18 +122,18 @@ def test_a_reader_that_starts_late_counts_what_is_gone(page: Page) -> None:
     assert (np.diff(rows[:, 0]) == 1).all()
 
 
-def test_who_only_reads_cannot_write(page: Page) -> None:
+def test_who_only_reads_cannot_write(page: SharedMemory) -> None:
     put(page, 7.0)
     fd = page.open_for_reading()
     code = f"""
 import mmap, os
-from gapbridge.bridge.ipc.shared_memory import Page
-page = Page(2, {fd}, writable=False)
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
+page = SharedMemory(2, {fd}, writable=False)
 assert page.reader().drain()[:, 1].tolist() == [7.0]
 again = os.open("/proc/self/fd/{fd}", os.O_RDWR)
 ways = (lambda: page.tell_state(3), lambda: os.write({fd}, b"x"), lambda: mmap.mmap({fd}, 64),
         lambda: os.pwrite(again, b"x", 0), lambda: mmap.mmap(again, 64),
-        lambda: os.ftruncate(again, 0), lambda: Page(2, again))
+        lambda: os.ftruncate(again, 0), lambda: SharedMemory(2, again))
 for way in ways:
     try:
         way()

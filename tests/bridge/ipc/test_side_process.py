@@ -17,7 +17,7 @@ import pytest
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc import side_process
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
 
 ECHO = """
@@ -26,16 +26,16 @@ ECHO = """
 
     order = take_order()
     reader = order.page.reader()
-    order.tell({"kind": "hello", "session": order.session, "extra": order.extra,
+    order.emit({"kind": "hello", "session": order.session, "extra": order.extra,
                 "cell": str(order.settings.cell), "n": order.n})
     while not order.events.closed:
         order.events.wait(0.05)
         for event in order.events.poll():
             event.pop("filling", None)
-            order.tell({"kind": "heard", "of": event})
+            order.emit({"kind": "heard", "of": event})
         rows = reader.drain()
         if len(rows):
-            order.tell({"kind": "rows", "timestamps": rows[:, 1].tolist()})
+            order.emit({"kind": "rows", "timestamps": rows[:, 1].tolist()})
     open(order.extra["last"], "w").write("finished")
 """
 DEAF = """
@@ -44,7 +44,7 @@ DEAF = """
 
     order = take_order()
     order.events.poll()
-    order.tell({"kind": "hello"})
+    order.emit({"kind": "hello"})
     time.sleep(1000)
 """
 
@@ -58,8 +58,8 @@ def wait_for(what: Callable[[], Any], limit: float = 20.0) -> Any:
 
 
 @pytest.fixture
-def page() -> Iterator[Page]:
-    found = Page(2)
+def page() -> Iterator[SharedMemory]:
+    found = SharedMemory(2)
     yield found
     found.close()
 
@@ -75,7 +75,7 @@ def order(tmp_path: Path) -> dict[str, Any]:
 
 @pytest.fixture
 def start(
-    page: Page, order: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    page: SharedMemory, order: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Callable[[str], SideProcess]]:
     monkeypatch.syspath_prepend(str(tmp_path))
     started: list[SideProcess] = []
@@ -102,7 +102,7 @@ def hear(side: SideProcess, kind: str) -> dict[str, Any]:
 
 
 def test_it_gets_its_order_the_cycles_and_the_events_and_answers(
-    start: Callable[[str], SideProcess], page: Page, tmp_path: Path
+    start: Callable[[str], SideProcess], page: SharedMemory, tmp_path: Path
 ) -> None:
     side = start(ECHO)
     hello = hear(side, "hello")
@@ -112,7 +112,7 @@ def test_it_gets_its_order_the_cycles_and_the_events_and_answers(
     page.next_row()[1:] = 5.0
     page.publish()
     assert hear(side, "rows")["timestamps"] == [5.0]
-    side.tell({"kind": "transition", "to": "armed"})
+    side.emit({"kind": "transition", "to": "armed"})
     assert hear(side, "heard")["of"] == {"kind": "transition", "to": "armed"}
     assert side.check() is None
     side.close()
@@ -131,7 +131,7 @@ def test_one_that_is_killed_comes_back_and_the_later_the_more_often(
         os.kill(side.pid, signal.SIGKILL)
         assert "ended with -9" in wait_for(side.check)
         gone = time.monotonic()
-        side.tell({"kind": "lost"})  # to nobody, and nobody waits
+        side.emit({"kind": "lost"})  # to nobody, and nobody waits
         wait_for(lambda: side.check() or side.pid)
         waits.append(time.monotonic() - gone)
     hear(side, "hello")
@@ -147,7 +147,7 @@ def test_one_that_does_not_read_loses_events_holds_up_nothing_and_is_ended(
     hear(side, "hello")
     begun = time.monotonic()
     for _ in range(2000):
-        side.tell({"kind": "status", "filling": "x" * 1000})
+        side.emit({"kind": "status", "filling": "x" * 1000})
     assert time.monotonic() - begun < 2.0
     assert side.dropped > 1000
     monkeypatch.setattr(side_process, "STALLED", 0.3)
@@ -165,14 +165,14 @@ def test_a_line_is_never_torn_though_the_pipe_was_full(
     assert side.pid is not None
     os.kill(side.pid, signal.SIGSTOP)
     for k in range(400):
-        side.tell({"kind": "status", "number": k, "filling": "x" * 3001})
+        side.emit({"kind": "status", "number": k, "filling": "x" * 3001})
     dropped = side.dropped
     assert dropped > 0
     os.kill(side.pid, signal.SIGCONT)
     heard: list[int] = []
 
     def all_of_them() -> bool:
-        side.tell({"kind": "poke", "number": -1})
+        side.emit({"kind": "poke", "number": -1})
         heard.extend(e["of"]["number"] for e in side.events() if e["kind"] == "heard")
         return len([k for k in heard if k >= 0]) == 400 - dropped
 
@@ -190,9 +190,9 @@ def test_when_the_daemon_is_killed_they_end(
 import json, sys, time
 sys.path.insert(0, {str(tmp_path)!r})
 from gapbridge.bridge.ipc import side_main
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
-side = SideProcess("side_under_test", json.loads({json.dumps(order)!r}), Page(2))
+side = SideProcess("side_under_test", json.loads({json.dumps(order)!r}), SharedMemory(2))
 while not side.events():
     time.sleep(0.02)
 print(side.pid, flush=True)

@@ -1,4 +1,4 @@
-"""The checks of every cycle: what is dropped, what holds, what is told, and each only once."""
+"""The checks of every cycle: what is dropped, what holds, what is reported, and each only once."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gapbridge.bridge.ipc.counts import Count
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.loop.checks import (
     DEGRADED,
     LATE,
@@ -21,7 +21,7 @@ from gapbridge.bridge.loop.checks import (
     OverrunWatch,
     SaturationWatch,
 )
-from gapbridge.bridge.loop.link_monitor import SampleCheck, StateWatch, hold_time
+from gapbridge.bridge.loop.link_monitor import LinkMonitor, SampleCheck, hold_time
 from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.supervisor import State, Supervisor
 from gapbridge.core.arm import builtin_arm
@@ -97,8 +97,8 @@ def test_what_an_arm_can_do_is_never_dropped(share: list[float], gap: float) -> 
 
 def test_values_that_stand_still_under_a_moving_command_are_frozen_after_a_second() -> None:
     watch = FrozenWatch()
-    told = [watch.update(state(k * T), Q + 1e-5 * k) for k in range(1000)]
-    first = next(k for k, words in enumerate(told) if words)
+    events = [watch.update(state(k * T), Q + 1e-5 * k) for k in range(1000)]
+    first = next(k for k, phrase in enumerate(events) if phrase)
     assert 500 <= first <= 505
 
 
@@ -125,9 +125,9 @@ def test_more_than_a_twentieth_of_the_cycles_missed_is_an_overrun() -> None:
 
 def test_an_offset_at_its_limit_for_a_second_is_saturated_and_a_ramp_is_not() -> None:
     watch = SaturationWatch()
-    told = [watch.update(k * T, 1 << ENVELOPE) for k in range(600)]
-    assert not any(told[:500])
-    assert all(told[502:])
+    events = [watch.update(k * T, 1 << ENVELOPE) for k in range(600)]
+    assert not any(events[:500])
+    assert all(events[502:])
     assert watch.update(2.0, 0) is None
     assert not any(watch.update(3 + k * T, 1 << RATE) for k in range(1000))
 
@@ -136,39 +136,39 @@ def test_an_offset_at_its_limit_for_a_second_is_saturated_and_a_ramp_is_not() ->
 
 
 class Bench:
-    """Checks with a supervisor in a state, and what they have told."""
+    """Checks with a supervisor in a state, and what they have reported."""
 
-    def __init__(self, page: Page, at: State) -> None:
-        self.told: list[dict[str, Any]] = []
+    def __init__(self, page: SharedMemory, at: State) -> None:
+        self.events: list[dict[str, Any]] = []
         self.page = page
         self.supervisor = Supervisor(lambda *change: self.changes.append(change))
         self.changes: list[Any] = []
         self.supervisor.state = at
-        self.checks = LoopChecks(500.0, self.supervisor, Reports(page, self.told.append))
+        self.checks = LoopChecks(500.0, self.supervisor, Reports(page, self.events.append))
 
 
 @pytest.fixture
-def page() -> Iterator[Page]:
-    found = Page(6)
+def page() -> Iterator[SharedMemory]:
+    found = SharedMemory(6)
     yield found
     found.close()
 
 
-def test_a_stop_of_the_robot_is_a_fault_counted_and_told_once(page: Page) -> None:
+def test_a_stop_of_the_robot_is_a_fault_counted_and_reported_once(page: SharedMemory) -> None:
     bench = Bench(page, State.COMPENSATING)
     bench.checks.begin(state(1.0), 0)
     for k in range(100):
         bench.checks.begin(state(1.0 + T * (k + 1), safety_mode=3), 0)
     assert bench.supervisor.state == State.FAULT
     assert len(bench.changes) == 1
-    assert bench.told == []
+    assert bench.events == []
     assert page.counts()["unsafe"] == 1
     assert "safety_mode 3" in bench.checks.robot
     bench.checks.begin(state(2.0), 0)
     assert bench.checks.fine
 
 
-def test_a_gap_of_more_than_ten_cycles_and_the_hold_time_begins_anew(page: Page) -> None:
+def test_a_gap_of_more_than_ten_cycles_and_the_hold_time_begins_anew(page: SharedMemory) -> None:
     bench = Bench(page, State.COMPENSATING)
     assert bench.checks.begin(state(1.0), 0) == 0
     assert bench.checks.begin(state(1.03), 14) == LATE
@@ -180,28 +180,28 @@ def test_a_gap_of_more_than_ten_cycles_and_the_hold_time_begins_anew(page: Page)
     assert page.counts()["late"] == 48
 
 
-def test_a_lost_sensor_is_flagged_in_every_cycle_and_told_twice(page: Page) -> None:
+def test_a_lost_sensor_is_flagged_in_every_cycle_and_reported_twice(page: SharedMemory) -> None:
     bench = Bench(page, State.COMPENSATING)
     for k in range(10):
         sample = state(1.0 + k * T, sensor_lost="silent" if 3 <= k < 7 else "")
         flags = (DEGRADED if 3 <= k < 7 else 0) | (LATE if k == 5 else 0)
         assert bench.checks.begin(sample, k == 5) == flags
-    assert [event["detail"] for event in bench.told] == ["silent", "the sensor is back"]
+    assert [event["detail"] for event in bench.events] == ["silent", "the sensor is back"]
     assert bench.supervisor.state == State.COMPENSATING
     assert page.counts()["sensor_lost"] == 1
 
 
-def test_while_only_observing_a_finding_is_told_and_changes_nothing(page: Page) -> None:
+def test_while_only_observing_a_finding_is_reported_and_changes_nothing(page: SharedMemory) -> None:
     bench = Bench(page, State.OBSERVING)
     for k in range(2000):
         bench.checks.end(state(k * T), Q + 1e-5 * k, 0, 1e-4)
     assert bench.supervisor.state == State.OBSERVING
-    assert [event["what"] for event in bench.told] == ["frozen"]
+    assert [event["what"] for event in bench.events] == ["frozen"]
     assert page.counts()["frozen"] == 1
 
 
 class Scripted(Driver):
-    """A driver that does what it is told to; no wire could be so exact about three in a row."""
+    """A driver that does what it is asked to; no wire could be so exact about three in a row."""
 
     def __init__(self) -> None:
         super().__init__(500.0, Model(ARM))
@@ -220,16 +220,16 @@ class Scripted(Driver):
     def close(self) -> None: ...
 
 
-def watched(page: Page) -> tuple[Scripted, Supervisor, StateWatch, list[dict[str, Any]]]:
-    told: list[dict[str, Any]] = []
+def watched(page: SharedMemory) -> tuple[Scripted, Supervisor, LinkMonitor, list[dict[str, Any]]]:
+    events: list[dict[str, Any]] = []
     driver, supervisor = Scripted(), Supervisor(lambda *_: None)
     supervisor.state = State.COMPENSATING
-    watch = StateWatch(driver, ARM, supervisor, Reports(page, told.append))
-    return driver, supervisor, watch, told
+    watch = LinkMonitor(driver, ARM, supervisor, Reports(page, events.append))
+    return driver, supervisor, watch, events
 
 
-def test_two_bad_samples_are_dropped_and_three_in_a_row_hold(page: Page) -> None:
-    driver, supervisor, watch, told = watched(page)
+def test_two_bad_samples_are_dropped_and_three_in_a_row_hold(page: SharedMemory) -> None:
+    driver, supervisor, watch, events = watched(page)
     good = driver.next
     for times, after in ((2, State.COMPENSATING), (3, State.HOLDING)):
         driver.next = InvalidStateError("torn")
@@ -240,11 +240,11 @@ def test_two_bad_samples_are_dropped_and_three_in_a_row_hold(page: Page) -> None
         assert watch.next() is not None
         watch.believe()
     assert page.counts()["dropped_torn"] == 5
-    assert [event["what"] for event in told] == ["dropped_torn"]  # not five times
+    assert [event["what"] for event in events] == ["dropped_torn"]  # not five times
 
 
 def test_a_state_that_is_late_is_counted_and_only_a_stale_one_holds(
-    page: Page, monkeypatch: pytest.MonkeyPatch
+    page: SharedMemory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = [100.0]
     monkeypatch.setattr("gapbridge.bridge.loop.link_monitor.time.monotonic", lambda: clock[0])
@@ -272,7 +272,7 @@ def test_the_hold_time_is_five_cycles_or_forty_milliseconds(rate: float, hold: f
 
 
 @pytest.mark.parametrize("bits", [1 << bit for bit in range(2, 11)])
-def test_a_stop_in_the_safety_bits_alone_is_a_fault(page: Page, bits: int) -> None:
+def test_a_stop_in_the_safety_bits_alone_is_a_fault(page: SharedMemory, bits: int) -> None:
     bench = Bench(page, State.COMPENSATING)
     bench.checks.begin(state(1.0), 0)
     bench.checks.begin(state(1.0 + T, safety_status_bits=1 | bits), 0)
@@ -282,7 +282,7 @@ def test_a_stop_in_the_safety_bits_alone_is_a_fault(page: Page, bits: int) -> No
 
 
 @pytest.mark.parametrize("bits", [1, 2])
-def test_normal_and_reduced_mode_are_no_stop(page: Page, bits: int) -> None:
+def test_normal_and_reduced_mode_are_no_stop(page: SharedMemory, bits: int) -> None:
     bench = Bench(page, State.COMPENSATING)
     bench.checks.begin(state(1.0, safety_status_bits=bits), 0)
     assert bench.supervisor.state == State.COMPENSATING
@@ -301,11 +301,11 @@ def test_normal_and_reduced_mode_are_no_stop(page: Page, bits: int) -> None:
     ],
 )
 def test_a_robot_that_does_not_follow_for_the_hold_time_is_held(
-    page: Page, found: dict[str, Any], moves_arm: bool, holds: bool
+    page: SharedMemory, found: dict[str, Any], moves_arm: bool, holds: bool
 ) -> None:
     bench = Bench(page, State.COMPENSATING)
     bench.checks = LoopChecks(
-        500.0, bench.supervisor, Reports(page, bench.told.append), moves_arm=moves_arm
+        500.0, bench.supervisor, Reports(page, bench.events.append), moves_arm=moves_arm
     )
     for k in range(40):
         bench.checks.begin(state(1.0 + k * T, **(found if k >= 10 else {})), 0)
@@ -316,7 +316,7 @@ def test_a_robot_that_does_not_follow_for_the_hold_time_is_held(
 
 
 def test_a_program_that_does_not_play_is_nobodys_fault_while_nothing_is_written(
-    page: Page,
+    page: SharedMemory,
 ) -> None:
     bench = Bench(page, State.OBSERVING)
     for k in range(100):
@@ -328,7 +328,7 @@ def test_a_program_that_does_not_play_is_nobodys_fault_while_nothing_is_written(
     assert bench.supervisor.state == State.COMPENSATING
 
 
-def test_a_load_that_cannot_be_holds_and_is_told_with_its_reason(page: Page) -> None:
+def test_a_load_that_cannot_be_holds_and_is_reported_with_its_reason(page: SharedMemory) -> None:
     bench = Bench(page, State.COMPENSATING)
     for _ in range(3):
         bench.checks.judge_loads("payload: found 400 kg, expected 0 to 7.5 kg")
@@ -340,14 +340,14 @@ def test_a_load_that_cannot_be_holds_and_is_told_with_its_reason(page: Page) -> 
 class Otherwise(Scripted):
     """A driver whose controller is set otherwise, from some moment on."""
 
-    asked, words = 0, ""
+    asked, phrase = 0, ""
 
     def mismatch(self) -> str | None:
         self.asked += 1
-        return self.words or None
+        return self.phrase or None
 
 
-def test_the_controllers_settings_are_compared_every_second_while_armed(page: Page) -> None:
+def test_the_controllers_settings_are_compared_every_second_while_armed(page: SharedMemory) -> None:
     bench, driver = Bench(page, State.OBSERVING), Otherwise()
     for k in range(1000):
         bench.checks.judge_settings(state(1.0 + k * T), driver)
@@ -356,19 +356,19 @@ def test_the_controllers_settings_are_compared_every_second_while_armed(page: Pa
     for k in range(1000):
         bench.checks.judge_settings(state(3.0 + k * T), driver)
     assert driver.asked == 2
-    driver.words = "the controller's TCP is 50.0 mm from the cell's"
+    driver.phrase = "the controller's TCP is 50.0 mm from the cell's"
     for k in range(501):
         bench.checks.judge_settings(state(5.0 + k * T), driver)
     assert bench.supervisor.state == State.HOLDING
-    assert bench.changes[0][3] == driver.words
+    assert bench.changes[0][3] == driver.phrase
 
 
 def test_a_hiccup_while_observing_latches_no_fault(
-    page: Page, monkeypatch: pytest.MonkeyPatch
+    page: SharedMemory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = [100.0]
     monkeypatch.setattr("gapbridge.bridge.loop.link_monitor.time.monotonic", lambda: clock[0])
-    driver, supervisor, watch, told = watched(page)
+    driver, supervisor, watch, events = watched(page)
     supervisor.state = State.OBSERVING
     good = driver.next
     driver.next = StaleStateError("the clock stands still")
@@ -377,7 +377,7 @@ def test_a_hiccup_while_observing_latches_no_fault(
         assert watch.next() is None
     assert supervisor.state == State.OBSERVING
     assert page.counts()["silence"] == 1
-    assert [event["what"] for event in told] == ["stale"]
+    assert [event["what"] for event in events] == ["stale"]
     driver.next = good
     assert watch.next() is not None
     watch.believe()

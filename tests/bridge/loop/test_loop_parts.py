@@ -10,8 +10,8 @@ import time
 import numpy as np
 import pytest
 
-from gapbridge.bridge.ipc.cycle_row import fill_row
-from gapbridge.bridge.ipc.shared_memory import ROWS, Page, Phase, RunPage
+from gapbridge.bridge.ipc.cycle_row import write_cycle
+from gapbridge.bridge.ipc.shared_memory import ROWS, Phase, RunPage, SharedMemory
 from gapbridge.bridge.loop.link_monitor import ControllerClock
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.core.load_bounds import LoadBounds
@@ -70,7 +70,7 @@ def test_a_first_payload_that_cannot_be_leaves_the_models_own() -> None:
     assert loads.update(state(1.0, payload=40.0, payload_cog=Q * 0)).payload_mass is None
 
 
-def test_a_force_that_does_not_count_is_not_doubted() -> None:
+def test_a_force_that_does_not_count_is_not_rejected() -> None:
     loads = LiveLoads(3, False, 0.0, LoadBounds(5.0))
     loads.update(state(1.0, actual_TCP_force=np.full(6, 9e3)))
     assert loads.doubt is None
@@ -169,19 +169,19 @@ def test_what_a_stalled_link_hands_on_at_once_is_old_until_the_newest_has_come()
 
 @pytest.fixture
 def page():
-    found = Page(3)
+    found = SharedMemory(3)
     yield found
     found.close()
 
 
-def put(page: Page, timestamp: float) -> None:
+def put(page: SharedMemory, timestamp: float) -> None:
     row = page.next_row()
-    fill_row(row, page.slices, state(timestamp), Q, Q + 1, np.arange(6.0))
+    write_cycle(row, page.slices, state(timestamp), Q, Q + 1, np.arange(6.0))
     row[2:9] = 0
     page.publish()
 
 
-def test_rows_come_through_once_and_in_order(page: Page) -> None:
+def test_rows_come_through_once_and_in_order(page: SharedMemory) -> None:
     reader = page.reader()
     for k in range(5):
         put(page, float(k))
@@ -196,7 +196,7 @@ def test_rows_come_through_once_and_in_order(page: Page) -> None:
     assert reader.drain()[:, 1].tolist() == [5]
 
 
-def test_rows_that_were_overwritten_are_counted_not_invented(page: Page) -> None:
+def test_rows_that_were_overwritten_are_counted_not_invented(page: SharedMemory) -> None:
     reader = page.reader()
     for k in range(2 * ROWS):
         put(page, float(k))
@@ -206,7 +206,7 @@ def test_rows_that_were_overwritten_are_counted_not_invented(page: Page) -> None
     assert len(rows) + reader.lost == 2 * ROWS
 
 
-def test_a_row_that_was_not_finished_is_not_read(page: Page) -> None:
+def test_a_row_that_was_not_finished_is_not_read(page: SharedMemory) -> None:
     reader = page.reader()
     put(page, 1.0)
     page.next_row()[1] = 99.0  # the loop was killed here
@@ -218,8 +218,8 @@ def test_another_process_sees_the_same_page_and_its_death_leaves_it_whole() -> N
     page.renew()
     code = f"""
 import os, time
-from gapbridge.bridge.ipc.shared_memory import Page, Phase
-page = Page(3, {page.fd})
+from gapbridge.bridge.ipc.shared_memory import SharedMemory, Phase
+page = SharedMemory(3, {page.fd})
 page.enter(Phase.RUNNING)
 page.tell_state(3)
 page.tell_seen()

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from gapbridge.bridge.cell.sections import LimitSettings, SetpointSettings
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
 from gapbridge.bridge.loop.reports import Reports
@@ -43,7 +43,7 @@ MODEL = Model(builtin_arm("ur10e")).with_compliance([1e-6] * 6, [1e-6] * 6)
 
 
 class Failing(Driver):
-    """A driver whose writes fail as they are told to; no wire fails so exactly."""
+    """A driver whose writes fail as they are asked to; no wire fails so exactly."""
 
     def __init__(self) -> None:
         super().__init__(500.0, MODEL)
@@ -88,7 +88,7 @@ class Stream(SetpointStream):
 class Bench:
     """A loop's writing half, compensating."""
 
-    def __init__(self, page: Page) -> None:
+    def __init__(self, page: SharedMemory) -> None:
         self.page, self.driver = page, Failing()
         self.changes: list[tuple[str, str]] = []  # cause and detail
         self.supervisor = Supervisor(lambda *change: self.changes.append(change[2:]))
@@ -120,7 +120,7 @@ class Bench:
             state = self.state()
             if self.supervisor.state.writes:
                 self.writing.write(state, self.q, self.loads.update(state))
-                self.driver.gate.clock = lambda: self.at
+                self.driver.gate.count_by(lambda: self.at)
 
     def count(self, name: str) -> int:
         return self.page.counts()[name]
@@ -128,7 +128,7 @@ class Bench:
 
 @pytest.fixture
 def bench() -> Iterator[Bench]:
-    page = Page(6)
+    page = SharedMemory(6)
     yield Bench(page)
     page.close()
 
@@ -185,7 +185,7 @@ def test_nothing_leaves_that_is_made_of_an_old_state_and_the_next_step_is_no_lar
     assert bench.supervisor.state == State.COMPENSATING
 
 
-def test_what_takes_the_watchdog_too_long_to_hear_lets_nothing_old_leave(bench: Bench) -> None:
+def test_what_takes_the_watchdog_too_long_to_notice_lets_nothing_old_leave(bench: Bench) -> None:
     bench.driver.keep_alive = lambda: time.sleep(0.03)  # type: ignore[method-assign]
     state = bench.state()
     expiry = time.monotonic() + 0.02
@@ -216,7 +216,7 @@ def test_a_process_that_was_stopped_after_the_judgement_sends_nothing_old(bench:
     assert len(bench.driver.sent) == sent + 1
 
 
-def test_a_process_that_was_stopped_while_it_sent_says_so_and_ends_the_motion(
+def test_a_process_that_was_stopped_while_it_sent_reports_so_and_ends_the_motion(
     bench: Bench,
 ) -> None:
     bench.driver._send = lambda _: time.sleep(0.03)  # type: ignore[method-assign]
@@ -367,7 +367,7 @@ def test_a_clock_that_goes_back_withdraws_the_offset_step_by_step(bench: Bench) 
     assert np.linalg.norm(offset[0]) > 1e-4
     bench.supervisor.take(Cause.IMPLAUSIBLE)  # what the watch over states makes of it
     bench.at -= 5.0
-    bench.driver.gate.clock = time.monotonic
+    bench.driver.gate.count_by(time.monotonic)
     for _ in range(700):
         bench.cycles(1)
         offset.append(bench.stream.limiter.offset_in_base)

@@ -49,7 +49,7 @@ def states(rate: float, count: int, late: int = 0) -> list[float]:
     return [(k + (late if k % 3 == 0 else 0)) / rate for k in range(count)]
 
 
-def test_a_rate_above_the_controllers_is_told_by_name() -> None:
+def test_a_rate_above_the_controllers_is_reported_by_name() -> None:
     check = RateCheck(500.0)
     for at in states(125.0, 40):
         check.take(at)

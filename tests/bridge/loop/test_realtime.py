@@ -47,13 +47,13 @@ def test_where_it_is_not_granted_the_loop_runs_without(tmp_path: Path, driver: P
     assert "processors awake" not in granted(tmp_path / "none", driver, 0.002)
 
 
-@pytest.mark.parametrize("told", ["none\n", None])
+@pytest.mark.parametrize("events", ["none\n", None])
 def test_where_the_kernel_could_not_do_it_nothing_is_claimed(
-    tmp_path: Path, driver: Path, told: str | None
+    tmp_path: Path, driver: Path, events: str | None
 ) -> None:
     file = tmp_path / "cpu_dma_latency"
     file.write_bytes(b"")
-    driver.unlink() if told is None else driver.write_text(told)
+    driver.unlink() if events is None else driver.write_text(events)
     assert "processors awake" not in granted(file, driver, 0.002)
     assert file.read_bytes() == b""
 

@@ -15,7 +15,7 @@ from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
 from gapbridge.bridge.ipc.command_page import Command, CommandPage, Commands
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.loop.loop import Exit, Loop
 from gapbridge.bridge.loop.main import _compile
 from gapbridge.bridge.loop.replay import ReplayedLoop
@@ -43,7 +43,7 @@ class Scripted(Driver):
     def __init__(self, cycles: int, commands: CommandPage, model: Model) -> None:
         super().__init__(20.0, model, moves_arm=False)  # no deadline that a busy machine misses
         self._now = 0.0  # s, of the script
-        self.gate.clock = lambda: self._now
+        self.gate.count_by(lambda: self._now)
         self._count = iter(range(cycles))
         self._commands = commands
         self._writes = itertools.count(1)
@@ -79,7 +79,9 @@ class Scripted(Driver):
             raise PartialWriteError("half of it")
 
 
-def run(loop: Loop, page: Page, commands: CommandPage, folder: Path, name: str) -> dict[str, Any]:
+def run(
+    loop: Loop, page: SharedMemory, commands: CommandPage, folder: Path, name: str
+) -> dict[str, Any]:
     settings = RecordingSettings(folder=folder, keep_free=0.0)
     recorder = Recorder(settings, name, page, {}, lambda _: None)
     assert loop.run(Commands(commands.fd), True) in (Exit.LINK, Exit.DONE)
@@ -92,21 +94,21 @@ def test_refused_and_half_sent_setpoints_gaps_and_lost_sensors_are_replayed(tmp_
     cell.write_text(CELL)
     model = load_cell(cell).model
     settings = DaemonSettings(cell=cell)
-    page, commands, told = Page(N), CommandPage(), []
+    page, commands, events = SharedMemory(N), CommandPage(), []
     source = TargetSource(SetpointSettings(), N, False, tmp_path, 20.0)
-    loop = Loop(settings, model, Scripted(1800, commands, model), source, page, told.append)
+    loop = Loop(settings, model, Scripted(1800, commands, model), source, page, events.append)
     _compile(settings, model)  # else the first cycles are late
     then = run(loop, page, commands, tmp_path, "then")
     flags = then["flags"].astype(int)
     assert {0.0, 1.0, 2.0} == set(then["attempted"])
     refused = (then["attempted"] == 1) & (then["written"] == 0)
-    assert refused.any(), told
+    assert refused.any(), events
     assert (flags & 1).any()  # sensor lost
     assert (flags & 4).any()  # gap
     assert (flags & 8).any()  # ramping out
     assert then["written"].sum() > 500
 
-    page, commands = Page(N), CommandPage()
+    page, commands = SharedMemory(N), CommandPage()
     driver = ReplayDriver(ReplaySettings(file=tmp_path / "then", speed=100.0), model)
     again = ReplayedLoop(settings, model, driver, source, page, lambda _: None)
     assert_same_bits(run(again, page, commands, tmp_path, "again"), then, len(then["number"]))

@@ -10,7 +10,7 @@ from gapbridge.bridge.ipc.counts import Count
 from gapbridge.bridge.loop.supervisor import TRANSITIONS, State, states_table
 
 PAGE = (Path(__file__).parents[3] / "docs" / "daemon.md").read_text(encoding="utf-8")
-ELSEWHERE = {Count.SILENCE, Count.LINK_LOST}  # what stale comes to, told in its row
+ELSEWHERE = {Count.SILENCE, Count.LINK_LOST}  # what stale comes to, reported in its row
 
 
 def test_the_page_has_the_table_as_it_is() -> None:
@@ -25,7 +25,7 @@ def test_the_page_has_the_table_as_it_is() -> None:
 
 @pytest.mark.parametrize("count", sorted(set(Count) - ELSEWHERE))
 def test_the_page_explains_every_counter(count: Count) -> None:
-    assert f"`{count.words}`" in PAGE
+    assert f"`{count.label}`" in PAGE
 
 
 @pytest.mark.parametrize("state", State)

@@ -63,11 +63,11 @@ def test_without_a_person_nothing_is_ever_written(causes: list[Cause]) -> None:
 
 
 @given(st.lists(st.sampled_from(list(Cause))))
-def test_every_change_is_told_and_nothing_else(causes: list[Cause]) -> None:
-    told: list[tuple[State, State]] = []
-    machine = Supervisor(lambda before, after, *_: told.append((before, after)))
+def test_every_change_is_reported_and_nothing_else(causes: list[Cause]) -> None:
+    events: list[tuple[State, State]] = []
+    machine = Supervisor(lambda before, after, *_: events.append((before, after)))
     changed = [machine.state for cause in causes if machine.take(cause)]
-    assert told == list(pairwise([State.DISCONNECTED, *changed]))
+    assert events == list(pairwise([State.DISCONNECTED, *changed]))
 
 
 def test_every_state_can_be_left_when_the_link_is_lost() -> None:

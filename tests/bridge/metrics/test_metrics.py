@@ -80,15 +80,15 @@ def test_cycles_are_counted_at_the_rate_of_the_loop_and_none_is_lost(feed):
     assert 0.5e-3 < length < value(found, "gapbridge_offset_limit_meters")
 
 
-def test_faults_transitions_restarts_and_drops_are_told_apart(feed):
+def test_faults_transitions_restarts_and_drops_are_separated(feed):
     before = families(feed)["gapbridge_faults"].samples
     assert all(s.labels["cause"] != "write failed" for s in before)
     feed.restarts = 3
     feed.counts = {"dropped_torn": 4, "stale": 2}
     feed.change(State.FAULT, "write failed", "the controller refused")
     feed.change(State.OBSERVING, "acknowledged")
-    feed.tell(kind="recorder", detail="recording paused: disk full", paused="disk full")
-    feed.tell(kind="recorder", detail="5 cycles lost", lost=5, paused="disk full")
+    feed.emit(kind="recorder", detail="recording paused: disk full", paused="disk full")
+    feed.emit(kind="recorder", detail="5 cycles lost", lost=5, paused="disk full")
     time.sleep(2.0)
     found = families(feed)
     assert value(found, "gapbridge_faults", cause="write failed") == 1

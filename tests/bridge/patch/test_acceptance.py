@@ -100,9 +100,9 @@ def write_log(path: Path, q: np.ndarray, put: Put | None, text: Callable[[float]
     path.write_text("\n".join(lines) + "\n")
 
 
-def gapbridge(folder: Path, *words: str) -> str:
+def gapbridge(folder: Path, *phrase: str) -> str:
     done = subprocess.run(
-        [sys.executable, "-m", "gapbridge", *words], capture_output=True, text=True, timeout=200,
+        [sys.executable, "-m", "gapbridge", *phrase], capture_output=True, text=True, timeout=200,
         check=False, cwd=folder,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

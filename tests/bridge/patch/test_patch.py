@@ -124,9 +124,9 @@ def test_springs_bend_as_predicted(tmp_path: Path, terms: list[Term]) -> None:
     model = NOMINAL.with_terms(terms)
     text, changed, _ = patched(tmp_path / "a.xml", mjcf(ARM, UR_JOINTS), model, "tcp")
     q = np.array([0.3, -0.6, 0.9, -0.4, 1.1, 0.2])
-    bent, rigid = model.predict(q[None]).position[0], NOMINAL.predict(q[None]).position[0]
+    deflected, rigid = model.predict(q[None]).position[0], NOMINAL.predict(q[None]).position[0]
     found = settled(text, q)
-    assert np.linalg.norm(found - bent) < 0.01 * np.linalg.norm(bent - rigid)
+    assert np.linalg.norm(found - deflected) < 0.01 * np.linalg.norm(deflected - rigid)
     assert any("nq is" in line for line in changed)
 
 
@@ -211,7 +211,7 @@ def test_another_arm_is_refused_by_the_joint_that_does_not_agree(tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "said"),
+    ("name", "text", "output"),
     [
         ("a.urdf", "<robot", "broken XML"),
         ("a.urdf", "<sdf/>", "found <sdf>"),
@@ -219,8 +219,8 @@ def test_another_arm_is_refused_by_the_joint_that_does_not_agree(tmp_path: Path)
         ("a.urdf", "<robot name='x'><link name='a'/></robot>", "joints: found"),
     ],
 )
-def test_what_is_no_model_is_one_line(tmp_path: Path, name: str, text: str, said: str) -> None:
+def test_what_is_no_model_is_one_line(tmp_path: Path, name: str, text: str, output: str) -> None:
     (tmp_path / name).write_text(text)
-    with pytest.raises(InputError, match=said) as error:
+    with pytest.raises(InputError, match=output) as error:
         format_of(tmp_path / name).patch(tmp_path / name, changes_of(NOMINAL), PatchOptions(), [])
     assert "\n" not in str(error.value)

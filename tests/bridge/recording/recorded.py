@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.recording.recorder import Recorder
 
@@ -19,7 +19,7 @@ CONFIGURATION = {"program": "test", "cell": "cell.yaml", "sha256": "00", "text":
 Array = NDArray[np.float64]
 
 
-def publish(page: Page, count: int, seed: int = 0) -> Array:
+def publish(page: SharedMemory, count: int, seed: int = 0) -> Array:
     """Have a loop publish cycles of random numbers; returns them as rows (count, width)."""
     random = np.random.default_rng(seed)
     rows = []
@@ -41,12 +41,12 @@ class Desk:
 
     def __init__(self, folder: Path, **settings: Any) -> None:
         self.folder = folder
-        self.page = Page(N)
-        self.told: list[dict[str, Any]] = []
+        self.page = SharedMemory(N)
+        self.events: list[dict[str, Any]] = []
         self.settings = RecordingSettings(folder=folder, **{"keep_free": 0.0, **settings})
 
     def recorder(self) -> Recorder:
-        return Recorder(self.settings, SESSION, self.page, CONFIGURATION, self.told.append)
+        return Recorder(self.settings, SESSION, self.page, CONFIGURATION, self.events.append)
 
     def record(self, *counts: int) -> Array:
         """Record so many cycles, a flush after each; returns the rows."""

@@ -40,7 +40,7 @@ def test_the_log_holds_the_contracts_columns_bit_for_bit(
     assert set(beside) <= set(log.unknown)
 
 
-def test_states_stand_in_words(desk: Desk, tmp_path: Path) -> None:
+def test_states_are_written_as_text(desk: Desk, tmp_path: Path) -> None:
     desk.record(3)
     export(desk.stem, tmp_path / "log.csv")
     lines = (tmp_path / "log.csv").read_text().splitlines()
@@ -78,7 +78,7 @@ def test_bounds_that_mean_nothing_are_refused() -> None:
             moment(text)
 
 
-def test_gaps_and_a_clock_that_goes_back_are_told(desk: Desk, tmp_path: Path) -> None:
+def test_gaps_and_a_clock_that_goes_back_are_reported(desk: Desk, tmp_path: Path) -> None:
     recorder = desk.recorder()
     publish(desk.page, 10)
     recorder.step(flush=True)
@@ -113,7 +113,7 @@ def test_the_command_writes_beside_the_recording_and_gives_the_cell_back(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "phrase"),
     [
         (["missing"], "missing: file not found, expected a recording"),
         (["{recording}", "--out", "log.txt"], "found .txt, expected .csv or .parquet"),
@@ -121,11 +121,11 @@ def test_the_command_writes_beside_the_recording_and_gives_the_cell_back(
         (["{recording}", "--out", "{recording}.csv/x.csv"], "found no folder"),
     ],
 )
-def test_what_cannot_be_exported_is_one_line(desk: Desk, arguments: list[str], words: str) -> None:
+def test_what_cannot_be_exported_is_one_line(desk: Desk, arguments: list[str], phrase: str) -> None:
     desk.record(3)
     given = [argument.format(recording=desk.stem) for argument in arguments]
     done = CliRunner().invoke(gapbridge, ["export", *given])
-    assert words in str(done.exception)
+    assert phrase in str(done.exception)
 
 
 def test_a_long_recording_is_exported_in_pieces(desk: Desk, tmp_path: Path) -> None:

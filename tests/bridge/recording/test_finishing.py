@@ -123,7 +123,7 @@ def test_the_next_run_finishes_what_the_last_one_left(desk: Desk) -> None:
         recorder.step(flush=True)
     recorder.close()
     assert is_whole(other)
-    assert any("finished" in str(event["detail"]) for event in desk.told)
+    assert any("finished" in str(event["detail"]) for event in desk.events)
     assert all(is_whole(one) for one in segments(other.parent, SESSION))
 
 

@@ -46,7 +46,7 @@ def test_a_write_that_fails_in_its_middle_loses_nothing_that_the_ring_holds(
     recorder.step(flush=True)
     assert recorder.pauses == 1
     assert recorder.path is None
-    assert "paused" in desk.told[-1]
+    assert "paused" in desk.events[-1]
     assert numbers(desk.stem) == list(range(100))
     allow(resource.RLIM_INFINITY)
     publish(desk.page, 50)
@@ -57,7 +57,9 @@ def test_a_write_that_fails_in_its_middle_loses_nothing_that_the_ring_holds(
 
 
 @pytest.mark.usefixtures("quick", "limited")
-def test_a_disk_that_stays_full_is_told_once_and_what_is_lost_is_counted(tmp_path: Path) -> None:
+def test_a_disk_that_stays_full_is_reported_once_and_what_is_lost_is_counted(
+    tmp_path: Path,
+) -> None:
     desk = Desk(tmp_path)
     recorder = desk.recorder()
     publish(desk.page, 20)
@@ -69,7 +71,7 @@ def test_a_disk_that_stays_full_is_told_once_and_what_is_lost_is_counted(tmp_pat
     recorder.close()
     assert recorder.pauses == 1
     assert recorder.lost == 100
-    assert sum("paused" in event for event in desk.told) == 1
+    assert sum("paused" in event for event in desk.events) == 1
     assert numbers(desk.files[0]) == list(range(20))
 
 

@@ -111,10 +111,10 @@ def test_events_and_configuration_stand_beside_the_cycles(desk: Desk) -> None:
     assert read_configuration(desk.stem)["session"] == SESSION
     with desk.files[0].open("rb") as file:
         (log,) = (m for s, c, m in SeekingReader(file).iter_messages(["/log"]))
-    said = json.loads(log.data)
-    assert said["level"] == 4
-    assert said["message"] == "OBSERVING -> FAULT (silence): no state"
-    assert said["timestamp"] == {"sec": 5, "nsec": 0}
+    entry = json.loads(log.data)
+    assert entry["level"] == 4
+    assert entry["message"] == "OBSERVING -> FAULT (silence): no state"
+    assert entry["timestamp"] == {"sec": 5, "nsec": 0}
 
 
 def test_what_was_flushed_is_there_before_the_file_is_closed(desk: Desk) -> None:
@@ -281,7 +281,7 @@ def test_a_recorder_that_comes_after_a_killed_one_goes_on_behind_it(desk: Desk) 
     assert second.lost == 0
 
 
-def test_what_the_ring_no_longer_holds_is_told(desk: Desk) -> None:
+def test_what_the_ring_no_longer_holds_is_reported(desk: Desk) -> None:
     from gapbridge.bridge.ipc.shared_memory import ROWS
 
     recorder = desk.recorder()
@@ -294,4 +294,4 @@ def test_what_the_ring_no_longer_holds_is_told(desk: Desk) -> None:
     assert recorder.lost == ROWS + 10 - len(found) > 0
     assert found[:10] == list(range(10))
     assert found[10:] == list(range(found[10], ROWS + 10))
-    assert any(event.get("lost") == recorder.lost for event in desk.told)
+    assert any(event.get("lost") == recorder.lost for event in desk.events)

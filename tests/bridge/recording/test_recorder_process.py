@@ -16,7 +16,7 @@ from recorded import SESSION, N
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
 from gapbridge.bridge.ipc import side_process
-from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.core.log.mcap_reading import read_columns, read_configuration, read_documents
@@ -30,7 +30,7 @@ class Publisher:
     """A loop's half of a page, in a thread of the test: 500 cycles a second."""
 
     def __init__(self) -> None:
-        self.page = Page(N)
+        self.page = SharedMemory(N)
         self.stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -84,7 +84,7 @@ class Recording:
         return len(list(self.stem.parent.glob("*.mcap")))
 
     def end(self) -> None:
-        self.process.tell({"kind": "ended", "time": time.time()})
+        self.process.emit({"kind": "ended", "time": time.time()})
         self.process.close(10.0)
 
     def numbers(self) -> list[int]:
@@ -113,7 +113,7 @@ def test_it_ends_in_order_with_everything_and_without_secrets(
     recording: Recording, publisher: Publisher
 ) -> None:
     recording.wait_for_file()
-    recording.process.tell({"kind": "transition", "time": time.time(), "from": "DISCONNECTED",
+    recording.process.emit({"kind": "transition", "time": time.time(), "from": "DISCONNECTED",
                             "to": "OBSERVING", "cause": "connected", "detail": ""})  # fmt: skip
     time.sleep(0.5)
     count = publisher.end()
@@ -178,7 +178,7 @@ def test_a_daemon_that_is_gone_without_an_end_is_outlived_until_the_loop_has_sto
 ) -> None:
     recording.wait_for_file()
     assert recording.process.pid is not None
-    os.kill(recording.process.pid, signal.SIGTERM)  # as a service manager tells all at once
+    os.kill(recording.process.pid, signal.SIGTERM)  # as a service manager ends all at once
     recording.process.begin_close()  # as the system does when the daemon is killed
     time.sleep(1.0)
     count = publisher.end()

@@ -48,23 +48,23 @@ def test_a_recorder_that_is_killed_amidst_a_run_loses_nothing(robot: Robot) -> N
     numbers = read_columns(run.daemon.recording)["number"]
     assert np.array_equal(numbers, np.arange(len(numbers)))
     assert len(numbers) >= summary.cycles  # a stale clock may be recorded and not count
-    assert sum("ended with -9" in line for line in run.said) == 2
+    assert sum("ended with -9" in line for line in run.output) == 2
 
 
 def test_a_full_disk_pauses_the_recording_and_not_the_run(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.wait(State.COMPENSATING)
-        wait_for(lambda: "recording into" in " ".join(run.said), 20.0, "a file")
+        wait_for(lambda: "recording into" in " ".join(run.output), 20.0, "a file")
         pid = recorder_pid(run)
         assert pid is not None
         before = resource.prlimit(pid, resource.RLIMIT_FSIZE)
         resource.prlimit(pid, resource.RLIMIT_FSIZE, (50_000, before[1]))  # as a full disk refuses
-        wait_for(lambda: "recording paused: File too large" in run.said, 20.0, "a pause")
+        wait_for(lambda: "recording paused: File too large" in run.output, 20.0, "a pause")
         written = run.daemon.tally.written
         time.sleep(0.5)
         assert run.daemon.tally.written > written
         resource.prlimit(pid, resource.RLIMIT_FSIZE, before)
-        wait_for(lambda: "-002.mcap" in run.said[-1], 20.0, "another file")
+        wait_for(lambda: "-002.mcap" in run.output[-1], 20.0, "another file")
         summary = run.end()
     assert summary.exit_code == 0
     assert summary.restarts == summary.lost_rows == 0
@@ -100,7 +100,7 @@ def test_the_daemon_runs_on_a_recording_and_makes_the_same_offsets(robot: Robot)
     with Run(cell) as again:
         summary = again.join(60.0)
     assert summary.exit_code == 0
-    assert any("come to its end" in line for line in again.said)
+    assert any("come to its end" in line for line in again.output)
     assert again.daemon.recording is not None
     found, expected = read_columns(again.daemon.recording), read_columns(then)
     for name in ("offset", "corrected_q", "written", "state", "actual_q"):
@@ -127,7 +127,7 @@ def kill_daemons(robot: Robot, times: int) -> None:
         time.sleep(random.uniform(0.0, 2.0))
         killed = time.monotonic()
         run.kill()
-        said, _ = run.communicate()
+        output, _ = run.communicate()
         wait_for(lambda at=k: robot.controller.log().count("rtde_control ended") > at, 10.0,
                  "the end of the loop")  # type: ignore[misc]  # fmt: skip
         (session,) = {p.name.rsplit("-", 1)[0] for p in folder.glob("*.mcap")} - before
@@ -135,7 +135,7 @@ def kill_daemons(robot: Robot, times: int) -> None:
         columns = read_columns(folder / session)
         numbers = columns["number"]
         assert np.array_equal(numbers, np.arange(len(numbers)))
-        if "->" not in said:  # a busy machine may have ended the loop before
+        if "->" not in output:  # a busy machine may have ended the loop before
             assert columns["received"][-1] > killed - 1.0
 
 

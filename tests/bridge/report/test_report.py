@@ -96,7 +96,7 @@ def test_what_a_quantity_foretells_is_not_called_noise():
     assert unexplained(blind) > 0
 
 
-def test_a_path_to_a_cell_is_told_by_its_file(tmp_path):
+def test_a_path_to_a_cell_is_reported_by_its_file(tmp_path):
     c = diagnosed("no gap")
     text = write_report(c.diagnosis, "a/b/line4.yaml", c.log, c.model, tmp_path).read_text("utf-8")
     assert "<h1>line4: " in text
@@ -118,7 +118,7 @@ def test_long_logs_are_thinned_but_keep_their_worst_samples():
     assert len(thinned(score[:20])) == 20
 
 
-def test_every_effect_of_the_catalogue_has_plain_words():
+def test_every_effect_of_the_catalogue_has_plain_text():
     assert all(effect.title for effect in CATALOGUE.values())
 
 
@@ -130,9 +130,9 @@ def test_every_effect_of_the_catalogue_has_plain_words():
     (quantity_words("actual_q_2"), "angle of joint 3"),
     (quantity_words("joint_temperatures_0"), "temperature of joint 1"),
 ])  # fmt: skip
-def test_values_are_told_in_the_units_that_people_use(text, wanted):
+def test_values_are_reported_in_the_units_that_people_use(text, wanted):
     assert text == wanted
 
 
-def test_an_interval_is_told_with_two_digits_of_its_width():
+def test_an_interval_is_reported_with_two_digits_of_its_width():
     assert (_decimals(0.0123), _decimals(1.23), _decimals(250.0)) == (3, 1, 0)

@@ -87,7 +87,7 @@ def _rest(link):
     return taken
 
 
-def test_an_address_that_is_taken_is_said_in_one_line():
+def test_an_address_that_is_taken_is_reported_in_one_line():
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
         s.listen()

@@ -152,7 +152,7 @@ def test_a_certificate_that_cannot_be_used_is_refused(tmp_path, token_file):
         check_credentials(load_cell(path).web, "web")
 
 
-def test_the_processes_listen_where_they_are_told_and_nowhere_else(plain, guarded, metrics):
+def test_the_processes_listen_where_they_are_configured_and_nowhere_else(plain, guarded, metrics):
     for feed in (plain, guarded, metrics):
         found = psutil.Process(feed.side.pid).net_connections("inet")
         listening = {c.laddr for c in found if c.status == psutil.CONN_LISTEN}

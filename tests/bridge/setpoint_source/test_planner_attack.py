@@ -101,8 +101,8 @@ def post(port: int, body: bytes, limit: float = 2.0) -> bytes:
 
 def test_a_posted_body_is_no_plan(target: Target) -> None:
     for _ in range(3):
-        said = post(target.port, target.lines())
-        assert said == b"" or said.startswith(b"error: ")  # reset, or refused in one line
+        reply = post(target.port, target.lines())
+        assert reply == b"" or reply.startswith(b"error: ")  # reset, or refused in one line
     time.sleep(0.3)
     target.assert_untouched()
 

@@ -19,7 +19,7 @@ from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.setpoint_source import make_source
 from gapbridge.bridge.setpoint_source.modbus import ModbusSource
 from gapbridge.bridge.setpoint_source.modbus_page import PlcPage
-from gapbridge.bridge.setpoint_source.source import SourceDryError, Told
+from gapbridge.bridge.setpoint_source.source import SourceDryError, SourceStatus
 from gapbridge.core.errors import InputError, RunError
 
 client_library = pytest.importorskip("pyModbusTCP.client", reason="pyModbusTCP is not installed")
@@ -34,8 +34,8 @@ def words_of(values: np.ndarray) -> list[int]:
     return found
 
 
-def numbers_of(words: list[int]) -> np.ndarray:
-    high, low = np.array(words[0::2], np.uint32), np.array(words[1::2], np.uint32)
+def numbers_of(phrase: list[int]) -> np.ndarray:
+    high, low = np.array(phrase[0::2], np.uint32), np.array(phrase[1::2], np.uint32)
     return (high << 16 | low).astype(np.int32) * UNIT
 
 
@@ -109,7 +109,7 @@ def test_a_plc_reads_state_corrected_joints_and_offset(source: ModbusSource) -> 
     first_of(source)
     assert plc.inputs()[:6] == [1, 3, 0, 0, 0, 0]
     offset = np.array([1e-3, -2e-3, 3e-4, 1e-4, -2e-4, 0.0])
-    source.tell(Told(State.COMPENSATING, HERE, HERE + 0.002, offset, True, 0))
+    source.emit(SourceStatus(State.COMPENSATING, HERE, HERE + 0.002, offset, True, 0))
     found = plc.inputs()
     assert found[:6] == [1, 3, 3, plc.sequence, 1, 1]
     assert numbers_of(found[10:16]) == pytest.approx(HERE + 0.002, abs=UNIT)

@@ -77,15 +77,15 @@ def test_a_trajectory_can_be_begun_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("old", "new", "phrase"),
     [
         ("5.5,", "4.5,", "row 3, column timestamp"),
         ("-1.0,1.0\n", "nan,1.0\n", "column target_q_1"),
         ("target_q_2", "other", "target_q"),
     ],
 )
-def test_a_bad_trajectory_is_one_line(old: str, new: str, words: str, tmp_path: Path) -> None:
-    with pytest.raises(LogError, match=words) as refusal:
+def test_a_bad_trajectory_is_one_line(old: str, new: str, phrase: str, tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=phrase) as refusal:
         trajectory(tmp_path, WAY.replace(old, new, 1))
     assert "\n" not in str(refusal.value)
 
@@ -218,9 +218,9 @@ def test_the_first_bad_line_ends_the_connection_and_nothing_after_it_counts(
     with planner(feed) as socket_:
         socket_.sendall(line.encode() + b"\n" + 5 * GOOD)
         assert first_of(feed, 0.1) is None
-        said = answer(socket_)
-        assert said.startswith(b"error: ")
-        assert said.count(b"\n") == 1
+        reply = answer(socket_)
+        assert reply.startswith(b"error: ")
+        assert reply.count(b"\n") == 1
     assert feed.refused == 1
     with planner(feed) as socket_:  # and the feed is free for another one
         socket_.sendall(GOOD)
@@ -351,9 +351,9 @@ def test_over_tcp_nothing_counts_before_the_token(line: str, tcp: TcpSource) -> 
     with planner(tcp) as link:
         link.sendall(line.encode() + b"\n" + GOOD)
         assert first_of(tcp, 0.1) is None
-        said = answer(link)
-        assert b"expected the token in the first line" in said
-        assert TOKEN.encode() not in said
+        reply = answer(link)
+        assert b"expected the token in the first line" in reply
+        assert TOKEN.encode() not in reply
 
 
 def test_over_tcp_the_token_opens_the_feed(tcp: TcpSource) -> None:
@@ -393,7 +393,7 @@ def test_a_loopback_address_is_taken(host: str) -> None:
     assert SetpointSettings(source="modbus", host=host).host == host
 
 
-def test_a_cell_with_a_port_and_no_token_is_refused_and_says_what_to_set(tmp_path: Path) -> None:
+def test_a_cell_with_a_port_and_no_token_is_refused_and_names_what_to_set(tmp_path: Path) -> None:
     path = tmp_path / "cell.yaml"
     path.write_text(
         "robot: {model: ur10e}\nlink: {host: 127.0.0.1}\nsetpoints: {source: tcp, port: 30310}\n"

@@ -62,9 +62,9 @@ def test_the_daemon_is_watched_and_nothing_about_it_can_be_changed_from_the_netw
     daemon.end()
     events = daemon.events()
     assert all({"time", "level", "event", "message"} <= set(event) for event in events)
-    told = [event["to"].lower() for event in events if event["event"] == "transition"]
-    assert told[0] == "observing"
-    assert told.index("armed") < told.index("compensating")
+    reported = [event["to"].lower() for event in events if event["event"] == "transition"]
+    assert reported[0] == "observing"
+    assert reported.index("armed") < reported.index("compensating")
     assert "robot:" not in daemon.log.read_text()  # the cell's own text is in no log
 
 

@@ -190,10 +190,10 @@ def test_a_cell_that_was_read_again_shows_its_envelope(browser, tmp_path):
             assert complaints == []
 
 
-def test_words_from_the_robot_are_shown_and_never_run(browser, feed):
+def test_text_from_the_robot_is_shown_and_never_run(browser, feed):
     with opened(browser, feed) as (page, _, complaints):
         live(page)
-        feed.tell(kind="fault", detail="<img src=x onerror=document.title='run'>")
+        feed.emit(kind="fault", detail="<img src=x onerror=document.title='run'>")
         page.wait_for_function(
             "() => document.querySelector('#events').textContent.includes('<img')", timeout=15_000
         )

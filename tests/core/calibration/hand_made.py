@@ -39,7 +39,7 @@ def hand_made(
     def part(vector: Array, rows: NDArray[np.bool_]) -> Errors:
         return Errors(vector[rows], np.flatnonzero(rows))
 
-    told: dict[str, object] = {
+    reported: dict[str, object] = {
         "noise": 2e-5, "repeatability": 1e-5, "tcp_std": np.full(held.sum(), 3e-5),
         "instrument_noise": 1e-5, "freedom": 60.0,
     } | given  # fmt: skip
@@ -48,5 +48,5 @@ def hand_made(
         covariance=np.zeros((0, 0)) if covariance is None else covariance, combinations=(),
         before=part(before, ~held), after=part(error, ~held), held_out_before=part(before, held),
         held_out_after=part(error, held), outliers=np.zeros(0, dtype=np.int64), stations=(frame,),
-        diagnosis=None, complete=True, verdict="", **told,  # type: ignore[arg-type]
+        diagnosis=None, complete=True, verdict="", **reported,  # type: ignore[arg-type]
     )  # fmt: skip

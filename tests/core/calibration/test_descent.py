@@ -29,7 +29,7 @@ from gapbridge.core.model import Model
 
 KIND = ARMS["cobot5"]
 LAYOUT = Layout(poses=18, held_out=10, repeated=3)
-SEED = 6  # undamped steps came to rest 15 deviations away from it
+SEED = 6  # undamped steps converged 15 deviations away from it
 POSITION = make_observable("position")
 
 
@@ -72,7 +72,7 @@ def test_a_payload_beside_flexibilities_is_found_and_does_not_run_away(
     assert found.held_out_before.rms > 20 * found.held_out_after.rms
 
 
-def test_what_one_load_cannot_tell_is_said_and_harms_no_prediction(
+def test_what_one_load_cannot_show_is_reported_and_harms_no_prediction(
     model: Model, parameters: Parameters
 ) -> None:
     readings = _session(parameters, 1.0)
@@ -93,10 +93,10 @@ def test_what_hangs_on_an_arm_weighs_nothing_or_more(parameters: Parameters) -> 
     assert bounds.lower[parameters.names.index("payload")] == pytest.approx(-lightest)
 
 
-def test_damping_shortens_what_two_parameters_hardly_tell_apart_most() -> None:
+def test_damping_shortens_what_two_parameters_hardly_separated_most() -> None:
     rng = np.random.default_rng(0)
     first, other = rng.normal(size=(2, 40))
-    J = np.column_stack([first, first + 1e-3 * other])  # their difference is hardly told
+    J = np.column_stack([first, first + 1e-3 * other])  # their difference is hardly determined
     system = System(J, np.zeros((40, 0)), J @ [3.0, -2.0])
     wide = Bounds(np.full(2, -np.inf), np.full(2, np.inf), np.full(2, 1e6), np.zeros(2))
     free = np.ones(2, dtype=bool)

@@ -89,7 +89,7 @@ def test_an_instrument_that_moved_leaves_some_poses_to_verify_in_one_place_only(
     model: Model, parameters: Parameters, session: tuple[Readings, dict[str, float], Instrument],
     verified: str,
 ) -> None:  # fmt: skip
-    """Where it stands now is told by poses there, to verify or not; nothing breaks over it."""
+    """Where it stands now is found from poses there, to verify or not; nothing breaks over it."""
     readings = session[0]
     held, second = readings.held_out, np.zeros(len(readings), dtype=np.int64)
     second[np.flatnonzero(held if verified == "after it" else ~held)[-6:]] = 1
@@ -104,7 +104,7 @@ def test_an_instrument_that_moved_leaves_some_poses_to_verify_in_one_place_only(
     assert some.held_out_after.rms < 2e-4
 
 
-def test_noise_of_instrument_and_arm_are_told_apart(
+def test_noise_of_instrument_and_arm_are_separated(
     found: Calibration, session: tuple[Readings, dict[str, float], Instrument]
 ) -> None:
     instrument = session[2]
@@ -137,7 +137,7 @@ def test_held_out_readings_never_touch_the_fit(
     assert "held-out" in " ".join(spoilt.notes)
 
 
-def test_wild_readings_are_listed_and_change_little(
+def test_outlier_readings_are_listed_and_change_little(
     model: Model,
     parameters: Parameters,
     found: Calibration,
@@ -146,13 +146,16 @@ def test_wild_readings_are_listed_and_change_little(
     readings = session[0]
     value = readings.value.copy()
     value[[4, 30]] += [[0.0, 3e-4, 0.0], [0.02, 0.0, 0.01]]
-    wild = calibrate(model, replace(readings, value=value), parameters, METROLOGY, diagnose=False)
-    assert list(wild.outliers) == [4, 30]
+    outlier = calibrate(
+        model, replace(readings, value=value), parameters, METROLOGY, diagnose=False
+    )
+    assert list(outlier.outliers) == [4, 30]
     off = [
-        abs(w.value - f.value) / f.std for w, f in zip(wild.estimates, found.estimates, strict=True)
+        abs(w.value - f.value) / f.std
+        for w, f in zip(outlier.estimates, found.estimates, strict=True)
     ]
     assert max(off) < 2.0
-    assert wild.held_out_after.rms < 1.15 * found.held_out_after.rms
+    assert outlier.held_out_after.rms < 1.15 * found.held_out_after.rms
 
 
 def test_flexibilities_stay_at_zero_or_above(model: Model, parameters: Parameters) -> None:

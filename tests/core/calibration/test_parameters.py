@@ -31,15 +31,15 @@ def parameters(model: Model) -> Parameters:
 
 
 def test_redundant_ones_are_left_out_and_named(parameters: Parameters) -> None:
-    told = dict(line.split(": ", 1) for line in parameters.redundant)
-    assert "joint_offset_1" in told and "instrument" in told["joint_offset_1"]
-    assert "joint_offset_6" in told and "tool_frame" in told["joint_offset_6"]
-    assert "link_geometry_3_d" in told and "link_geometry_2_d" in told["link_geometry_3_d"]
-    assert "nothing" in told["axial_compliance_1"]  # weights do not turn a vertical joint
-    assert not set(told) & set(parameters.names)
+    reported = dict(line.split(": ", 1) for line in parameters.redundant)
+    assert "joint_offset_1" in reported and "instrument" in reported["joint_offset_1"]
+    assert "joint_offset_6" in reported and "tool_frame" in reported["joint_offset_6"]
+    assert "link_geometry_3_d" in reported and "link_geometry_2_d" in reported["link_geometry_3_d"]
+    assert "nothing" in reported["axial_compliance_1"]  # weights do not turn a vertical joint
+    assert not set(reported) & set(parameters.names)
 
 
-def test_what_is_left_is_told_apart_by_readings(parameters: Parameters) -> None:
+def test_what_is_left_is_separated_by_readings(parameters: Parameters) -> None:
     # a UR has 4 geometric parameters a joint less the redundant ones (three parallel axes), a
     # tool point, and no more than 6 of the frame; every compliance that weight excites
     geometric = [name for name in parameters.names if "compliance" not in name]
@@ -124,8 +124,8 @@ def test_a_base_that_gives_way_is_found_about_both_axes_wherever_it_is_named(mod
     found = [Parameters.of(model, effects, observable=POSITION) for effects in chosen]
     assert set(found[0].names) == set(found[1].names)
     assert {"base_compliance_x", "base_compliance_y"} <= set(found[0].names)
-    told = dict(line.split(": ", 1) for line in found[0].redundant)
-    assert "base_compliance_x and base_compliance_y" in told["radial_compliance_1"]
+    reported = dict(line.split(": ", 1) for line in found[0].redundant)
+    assert "base_compliance_x and base_compliance_y" in reported["radial_compliance_1"]
 
 
 def test_a_payload_is_a_parameter_of_an_arm_whose_softness_is_to_be_found(model: Model) -> None:

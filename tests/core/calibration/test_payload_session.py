@@ -110,7 +110,7 @@ def test_a_bare_flange_weighs_nothing_and_has_no_centre(model: Model) -> None:
     assert not np.isfinite(found.estimates[1].std)
 
 
-def test_planned_orientations_tell_what_they_promise(model: Model) -> None:
+def test_planned_orientations_show_what_they_promise(model: Model) -> None:
     plan = plan_payload(model, BEGIN, mass=2.0, noise=(FORCE, TORQUE))
     assert all(np.array_equal(q[:3], BEGIN[:3]) for q in plan.poses)
     assert plan.bought[-1][0] == len(plan.poses)
@@ -122,7 +122,7 @@ def test_planned_orientations_tell_what_they_promise(model: Model) -> None:
     assert np.std(found) == pytest.approx(plan.std[0], rel=0.3)
 
 
-def test_a_wrist_that_cannot_turn_is_told_when_planning(model: Model) -> None:
+def test_a_wrist_that_cannot_turn_is_reported_when_planning(model: Model) -> None:
     limits = replace(model.arm.limits, lower=BEGIN - 0.051, upper=BEGIN + 0.051)
     fixed = replace(model, arm=replace(model.arm, limits=limits))
     with pytest.raises(ExcitationError, match="cannot turn the flange far enough"):

@@ -72,7 +72,7 @@ def test_a_slipped_touch_is_listed(model: Model) -> None:
     assert found.tcp == pytest.approx(TRUE_TIP, abs=3e-4)
 
 
-def test_a_ball_held_against_a_ball_tells_the_tip_too(model: Model) -> None:
+def test_a_ball_held_against_a_ball_shows_the_tip_too(model: Model) -> None:
     q = np.array(plan_tool(model, BEGIN, poses=14).poses)
     rng = np.random.default_rng(3)
     around = rng.normal(size=(len(q), 3))

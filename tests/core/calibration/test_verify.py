@@ -82,10 +82,10 @@ def test_a_joint_whose_zero_moved_is_named_with_how_far(calibrated: Calibrated) 
     assert "joint 3" in seen.verdict
 
 
-def test_a_tool_that_was_bent_is_named(calibrated: Calibrated) -> None:
+def test_a_tool_that_was_deflected_is_named(calibrated: Calibrated) -> None:
     found, document, real, instrument = calibrated
-    bent = with_values(real, {"tool_frame_x": 4e-4, "tool_frame_z": -2e-4})
-    seen = verify(found.model, _again(bent, instrument), document, METROLOGY)
+    deflected = with_values(real, {"tool_frame_x": 4e-4, "tool_frame_z": -2e-4})
+    seen = verify(found.model, _again(deflected, instrument), document, METROLOGY)
     assert seen.moved is not None
     assert seen.moved.name == "tool_frame"
 

@@ -1,4 +1,4 @@
-"""What is told of regions and sessions that were not fitted."""
+"""What is reported of regions and sessions that were not fitted."""
 
 from __future__ import annotations
 

@@ -98,18 +98,18 @@ def test_a_needless_cause_does_not_shrink_the_held_out_gap(selection):
 
 def test_a_shrink_is_one_less_the_ratio_of_its_gaps_and_repeats(selection):
     chosen = selection.found.chosen
-    told, again = (HeldOut(selection).shrink(chosen, ()) for _ in range(2))
-    assert told == again
-    assert told.shrink == pytest.approx(1 - told.gap_with / told.gap_without)
-    assert told.interval[0] <= told.shrink <= told.interval[1]
+    reported, again = (HeldOut(selection).shrink(chosen, ()) for _ in range(2))
+    assert reported == again
+    assert reported.shrink == pytest.approx(1 - reported.gap_with / reported.gap_without)
+    assert reported.interval[0] <= reported.shrink <= reported.interval[1]
     nothing = HeldOut(selection).shrink(chosen, chosen)
     assert (nothing.shrink, nothing.interval) == (0.0, (0.0, 0.0))
     other = HeldOut(selection, seed=9).shrink(chosen, ())
-    assert other != told
-    assert other.shrink == pytest.approx(told.shrink, abs=0.05)
+    assert other != reported
+    assert other.shrink == pytest.approx(reported.shrink, abs=0.05)
 
 
-def test_the_told_figure_is_the_held_out_one():
+def test_the_reported_figure_is_the_held_out_one():
     (channel,) = small.diagnosed("backlash").channels
     chosen = channel.selection.found.chosen
     held = HeldOut(channel.selection)

@@ -1,4 +1,4 @@
-"""The judgement: ties are told, weak accusations withdrawn, causes and losers accounted for."""
+"""The judgement: ties are reported, weak accusations withdrawn, causes and losers accounted for."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def channel_of(effect: str):
 
 
 @pytest.mark.parametrize("effect", LOGS)
-def test_every_effect_of_the_catalogue_is_a_cause_or_told_why_not(effect):
+def test_every_effect_of_the_catalogue_is_a_cause_or_reported_why_not(effect):
     channel = channel_of(effect)
     accused = {c.effect for c in channel.causes}
     considered = [c.effect for c in channel.considered]
@@ -49,14 +49,14 @@ def test_every_term_is_accused_or_withdrawn(effect):
     assert named == sorted(channel.selection.terms[p].effect for p in accused)
 
 
-def test_an_accusation_beside_a_leftover_is_withdrawn_and_said_so():
+def test_an_accusation_beside_a_leftover_is_withdrawn_and_reported_so():
     found = small.diagnosed("cross_coupling")
     (channel,) = found.channels
     assert channel.judgement.structured
     assert channel.judgement.accused == ()
     for position, reason in channel.judgement.withdrawn:
         effect = channel.selection.terms[position].effect
-        assert any(effect in told and reason in told for told in found.findings)
+        assert any(effect in reported and reason in reported for reported in found.findings)
         assert next(c for c in channel.considered if c.effect == effect).reason == reason
     assert found.model.terms == small.model_of().terms  # nothing withdrawn reaches the model
 
@@ -130,7 +130,7 @@ def test_a_tie_names_the_other_and_leaves_the_strangers_out():
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 999), sigma=st.floats(1e-6, 1e-2), pairs=st.integers(30, 60))
-def test_repeats_tell_the_noise_whatever_the_poses_are_off_by(seed, sigma, pairs):
+def test_repeats_show_the_noise_whatever_the_poses_are_off_by(seed, sigma, pairs):
     rng = np.random.default_rng(seed)
     groups = np.repeat(np.arange(pairs), 3)
     noise = rng.normal(0, sigma, (3 * pairs, 3))
@@ -157,17 +157,17 @@ def test_a_loser_that_scores_well_alone_is_not_probable_beside_the_cause():
     assert all(c.probability < 0.5 for c in alone.values())
 
 
-def test_a_parameter_on_its_bound_is_told():
+def test_a_parameter_on_its_bound_is_reported():
     channel = channel_of("backlash")
     selection = channel.selection
     (term,) = selection.terms
     flat = replace(selection, terms=(term.with_values(np.zeros(1)),))
-    for chosen, words in ((selection, []), (flat, ["backlash_2 stands on its bound (0 rad)"])):
+    for chosen, phrase in ((selection, []), (flat, ["backlash_2 stands on its bound (0 rad)"])):
         (cause,) = causes_of(chosen, channel.judgement, HeldOut(chosen), small.model_of().arm)
-        assert list(cause.notes) == words
+        assert list(cause.notes) == phrase
 
 
-def test_what_a_log_cannot_show_says_what_it_needs():
+def test_what_a_log_cannot_show_reports_what_it_needs():
     rigid = {c.effect: c for c in channel_of("none").considered}
     payload = rigid["payload"]  # positions of a rigid model do not show it
     assert (payload.excited, payload.probability, payload.shrink_alone) == (False, 0.0, None)
@@ -176,8 +176,8 @@ def test_what_a_log_cannot_show_says_what_it_needs():
     channel = channel_of("none")
     held = HeldOut(channel.selection)
     arm = small.model_of().arm
-    told = considered_of(channel.selection, channel.judgement, held, arm, ("payload",))
-    assert "payload" not in {c.effect for c in told}
+    reported = considered_of(channel.selection, channel.judgement, held, arm, ("payload",))
+    assert "payload" not in {c.effect for c in reported}
     cold = small.session_of(0)
     without = small.log_of(
         cold, small.readings(small.NOMINAL, cold), joint_temperatures=None, approach=None

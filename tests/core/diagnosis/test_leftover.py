@@ -1,4 +1,4 @@
-"""The leftover: noise has no structure, structure is seen, and what it follows is named."""
+"""Residual structure: noise has none, structure is seen, and what it follows is named."""
 
 from __future__ import annotations
 
@@ -72,13 +72,13 @@ def test_structure_in_some_rows_shows_in_those_alone():
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 999), planted=st.sampled_from([3, 4, 5, TIME]))
 def test_what_the_leftover_follows_comes_first(seed, planted):
-    told = dependence(space(seed, (planted,)), FRAME, (), GROUPS)
-    name, share = told[0]
+    reported = dependence(space(seed, (planted,)), FRAME, (), GROUPS)
+    name, share = reported[0]
     assert name == CANDIDATES[planted].quantity
     assert 0.4 < share < 1
-    shares = [s for _, s in told]
+    shares = [s for _, s in reported]
     assert shares == sorted(shares, reverse=True)
-    assert len({n for n, _ in told}) == len(told)
+    assert len({n for n, _ in reported}) == len(reported)
 
 
 def test_noise_follows_nothing():
@@ -88,9 +88,9 @@ def test_noise_follows_nothing():
 
 def test_what_is_in_the_model_is_not_followed_any_more():
     both = space(5, (3, TIME))
-    told = dict(dependence(both, FRAME, (3,), GROUPS))
-    assert max(told, key=lambda n: told[n]) == "timestamp"
-    assert told["actual_q_0"] < 0.1
+    reported = dict(dependence(both, FRAME, (3,), GROUPS))
+    assert max(reported, key=lambda n: reported[n]) == "timestamp"
+    assert reported["actual_q_0"] < 0.1
 
 
 def test_a_function_is_judged_on_conditions_that_it_was_not_fitted_to():
@@ -105,7 +105,7 @@ def test_a_function_is_judged_on_conditions_that_it_was_not_fitted_to():
     assert apart["actual_q_0"] > 0.9
 
 
-def test_joint_temperatures_rise_together_and_are_told_once():
+def test_joint_temperatures_rise_together_and_are_reported_once():
     names = [n for n, _ in dependence(space(6, (7,)), FRAME, (), GROUPS)]
     assert sum(n.startswith("joint_temperatures_") for n in names) == 1
     assert names[0] == "joint_temperatures_0"

@@ -35,25 +35,25 @@ def test_a_soft_arm_behind_a_rigid_cell_is_sent_to_the_fit(rigid: Model) -> None
     assert {c.effect for c in found.channels[0].causes} & {"axial_compliance", "radial_compliance"}
     (word,) = softness_findings(rigid, log_of(TYPE), FREE)
     assert (word in found.findings) is (found.verdict == "partly_explained")
-    told = re.search(r"from ([\d.]+) to ([\d.]+) mm", word)
-    assert told is not None
-    before, after = map(float, told.groups())
+    reported = re.search(r"from ([\d.]+) to ([\d.]+) mm", word)
+    assert reported is not None
+    before, after = map(float, reported.groups())
     assert before == pytest.approx(1e3 * found.channels[0].gap_rms, rel=0.2)
     assert after < 0.05
 
 
-def test_nothing_is_said_where_the_cell_names_flexibilities(rigid: Model) -> None:
+def test_nothing_is_reported_where_the_cell_names_flexibilities(rigid: Model) -> None:
     half = rigid.with_compliance(TYPE.axial / 2, TYPE.radial / 2)
     assert softness_findings(half, log_of(TYPE), FREE) == []
 
 
-def test_nothing_is_said_where_softness_is_not_the_main_thing(rigid: Model) -> None:
+def test_nothing_is_reported_where_softness_is_not_the_main_thing(rigid: Model) -> None:
     log = log_of(STIFF)
     log.columns["actual_q"][:, 1] += 2e-3 * np.sin(3 * log.columns["actual_q"][:, 0])
     assert softness_findings(rigid, log, FREE) == []
 
 
-def test_nothing_is_said_where_no_fit_can_be_made(rigid: Model) -> None:
+def test_nothing_is_reported_where_no_fit_can_be_made(rigid: Model) -> None:
     few = log_of(TYPE, poses=4)
     assert softness_findings(rigid, few, FREE) == []
 

@@ -44,7 +44,7 @@ def tied():
     return diagnose(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
 
 
-def test_a_tie_is_told_and_asked(tied):
+def test_a_tie_is_reported_and_asked(tied):
     (cause,) = tied.channels[0].causes
     names = {cause.effect, *cause.indistinguishable_from}
     assert {"joint_offset", "backlash"} <= names
@@ -53,10 +53,10 @@ def test_a_tie_is_told_and_asked(tied):
 
 
 def test_proposed_poses_stand_within_the_joint_limits_and_the_rated_load(tied):
-    for told in tied.next_measurements:
-        assert np.all(np.array(told.q) >= small.LIMITS.lower)
-        assert np.all(np.array(told.q) <= small.LIMITS.upper)
-        assert 0 <= told.payload <= small.KIND.rated * 1.05
+    for reported in tied.next_measurements:
+        assert np.all(np.array(reported.q) >= small.LIMITS.lower)
+        assert np.all(np.array(reported.q) <= small.LIMITS.upper)
+        assert 0 <= reported.payload <= small.KIND.rated * 1.05
 
 
 def test_at_a_proposed_pose_the_tied_pair_really_differs(tied):
@@ -64,13 +64,13 @@ def test_at_a_proposed_pose_the_tied_pair_really_differs(tied):
     play = small.turned(2, lambda s, q: s.approach[:, 1] * -PLAY / 2)
     seen = small.session_of(3, ONE_SIDED)
     assert np.allclose(stand(OFFSET, seen).tcp, stand(play, seen).tcp, atol=1e-9)  # on the log
-    for told in tied.next_measurements:
-        if set(told.separates) != {"joint_offset", "backlash"}:
+    for reported in tied.next_measurements:
+        if set(reported.separates) != {"joint_offset", "backlash"}:
             continue
-        assert told.approach is not None
-        there = session_at(told.q, told.payload, told.approach)
+        assert reported.approach is not None
+        there = session_at(reported.q, reported.payload, reported.approach)
         apart = np.linalg.norm(stand(OFFSET, there).tcp - stand(play, there).tcp)
-        assert apart / small.FLOOR == pytest.approx(told.expected_gain, rel=0.25)
+        assert apart / small.FLOOR == pytest.approx(reported.expected_gain, rel=0.25)
         assert apart > 5 * small.FLOOR
 
 
@@ -107,8 +107,8 @@ def test_any_limits_are_kept(tied, low, width, open_below, seed):
     model = small.model_of()
     model = replace(model, arm=replace(model.arm, limits=limits))
     log = small.log_of(small.session_of(3, ONE_SIDED), np.zeros((60, 3)))
-    for told in next_measurements(model, log, tied.channels, seed):
-        q = np.array(told.q)
+    for reported in next_measurements(model, log, tied.channels, seed):
+        q = np.array(reported.q)
         assert np.all((limits.lower <= q) & (q <= limits.upper))
         assert np.ptp(q) < 20
 
@@ -150,12 +150,12 @@ def test_a_tie_of_the_flange_sensor_is_asked(one_attitude):
     asked = [m for m in one_attitude.next_measurements if set(m.separates) == pair]
     assert asked
     bias = (flange_reading([0.0, 0.7, -1.1], 4.0) * GAIN)[0]
-    for told in asked:
-        q = np.array(told.q)
+    for reported in asked:
+        q = np.array(reported.q)
         assert np.all((small.LIMITS.lower <= q) & (q <= small.LIMITS.upper))
-        apart = flange_reading(q, told.payload)[0] * GAIN - bias
+        apart = flange_reading(q, reported.payload)[0] * GAIN - bias
         promised = np.linalg.norm(apart * (0.2 / NOISE)) / channel.noise_floor_rms
-        assert promised == pytest.approx(told.expected_gain, rel=0.35)
+        assert promised == pytest.approx(reported.expected_gain, rel=0.35)
         assert promised > 3
 
 
@@ -184,12 +184,12 @@ def test_an_effect_the_log_cannot_show_is_asked_for_where_it_shows():
         small.COMPLIANT,
         gravity=turn(np.array([[size.scale, size.scale, 0.0]]))[0] @ small.NOMINAL.gravity,
     )
-    for told in asked:
-        there = session_at(told.q, told.payload, np.ones(3))
+    for reported in asked:
+        there = session_at(reported.q, reported.payload, np.ones(3))
         there = small.replace(there, payload_cog=near.payload_cog[-1:])
         promised = beside_a_frame(leaning, small.COMPLIANT, near, there)
         assert promised == pytest.approx(
-            told.expected_gain * found.channels[0].noise_floor_rms, rel=0.1
+            reported.expected_gain * found.channels[0].noise_floor_rms, rel=0.1
         )
 
 

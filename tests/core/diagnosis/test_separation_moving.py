@@ -1,4 +1,4 @@
-"""What to record next: motions that tell apart what a slow recording leaves open."""
+"""What to record next: motions that separate what a slow recording leaves open."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def recorded(step: float):
     return diagnose(MODEL, truth.log_of(N, timestamp=t, actual_q=late, target_q=at(t)))
 
 
-def test_a_delay_or_a_lag_in_slow_motion_is_told_as_a_tie(slow):
+def test_a_delay_or_a_lag_in_slow_motion_is_reported_as_a_tie(slow):
     (cause,) = slow.channels[0].causes
     assert {cause.effect, *cause.indistinguishable_from} == {"latency", "tracking_lag"}
     assert cause.joints == (3,)
@@ -51,12 +51,14 @@ def test_rows_enough_decide_what_few_of_them_leave_open():
 def test_the_motion_asked_for_is_one_the_arm_can_make_and_quicker_than_the_recording(slow):
     asked = [m for m in slow.next_measurements if len(m.separates) == 2]
     assert asked
-    for told in asked:
-        assert np.all(np.abs(told.velocity) <= MODEL.arm.limits.velocity)
-        began = np.array(told.velocity) - 0.5 * np.array(told.acceleration)
+    for reported in asked:
+        assert np.all(np.abs(reported.velocity) <= MODEL.arm.limits.velocity)
+        began = np.array(reported.velocity) - 0.5 * np.array(reported.acceleration)
         assert np.all(np.abs(began) <= MODEL.arm.limits.velocity * 1.000001)
-        assert abs(told.acceleration[2]) > 3 * 0.5 * SLOW**2  # the recording's own hardest, thrice
-        assert told.expected_gain > 1
+        assert (
+            abs(reported.acceleration[2]) > 3 * 0.5 * SLOW**2
+        )  # the recording's own hardest, thrice
+        assert reported.expected_gain > 1
 
 
 def test_the_expected_gain_is_what_the_two_explanations_come_to_there(slow):
@@ -69,6 +71,6 @@ def test_the_expected_gain_is_what_the_two_explanations_come_to_there(slow):
 
 
 def test_speed_and_acceleration_stand_in_the_document(slow):
-    told = [m for m in document(slow)["next_measurements"] if len(m["separates"]) == 2]
-    assert told
-    assert all(len(m["velocity"]) == len(m["acceleration"]) == N for m in told)
+    reported = [m for m in document(slow)["next_measurements"] if len(m["separates"]) == 2]
+    assert reported
+    assert all(len(m["velocity"]) == len(m["acceleration"]) == N for m in reported)

@@ -1,7 +1,7 @@
 """Several sessions: frames and tool points of their own, effects shared, what changed is named.
 
-The truth comes from the blind benchmark's mechanics. What is told of a new session is compared with
-what the model leaves of further sessions, placed by code of this file.
+The truth comes from the blind benchmark's mechanics. What is reported of a new session is compared
+with what the model leaves of further sessions, placed by code of this file.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def test_a_cause_is_found_across_frames_and_tool_points(compliant) -> None:
     assert [s for s, _ in across.values] == [0, 1]
 
 
-def test_what_is_told_of_a_new_session_holds_for_further_ones(compliant) -> None:
+def test_what_is_reported_of_a_new_session_holds_for_further_ones(compliant) -> None:
     real = small.REAL["axial_compliance"]
     found = compliant.channels[0].elsewhere
     further = [placed(compliant.model, session(real, s, remounted=True), True) for s in (44, 45)]
@@ -127,8 +127,8 @@ def test_a_value_that_changed_is_named_as_changed() -> None:
 def test_what_holds_in_one_session_only_depends_on_the_session() -> None:
     """Nothing of the catalogue: two sessions of three bend by the square of another joint."""
     real = small.REAL["cross_coupling"]
-    bent = replace(real, angle_errors=(lambda s: 3 * real.angle_errors[0](s),))
-    logs = [session(bent, 1), session(small.NOMINAL, 2), session(bent, 3)]
+    deflected = replace(real, angle_errors=(lambda s: 3 * real.angle_errors[0](s),))
+    logs = [session(deflected, 1), session(small.NOMINAL, 2), session(deflected, 3)]
     found = diagnose(MODEL, join_sessions(logs, MODEL), Metrology(sigma=small.SIGMA))
     assert "session" in found.channels[0].selection.observation.quantities
     assert found.channels[0].structured
@@ -183,6 +183,6 @@ def test_a_parameter_that_one_session_does_not_show_is_not_compared() -> None:
         selection, space=replace(selection.space, X=X),
         raw=replace(selection.raw, taken=taken),
     )  # fmt: skip
-    told = carried(changed, (own, other), MODEL.arm)
-    assert all(np.isfinite(c.p_value) for c in told)
-    assert "axial_compliance" in {c.effect for c in told}
+    reported = carried(changed, (own, other), MODEL.arm)
+    assert all(np.isfinite(c.p_value) for c in reported)
+    assert "axial_compliance" in {c.effect for c in reported}

@@ -1,4 +1,4 @@
-"""Slips, droop and dead bands in a diagnosis: found, dated, told apart, and named where unseen."""
+"""Slips, droop and dead bands in a diagnosis: found, dated, separated, and named where unseen."""
 
 from __future__ import annotations
 
@@ -72,9 +72,9 @@ def test_a_target_that_slips_is_no_joint_that_does() -> None:
     channel, findings = position(sampled([Term("target_slip", Site(), shift)]))
     (cause,) = channel.causes
     assert cause.effect == "target_slip"
-    for told, true in zip(cause.parameters, shift, strict=False):
-        assert told.std is not None
-        assert abs(told.value - true) < 4 * told.std
+    for reported, true in zip(cause.parameters, shift, strict=False):
+        assert reported.std is not None
+        assert abs(reported.value - true) < 4 * reported.std
     (sentence,) = [f for f in findings if "target_slip" in f]
     (far,) = re.findall(r"the target on the tool moved by (\S+) mm", sentence)
     assert abs(float(far) - 1e3 * np.linalg.norm(shift)) < 0.05

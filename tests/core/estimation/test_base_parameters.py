@@ -10,7 +10,7 @@ SIGMA = 1e-4  # rad/Nm, the prior's
 
 
 def problem(columns, values):
-    """Return a problem whose columns (M, 4) are told in units of the noise per prior sigma."""
+    """Return a problem whose columns (M, 4) are given in units of the noise per prior sigma."""
     columns = np.asarray(columns, dtype=float)
     return Linear(columns / SIGMA, columns / SIGMA @ (np.asarray(values) * SIGMA))
 
@@ -23,8 +23,8 @@ def chosen(linear, nonnegative=True):
 def test_what_has_columns_of_its_own_is_kept_and_the_empty_ones_are_held():
     kept, shown = chosen(problem(np.diag([50.0, 20.0, 0.0, 1.0]), [1, 1, 0, 0]))
     assert kept.tolist() == [True, True, False, False]
-    held = "not shown by these data, stays at the model's value"
-    assert shown.told == (f"radial_compliance_1: {held}", f"radial_compliance_2: {held}")
+    held = "not identifiable from these data, stays at the model's value"
+    assert shown.reported == (f"radial_compliance_1: {held}", f"radial_compliance_2: {held}")
     std = np.sqrt(np.diag(shown.covariance)) / SIGMA
     np.testing.assert_allclose(std[:2], [1 / 50, 1 / 20], rtol=2e-3)
     np.testing.assert_array_equal(std[2:], 1)
@@ -36,10 +36,10 @@ def test_two_that_act_alike_are_carried_by_one_and_both_are_named():
     kept, shown = chosen(problem(columns, [1, 0.5, 1, 0.5]))
     assert kept[[0, 2]].all()
     assert kept[1] != kept[3]
-    assert len(shown.told) == 1
-    assert "not shown alone by these data, it acts like +1.00 " in shown.told[0]
-    assert name(1, 4) in shown.told[0]
-    assert name(3, 4) in shown.told[0]
+    assert len(shown.reported) == 1
+    assert "not identifiable alone from these data, it acts like +1.00 " in shown.reported[0]
+    assert name(1, 4) in shown.reported[0]
+    assert name(3, 4) in shown.reported[0]
 
 
 def test_of_a_difference_the_one_is_kept_that_can_carry_it_without_going_below_zero():
@@ -57,7 +57,7 @@ def test_a_sum_that_shows_though_none_of_its_members_does_is_named():
     columns[0] = 0.7 * VISIBLE
     kept, shown = chosen(problem(columns, [1, 1, 1, 1]))
     assert not kept.any()
-    together = [line for line in shown.told if "shown together, none of them alone" in line]
+    together = [line for line in shown.reported if "shown together, none of them alone" in line]
     assert len(together) == 1
     for i in range(4):
         assert f"+0.50 {name(i, 4)}" in together[0]
@@ -71,7 +71,7 @@ def test_two_kept_ones_whose_sum_is_much_better_known_are_named(sign):
     _, shown = chosen(problem(columns, [1, 1, 1, 1]))
     what = "sum" if sign > 0 else "difference"
     line = f"axial_compliance_1 and axial_compliance_2: mostly their {what} is known"
-    assert shown.told[0].startswith(line)
+    assert shown.reported[0].startswith(line)
 
 
 def test_flexibilities_are_named_as_the_effects_are():

@@ -1,4 +1,4 @@
-"""Flexibilities are found from poses and loads; intervals are honest, gaps in the data told."""
+"""Flexibilities are found from poses and loads; intervals are honest, gaps in the data reported."""
 
 import numpy as np
 import pytest
@@ -104,13 +104,13 @@ def test_a_frame_that_nobody_registered_is_found_along():
     np.testing.assert_allclose(np.concatenate([found.axial, found.radial]), planted, rtol=1e-3)
 
 
-def test_wild_readings_are_named_and_do_not_count():
+def test_outlier_readings_are_named_and_do_not_count():
     planted, columns = truth(6, 60, 4)
-    wild = [7, 23, 41]
-    columns["measured_position"][wild] += [0.003, -0.002, 0.004]
+    outlier = [7, 23, 41]
+    columns["measured_position"][outlier] += [0.003, -0.002, 0.004]
     found = identify_compliance(model_of(6), log_of(6, columns), KNOWN)
-    assert found.outliers.tolist() == wild
-    assert "3 wild reading(s) weighed down" in found.notes
+    assert found.outliers.tolist() == outlier
+    assert "3 outlier(s) down-weighted" in found.notes
     assert found.remaining_rms < 1.2 * NOISE
     std = np.concatenate([found.std_axial, found.std_radial])
     assert (np.abs(np.concatenate([found.axial, found.radial]) - planted) < 5 * std).all()
@@ -131,8 +131,8 @@ def test_what_the_data_do_not_show_is_named():
     del columns["actual_TCP_force"]
     found = identify_compliance(model_of(6), log_of(6, columns), KNOWN)
     assert not found.identifiable[0]
-    told = "axial_compliance_1: not shown by these data, stays at the model's value"
-    assert told in found.combinations
+    reported = "axial_compliance_1: not identifiable from these data, stays at the model's value"
+    assert reported in found.combinations
     assert found.identifiable[1:3].all()
 
 
@@ -150,13 +150,15 @@ def test_what_the_data_do_not_show_stays_exactly_at_the_models_value(own):
     np.testing.assert_array_equal(values[held], own)
     assert (values[found.identifiable] != own).sum() > 6
     for i in held:
-        told = [line for line in found.combinations if line.startswith(f"{name(i, 12)}: not sh")]
-        assert len(told) == 1
-        assert "stays at the model's value" in told[0]
+        reported = [
+            line for line in found.combinations if line.startswith(f"{name(i, 12)}: not sh")
+        ]
+        assert len(reported) == 1
+        assert "stays at the model's value" in reported[0]
 
 
 def test_of_a_sum_that_is_known_alone_one_member_carries_the_whole():
-    # as above, with an instrument too coarse to tell the shoulder's give from the base's tilt
+    # as above, with an instrument too coarse to separate the shoulder's give from the base's tilt
     planted, columns = truth(6, 40, 7, noise=2e-3, rotation=False, pull=0.0, still=(1, 2))
     found = identify_compliance(model_of(6), log_of(6, columns), KNOWN)
     both = found.identifiable[[1, 6]]
@@ -168,9 +170,9 @@ def test_of_a_sum_that_is_known_alone_one_member_carries_the_whole():
     )
     assert abs(value - planted[1] - planted[6]) < 4 * std
     other = name(np.array([1, 6])[~both][0], 12)
-    told = next(line for line in found.combinations if line.startswith(other))
-    assert "not shown alone by these data, it acts like" in told
-    assert name(carrier, 12) in told
+    reported = next(line for line in found.combinations if line.startswith(other))
+    assert "not identifiable alone from these data, it acts like" in reported
+    assert name(carrier, 12) in reported
 
 
 def test_a_tool_point_that_nobody_registered_is_found_along_and_costs_no_flexibility():
@@ -181,8 +183,8 @@ def test_a_tool_point_that_nobody_registered_is_found_along_and_costs_no_flexibi
     columns["measured_position"] = columns["measured_position"] + turn @ shift
     columns["actual_TCP_force"][:] = 0.0  # a pull acts at the tool point, wherever that is
     q, loads = columns["actual_q"], Loads(columns["payload"], columns["payload_cog"])
-    bent = model_of(6).with_compliance(planted[:6], planted[6:]).predict(q, loads)
-    columns["measured_position"] = bent.position + bent.rotation @ shift
+    deflected = model_of(6).with_compliance(planted[:6], planted[6:]).predict(q, loads)
+    columns["measured_position"] = deflected.position + deflected.rotation @ shift
     log = log_of(6, columns)
     found = identify_compliance(model_of(6), log, Metrology(registered=False))
     np.testing.assert_allclose(found.tool_offset, shift, atol=1e-6)
@@ -190,8 +192,8 @@ def test_a_tool_point_that_nobody_registered_is_found_along_and_costs_no_flexibi
     np.testing.assert_allclose(values[[1, 2, 3, 4, 7, 8, 9]], planted[[1, 2, 3, 4, 7, 8, 9]],
                                rtol=1e-3)  # fmt: skip
     assert found.remaining_rms < 1e-8
-    told = "frame and tool point were estimated along and are not written to the cell"
-    assert told in found.notes
+    reported = "frame and tool point were estimated along and are not written to the cell"
+    assert reported in found.notes
     known = identify_compliance(model_of(6), log, KNOWN)
     np.testing.assert_array_equal(known.tool_offset, 0)
     assert known.remaining_rms > 1e-2
@@ -199,7 +201,7 @@ def test_a_tool_point_that_nobody_registered_is_found_along_and_costs_no_flexibi
 
 @pytest.mark.parametrize("metrology", [KNOWN, Metrology(sigma=NOISE)])
 def test_before_and_after_are_counted_alike(metrology):
-    # a model that is right already gains nothing, on seen and on unseen poses, wild ones left out
+    # a model that is right already gains nothing, on seen and on unseen poses, outliers left out
     planted, columns = truth(6, 60, 5, rotation=False)
     columns["measured_position"][[4, 33]] += [0.004, -0.003, 0.002]
     right = model_of(6).with_compliance(planted[:6], planted[6:])
@@ -210,12 +212,12 @@ def test_before_and_after_are_counted_alike(metrology):
     assert found.gap_rms_held_out < found.remaining_rms_held_out < 1.3 * found.gap_rms_held_out
 
 
-def test_two_flexibilities_that_act_alike_are_told_as_one_combination():
+def test_two_flexibilities_that_act_alike_are_reported_as_one_combination():
     # where shoulder and elbow never turn, the base's tilt and the shoulder's give look the same
     planted, columns = truth(6, 40, 7, rotation=False, pull=0.0, still=(1, 2))
     found = identify_compliance(model_of(6), log_of(6, columns), KNOWN)
-    told = [line for line in found.combinations if "mostly their sum is known" in line]
-    assert told[0].startswith("axial_compliance_2 and radial_compliance_1")
+    reported = [line for line in found.combinations if "mostly their sum is known" in line]
+    assert reported[0].startswith("axial_compliance_2 and radial_compliance_1")
     both = found.axial[1] + found.radial[0]
     of_both = found.covariance[np.ix_([1, 6], [1, 6])].sum() ** 0.5
     assert of_both < 0.3 * found.std_axial[1]
@@ -234,12 +236,12 @@ def test_flexibilities_stay_at_or_above_zero_unless_asked_otherwise():
     planted[[3, 9]] = 0.0
     q, n = columns["actual_q"], 6
     loads = Loads(columns["payload"], columns["payload_cog"], columns["actual_TCP_force"])
-    bent = model_of(6).with_compliance(planted[:n], planted[n:]).predict(q, loads)
+    deflected = model_of(6).with_compliance(planted[:n], planted[n:]).predict(q, loads)
     del columns["measured_rotation"]
     below = 0
     for seed in range(4):
         rng = np.random.default_rng(seed)
-        columns["measured_position"] = bent.position + rng.normal(size=(50, 3)) * NOISE
+        columns["measured_position"] = deflected.position + rng.normal(size=(50, 3)) * NOISE
         bound = identify_compliance(model_of(6), log_of(6, columns), KNOWN)
         free = identify_compliance(model_of(6), log_of(6, columns), KNOWN, nonnegative=False)
         values = np.concatenate([bound.axial, bound.radial])
@@ -264,7 +266,7 @@ def test_a_log_that_excites_nothing_is_declined_with_the_reason():
         identify_compliance(model, log_of(6, columns))
 
 
-def test_too_few_rows_and_missing_columns_are_told():
+def test_too_few_rows_and_missing_columns_are_reported():
     _, columns = truth(6, 4, 10)
     few = {k: v[:2] for k, v in columns.items()}
     with pytest.raises(ExcitationError, match=r"found 2 row\(s\).*expected at least 4"):
@@ -301,7 +303,7 @@ def test_fifty_noisy_poses_foretell_fifty_others_of_finite_elements_to_the_noise
     columns = poses.measured(paper.frame_arm("ur10e", np.random.default_rng(1)),
                              np.random.default_rng(1), "ur10e")  # fmt: skip
     for registered in (True, False):
-        found = poses.tell("ur10e", columns, 1, registered)
+        found = poses.emit("ur10e", columns, 1, registered)
         rest = slice(poses.POSES, None)
         loads = Loads(columns["payload"], columns["payload_cog"], columns["actual_TCP_force"])[rest]
         predicted = found.model.predict(columns["actual_q"][rest], loads).position

@@ -22,7 +22,7 @@ COUNT = LANES + 6  # a whole block, and one that is not
 SHOWN = [name for name, effect in CATALOGUE.items() if "position" in effect.channels]
 
 
-def bent(effects: list[str], size: float = 3.0, seed: int = 0) -> Model:
+def deflected(effects: list[str], size: float = 3.0, seed: int = 0) -> Model:
     """Return an arm that bends and tilts, with these effects at some usual sizes everywhere."""
     rng = np.random.default_rng(seed)
     tool = np.eye(4)
@@ -83,7 +83,7 @@ def every(model: Model, effects: list[str]) -> tuple[list[tuple[int, int]], Arra
 
 @pytest.mark.parametrize("effect", SHOWN)
 def test_columns_are_those_of_differences_on_an_arm_that_bends(effect):
-    model, (q, loads) = bent([effect]), situation(COUNT)
+    model, (q, loads) = deflected([effect]), situation(COUNT)
     places, scales = every(model, [effect])
     found = pose_columns(model, q, loads, places, 0.01 * scales)
     poses = model.predict(q, loads)
@@ -91,46 +91,46 @@ def test_columns_are_those_of_differences_on_an_arm_that_bends(effect):
     assert np.abs(found.poses.rotation - poses.rotation).max() < 1e-12
     for c, (t, k) in enumerate(places):
         expected = difference(model, q, loads, t, k, 0.05 * scales[c])
-        off = np.abs(found.slopes[:, c] - expected).max()
+        off = np.abs(found.jacobian[:, c] - expected).max()
         # a moment has no slope at all: the step is where it is
         assert off <= 2e-7 * np.abs(expected).max(), (model.terms[t], k)
 
 
 def test_columns_at_zero_are_those_of_the_rigid_arm():
     effects = ["joint_offset", "link_geometry", "tool_frame", "axial_compliance"]
-    model = replace(bent(effects, size=0.0), gravity=np.array([1.0, 2.0, -9.0]))
+    model = replace(deflected(effects, size=0.0), gravity=np.array([1.0, 2.0, -9.0]))
     model = replace(model, terms=tuple(t.with_values(0 * np.array(t.values)) for t in model.terms))
     q, loads = situation(5)
     places, scales = every(model, effects)
     found = pose_columns(model, q, loads, places, 0.01 * scales)
     for c, (t, k) in enumerate(places):
         expected = difference(model, q, loads, t, k, 0.05 * scales[c])
-        off = np.abs(found.slopes[:, c] - expected).max()
+        off = np.abs(found.jacobian[:, c] - expected).max()
         assert off < 2e-7 * max(np.abs(expected).max(), 1e-9), (model.terms[t], k)
 
 
 def test_where_a_link_bends_itself_every_column_is_a_difference():
     effects = ["link_flexibility", "joint_offset"]
-    model, (q, loads) = bent(effects), situation(4)
+    model, (q, loads) = deflected(effects), situation(4)
     places, scales = every(model, effects)
     found = pose_columns(model, q, loads, places, 0.01 * scales)
     for c, (t, k) in enumerate(places):
         expected = difference(model, q, loads, t, k, 0.01 * scales[c])
-        assert np.abs(found.slopes[:, c] - expected).max() < 1e-6 * np.abs(expected).max()
+        assert np.abs(found.jacobian[:, c] - expected).max() < 1e-6 * np.abs(expected).max()
 
 
 def test_a_row_has_the_columns_that_it_has_alone():
-    model, (q, loads) = bent(["joint_offset", "payload"]), situation(COUNT)
+    model, (q, loads) = deflected(["joint_offset", "payload"]), situation(COUNT)
     places, scales = every(model, ["joint_offset", "payload", "axial_compliance"])
-    whole = pose_columns(model, q, loads, places, scales).slopes
+    whole = pose_columns(model, q, loads, places, scales).jacobian
     for r in (0, LANES, COUNT - 1):
-        alone = pose_columns(model, q[r : r + 1], loads[r : r + 1], places, scales).slopes
+        alone = pose_columns(model, q[r : r + 1], loads[r : r + 1], places, scales).jacobian
         scale = np.abs(whole).max(axis=(0, 2))[:, None]
         assert (np.abs(alone[..., 0] - whole[..., r]) / scale.T).max() < 1e-9
 
 
 def test_a_load_under_which_the_arm_buckles_is_named():
-    model, (q, loads) = bent(["joint_offset"]), situation(4)
+    model, (q, loads) = deflected(["joint_offset"]), situation(4)
     soft = model.with_compliance([1e-1] * 6, [1e-1] * 6)
     with pytest.raises(InputError, match="row 1: the arm finds no equilibrium"):
         pose_columns(soft, q, loads, [(0, 0)], np.array([1e-5]))

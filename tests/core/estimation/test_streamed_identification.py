@@ -30,7 +30,7 @@ def nominal() -> Model:
     return Model(builtin_arm("ur10e"), tool)
 
 
-def measured_log(rotations: bool, shifted: bool, wild: int = 0) -> Log:
+def measured_log(rotations: bool, shifted: bool, outlier: int = 0) -> Log:
     rng = np.random.default_rng(3)
     true = nominal().with_compliance([3e-6, 5e-6, 4e-6, 8e-6, 8e-6, 9e-6], [1e-6] * 6)
     if shifted:
@@ -48,7 +48,7 @@ def measured_log(rotations: bool, shifted: bool, wild: int = 0) -> Log:
     frame = rotation_matrix(np.array([[0.1, -0.2, 0.7]]))[0] if shifted else np.eye(3)
     position = poses.position @ frame.T + (0.5 if shifted else 0.0)
     columns["measured_position"] = position + rng.normal(0, 2e-5, position.shape)
-    columns["measured_position"][:wild] += 0.02
+    columns["measured_position"][:outlier] += 0.02
     columns["measured_position"][40] = np.nan  # a row that nobody measured
     if rotations:
         columns["measured_rotation"] = rotation_vector(frame @ poses.rotation)
@@ -61,10 +61,10 @@ def pieces_of(log: Log) -> list[Log]:
 
 
 @pytest.mark.parametrize(
-    ("rotations", "shifted", "wild"), [(False, False, 0), (False, True, 20), (True, True, 0)]
+    ("rotations", "shifted", "outlier"), [(False, False, 0), (False, True, 20), (True, True, 0)]
 )
-def test_pieces_give_what_the_whole_gives(rotations, shifted, wild):
-    log, metrology = measured_log(rotations, shifted, wild), Metrology(registered=not shifted)
+def test_pieces_give_what_the_whole_gives(rotations, shifted, outlier):
+    log, metrology = measured_log(rotations, shifted, outlier), Metrology(registered=not shifted)
     whole = identify_compliance(nominal(), log, metrology)
     found = identify_streamed(nominal(), pieces_of(log), metrology)
     for name in ("axial", "radial"):

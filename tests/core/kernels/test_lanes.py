@@ -126,7 +126,7 @@ def test_threads_and_rows_that_do_not_settle_change_nothing(monkeypatch):
         np.testing.assert_allclose(one, other, atol=1e-12 * np.abs(other).max())
 
 
-def test_what_goes_wrong_in_a_thread_is_told(monkeypatch):
+def test_what_goes_wrong_in_a_thread_is_reported(monkeypatch):
     monkeypatch.setattr(threads, "FEWEST", LANES)
     monkeypatch.setattr(threads, "processors", lambda: 2)
 

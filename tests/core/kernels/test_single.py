@@ -15,7 +15,7 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 
 
-def bent() -> Model:
+def deflected() -> Model:
     rng = np.random.default_rng(4)
     tool = np.eye(4)
     tool[:3, 3] = (0.03, 0.01, 0.2)
@@ -36,7 +36,7 @@ def path(count: int = 60) -> np.ndarray:
 
 
 def test_each_correction_along_a_path_is_that_of_the_general_way():
-    one, other = Compensator(bent()), Compensator(bent())
+    one, other = Compensator(deflected()), Compensator(deflected())
     other._stiff_links = False
     rng = np.random.default_rng(0)
     for q in path():
@@ -51,22 +51,22 @@ def test_each_correction_along_a_path_is_that_of_the_general_way():
     "q", [np.zeros(6), np.array([0.0, -1.5, 0.0, -1.5, 0.0, 0.0]), np.full(6, np.nan)]
 )
 def test_singular_poses_and_no_numbers_go_the_same_way(q):
-    one, other = Compensator(bent()), Compensator(bent())
+    one, other = Compensator(deflected()), Compensator(deflected())
     other._stiff_links = False
     quick, general = one.correct(q), other.correct(q)
     np.testing.assert_allclose(quick.q, general.q, rtol=0, atol=1e-9)
     np.testing.assert_allclose(quick.residual, general.residual, rtol=1e-6, atol=1e-9)
 
 
-def test_a_load_under_which_the_arm_buckles_is_told_and_forgotten():
-    one = Compensator(bent())
+def test_a_load_under_which_the_arm_buckles_is_reported_and_forgotten():
+    one = Compensator(deflected())
     assert one.correct(path()[0], Loads(wrench=np.full((1, 6), 1e9))).residual == np.inf
     after = one.correct(path()[0], Loads())
-    np.testing.assert_allclose(after.q, Compensator(bent()).correct(path()[0]).q, atol=1e-12)
+    np.testing.assert_allclose(after.q, Compensator(deflected()).correct(path()[0]).q, atol=1e-12)
 
 
 def test_a_correction_leaves_nothing_behind_in_memory():
-    live, found, poses = Compensator(bent()), np.empty(12), path(400)
+    live, found, poses = Compensator(deflected()), np.empty(12), path(400)
     live.correct(poses[0])
 
     def run() -> None:

@@ -25,7 +25,7 @@ from gapbridge.core.planning import design
 from gapbridge.core.planning.candidates import candidates_of
 from gapbridge.core.planning.design import reference_of
 from gapbridge.core.planning.exchange import Choice, exchanged, grown, shrunk
-from gapbridge.core.planning.information import blocks, gathered, inverse
+from gapbridge.core.planning.information import blocks, information_of, inverse
 from gapbridge.core.planning.workspace import Place, Reflector, Space
 
 
@@ -101,7 +101,7 @@ def test_more_poses_buy_less_uncertainty(planned: Plan) -> None:
     assert 12 in counts and len(counts) >= 4
     assert list(counts) == sorted(counts)
     assert list(std) == sorted(std, reverse=True)
-    # the second visits tell a little too
+    # the second visits determine a little too
     assert planned.expected.tcp_std < dict(planned.bought)[12]
 
 
@@ -115,7 +115,7 @@ def test_planned_poses_beat_more_random_ones(
 
     def chance(count: int) -> list[np.ndarray]:
         drawn = [rows[random.choice(len(rows), count, replace=False)] for _ in range(30)]
-        return [reference.std(inverse(gathered(some))) for some in drawn]
+        return [reference.std(inverse(information_of(some))) for some in drawn]
 
     half_more, twice = chance(18), chance(24)
     rms = np.median([np.sqrt(np.mean(std**2)) for std in half_more])
@@ -162,17 +162,19 @@ def test_a_gauge_keeps_within_its_range(model: Model) -> None:
     assert long.min() >= 0.15 and long.max() <= 0.4
 
 
-def test_progress_is_told_from_nothing_to_all(parameters: Parameters, space: Space) -> None:
-    told: list[float] = []
+def test_progress_is_reported_from_nothing_to_all(parameters: Parameters, space: Space) -> None:
+    reported: list[float] = []
     plan(
         parameters, POSITION, LOADS, space, poses=8, held_out=0, repeats=0,
-        progress=lambda text, share: told.append(share),
+        progress=lambda text, share: reported.append(share),
     )  # fmt: skip
-    assert told[0] == 0.0 and told[-1] == 1.0
-    assert told == sorted(told)
+    assert reported[0] == 0.0 and reported[-1] == 1.0
+    assert reported == sorted(reported)
 
 
-def test_one_load_alone_and_an_unknown_place_are_said(parameters: Parameters, space: Space) -> None:
+def test_one_load_alone_and_an_unknown_place_are_reported(
+    parameters: Parameters, space: Space
+) -> None:
     space = replace(space, places=())
     planned = plan(parameters, POSITION, LOADS[:1], space, poses=8, held_out=0, repeats=0)
     assert any("where the instrument stands" in note for note in planned.notes)
@@ -196,7 +198,7 @@ def test_wishes_that_cannot_be_met_are_declined_in_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_where_nothing_is_seen_the_reason_is_told(parameters: Parameters, space: Space) -> None:
+def test_where_nothing_is_seen_the_reason_is_reported(parameters: Parameters, space: Space) -> None:
     blind = replace(space, places=(Place((9.0, 0.0, 0.5), farthest=1.0),))
     with pytest.raises(PlanError, match=r"no pose can be reached and seen: .* out of range"):
         plan(parameters, POSITION, LOADS, blind)
@@ -243,7 +245,7 @@ def test_two_places_and_two_balls_are_visited_one_place_after_the_other(
     assert turns <= 3  # a load is not hung anew for the second place
 
 
-def test_a_load_that_tells_nothing_is_named(parameters: Parameters, space: Space) -> None:
+def test_a_load_that_shows_nothing_is_named(parameters: Parameters, space: Space) -> None:
     loads = [Payload(0.0), Payload(0.01), Payload(4.0, (0.0, 0.02, 0.06))]
     planned = plan(parameters, POSITION, loads, space, poses=9, held_out=3, repeats=0)
     hung = {planned.loads[pose.load].mass for pose in planned.poses}

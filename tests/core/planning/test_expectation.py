@@ -37,7 +37,7 @@ def test_scatter_over_sessions_is_what_was_expected(parameters, planned) -> None
     ratio = scatter.std[shown] / planned.expected.std[shown]
     assert shown.sum() > 25
     assert np.mean(ratio) == pytest.approx(1, abs=0.02)
-    assert np.abs(ratio - 1).max() < 0.13  # 600 sessions tell a deviation to 3 %, 25 of them
+    assert np.abs(ratio - 1).max() < 0.13  # 600 sessions determine a deviation to 3 %, 25 of them
 
 
 def test_expectation_of_a_plans_readings_is_the_plans(parameters, planned) -> None:

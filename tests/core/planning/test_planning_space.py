@@ -80,8 +80,8 @@ def test_the_load_is_part_of_the_arm(model: Model) -> None:
 
 def test_a_straight_arm_is_nearly_singular(model: Model) -> None:
     space = Space.of(model)
-    bent = np.array([[0.3, -1.2, 1.3, -1.0, 1.2, 0.4]])
-    assert space.near_singular(space.frames(np.vstack([OUT, bent]))).tolist() == [True, False]
+    deflected = np.array([[0.3, -1.2, 1.3, -1.0, 1.2, 0.4]])
+    assert space.near_singular(space.frames(np.vstack([OUT, deflected]))).tolist() == [True, False]
 
 
 def test_the_tracker_sees_what_is_before_the_arm_and_not_what_is_behind_it(model: Model) -> None:

@@ -9,7 +9,7 @@ from planned_cell import LOADS, POSITION, SIGMA, small_model, small_parameters, 
 
 from gapbridge.core.planning.candidates import candidates_of
 from gapbridge.core.planning.design import reference_of
-from gapbridge.core.planning.information import Reference, blocks, gathered, inverse
+from gapbridge.core.planning.information import Reference, blocks, information_of, inverse
 from gapbridge.core.planning.refinement import Refined, Refiner
 from gapbridge.core.planning.worst_places import ROUNDS, evened, leaning
 
@@ -32,7 +32,7 @@ def begun() -> tuple[Refiner, Reference, Refined]:
 
 
 def std(reference: Reference, rows: Array) -> Array:
-    return reference.std(inverse(gathered(rows)))
+    return reference.std(inverse(information_of(rows)))
 
 
 def test_places_known_worse_weigh_more(begun: tuple[Refiner, Reference, Refined]) -> None:
@@ -49,15 +49,15 @@ def test_the_worst_place_gets_better_and_the_mean_hardly_pays_for_it(
     begun: tuple[Refiner, Reference, Refined],
 ) -> None:
     refiner, reference, poses = begun
-    told: list[float] = []
+    reported: list[float] = []
     found, weight = evened(
-        refiner, reference, poses, leaning(reference, poses.rows), 0, told.append
+        refiner, reference, poses, leaning(reference, poses.rows), 0, reported.append
     )
     by_mean = refiner.refined(poses, ROUNDS, np.random.default_rng(0))
     even, usual = std(reference, found.rows), std(reference, by_mean.rows)
     assert even.max() < 0.97 * usual.max()
     assert np.sqrt(np.mean(even**2)) < 1.05 * np.sqrt(np.mean(usual**2))
-    assert told == sorted(told) and told[-1] == 1.0
+    assert reported == sorted(reported) and reported[-1] == 1.0
     # the weight that comes with them is the one that they were judged by last
     last = Refiner(refiner.parameters, POSITION, refiner.space, refiner.found, weight, SIGMA)
     assert last.value(found.rows) <= last.value(by_mean.rows)

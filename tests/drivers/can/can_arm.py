@@ -21,8 +21,8 @@ from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.simulated.can.nodes import CanNodes
 from gapbridge.drivers.simulated.can.server import make_servers
-from gapbridge.drivers.simulated.peer.peer import Peer, make_peer
-from gapbridge.drivers.simulated.peer.peer_server import PeerThread
+from gapbridge.drivers.simulated.server.arm_controller import ArmController, make_controller
+from gapbridge.drivers.simulated.server.protocol_server import ServerThread
 from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 _channels = itertools.count()
@@ -31,7 +31,7 @@ MODEL = Model(builtin_arm("ur10e"))
 
 
 class Served(NamedTuple):
-    peer: Peer
+    controller: ArmController
     nodes: CanNodes
     settings: CanSettings
     driver: CanDriver
@@ -43,12 +43,12 @@ def served_arm(profile: str = "piper", **keys: object) -> Iterator[Served]:
     channel = f"faults{next(_channels)}"
     given = {"foreign_quiet": 0.2, "state_timeout": 0.3, **keys}
     settings = CanSettings(profile=profile, interface="virtual", channel=channel, **given)
-    peer = make_peer(*simulated_arm(MODEL.arm, seed=5), period=0.004)
-    (nodes,) = make_servers(settings, "127.0.0.2", peer)
-    with PeerThread(peer, [nodes], "127.0.0.2"):
+    controller = make_controller(*simulated_arm(MODEL.arm, seed=5), period=0.004)
+    (nodes,) = make_servers(settings, "127.0.0.2", controller)
+    with ServerThread(controller, [nodes], "127.0.0.2"):
         driver = CanDriver(settings, MODEL)
         try:
-            yield Served(peer, nodes, settings, driver)
+            yield Served(controller, nodes, settings, driver)
         finally:
             driver.close()
 

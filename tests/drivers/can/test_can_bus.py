@@ -67,7 +67,7 @@ def test_thousands_of_frames_arrive_once_and_in_order(hub):
     close_bus(receiver)
 
 
-def test_the_end_of_the_hub_is_told_instead_of_spinning(hub):
+def test_the_end_of_the_hub_is_reported_instead_of_spinning(hub):
     bus = open_bus(settings_of(hub))
     hub.close()
     before = time.process_time()
@@ -107,8 +107,8 @@ def test_joining_a_busy_bus_takes_no_luck(hub):
 
 def test_garbage_from_a_client_harms_nobody_else(hub):
     bus, other = joined(hub, 2)
-    with socket.create_connection((hub.host, hub.port)) as wild:
-        wild.sendall(b"< send zzz 8 1 >< send 155 2 1 ><send 155 1 100 >< nonsense >" + b"x" * 500)
+    with socket.create_connection((hub.host, hub.port)) as bogus:
+        bogus.sendall(b"< send zzz 8 1 >< send 155 2 1 ><send 155 1 100 >< nonsense >" + b"x" * 500)
         bus.send(can.Message(arbitration_id=1, data=[1], is_extended_id=False))
         assert frames_of(other, 1) == [(1, b"\1", False)]
     close_bus(bus)

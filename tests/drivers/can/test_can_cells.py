@@ -8,10 +8,10 @@ import pytest
 from can_arm import next_state
 
 from gapbridge.bridge.cell import load_cell
-from gapbridge.bridge.cell.simulation import simulated_peer
+from gapbridge.bridge.cell.simulation import served_controller
 from gapbridge.core.errors import LinkError
 from gapbridge.drivers import make_driver
-from gapbridge.drivers.simulated.peer.peer_server import PeerThread
+from gapbridge.drivers.simulated.server.protocol_server import ServerThread
 
 CONFIG = Path(__file__).parents[3] / "config"
 PORTS = itertools.count(29581)  # another one where a busy machine asks for a second try
@@ -23,8 +23,11 @@ def test_a_ready_cell_is_served_read_armed_and_let_go(path):
     cell = load_cell(path)
     given = {"port": next(PORTS), "state_timeout": 0.5, "foreign_quiet": 0.1}
     link = cell.link.model_copy(update=given)
-    found = simulated_peer(cell, link)
-    with PeerThread(found.peer, found.servers, found.host), make_driver(link, cell.model) as driver:
+    found = served_controller(cell, link)
+    with (
+        ServerThread(found.controller, found.servers, found.host),
+        make_driver(link, cell.model) as driver,
+    ):
         state = next_state(driver)
         assert state.actual_q == pytest.approx(cell.file.simulation.start_q, abs=1e-4)
         driver.arm(state)
@@ -32,7 +35,7 @@ def test_a_ready_cell_is_served_read_armed_and_let_go(path):
         driver.release()
 
 
-def test_the_real_arms_cell_loads_and_its_bus_is_told_where_it_is_missing():
+def test_the_real_arms_cell_loads_and_its_bus_is_reported_where_it_is_missing():
     cell = load_cell(CONFIG / "piper_can.yaml")
     driver = make_driver(cell.link, cell.model)
     with pytest.raises(LinkError, match=r"socketcan can0: cannot be opened|never heard"):

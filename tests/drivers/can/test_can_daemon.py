@@ -22,8 +22,8 @@ compliance: &soft
 
 
 @contextmanager
-def gapbridge(*words):
-    code = [sys.executable, "-m", "gapbridge", *map(str, words)]
+def gapbridge(*phrase):
+    code = [sys.executable, "-m", "gapbridge", *map(str, phrase)]
     with subprocess.Popen(code, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:
         try:
             yield process

@@ -52,7 +52,7 @@ class Listener:
 
 
 class Breaking:
-    """A bus whose sends fail when it is told so."""
+    """A bus whose sends fail when it is asked to."""
 
     def __init__(self, bus, fails):
         self._bus, self._fails = bus, fails
@@ -80,10 +80,10 @@ def test_connecting_and_reading_send_no_frame():
 
 
 def test_arming_enables_where_the_arm_stands_and_moves_nothing(served):
-    before = np.array(served.peer.q)
+    before = np.array(served.controller.q)
     state = armed(served)
     time.sleep(0.1)
-    assert np.abs(before - served.peer.q).max() < 2 * UNIT
+    assert np.abs(before - served.controller.q).max() < 2 * UNIT
     assert (state.robot_mode, state.safety_mode) == (7, 1)
     assert all(served.nodes.enabled)
 
@@ -125,7 +125,8 @@ def test_half_a_setpoint_is_taken_back(served, at):
             return True
         return False
 
-    served.driver.writer.bus = breaking = Breaking(served.driver.reader.bus, once)
+    breaking = Breaking(served.driver.reader.bus, once)
+    served.driver.writer.use(breaking)
     with pytest.raises(WriteError, match=rf"{at} of 4 frames out; the setpoint before was sent"):
         served.driver.write_setpoint(setpoint_of(q + 0.001))
     assert breaking.sent[at:] == [
@@ -133,7 +134,7 @@ def test_half_a_setpoint_is_taken_back(served, at):
     ]  # whole, and last on the wire
     assert served.driver.writer.mended == 1
     time.sleep(0.1)
-    assert served.peer.target_q == pytest.approx(q, abs=UNIT)
+    assert served.controller.target_q == pytest.approx(q, abs=UNIT)
 
 
 def test_where_the_setpoint_before_does_not_go_out_either_the_arm_is_stopped(served):
@@ -143,7 +144,8 @@ def test_where_the_setpoint_before_does_not_go_out_either_the_arm_is_stopped(ser
     def only_the_stop(frame, sent):
         return sent >= 2 and frame.arbitration_id != 0x150
 
-    served.driver.writer.bus = breaking = Breaking(served.driver.reader.bus, only_the_stop)
+    breaking = Breaking(served.driver.reader.bus, only_the_stop)
+    served.driver.writer.use(breaking)
     with pytest.raises(WriteError, match="the stop sequence was sent"):
         served.driver.write_setpoint(setpoint_of(q + 0.001))
     assert breaking.sent[-1] == (0x150, b"\x01" + bytes(7))
@@ -153,7 +155,8 @@ def test_where_the_setpoint_before_does_not_go_out_either_the_arm_is_stopped(ser
 
 def test_a_first_frame_that_fails_leaves_nothing_to_take_back(served):
     q = armed(served).actual_q
-    served.driver.writer.bus = breaking = Breaking(served.driver.reader.bus, lambda *_: True)
+    breaking = Breaking(served.driver.reader.bus, lambda *_: True)
+    served.driver.writer.use(breaking)
     with pytest.raises(WriteError, match="0 of 4 frames out; nothing of it was sent"):
         served.driver.write_setpoint(setpoint_of(q))
     assert breaking.sent == []
@@ -162,7 +165,8 @@ def test_a_first_frame_that_fails_leaves_nothing_to_take_back(served):
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 7.0])
 def test_a_setpoint_that_no_frame_can_carry_sends_nothing(served, bad):
     q = armed(served).actual_q
-    served.driver.writer.bus = breaking = Breaking(served.driver.reader.bus, lambda *_: False)
+    breaking = Breaking(served.driver.reader.bus, lambda *_: False)
+    served.driver.writer.use(breaking)
     wrong = q.copy()
     wrong[5] = bad  # the last frame's: those before must not be out
     with pytest.raises(WriteError):
@@ -188,7 +192,7 @@ def test_everything_we_send_is_in_the_allow_list(served):
     assert ids == {0x151, 0x155, 0x156, 0x157, 0x471}
 
 
-def test_a_motor_that_loses_its_power_while_we_write_is_told(served):
+def test_a_motor_that_loses_its_power_while_we_write_is_reported(served):
     armed(served)
     served.nodes.enabled[2] = False
     until = time.monotonic() + 2.0
@@ -196,7 +200,7 @@ def test_a_motor_that_loses_its_power_while_we_write_is_told(served):
         assert time.monotonic() < until
 
 
-def test_a_mode_taken_away_at_the_arm_is_told_only_while_we_write(served):
+def test_a_mode_taken_away_at_the_arm_is_reported_only_while_we_write(served):
     assert next_state(served.driver).robot_mode == 7  # standby, but we only read
     armed(served)
     served.nodes.control_mode = 2  # somebody drags the arm
@@ -205,7 +209,7 @@ def test_a_mode_taken_away_at_the_arm_is_told_only_while_we_write(served):
 
 
 def test_the_stop_button_is_an_emergency_stop_and_keeps_us_from_arming(served):
-    served.peer.emergency_stop()
+    served.controller.emergency_stop()
     time.sleep(0.05)
     state = next_state(served.driver)
     assert state.safety_mode == 7
@@ -223,21 +227,21 @@ def test_status_that_falls_silent_while_joints_go_on_is_stale(served):
 
 def test_joints_that_stand_still_though_commanded_away_are_stale(served):
     state = armed(served)
-    served.peer.frozen = True  # the same joints again and again
+    served.controller.frozen = True  # the same joints again and again
     goal = state.actual_q + 0.04
     served.driver.write_setpoint(setpoint_of(goal))
     with pytest.raises(StaleStateError, match="joints have stood still"):
         read(served.driver, 500)
 
 
-def test_a_lost_frame_costs_its_sample_and_is_told(served):
+def test_a_lost_frame_costs_its_sample_and_is_reported(served):
     next_state(served.driver)
     served.nodes.withheld.add(0x2A6)
     with pytest.raises((InvalidStateError, StaleStateError)):
         for_three_samples(served.driver)
     served.nodes.withheld.clear()
     state = next_state(served.driver)
-    assert state.actual_q == pytest.approx(served.peer.q, abs=UNIT)
+    assert state.actual_q == pytest.approx(served.controller.q, abs=UNIT)
 
 
 def test_an_arm_that_is_not_on_the_bus_is_one_line_with_what_was_missed():
@@ -274,10 +278,10 @@ def test_a_backlog_full_of_others_frames_does_not_keep_old_samples_alive(served)
     thread = threading.Thread(target=chatter)
     thread.start()
     try:
-        served.peer.move_own(tuple(q + 0.3 for q in served.peer.q))
+        served.controller.move_own(tuple(q + 0.3 for q in served.controller.q))
         for _ in range(10):  # slower than the arm sends
             time.sleep(0.05)
-            before = np.array(served.peer.q)
+            before = np.array(served.controller.q)
             state = next_state(served.driver)
             assert np.abs(state.actual_q - before).max() < 0.012  # 24 ms at 0.5 rad/s
     finally:
@@ -289,10 +293,10 @@ def test_a_backlog_full_of_others_frames_does_not_keep_old_samples_alive(served)
 def test_velocity_torque_and_temperature_are_the_plants(served):
     state = next_state(served.driver)
     assert state.actual_current_as_torque == pytest.approx(
-        np.clip(served.peer.joint_torque, -38.7, 38.7),  # what the currents' 16 bits hold
+        np.clip(served.controller.joint_torque, -38.7, 38.7),  # what the currents' 16 bits hold
         abs=2.0,
     )
-    assert state.joint_temperatures == pytest.approx(served.peer.temperatures, abs=0.6)
+    assert state.joint_temperatures == pytest.approx(served.controller.temperatures, abs=0.6)
 
 
 def test_frames_on_the_wire_are_those_of_the_manual(served):

@@ -16,9 +16,9 @@ from gapbridge.bridge.cell import load_cell
 from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.simulated.can.server import make_servers
-from gapbridge.drivers.simulated.peer.peer import make_peer
-from gapbridge.drivers.simulated.peer.peer_server import PeerThread
 from gapbridge.drivers.simulated.plant.plant_arm import plant_arm
+from gapbridge.drivers.simulated.server.arm_controller import make_controller
+from gapbridge.drivers.simulated.server.protocol_server import ServerThread
 from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 CONFIG = Path(__file__).parents[3] / "config"
@@ -37,12 +37,12 @@ def test_the_cells_arm_is_the_one_of_the_vendors_kinematics():
 @pytest.fixture
 def served():
     cell = load_cell(CELL)
-    peer = make_peer(*simulated_arm(cell.arm, seed=3, start_q=START), period=0.004)
+    controller = make_controller(*simulated_arm(cell.arm, seed=3, start_q=START), period=0.004)
     link = CanSettings(
         profile="piper", interface="socketcand", host="127.0.0.2", port=29571, state_timeout=0.5
     )
-    with PeerThread(peer, make_servers(link, "127.0.0.2", peer), "127.0.0.2"):
-        yield peer, link, cell.model
+    with ServerThread(controller, make_servers(link, "127.0.0.2", controller), "127.0.0.2"):
+        yield controller, link, cell.model
 
 
 @pytest.fixture
@@ -57,8 +57,8 @@ def vendor(served, monkeypatch):
 
 
 def joints_of(sdk):
-    told = sdk.GetArmJointMsgs().joint_state
-    return np.radians([getattr(told, f"joint_{i}") * 1e-3 for i in range(1, 7)])
+    reported = sdk.GetArmJointMsgs().joint_state
+    return np.radians([getattr(reported, f"joint_{i}") * 1e-3 for i in range(1, 7)])
 
 
 def wait_for(true, seconds=5.0):
@@ -69,10 +69,10 @@ def wait_for(true, seconds=5.0):
 
 
 def test_the_vendors_client_reads_and_commands_our_arm_and_we_notice_it(served, vendor):
-    peer, link, model = served
-    wait_for(lambda: np.abs(joints_of(vendor) - peer.q).max() < 1e-5)
+    controller, link, model = served
+    wait_for(lambda: np.abs(joints_of(vendor) - controller.q).max() < 1e-5)
     with CanDriver(link, model) as driver:
-        assert next_state(driver).actual_q == pytest.approx(peer.q, abs=1e-5)
+        assert next_state(driver).actual_q == pytest.approx(controller.q, abs=1e-5)
         until = time.monotonic() + 5.0
         while not vendor.EnablePiper():
             assert time.monotonic() < until
@@ -84,7 +84,7 @@ def test_the_vendors_client_reads_and_commands_our_arm_and_we_notice_it(served, 
             vendor.MotionCtrl_2(0x01, 0x01, 100, 0x00)
             vendor.JointCtrl(*counts)
             next_state(driver)
-            return np.abs(goal - peer.q).max() < 1e-4
+            return np.abs(goal - controller.q).max() < 1e-4
 
         wait_for(command)
         state = next_state(driver)

@@ -88,8 +88,8 @@ def test_a_signal_anywhere_in_a_frame(data, length, at, big, signed, floats, sca
     place = place_of(message, "s")
     assert place is not None
     lines, found = np.array([[np.nan], [1.0], [0.0]]), np.empty(1)
-    places, told = np.array([(0, *place, 0)]), np.ones(1, np.uint8)
+    places, reported = np.array([(0, *place, 0)]), np.ones(1, np.uint8)
     raw = np.frombuffer(bytearray(data), np.uint8)
-    fill(raw, told, places, np.array([[float(scale), float(offset)]]), lines, found)
+    fill(raw, reported, places, np.array([[float(scale), float(offset)]]), lines, found)
     wanted = float(message.decode(data)["s"])
     np.testing.assert_array_equal(found, [wanted])

@@ -11,8 +11,8 @@ from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.driver import DriverSettings
 from gapbridge.drivers.simulated.can.server import make_servers
-from gapbridge.drivers.simulated.peer.peer import make_peer
-from gapbridge.drivers.simulated.peer.peer_server import PeerThread
+from gapbridge.drivers.simulated.server.arm_controller import make_controller
+from gapbridge.drivers.simulated.server.protocol_server import ServerThread
 from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 PAGE = Path(__file__).parents[3] / "docs" / "porting.md"
@@ -34,18 +34,18 @@ def test_the_page_s_arm_is_read_armed_and_moved(folder):
         profile="my_can_arm.yaml", interface="socketcand", host="127.0.0.2", port=29577,
         state_timeout=0.5, foreign_quiet=0.1,
     ).located(folder)  # fmt: skip
-    peer = make_peer(*simulated_arm(MODEL.arm, seed=2), period=0.004)
-    servers = make_servers(settings, "127.0.0.2", peer)
-    with PeerThread(peer, servers, "127.0.0.2"), CanDriver(settings, MODEL) as driver:
+    controller = make_controller(*simulated_arm(MODEL.arm, seed=2), period=0.004)
+    servers = make_servers(settings, "127.0.0.2", controller)
+    with ServerThread(controller, servers, "127.0.0.2"), CanDriver(settings, MODEL) as driver:
         assert driver.rate == 100.0
         state = next_state(driver)
-        assert state.actual_q == pytest.approx(peer.q, abs=HALF * 1.01)
+        assert state.actual_q == pytest.approx(controller.q, abs=HALF * 1.01)
         driver.arm(state)
         goal = state.actual_q + np.linspace(0.01, -0.01, 6)
         driver.write_setpoint(setpoint_of(goal))
         for _ in range(30):
             state = next_state(driver)
-        assert np.abs(goal - peer.q).max() < 1.1 * HALF
+        assert np.abs(goal - controller.q).max() < 1.1 * HALF
         assert state.actual_q == pytest.approx(goal, abs=2.1 * HALF)
 
 

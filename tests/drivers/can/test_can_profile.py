@@ -51,12 +51,12 @@ DBC = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("old", "new", "words"), [d[1:] for d in DBC], ids=[d[0] for d in DBC])
-def test_a_dbc_is_refused_with_the_line_that_is_wrong(folder, old, new, words):
+@pytest.mark.parametrize(("old", "new", "phrase"), [d[1:] for d in DBC], ids=[d[0] for d in DBC])
+def test_a_dbc_is_refused_with_the_line_that_is_wrong(folder, old, new, phrase):
     line = broken(folder, "invented.dbc", old, new)
     text = message_of(folder)
     assert text.startswith(f"{folder / 'invented.dbc'}, line {line}: ")
-    for word in words:
+    for word in phrase:
         assert word in text
 
 
@@ -97,8 +97,8 @@ YAML = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("old", "new", "words"), [d[1:] for d in YAML], ids=[d[0] for d in YAML])
-def test_a_profile_is_refused_with_the_line_and_key_that_are_wrong(folder, old, new, words):
+@pytest.mark.parametrize(("old", "new", "phrase"), [d[1:] for d in YAML], ids=[d[0] for d in YAML])
+def test_a_profile_is_refused_with_the_line_and_key_that_are_wrong(folder, old, new, phrase):
     path = folder / "invented.yaml"
     text = path.read_text()
     assert old in text
@@ -106,7 +106,7 @@ def test_a_profile_is_refused_with_the_line_and_key_that_are_wrong(folder, old, 
     found = message_of(folder)
     if "other.dbc" not in found:
         assert found.startswith(f"{path}, line ")
-    for word in words:
+    for word in phrase:
         assert word in found
 
 

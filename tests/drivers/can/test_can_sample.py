@@ -17,8 +17,8 @@ from gapbridge.drivers.can.state import StateBuilder
 PIPER = load_profile("piper")
 PERIOD = 0.005  # s
 INVENTED = Path(__file__).with_name("invented.yaml")
-# A frame that is later than this cannot be told from one of the next cycle, where those between are
-# lost and none carries a count.
+# A frame that is later than this cannot be distinguished from one of the next cycle, where those
+# between are lost and none carries a count.
 LATE = PERIOD - PIPER.window - 1e-4  # s
 IDS = (0x2A5, 0x2A6, 0x2A7)
 
@@ -122,30 +122,30 @@ def wild_frames(random, number):
 
 @pytest.mark.slow
 @pytest.mark.timeout(120)
-def test_a_million_wild_frames_raise_nothing_and_no_wrong_sample_is_taken_for_good():
-    """Wild frames among a true stream whose every cycle says its own number in all joints.
+def test_a_million_outlier_frames_raise_nothing_and_no_wrong_sample_is_taken_for_good():
+    """Stray frames among a true stream whose every cycle says its own number in all joints.
 
-    A wild frame that stands in for a true one can only be told by what an arm can do between two
-    samples; one beside the true one makes a sample torn.
+    A stray frame that stands in for a true one can only be recognised by what an arm can do between
+    two samples; one beside the true one makes a sample torn.
     """
     random = np.random.default_rng(7)
     assembler, builder = Assembler(PIPER), StateBuilder(PIPER, builtin_arm("ur10e"))
     stream = wild_frames(random, 1_000_000)
     good = wrong = refused = k = 0
     begun = time.monotonic()
-    wild = next(stream, None)
-    while wild is not None:
+    outlier = next(stream, None)
+    while outlier is not None:
         k += 1
         now = k * PERIOD
         number = abs((k + 500) % 1000 - 500)
-        true = cycle(number) if k % 4 else []  # every fourth cycle is all wild
+        true = cycle(number) if k % 4 else []  # every fourth cycle is all stray
         places = random.integers(0, 4, 4)
         frames = [((i, False), d) for i, d in true]
         for place in sorted(places.tolist(), reverse=True):
-            if wild is None:
+            if outlier is None:
                 break
-            frames.insert(place, wild)
-            wild = next(stream, None)
+            frames.insert(place, outlier)
+            outlier = next(stream, None)
         for n, (key, data) in enumerate(frames):
             sample = assembler.take(key, data, now + n * 1e-4, now + n * 1e-4)
             if sample is None:

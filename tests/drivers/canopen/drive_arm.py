@@ -19,8 +19,8 @@ from gapbridge.core.state import RobotState
 from gapbridge.drivers.canopen.driver import CanopenDriver
 from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.simulated.canopen.server import CanopenServer
-from gapbridge.drivers.simulated.peer.peer import Peer, make_peer
-from gapbridge.drivers.simulated.peer.peer_server import PeerThread
+from gapbridge.drivers.simulated.server.arm_controller import ArmController, make_controller
+from gapbridge.drivers.simulated.server.protocol_server import ServerThread
 from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 HOST = "127.0.0.1"
@@ -37,9 +37,11 @@ class DriveArm:
         }  # fmt: skip
         self.settings = CanopenSettings(profile=profile, **{**chosen, **keys})
         self.model = Model(builtin_arm("ur10e"))
-        self.peer: Peer = make_peer(*simulated_arm(self.model.arm, seed=3), period=0.004)
-        self.server = CanopenServer(self.settings, HOST, self.peer)
-        self.thread = PeerThread(self.peer, [self.server], HOST)
+        self.controller: ArmController = make_controller(
+            *simulated_arm(self.model.arm, seed=3), period=0.004
+        )
+        self.server = CanopenServer(self.settings, HOST, self.controller)
+        self.thread = ServerThread(self.controller, [self.server], HOST)
 
     def driver(self, **keys: Any) -> CanopenDriver:
         """Return a driver, not connected."""
@@ -88,13 +90,17 @@ def setpoint(q: np.ndarray, state: RobotState) -> Setpoint:
 
 
 def follow(
-    driver: CanopenDriver, goal: np.ndarray, peer: Peer, within: float = 1e-4, seconds: float = 4.0
+    driver: CanopenDriver,
+    goal: np.ndarray,
+    controller: ArmController,
+    within: float = 1e-4,
+    seconds: float = 4.0,
 ) -> None:
     """Lead the arm to joints at 0.2 rad/s."""
-    start, begun = np.array(peer.q), time.monotonic()
+    start, begun = np.array(controller.q), time.monotonic()
     way = float(np.abs(goal - start).max())
-    while np.abs(goal - peer.q).max() > within:
-        assert time.monotonic() - begun < seconds, f"not there: {goal - peer.q}"
+    while np.abs(goal - controller.q).max() > within:
+        assert time.monotonic() - begun < seconds, f"not there: {goal - controller.q}"
         state = settled(driver)
         share = min((time.monotonic() - begun) * 0.2 / way, 1.0)
         driver.write_setpoint(setpoint(start + share * (goal - start), state))

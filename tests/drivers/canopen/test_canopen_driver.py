@@ -58,33 +58,33 @@ def test_setpoints_in_both_modes_bring_the_plant_there_and_release_leaves_it(
         before = [drive.number(0x6060) for drive in arm.server.drives]
         driver.arm(settled(driver))
         assert phases(arm) == {Phase.ENABLED}
-        goal = np.array(arm.peer.q) + 0.05 * np.array([1, -1, 1, -1, 1, -1])
-        follow(driver, goal, arm.peer)
+        goal = np.array(arm.controller.q) + 0.05 * np.array([1, -1, 1, -1, 1, -1])
+        follow(driver, goal, arm.controller)
         assert settled(driver).robot_mode == 7
         driver.release()
         assert phases(arm) == {Phase.SWITCH_ON_DISABLED}
-        assert np.abs(goal - arm.peer.q).max() < 2e-4
+        assert np.abs(goal - arm.controller.q).max() < 2e-4
         assert [drive.number(0x6060) for drive in arm.server.drives] == before
         assert all(drive.number(0x1016, 1) == 0 for drive in arm.server.drives)
 
 
 def test_connecting_reading_and_closing_enable_nothing_and_move_nothing(arm: DriveArm) -> None:
-    start = arm.peer.q
+    start = arm.controller.q
     with arm.driver() as driver:
         for _ in range(10):
             settled(driver)
         assert phases(arm) == {Phase.SWITCH_ON_DISABLED}
-    assert arm.peer.q == start
+    assert arm.controller.q == start
     assert all(drive.nmt.state == "PRE-OPERATIONAL" for drive in arm.server.drives)
 
 
 def test_arming_holds_the_arm_where_it_stands(arm: DriveArm) -> None:
     with arm.driver() as driver:
-        start = np.array(arm.peer.q)
+        start = np.array(arm.controller.q)
         driver.arm(settled(driver))
         for _ in range(20):
             settled(driver)
-        assert np.abs(start - arm.peer.q).max() < 2e-5
+        assert np.abs(start - arm.controller.q).max() < 2e-5
 
 
 def test_it_can_be_armed_released_and_armed_again(generic: DriveArm, driver: CanopenDriver) -> None:
@@ -98,7 +98,7 @@ def test_it_can_be_armed_released_and_armed_again(generic: DriveArm, driver: Can
 def test_torque_is_in_newton_metres_with_the_joints_sign(
     generic: DriveArm, driver: CanopenDriver
 ) -> None:
-    wanted = np.mean([generic.peer.joint_torque for _ in range(1)], axis=0)
+    wanted = np.mean([generic.controller.joint_torque for _ in range(1)], axis=0)
     found = np.mean([settled(driver).actual_current_as_torque for _ in range(20)], axis=0)
     assert found == pytest.approx(wanted, abs=1.5)
     assert np.abs(found).max() > 5.0
@@ -112,9 +112,9 @@ def test_setpoints_take_effect_together_at_the_next_sync(
     goal = state.actual_q + 0.01
     driver.write_setpoint(setpoint(goal, state))
     time.sleep(0.05)
-    assert np.abs(goal - generic.peer.q).min() > 0.009, "a setpoint counted without a SYNC"
+    assert np.abs(goal - generic.controller.q).min() > 0.009, "a setpoint counted without a SYNC"
     settled(driver)
-    wait_for(lambda: bool(np.abs(goal - generic.peer.q).max() < 1e-4), 1.0, "the setpoint")
+    wait_for(lambda: bool(np.abs(goal - generic.controller.q).max() < 1e-4), 1.0, "the setpoint")
 
 
 class _Failing:
@@ -140,7 +140,7 @@ def test_a_part_of_a_setpoint_never_takes_effect(
 ) -> None:
     driver.arm(settled(driver))
     state = settled(driver)
-    hold = np.array(generic.peer.q)
+    hold = np.array(generic.controller.q)
     network = driver.master.network
     real, network.bus = network.bus, _Failing(network.bus, 3, broken)
     with pytest.raises(WriteError, match=r"no buffer space.*3 of 6 out"):
@@ -151,7 +151,7 @@ def test_a_part_of_a_setpoint_never_takes_effect(
     network.bus = real
     for _ in range(5):
         settled(driver)
-    assert np.abs(hold - generic.peer.q).max() < 1e-5
+    assert np.abs(hold - generic.controller.q).max() < 1e-5
     assert driver.writer.mended > 0
     driver.write_setpoint(setpoint(hold + 0.001, settled(driver)))
 
@@ -164,7 +164,7 @@ def test_a_setpoint_that_is_not_finite_or_leaves_the_counts_is_refused(
     for wrong in (np.full(6, np.nan), np.full(6, 1e6), np.zeros(5)):
         with pytest.raises(WriteError):
             driver.write_setpoint(setpoint(wrong, state))
-    assert np.abs(state.actual_q - generic.peer.q).max() < 1e-4
+    assert np.abs(state.actual_q - generic.controller.q).max() < 1e-4
 
 
 # -- samples --------------------------------------------------------------------------------------
@@ -193,22 +193,22 @@ def test_a_pdo_of_the_sync_before_is_never_taken_for_this_ones(
             except (InvalidStateError, StaleStateError):
                 torn += 1
             else:
-                assert np.abs(state.actual_q - generic.peer.q).max() < 1e-3
+                assert np.abs(state.actual_q - generic.controller.q).max() < 1e-3
     assert torn >= 5
 
 
-def test_a_pdo_that_no_sync_asked_for_is_told(generic: DriveArm, driver: CanopenDriver) -> None:
+def test_a_pdo_that_no_sync_asked_for_is_reported(generic: DriveArm, driver: CanopenDriver) -> None:
     settled(driver)
-    said, until = "", time.monotonic() + 10.0
+    text, until = "", time.monotonic() + 10.0
     with generic.other_bus() as bus:
-        while "came without a SYNC" not in said and time.monotonic() < until:
+        while "came without a SYNC" not in text and time.monotonic() < until:
             bus.send(can.Message(arbitration_id=0x181, data=bytes(6), is_extended_id=False))
             time.sleep(0.02)  # on a busy machine it may come between a SYNC and its answer
             try:
                 driver.read_state()
             except LinkError as error:
-                said = str(error)
-    assert "TPDO1 of node 1 came without a SYNC" in said
+                text = str(error)
+    assert "TPDO1 of node 1 came without a SYNC" in text
     settled(driver)
 
 
@@ -220,7 +220,7 @@ def test_frames_of_others_are_no_samples(
         for identifier in (0x181, 0x205) if extended else (0x1F0, 0x190):
             bus.send(can.Message(arbitration_id=identifier, data=bytes(8), is_extended_id=extended))
     state = settled(driver)
-    assert np.abs(state.actual_q - generic.peer.q).max() < 1e-3
+    assert np.abs(state.actual_q - generic.controller.q).max() < 1e-3
     assert driver.foreign is None
 
 
@@ -280,7 +280,7 @@ def test_faults_are_reset_where_the_cell_says_so(generic: DriveArm) -> None:
 
 def test_a_drive_that_cannot_be_enabled_leaves_none_enabled(generic: DriveArm) -> None:
     with generic.driver(arming_time=0.3, clear_faults=True) as driver:
-        generic.peer.emergency_stop()
+        generic.controller.emergency_stop()
         state = settled(driver)
         with pytest.raises(WriteError, match="does not follow setpoints"):
             driver.arm(state)
@@ -296,9 +296,9 @@ def test_drives_stop_by_themselves_when_we_fall_silent(
     settled(driver)
     time.sleep(0.6)  # as a process that hangs, or was killed
     assert Phase.ENABLED not in phases(generic)
-    rest = generic.peer.q
+    rest = generic.controller.q
     time.sleep(0.1)
-    assert generic.peer.q == rest
+    assert generic.controller.q == rest
 
 
 def test_a_bus_that_dies_is_a_lost_link() -> None:
@@ -317,7 +317,7 @@ def test_a_bus_that_dies_is_a_lost_link() -> None:
 
 
 @pytest.mark.parametrize(
-    ("identifier", "data", "words"),
+    ("identifier", "data", "phrase"),
     [
         (0x080, b"", "SYNC"),
         (0x000, b"\x01\x05", "NMT command"),
@@ -327,14 +327,14 @@ def test_a_bus_that_dies_is_a_lost_link() -> None:
     ],
 )
 def test_another_master_is_noticed_and_writing_refused(
-    generic: DriveArm, driver: CanopenDriver, identifier: int, data: bytes, words: str
+    generic: DriveArm, driver: CanopenDriver, identifier: int, data: bytes, phrase: str
 ) -> None:
     driver.arm(settled(driver))
     with generic.other_bus() as bus:
         bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
         wait_for(lambda: driver.foreign is not None, 1.0, "the other master's frame")
     state = settled(driver)
-    with pytest.raises(WriteError, match=f"another master sent {words}"):
+    with pytest.raises(WriteError, match=f"another master sent {phrase}"):
         driver.write_setpoint(setpoint(state.actual_q, state))
     driver.release()
 
@@ -369,7 +369,7 @@ def test_a_node_that_is_not_there_is_named() -> None:
             arm.driver(sdo_timeout=0.1).connect()
 
 
-def test_a_bus_that_is_not_served_is_told_soon() -> None:
+def test_a_bus_that_is_not_served_is_reported_soon() -> None:
     arm = DriveArm("cia402", interface="socketcand", port=29812)
     with pytest.raises(LinkError, match="cannot be reached"):
         arm.driver().connect()
@@ -401,9 +401,9 @@ def test_fixed_pdos_that_are_others_are_refused(generic: DriveArm) -> None:
         driver.connect()
 
 
-@pytest.mark.parametrize(("rate", "words"), [(500.0, "at most 250"), (93.0, "whole ms")])
-def test_a_rate_that_the_drives_cannot_keep_is_refused(rate: float, words: str) -> None:
-    with pytest.raises(InputError, match=rf"link\.rate: found {rate:g}.*{words}"):
+@pytest.mark.parametrize(("rate", "phrase"), [(500.0, "at most 250"), (93.0, "whole ms")])
+def test_a_rate_that_the_drives_cannot_keep_is_refused(rate: float, phrase: str) -> None:
+    with pytest.raises(InputError, match=rf"link\.rate: found {rate:g}.*{phrase}"):
         DriveArm("cia402").driver(rate=rate)
 
 

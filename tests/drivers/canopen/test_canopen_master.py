@@ -69,18 +69,20 @@ def test_the_librarys_master_enables_moves_and_disables_a_drive(arm: DriveArm) -
         for state in ("READY TO SWITCH ON", "SWITCHED ON", "OPERATION ENABLED"):
             node.state = state
             assert node.state == state
-        start, counts = arm.peer.q[NODE - 1], arm.server.profile.counts_per_radian[NODE - 1]
+        start, counts = arm.controller.q[NODE - 1], arm.server.profile.counts_per_radian[NODE - 1]
         for step in range(100):
             node.rpdo[1]["Target position"].raw = here + round(0.05 * counts * step / 99)
             time.sleep(0.01)
-        wait_for(lambda: abs(arm.peer.q[NODE - 1] - start - 0.05) < 1e-5, 2.0, "the plant's joint")
+        wait_for(
+            lambda: abs(arm.controller.q[NODE - 1] - start - 0.05) < 1e-5, 2.0, "the plant's joint"
+        )
         assert all(not other.axis.holds for other in arm.server.drives if other.node != NODE)
         node.state = "SWITCHED ON"
         node.state = "SWITCH ON DISABLED"
         wait_for(lambda: not axis.holds, 1.0, "the drive's end")
 
 
-def test_the_librarys_master_resets_a_fault_that_an_emcy_told(arm: DriveArm) -> None:
+def test_the_librarys_master_resets_a_fault_that_an_emcy_reported(arm: DriveArm) -> None:
     with master(arm) as (_, node):
         arm.server.fail(NODE, 0x8611)
         wait_for(lambda: bool(node.emcy.active), 1.0, "an EMCY")

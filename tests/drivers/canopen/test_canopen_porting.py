@@ -37,18 +37,18 @@ def profile(tmp_path: Path) -> Path:
 def test_drives_that_no_code_knows_are_moved_from_the_pages_profile(profile: Path) -> None:
     with served(str(profile)) as arm, arm.driver() as driver:
         state = settled(driver)
-        assert np.abs(state.actual_q - arm.peer.q).max() < 1e-4
-        assert state.actual_current_as_torque == pytest.approx(arm.peer.joint_torque, abs=2.0)
+        assert np.abs(state.actual_q - arm.controller.q).max() < 1e-4
+        assert state.actual_current_as_torque == pytest.approx(arm.controller.joint_torque, abs=2.0)
         driver.arm(state)
-        goal = np.array(arm.peer.q) + 0.03 * np.array([1, 1, -1, -1, 1, 1])
-        follow(driver, goal, arm.peer)
+        goal = np.array(arm.controller.q) + 0.03 * np.array([1, 1, -1, -1, 1, 1])
+        follow(driver, goal, arm.controller)
         driver.release()
     drives = {drive.node: drive for drive in arm.server.drives}
-    raw = (arm.peer.q[1] - 0.1) * -65536 * 100 / (2 * np.pi)
+    raw = (arm.controller.q[1] - 0.1) * -65536 * 100 / (2 * np.pi)
     assert drives[12].number(0x6064) == pytest.approx(raw, abs=1.0)
 
 
-def test_a_mistake_in_the_pages_profile_is_told_with_its_line(profile: Path) -> None:
+def test_a_mistake_in_the_pages_profile_is_reported_with_its_line(profile: Path) -> None:
     profile.write_text(profile.read_text().replace("node: 13", "node: 12"))
     with pytest.raises(InputError, match=r"my_drives\.yaml, line 19: joints\.3\.node: found 12 ag"):
         read_profile(profile)

@@ -1,4 +1,4 @@
-"""Profiles are data: the shipped ones are sound, and a wrong one is told with its line."""
+"""Profiles are data: the shipped ones are sound, and a wrong one is reported with its line."""
 
 from __future__ import annotations
 
@@ -78,9 +78,9 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("old", "new", "words"), WRONG)
+@pytest.mark.parametrize(("old", "new", "phrase"), WRONG)
 def test_a_wrong_profile_is_refused_with_file_line_and_key(
-    copy: Path, old: str, new: str, words: str
+    copy: Path, old: str, new: str, phrase: str
 ) -> None:
     text = copy.read_text()
     assert old in text
@@ -89,7 +89,7 @@ def test_a_wrong_profile_is_refused_with_file_line_and_key(
         read_profile(copy)
     message = str(caught.value)
     assert message.startswith(f"{copy}, line ") or "found twice" in message
-    assert words in message
+    assert phrase in message
     assert "\n" not in message
 
 
@@ -105,7 +105,7 @@ def test_an_eds_that_is_no_drives_is_refused(copy: Path) -> None:
         read_profile(copy)
 
 
-def test_a_broken_eds_is_told_in_one_line(copy: Path) -> None:
+def test_a_broken_eds_is_reported_in_one_line(copy: Path) -> None:
     copy.with_name("cia402.eds").write_bytes(b"\xff\xfe[garbage\n=\n")
     with pytest.raises(InputError, match="broken EDS"):
         read_profile(copy)

@@ -39,7 +39,7 @@ def test_a_set_is_given_only_when_each_pdo_came_once_and_whole(
     for cob_id, more in frames:
         collector.take(cob_id, bytes(LENGTHS.get(cob_id, 3) + more), 0.0)
     ours = [(cob_id, more) for cob_id, more in frames if cob_id in LENGTHS]
-    # what comes after the set was whole is told as a stray, not as a part of it
+    # what comes after the set was whole is reported as a stray, not as a part of it
     first = ours[: len(COB_IDS)]
     whole = sorted(cob_id for cob_id, _ in first) == sorted(COB_IDS) and not any(
         m for _, m in first
@@ -66,7 +66,7 @@ def test_a_frame_before_any_sync_or_after_the_set_is_a_stray() -> None:
     collector = SyncCollector(PROFILE)
     collector.take(COB_IDS[0], frame_of(COB_IDS[0], 0), 0.0)
     assert collector.stray == "TPDO1 of node 1"
-    collector.stray = ""
+    collector.forget_stray()
     collector.begin(0.0)
     for cob_id in COB_IDS:
         collector.take(cob_id, frame_of(cob_id, 0), 0.0)
@@ -133,14 +133,14 @@ def test_speeds_are_the_drives_own_or_come_from_positions(name: str) -> None:
     profile = read_profile(SHIPPED / f"{name}.yaml")
     builder = StateBuilder(profile, builtin_arm("ur10e"))
     speed = np.array([0.5, -0.5, 0.2, 0.0, -0.3, 1.0])
-    told = np.rint(speed * profile.counts_per_radian)
+    reported = np.rint(speed * profile.counts_per_radian)
     for step in range(8):
         synced = 0.01 * step + (0.0005 if step % 2 else 0.0)  # a SYNC that is not punctual
         counts = profile.counts(speed * synced)
         rows = [
             {"Statusword": 0x0250, "Position actual value": int(q), "Velocity actual value": int(v),
              "Torque actual value": 0}
-            for q, v in zip(counts, told, strict=True)
+            for q, v in zip(counts, reported, strict=True)
         ]  # fmt: skip
         state = builder.build(SyncSet(tuple(rows), synced, synced + 0.001), None, False)
     assert state.actual_qd == pytest.approx(speed, abs=1e-3)

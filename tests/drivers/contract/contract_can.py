@@ -17,7 +17,7 @@ from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.simulated.can.nodes import CanNodes
 from gapbridge.drivers.simulated.can.server import make_servers
-from gapbridge.drivers.simulated.peer.peer_server import PeerServer
+from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
 
 INVENTED = Path(__file__).parents[1] / "can" / "invented.yaml"
 _ports = itertools.count(29600)
@@ -53,9 +53,9 @@ class CanCase(Case):
         super().__init__()
         self.settings = self.settings.model_copy(update={"host": self.host})
 
-    def make_servers(self) -> list[PeerServer]:
+    def make_servers(self) -> list[ProtocolServer]:
         """Return the arm's nodes."""
-        return make_servers(self.settings, self.host, self.peer)
+        return make_servers(self.settings, self.host, self.controller)
 
     def driver(self) -> Driver:
         """Return a CAN driver."""

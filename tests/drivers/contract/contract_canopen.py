@@ -13,7 +13,7 @@ from gapbridge.drivers.canopen.driver import CanopenDriver
 from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.simulated.canopen.server import CanopenServer, make_servers
-from gapbridge.drivers.simulated.peer.peer_server import PeerServer
+from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
 
 LATE = 0.012  # s that a torn sample's PDO is late: it comes after the next SYNC's slot
 _ports = itertools.count(29900)
@@ -22,8 +22,8 @@ _ports = itertools.count(29900)
 class CanopenCase(Case):
     """Drives on a bus: their profile, their wire, half a count of the coarsest joint.
 
-    ``speed`` None: the drives tell none in a known unit, and positions of a plant that a busy
-    machine moves in bursts tell it badly.
+    ``speed`` None: the drives report none in a known unit, and positions of a plant that a busy
+    machine moves in bursts show it badly.
     """
 
     def __init__(
@@ -38,9 +38,9 @@ class CanopenCase(Case):
         super().__init__()
         self.settings = self.settings.model_copy(update={"host": self.host})
 
-    def make_servers(self) -> list[PeerServer]:
+    def make_servers(self) -> list[ProtocolServer]:
         """Return the drives."""
-        return make_servers(self.settings, self.host, self.peer)
+        return make_servers(self.settings, self.host, self.controller)
 
     def driver(self) -> Driver:
         """Return a CANopen driver."""

@@ -15,8 +15,8 @@ from gapbridge.bridge.cell import load_cell
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.model import Model
 from gapbridge.drivers.driver import Driver
-from gapbridge.drivers.simulated.peer.peer import Peer, make_peer
-from gapbridge.drivers.simulated.peer.peer_server import PeerServer, PeerThread
+from gapbridge.drivers.simulated.server.arm_controller import ArmController, make_controller
+from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer, ServerThread
 from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 PERIOD = 0.004  # s
@@ -49,7 +49,8 @@ class Case(ABC):
     """A simulated controller served over its wire, and drivers for it.
 
     resolution: half a count of the joint angles, rad; speed_resolution the same, None where the
-    controller does not tell speeds; clocked: whether it tells a time of its own, so that a clock
+    controller does not report speeds; clocked: whether it reports a time of its own, so that a
+    clock
     that stands still can be noticed; force: half a count of the TCP force, N, None where there is
     none; writes: ``offset``, ``joints`` or None.
     """
@@ -65,12 +66,14 @@ class Case(ABC):
     def __init__(self) -> None:
         self.host = own_address()
         self.model = model_of(self.n)
-        self.peer: Peer = make_peer(*simulated_arm(self.model.arm, seed=11), period=PERIOD)
+        self.controller: ArmController = make_controller(
+            *simulated_arm(self.model.arm, seed=11), period=PERIOD
+        )
         self.servers = self.make_servers()
-        self._thread = PeerThread(self.peer, self.servers, self.host)
+        self._thread = ServerThread(self.controller, self.servers, self.host)
 
     @abstractmethod
-    def make_servers(self) -> list[PeerServer]:
+    def make_servers(self) -> list[ProtocolServer]:
         """Return the servers of the peer at ``host``."""
 
     @abstractmethod

@@ -86,26 +86,26 @@ def check_closed(driver: Driver) -> None:
 
 def check_angles(case: Case, driver: Driver) -> None:
     """Angles, speeds and their signs are the plant's, each joint on its own."""
-    peer = case.peer
-    start = peer.q
+    controller = case.controller
+    start = controller.q
     goal = tuple(
         min(max(q + (0.3 + 0.05 * i) * (-1) ** i, lo + 0.01), hi - 0.01)
         for i, (q, lo, hi) in enumerate(
-            zip(start, peer.plant.arm.lower, peer.plant.arm.upper, strict=True)
+            zip(start, controller.plant.arm.lower, controller.plant.arm.upper, strict=True)
         )
     )
-    peer.move_own(goal)
+    controller.move_own(goal)
     fastest = 0.0
     for _ in range(200):
         state = next_state(driver)
-        speed = np.array(peer.qd)
+        speed = np.array(controller.qd)
         slack = case.resolution + LATE * np.abs(speed).max() + 0.005
-        assert np.abs(state.actual_q - peer.q).max() <= slack + 0.02
+        assert np.abs(state.actual_q - controller.q).max() <= slack + 0.02
         if case.speed_resolution is not None and np.abs(speed).min() > 0.05:
             assert (np.sign(state.actual_qd) == np.sign(speed)).all()
             assert state.actual_qd == pytest.approx(speed, abs=0.1 + case.speed_resolution)
             fastest = max(fastest, float(np.abs(state.actual_qd).max()))
-        if max(map(abs, peer.qd)) < 1e-6 and np.allclose(peer.q, goal, atol=1e-6):
+        if max(map(abs, controller.qd)) < 1e-6 and np.allclose(controller.q, goal, atol=1e-6):
             break
     for _ in range(3):
         state = next_state(driver)
@@ -118,40 +118,40 @@ def check_angles(case: Case, driver: Driver) -> None:
 
 def check_force(case: Case, driver: Driver) -> None:
     """The force at the TCP is what the surroundings apply, in base axes."""
-    load = case.peer.plant.load
+    load = case.controller.plant.load
     before = np.mean([next_state(driver).actual_TCP_force for _ in range(10)], axis=0)
-    case.peer.plant.load = type(load)(load.mass, load.cog, (30.0, -50.0, 40.0), load.torque)
+    case.controller.plant.load = type(load)(load.mass, load.cog, (30.0, -50.0, 40.0), load.torque)
     settled = time.monotonic() + 0.5  # some controllers renew ten times a second
     while time.monotonic() < settled:
         next_state(driver)
     after = np.mean([next_state(driver).actual_TCP_force for _ in range(10)], axis=0)
-    case.peer.plant.load = load
+    case.controller.plant.load = load
     assert (after - before)[:3] == pytest.approx((30.0, -50.0, 40.0), abs=1.5 + (case.force or 0.0))
 
 
 def check_offset(case: Case, driver: Driver) -> None:
     """An offset moves the plant's TCP by just that, and goes again with its release."""
-    peer = case.peer
-    arm, tool = peer.plant.arm, peer.declared.tool
-    bare = tcp_in_base(arm, peer.q, tool)
+    controller = case.controller
+    arm, tool = controller.plant.arm, controller.declared.tool
+    bare = tcp_in_base(arm, controller.q, tool)
 
     def moved() -> list[float]:
-        return list(gap(bare, tcp_in_base(arm, peer.q, tool)))
+        return list(gap(bare, tcp_in_base(arm, controller.q, tool)))
 
     driver.arm(next_state(driver))
     stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), 1.0)
     assert moved() == pytest.approx(OFFSET, abs=2e-6)
     nominal = driver.nominal_q(next_state(driver))
-    assert np.abs(nominal - peer.own_q).max() <= case.resolution + 2e-5
+    assert np.abs(nominal - controller.own_q).max() <= case.resolution + 2e-5
     driver.release()
     wait_for(lambda: max(map(abs, moved())) < 2e-6, 3.0, "the offset's end")
 
 
 def check_joints(case: Case, driver: Driver) -> None:
     """Joint setpoints bring the plant there; after the release it stays."""
-    peer = case.peer
-    start = np.array(peer.q)
-    sign = np.array([(-1.0) ** i for i in range(peer.n)])
+    controller = case.controller
+    start = np.array(controller.q)
+    sign = np.array([(-1.0) ** i for i in range(controller.n)])
     goal = start + STEP * sign
     begun = time.monotonic()
     driver.arm(next_state(driver))
@@ -162,20 +162,23 @@ def check_joints(case: Case, driver: Driver) -> None:
         return setpoint_of(state, q, q, (0.0,) * 6)
 
     stream(
-        driver, setpoint, 8.0, lambda: bool(np.abs(goal - peer.q).max() < case.resolution + 1e-4)
+        driver,
+        setpoint,
+        8.0,
+        lambda: bool(np.abs(goal - controller.q).max() < case.resolution + 1e-4),
     )
-    assert np.abs(goal - peer.q).max() < case.resolution + 1e-4
+    assert np.abs(goal - controller.q).max() < case.resolution + 1e-4
     driver.release()
     time.sleep(0.2)
-    rest = np.array(peer.q)
+    rest = np.array(controller.q)
     time.sleep(0.2)
-    assert np.abs(rest - peer.q).max() < 1e-6
-    assert np.abs(goal - peer.q).max() < case.resolution + 1e-3
+    assert np.abs(rest - controller.q).max() < 1e-6
+    assert np.abs(goal - controller.q).max() < case.resolution + 1e-3
 
 
 def check_gate(case: Case, driver: Driver) -> None:
     """What is no number or far off never leaves, and the arm stays where it is."""
-    before = np.array(case.peer.target_q)
+    before = np.array(case.controller.target_q)
     driver.arm(next_state(driver))
     state = next_state(driver)
     q = driver.nominal_q(state)
@@ -190,14 +193,14 @@ def check_gate(case: Case, driver: Driver) -> None:
         with pytest.raises(GateError):
             driver.write_setpoint(setpoint_of(state, q, q, (length, *nothing[1:])))
     time.sleep(0.1)
-    assert np.abs(before - case.peer.target_q).max() <= 2.0 * case.resolution + 1e-6
+    assert np.abs(before - case.controller.target_q).max() <= 2.0 * case.resolution + 1e-6
     driver.write_setpoint(setpoint_of(state, q, q, nothing))
 
 
 def check_stall(case: Case, driver: Driver) -> None:
     """A controller that falls silent is stale in time, and is heard again afterwards."""
     next_state(driver)
-    case.peer.stall(2.0 * case.state_timeout + 0.3)
+    case.controller.stall(2.0 * case.state_timeout + 0.3)
     begun = time.monotonic()
     with pytest.raises(StaleStateError):
         read_on(driver)
@@ -208,12 +211,12 @@ def check_stall(case: Case, driver: Driver) -> None:
 def check_frozen(case: Case, driver: Driver) -> None:
     """A controller that answers while its clock stands still is stale."""
     next_state(driver)
-    case.peer.frozen = True
+    case.controller.frozen = True
     begun = time.monotonic()
     with pytest.raises(StaleStateError):
         read_on(driver)
     assert time.monotonic() - begun < 2.0 * case.state_timeout + 3.0
-    case.peer.frozen = False
+    case.controller.frozen = False
     _recovers(driver)
 
 
@@ -230,7 +233,7 @@ def check_torn(case: Case, driver: Driver) -> None:
             except InvalidStateError:
                 dropped += 1
             else:
-                assert np.abs(state.actual_q - case.peer.q).max() <= case.resolution + 1e-3
+                assert np.abs(state.actual_q - case.controller.q).max() <= case.resolution + 1e-3
     assert dropped > 0, "no torn sample was ever read"
 
 

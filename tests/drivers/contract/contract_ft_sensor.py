@@ -11,7 +11,7 @@ FT_SENSOR = str(Path(__file__).parents[1] / "ft_sensor")
 sys.path.insert(0, FT_SENSOR)
 
 from contract_modbus import ModbusCase  # noqa: E402
-from sensor_wires import RESOLUTION, RPY, XYZ, felt_of, make_wire  # noqa: E402
+from sensor_wires import RESOLUTION, RPY, XYZ, make_wire, reaction_of  # noqa: E402
 
 from gapbridge.drivers.driver import Driver  # noqa: E402
 from gapbridge.drivers.ft_sensor.joined import DriverWithSensor  # noqa: E402
@@ -22,7 +22,7 @@ class SensorCase(ModbusCase):
 
     def __init__(self, profile: str, kind: str) -> None:
         super().__init__(profile)
-        self._wire = make_wire(kind, felt_of(self.peer))
+        self._wire = make_wire(kind, reaction_of(self.controller))
         self.force = RESOLUTION[kind][0]
 
     def driver(self) -> Driver:

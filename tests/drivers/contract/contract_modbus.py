@@ -17,7 +17,7 @@ from gapbridge.drivers.modbus.registers import UNITS
 from gapbridge.drivers.modbus.schema import Vector
 from gapbridge.drivers.modbus.settings import SHIPPED, ModbusSettings
 from gapbridge.drivers.simulated.modbus.server import ModbusServer, make_servers
-from gapbridge.drivers.simulated.peer.peer_server import PeerServer
+from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
 
 INVENTED = Path(__file__).parents[1] / "modbus" / "invented.yaml"
 _ports = itertools.count(15100)
@@ -47,9 +47,9 @@ class ModbusCase(Case):
         super().__init__()
         self.settings = self.settings.model_copy(update={"host": self.host})
 
-    def make_servers(self) -> list[PeerServer]:
+    def make_servers(self) -> list[ProtocolServer]:
         """Return the Modbus server."""
-        return make_servers(self.settings, self.host, self.peer)
+        return make_servers(self.settings, self.host, self.controller)
 
     def driver(self) -> Driver:
         """Return a Modbus driver."""

@@ -65,9 +65,9 @@ def test_what_is_written_moves_the_plant(case: Case, driver: Driver) -> None:
 
 
 def test_without_arming_nothing_leaves(case: Case, driver: Driver) -> None:
-    before = np.array(case.peer.q)
+    before = np.array(case.controller.q)
     check_not_armed(driver)
-    assert np.abs(before - case.peer.q).max() < 1e-9
+    assert np.abs(before - case.controller.q).max() < 1e-9
 
 
 def test_what_the_gate_refuses_never_reaches_the_plant(case: Case, driver: Driver) -> None:
@@ -81,7 +81,7 @@ def test_silence_is_stale_in_time(case: Case, driver: Driver) -> None:
 
 def test_a_clock_that_stands_still_is_stale(case: Case, driver: Driver) -> None:
     if not case.clocked:
-        assert not case.clocked, "nothing but arrival tells a sample's age here"
+        assert not case.clocked, "nothing but arrival shows a sample's age here"
         return
     check_frozen(case, driver)
 
@@ -90,7 +90,7 @@ def test_a_torn_sample_is_never_taken(case: Case, driver: Driver) -> None:
     check_torn(case, driver)
 
 
-def test_a_controller_that_goes_away_is_told_and_met_again(case: Case, driver: Driver) -> None:
+def test_a_controller_that_goes_away_is_reported_and_met_again(case: Case, driver: Driver) -> None:
     check_loss(case, driver)
 
 

@@ -20,12 +20,12 @@ from gapbridge.drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
 from gapbridge.drivers.ft_sensor.settings import AnyFtSensor, FtSensorSettings
 from gapbridge.drivers.simulated.ft_sensor.ati_node import AtiNode
 from gapbridge.drivers.simulated.ft_sensor.ft300_device import Ft300Device
-from gapbridge.drivers.simulated.ft_sensor.mounting import felt_by
+from gapbridge.drivers.simulated.ft_sensor.mounting import reaction_at
 from gapbridge.drivers.simulated.ft_sensor.node import SimulatedSensor
 from gapbridge.drivers.simulated.ft_sensor.robotous_node import RobotousNode
-from gapbridge.drivers.simulated.peer.peer import Peer, make_peer
 from gapbridge.drivers.simulated.plant.plant_arm import plant_arm
 from gapbridge.drivers.simulated.plant.plant_settings import draw_plant_settings
+from gapbridge.drivers.simulated.server.arm_controller import ArmController, make_controller
 
 Array = NDArray[np.float64]
 KINDS = ("robotous_rft", "ati_netcanoem", "robotiq_ft300", "robotiq_ft300 registers")
@@ -45,7 +45,7 @@ def settings_of(**keys: Any) -> FtSensorSettings:
 
 
 @dataclass
-class Felt:
+class Reaction:
     """What the device is made to feel; a plant behind it is felt through ``felt_by``."""
 
     wrench: tuple[float, ...] = (3.0, -4.5, 12.25, 0.35, -0.6, 1.1)
@@ -68,16 +68,16 @@ class Wire:
         return settings_of(**keys)
 
 
-def make_wire(kind: str, felt: Callable[[], Any]) -> Wire:
+def make_wire(kind: str, reaction: Callable[[], Any]) -> Wire:
     """Return a device of a kind on a wire of its own, not yet started."""
     name, *mode = kind.split()
     if name == "robotiq_ft300":
         keys: dict[str, Any] = {"driver": name, "mode": (mode or ["stream"])[0], "max_age": 0.2}
-        return Wire(Ft300Device(felt), keys)
+        return Wire(Ft300Device(reaction), keys)
     channel = f"ft-{os.getpid()}-{next(_channels)}"
     bus = BusSettings(interface="virtual", channel=channel)
     keys = {"driver": name, "interface": "virtual", "channel": channel, "max_age": 0.2}
-    node = RobotousNode(felt, bus) if name == "robotous_rft" else AtiNode(felt, bus, seed=5)
+    node = RobotousNode(reaction, bus) if name == "robotous_rft" else AtiNode(reaction, bus, seed=5)
     return Wire(node, keys)
 
 
@@ -91,7 +91,7 @@ def next_reading(sensor: ForceTorqueSensor, limit: float = 3.0) -> Reading:
     raise AssertionError(f"no sample within {limit:g} s, {sensor.dropped} dropped")
 
 
-def resting_peer(q: tuple[float, ...]) -> Peer:
+def resting_controller(q: tuple[float, ...]) -> ArmController:
     """Return an arm at rest with a known mass on its flange; its sensor has no noise, no bias."""
     arm = plant_arm("ur10e")
     plant = replace(
@@ -99,15 +99,15 @@ def resting_peer(q: tuple[float, ...]) -> Peer:
         torque_noise=0.0, sensor_bias=(0.0,) * 6, axial=(0.0,) * 6, radial=(0.0,) * 6,
         tcp=(0.0, 0.0, 0.18, 0.0, 0.0, 0.0),
     )  # fmt: skip
-    peer = make_peer(arm, plant, q, 0.004)
+    controller = make_controller(arm, plant, q, 0.004)
     for _ in range(5):
-        peer.cycle()
-    return peer
+        controller.cycle()
+    return controller
 
 
-def felt_of(peer: Peer, sign: int = 1) -> Callable[[], Any]:
+def reaction_of(controller: ArmController, sign: int = 1) -> Callable[[], Any]:
     """Return what a sensor mounted at XYZ, RPY on the peer's flange feels."""
-    return felt_by(lambda: peer.raw_wrench, XYZ, RPY, sign)
+    return reaction_at(lambda: controller.raw_wrench, XYZ, RPY, sign)
 
 
 def flange_rotation(q: tuple[float, ...]) -> Array:

@@ -63,11 +63,11 @@ def simulated(cell: Path) -> Iterator[subprocess.Popen[str]]:
     )  # fmt: skip
     assert process.stdout is not None
     try:
-        said = ""
-        while "ready" not in said:
+        output = ""
+        while "ready" not in output:
             line = process.stdout.readline()
-            said += line
-            assert line, said
+            output += line
+            assert line, output
         yield process
     finally:
         process.terminate()
@@ -186,7 +186,7 @@ def test_arm_and_sensor_share_one_can_bus(tmp_path: Path) -> None:
     assert weight == pytest.approx(MASS * 9.80665, abs=0.15)
 
 
-def test_a_run_without_the_sensor_says_which_and_ends(tmp_path: Path) -> None:
+def test_a_run_without_the_sensor_reports_which_and_ends(tmp_path: Path) -> None:
     with_sensor = cell_in(tmp_path, "robotous_rft")
     text = with_sensor.read_text(encoding="utf-8")
     elsewhere = tmp_path / "elsewhere.yaml"
@@ -203,7 +203,7 @@ def test_a_run_without_the_sensor_says_which_and_ends(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("section", "words"),
+    ("section", "phrase"),
     [
         ("driver: bota", "ft_sensor.driver"),
         ("rate: 100", "expected a key 'driver'"),
@@ -216,14 +216,14 @@ def test_a_run_without_the_sensor_says_which_and_ends(tmp_path: Path) -> None:
     ],
 )
 def test_a_section_that_cannot_be_is_one_clear_line(
-    tmp_path: Path, section: str, words: str
+    tmp_path: Path, section: str, phrase: str
 ) -> None:
     path = tmp_path / "cell.yaml"
     path.write_text(f"robot: {{model: ur10e}}\nft_sensor: {{{section}}}\n", encoding="utf-8")
-    with pytest.raises(InputError) as told:
+    with pytest.raises(InputError) as reported:
         load_cell(path)
-    message = str(told.value)
-    assert words in message and "line 2" in message and "\n" not in message
+    message = str(reported.value)
+    assert phrase in message and "line 2" in message and "\n" not in message
 
 
 @pytest.mark.parametrize("name", ["ur10e_ft_robotous.yaml", "ur10e_ft300.yaml"])

@@ -14,7 +14,7 @@ BRIDGE = str(Path(__file__).resolve().parents[2] / "bridge")
 sys.path.insert(0, BRIDGE)
 
 from daemon_cell import Robot, Run, offsets, wait_for  # noqa: E402
-from sensor_wires import Felt  # noqa: E402
+from sensor_wires import Reaction  # noqa: E402
 
 from gapbridge.bridge.loop.supervisor import State  # noqa: E402
 from gapbridge.drivers.can_bus.bus import BusSettings  # noqa: E402
@@ -34,7 +34,7 @@ def robot(tmp_path: Path) -> Iterator[Robot]:
 def sensor(robot: Robot) -> Iterator[RobotousNode]:
     with Hub(robot.host) as hub:
         bus = BusSettings(interface="socketcand", host=robot.host, port=hub.port)
-        with RobotousNode(Felt(WEIGHT), bus) as node:
+        with RobotousNode(Reaction(WEIGHT), bus) as node:
             yield node
 
 
@@ -60,7 +60,7 @@ def test_a_silent_sensor_is_seen_and_its_return_is_observed(
         time.sleep(0.3)
         run.end()
         raw = np.stack([run.cycles()[f"ft_raw_wrench_{i}"] for i in range(6)], axis=1)
-    assert any("robotous_rft" in line and "max_age" in line for line in run.said), run.said
+    assert any("robotous_rft" in line and "max_age" in line for line in run.output), run.output
     assert np.abs(raw - WEIGHT).max() <= 0.02  # not one cycle with another wrench
 
 
@@ -90,7 +90,7 @@ def test_overload_stops_the_writing(robot: Robot, sensor: RobotousNode) -> None:
         sensor.status = 0x10
         wait_for(lambda: run.daemon.state != State.COMPENSATING, 1.0, "no longer compensating")
         run.end()
-    assert any("overload" in line for line in run.said), run.said
+    assert any("overload" in line for line in run.output), run.output
 
 
 def test_a_lost_sensor_drops_the_force_and_the_angles_stay_corrected(
@@ -100,10 +100,10 @@ def test_a_lost_sensor_drops_the_force_and_the_angles_stay_corrected(
         run.wait(State.COMPENSATING)
         time.sleep(1.0)
         sensor.silent = True
-        wait_for(lambda: any("max_age" in line for line in run.said), 2.0, "the event")
+        wait_for(lambda: any("max_age" in line for line in run.output), 2.0, "the event")
         time.sleep(0.5)
         sensor.silent = False
-        wait_for(lambda: "the sensor is back" in run.said, 5.0, "the sensor")
+        wait_for(lambda: "the sensor is back" in run.output, 5.0, "the sensor")
         time.sleep(0.3)
         assert run.daemon.state == State.COMPENSATING
         status = run.daemon.status()

@@ -17,7 +17,7 @@ PERIOD, APART = 0.005, 0.0003  # s between samples, between the frames of one
 
 
 def sample_of(k: int) -> tuple[int, ...]:
-    """Return six counts that tell which sample they are of, each of them."""
+    """Return six counts that identify which sample they are of, each of them."""
     k &= 0x7FFF
     return (k, -k, k ^ 0x2AAA, k, -k, k ^ 0x1555)
 
@@ -88,10 +88,10 @@ def answers(frames: int) -> None:
     for i in range(0, frames, 2):
         k, (a, b, c, d, e, f) = i // 2, sample_of(i // 2)
         status = k & 0x3FFF
-        for half, words in enumerate(((status, a & 0xFFFF, c & 0xFFFF, e & 0xFFFF),
+        for half, phrase in enumerate(((status, a & 0xFFFF, c & 0xFFFF, e & 0xFFFF),
                                       (b & 0xFFFF, d & 0xFFFF, f & 0xFFFF))):  # fmt: skip
             fate, length = fates[i + half], int(lengths[i + half])
-            data = b"".join(w.to_bytes(2, "big") for w in words)
+            data = b"".join(w.to_bytes(2, "big") for w in phrase)
             identifier, stamp = 0x200 + half, k * PERIOD + half * APART
             if fate == 0:
                 continue

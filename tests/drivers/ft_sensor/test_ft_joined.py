@@ -15,12 +15,12 @@ from sensor_wires import (
     RESOLUTION,
     RPY,
     XYZ,
-    Felt,
+    Reaction,
     Wire,
-    felt_of,
     flange_rotation,
     make_wire,
-    resting_peer,
+    reaction_of,
+    resting_controller,
 )
 
 from gapbridge.core.arm import builtin_arm
@@ -32,7 +32,7 @@ from gapbridge.core.setpoint import Setpoint
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.ft_sensor.joined import DriverWithSensor
-from gapbridge.drivers.simulated.peer.peer import Peer
+from gapbridge.drivers.simulated.server.arm_controller import ArmController
 
 TURNED = (0.3, -1.2, 1.4, -1.1, -1.3, 0.8)  # rad
 MOUNTED = {"sensor_in_flange": {"xyz": XYZ, "rpy": RPY}}
@@ -40,12 +40,15 @@ TOOL = transform(np.eye(3), np.array((0.0, 0.0, 0.18)))
 PERIOD = 0.002  # s
 
 
-class PeerDriver(Driver):
+class ControllerDriver(Driver):
     """An arm without a wire of its own: reads a simulated peer's plant, at 500 Hz."""
 
-    def __init__(self, peer: Peer, lead: float = 0.0) -> None:
+    def __init__(self, controller: ArmController, lead: float = 0.0) -> None:
         super().__init__(1.0 / PERIOD, Model(builtin_arm("ur10e")))
-        self.peer, self.lead = peer, lead  # lead: s of the arm's clock on this machine's
+        self.controller, self.lead = (
+            controller,
+            lead,
+        )  # lead: s of the arm's clock on this machine's
         self.written: list[Setpoint] = []
         self.open = False
         self._due = 0.0
@@ -57,7 +60,7 @@ class PeerDriver(Driver):
         time.sleep(max(self._due - time.monotonic(), 0.0))
         self._due = max(self._due + PERIOD, time.monotonic())
         now = time.monotonic()
-        q, still = np.array(self.peer.q), np.zeros(self.n)
+        q, still = np.array(self.controller.q), np.zeros(self.n)
         return RobotState(now + self.lead, now, q, still, q, np.full(6, 99.0))
 
     def _send(self, setpoint: Setpoint) -> None:
@@ -73,9 +76,13 @@ def model(**changed: Any) -> Model:
     )
 
 
-def joined(wire: Wire, peer: Peer, m: Model | None = None, **keys: Any) -> DriverWithSensor:
+def joined(
+    wire: Wire, controller: ArmController, m: Model | None = None, **keys: Any
+) -> DriverWithSensor:
     settings = wire.settings(**{**MOUNTED, **keys})
-    return DriverWithSensor(PeerDriver(peer, keys.pop("lead", 0.0)), settings, m or model())
+    return DriverWithSensor(
+        ControllerDriver(controller, keys.pop("lead", 0.0)), settings, m or model()
+    )
 
 
 def bounds(kind: str, lever: float = 0.3) -> np.ndarray[Any, Any]:
@@ -86,21 +93,21 @@ def bounds(kind: str, lever: float = 0.3) -> np.ndarray[Any, Any]:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_raw_wrench_and_tcp_force_are_the_plants(kind: str) -> None:
-    peer = resting_peer(TURNED)
-    wire = make_wire(kind, felt_of(peer))
+    controller = resting_controller(TURNED)
+    wire = make_wire(kind, reaction_of(controller))
     pull = (12.0, -7.0, 20.0, 0.5, 1.0, -0.8)
-    with wire.device, joined(wire, peer) as driver:
+    with wire.device, joined(wire, controller) as driver:
         state = driver.read_state()
         assert state.ft_raw_wrench is not None
-        assert np.all(np.abs(state.ft_raw_wrench - peer.raw_wrench) <= bounds(kind))
+        assert np.all(np.abs(state.ft_raw_wrench - controller.raw_wrench) <= bounds(kind))
         assert np.all(np.abs(state.actual_TCP_force) <= bounds(kind))  # nothing but the payload
-        load = peer.plant.load
-        peer.plant.load = replace(load, force=pull[:3], torque=pull[3:])
-        peer.cycle()
+        load = controller.plant.load
+        controller.plant.load = replace(load, force=pull[:3], torque=pull[3:])
+        controller.cycle()
         time.sleep(0.1)
         state = driver.read_state()
     assert state.ft_raw_wrench is not None
-    assert np.all(np.abs(state.ft_raw_wrench - peer.raw_wrench) <= bounds(kind))
+    assert np.all(np.abs(state.ft_raw_wrench - controller.raw_wrench) <= bounds(kind))
     assert np.all(np.abs(state.actual_TCP_force - pull) <= bounds(kind))
     rotation = flange_rotation(TURNED)
     down = rotation @ state.ft_raw_wrench[:3] - pull[:3]
@@ -108,9 +115,9 @@ def test_raw_wrench_and_tcp_force_are_the_plants(kind: str) -> None:
 
 
 def test_the_controllers_declared_payload_stands_instead_of_the_models() -> None:
-    peer = resting_peer(TURNED)
-    wire = make_wire("robotous_rft", felt_of(peer))
-    arm = PeerDriver(peer)
+    controller = resting_controller(TURNED)
+    wire = make_wire("robotous_rft", reaction_of(controller))
+    arm = ControllerDriver(controller)
     states = arm.read_state
 
     def declared() -> RobotState:
@@ -123,45 +130,45 @@ def test_the_controllers_declared_payload_stands_instead_of_the_models() -> None
 
 
 def test_an_arm_may_keep_its_own_tcp_force() -> None:
-    peer = resting_peer(TURNED)
-    wire = make_wire("robotous_rft", felt_of(peer))
-    with wire.device, joined(wire, peer, tcp_force="arm") as driver:
+    controller = resting_controller(TURNED)
+    wire = make_wire("robotous_rft", reaction_of(controller))
+    with wire.device, joined(wire, controller, tcp_force="arm") as driver:
         state = driver.read_state()
     assert np.all(state.actual_TCP_force == 99.0)
     assert state.ft_raw_wrench is not None
 
 
 def test_sensor_errors_in_the_model_are_undone_in_the_tcp_force_but_not_in_the_raw_wrench() -> None:
-    peer = resting_peer(TURNED)
+    controller = resting_controller(TURNED)
     bias = (2.0, -1.0, 3.0, 0.2, -0.1, 0.3)
     wire = make_wire(
         "robotous_rft",
-        lambda: tuple(1.05 * v + b for v, b in zip(peer.raw_wrench, bias, strict=True)),
+        lambda: tuple(1.05 * v + b for v, b in zip(controller.raw_wrench, bias, strict=True)),
     )
     terms = (
         Term("ft_bias", Site(), bias),
         Term("ft_gain", Site(), (0.05,) * 6),
     )
     straight = {"sensor_in_flange": {"xyz": (0, 0, 0), "rpy": (0, 0, 0)}}
-    with wire.device, joined(wire, peer, model(terms=terms), **straight) as driver:
+    with wire.device, joined(wire, controller, model(terms=terms), **straight) as driver:
         state = driver.read_state()
     assert state.ft_raw_wrench is not None
-    expected = 1.05 * np.array(peer.raw_wrench) + bias
+    expected = 1.05 * np.array(controller.raw_wrench) + bias
     assert np.all(np.abs(state.ft_raw_wrench - expected) <= bounds("robotous_rft"))
     assert np.all(np.abs(state.actual_TCP_force) <= bounds("robotous_rft"))
 
 
-def test_a_stale_sensor_is_told_while_the_arm_goes_on_and_its_return_heals() -> None:
-    peer = resting_peer(TURNED)
-    wire = make_wire("ati_netcanoem", felt_of(peer))
-    with wire.device, joined(wire, peer, max_age=0.08) as driver:
+def test_a_stale_sensor_is_reported_while_the_arm_goes_on_and_its_return_heals() -> None:
+    controller = resting_controller(TURNED)
+    wire = make_wire("ati_netcanoem", reaction_of(controller))
+    with wire.device, joined(wire, controller, max_age=0.08) as driver:
         driver.read_state()
         wire.device.silent = True
         begun = time.monotonic()
-        with pytest.raises(StaleStateError, match=r"ati_netcanoem.*ft_sensor\.max_age") as told:
+        with pytest.raises(StaleStateError, match=r"ati_netcanoem.*ft_sensor\.max_age") as reported:
             read_for(driver, 2.0)
         assert 0.05 < time.monotonic() - begun < 0.5
-        assert "\n" not in str(told.value)
+        assert "\n" not in str(reported.value)
         longest = 0.0
         for _ in range(50):  # the arm's cycle does not wait for the sensor
             before = time.monotonic()
@@ -190,10 +197,10 @@ def heal(driver: DriverWithSensor, limit: float = 4.0) -> RobotState:
 
 
 def test_a_sensor_that_was_switched_off_and_on_comes_back() -> None:
-    peer = resting_peer(TURNED)
+    controller = resting_controller(TURNED)
     for kind in ("robotous_rft", "ati_netcanoem"):
-        wire = make_wire(kind, felt_of(peer))
-        with joined_started(wire, peer) as driver:
+        wire = make_wire(kind, reaction_of(controller))
+        with joined_started(wire, controller) as driver:
             wire.device.stop()
             time.sleep(0.3)
             with pytest.raises(StaleStateError):
@@ -203,20 +210,20 @@ def test_a_sensor_that_was_switched_off_and_on_comes_back() -> None:
             wire.device.stop()
 
 
-def joined_started(wire: Wire, peer: Peer) -> DriverWithSensor:
+def joined_started(wire: Wire, controller: ArmController) -> DriverWithSensor:
     wire.device.start()
-    return joined(wire, peer)
+    return joined(wire, controller)
 
 
-def test_a_cut_serial_line_is_told_and_opened_anew(tmp_path: Any) -> None:
+def test_a_cut_serial_line_is_reported_and_opened_anew(tmp_path: Any) -> None:
     from gapbridge.drivers.simulated.ft_sensor.ft300_device import Ft300Device
 
-    peer, link = resting_peer(TURNED), tmp_path / "ft300"
-    device = Ft300Device(felt_of(peer), link)
+    controller, link = resting_controller(TURNED), tmp_path / "ft300"
+    device = Ft300Device(reaction_of(controller), link)
     wire = Wire(device, {"driver": "robotiq_ft300", "max_age": 0.2})
     device.start()
     settings = wire.settings(**MOUNTED).model_copy(update={"port": str(link)})
-    with DriverWithSensor(PeerDriver(peer), settings, model()) as driver:
+    with DriverWithSensor(ControllerDriver(controller), settings, model()) as driver:
         driver.read_state()
         device.stop()
         time.sleep(0.3)
@@ -228,24 +235,24 @@ def test_a_cut_serial_line_is_told_and_opened_anew(tmp_path: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("limits", "words"),
+    ("limits", "phrase"),
     [({"force": 30.0}, r"force of 39\.\d N.*overload\.force"),
      ({"torque": 0.5}, r"torque of .* Nm.*overload\.torque")],
 )  # fmt: skip
 def test_more_than_the_sensor_may_carry_is_not_believed(
-    limits: dict[str, float], words: str
+    limits: dict[str, float], phrase: str
 ) -> None:
-    peer = resting_peer(TURNED)
-    wire = make_wire("robotous_rft", felt_of(peer))
-    driver = joined(wire, peer, overload=limits)
-    with wire.device, driver, pytest.raises(InvalidStateError, match=words):
+    controller = resting_controller(TURNED)
+    wire = make_wire("robotous_rft", reaction_of(controller))
+    driver = joined(wire, controller, overload=limits)
+    with wire.device, driver, pytest.raises(InvalidStateError, match=phrase):
         driver.read_state()
 
 
 def test_the_sensors_own_overload_bits_are_not_believed_and_pass() -> None:
-    peer = resting_peer(TURNED)
-    wire = make_wire("robotous_rft", felt_of(peer))
-    with wire.device, joined(wire, peer) as driver:
+    controller = resting_controller(TURNED)
+    wire = make_wire("robotous_rft", reaction_of(controller))
+    with wire.device, joined(wire, controller) as driver:
         driver.read_state()
         wire.device.status = 0x20
         time.sleep(0.05)
@@ -257,13 +264,13 @@ def test_the_sensors_own_overload_bits_are_not_believed_and_pass() -> None:
 
 
 def test_no_sensor_is_a_link_error_and_the_arm_is_let_go() -> None:
-    peer = resting_peer(TURNED)
-    wire = make_wire("robotous_rft", Felt())
+    controller = resting_controller(TURNED)
+    wire = make_wire("robotous_rft", Reaction())
     wire.device.silent = True
-    driver = joined(wire, peer, connect_timeout=0.2)
+    driver = joined(wire, controller, connect_timeout=0.2)
     with wire.device, pytest.raises(LinkError, match=r"ft_sensor\.connect_timeout"):
         driver.connect()
-    assert isinstance(driver._arm, PeerDriver)
+    assert isinstance(driver._arm, ControllerDriver)
     assert not driver._arm.open
     driver.close()
 
@@ -276,11 +283,14 @@ def test_each_state_gets_the_wrench_of_its_own_moment_whatever_the_arms_clock_sa
     begun = time.monotonic()
     slope = 100.0
     wire = make_wire("ati_netcanoem", lambda: (0, 0, slope * (time.monotonic() - begun), 0, 0, 0))
-    peer = resting_peer(TURNED)
+    controller = resting_controller(TURNED)
     straight = {"sensor_in_flange": {"xyz": (0, 0, 0), "rpy": (0, 0, 0)}}
     settings = wire.settings(**straight)
     gaps = []
-    with wire.device, DriverWithSensor(PeerDriver(peer, lead), settings, model()) as driver:
+    with (
+        wire.device,
+        DriverWithSensor(ControllerDriver(controller, lead), settings, model()) as driver,
+    ):
         for _ in range(400):
             state = driver.read_state()
             assert state.ft_raw_wrench is not None
@@ -292,14 +302,14 @@ def test_each_state_gets_the_wrench_of_its_own_moment_whatever_the_arms_clock_sa
 
 
 def test_setpoints_and_the_arms_own_wishes_pass_through() -> None:
-    peer = resting_peer(TURNED)
-    wire = make_wire("robotous_rft", felt_of(peer))
-    with wire.device, joined(wire, peer) as driver:
+    controller = resting_controller(TURNED)
+    wire = make_wire("robotous_rft", reaction_of(controller))
+    with wire.device, joined(wire, controller) as driver:
         state = driver.read_state()
         driver.arm(state)
         setpoint = Setpoint(state.target_q, state.target_q, np.zeros(6), state.timestamp, 0.0)
         driver.write_setpoint(setpoint)
-        assert isinstance(driver._arm, PeerDriver)
+        assert isinstance(driver._arm, ControllerDriver)
         assert driver._arm.written == [setpoint]
         assert np.array_equal(driver.nominal_q(state), state.target_q)
         assert (driver.rate, driver.n, driver.moves_arm) == (500.0, 6, True)

@@ -16,13 +16,13 @@ from sensor_wires import (
     RESOLUTION,
     RPY,
     XYZ,
-    Felt,
+    Reaction,
     Wire,
-    felt_of,
     flange_rotation,
     make_wire,
     next_reading,
-    resting_peer,
+    reaction_of,
+    resting_controller,
     settings_of,
 )
 
@@ -44,25 +44,25 @@ def tolerance(kind: str) -> np.ndarray[Any, Any]:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_known_wrench_is_read_in_newtons_and_newton_metres(kind: str) -> None:
-    felt = Felt()
-    wire = make_wire(kind, felt)
+    reaction = Reaction()
+    wire = make_wire(kind, reaction)
     with wire.device, make_sensor(wire.settings()) as sensor:
         reading = next_reading(sensor)
-        assert np.all(np.abs(reading.wrench - felt.wrench) <= tolerance(kind))
+        assert np.all(np.abs(reading.wrench - reaction.wrench) <= tolerance(kind))
         assert reading.status == 0
         assert reading.timestamp <= reading.received <= time.monotonic()
-        felt.wrench = tuple(-v for v in felt.wrench)
+        reaction.wrench = tuple(-v for v in reaction.wrench)
         time.sleep(0.05)
         for _ in range(20):
             reading = next_reading(sensor)
-        assert np.all(np.abs(reading.wrench - felt.wrench) <= tolerance(kind))
+        assert np.all(np.abs(reading.wrench - reaction.wrench) <= tolerance(kind))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_mass_at_rest_reads_its_weight_pointing_down(kind: str, sign: int) -> None:
-    peer = resting_peer(TURNED)
-    wire = make_wire(kind, felt_of(peer, sign))
+    controller = resting_controller(TURNED)
+    wire = make_wire(kind, reaction_of(controller, sign))
     wire.keys |= {"sensor_in_flange": {"xyz": XYZ, "rpy": RPY}, "sign": sign}
     with wire.device, make_sensor(wire.settings()) as sensor:
         reading = next_reading(sensor)
@@ -92,37 +92,39 @@ def test_the_constructor_touches_no_wire_and_the_table_is_whole() -> None:
 
 
 @pytest.mark.parametrize("kind", ["robotous_rft", "ati_netcanoem"])
-def test_overload_bits_are_told(kind: str) -> None:
-    wire = make_wire(kind, Felt())
+def test_overload_bits_are_reported(kind: str) -> None:
+    wire = make_wire(kind, Reaction())
     wire.device.status = 0x2000 if kind == "ati_netcanoem" else 0x04
     with wire.device, make_sensor(wire.settings()) as sensor:
         reading = next_reading(sensor)
         assert reading.status == wire.device.status
-        words = sensor.describe(reading.status)
-    assert ("DAC" if kind == "ati_netcanoem" else "overload") in words
+        phrase = sensor.describe(reading.status)
+    assert ("DAC" if kind == "ati_netcanoem" else "overload") in phrase
 
 
 def test_a_saturated_gauge_is_overload() -> None:
-    wire = make_wire("ati_netcanoem", Felt((900.0, 0.0, 0.0, 0.0, 0.0, 0.0)))
+    wire = make_wire("ati_netcanoem", Reaction((900.0, 0.0, 0.0, 0.0, 0.0, 0.0)))
     with wire.device, make_sensor(wire.settings()) as sensor:
         reading = next_reading(sensor)
         assert "saturated" in sensor.describe(reading.status)
 
 
 def test_a_sensor_calibrated_in_pounds_is_read_in_newtons() -> None:
-    felt = Felt()
-    wire = make_wire("ati_netcanoem", felt)
+    reaction = Reaction()
+    wire = make_wire("ati_netcanoem", reaction)
     assert isinstance(wire.device, AtiNode)
-    pounds = AtiNode(felt, wire.device._settings, seed=9, units=((1, 4.4482216), (2, 1.3558179)))
+    pounds = AtiNode(
+        reaction, wire.device._settings, seed=9, units=((1, 4.4482216), (2, 1.3558179))
+    )
     with pounds, make_sensor(wire.settings()) as sensor:
         assert np.all(
-            np.abs(next_reading(sensor).wrench - felt.wrench) <= tolerance("ati_netcanoem")
+            np.abs(next_reading(sensor).wrench - reaction.wrench) <= tolerance("ati_netcanoem")
         )
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_silent_sensor_gives_no_reading_and_its_return_does(kind: str) -> None:
-    wire = make_wire(kind, Felt())
+    wire = make_wire(kind, Reaction())
     with wire.device, make_sensor(wire.settings()) as sensor:
         next_reading(sensor)
         wire.device.silent = True
@@ -135,7 +137,7 @@ def test_a_silent_sensor_gives_no_reading_and_its_return_does(kind: str) -> None
 
 
 def test_a_sensor_that_does_not_answer_is_no_sensor() -> None:
-    wire = make_wire("ati_netcanoem", Felt())
+    wire = make_wire("ati_netcanoem", Reaction())
     wire.device.silent = True
     with wire.device, pytest.raises(LinkError, match="base id 0x20"):
         make_sensor(wire.settings()).connect()
@@ -143,7 +145,7 @@ def test_a_sensor_that_does_not_answer_is_no_sensor() -> None:
 
 @pytest.mark.parametrize("kind", ["robotous_rft", "robotiq_ft300"])
 def test_close_ends_the_stream(kind: str) -> None:
-    wire = make_wire(kind, Felt())
+    wire = make_wire(kind, Reaction())
     device: Any = wire.device
     with device:
         with make_sensor(wire.settings()) as sensor:
@@ -156,7 +158,7 @@ def test_close_ends_the_stream(kind: str) -> None:
 
 
 def test_a_stream_left_running_does_not_disturb_the_start() -> None:
-    wire = make_wire("robotiq_ft300", Felt())
+    wire = make_wire("robotiq_ft300", Reaction())
     device = wire.device
     assert isinstance(device, Ft300Device)
     with device:
@@ -168,7 +170,7 @@ def test_a_stream_left_running_does_not_disturb_the_start() -> None:
 
 
 def test_garbage_on_the_line_is_dropped_and_the_stream_goes_on() -> None:
-    wire = make_wire("robotiq_ft300", Felt())
+    wire = make_wire("robotiq_ft300", Reaction())
     device = wire.device
     assert isinstance(device, Ft300Device)
     with device, make_sensor(wire.settings()) as sensor:
@@ -178,7 +180,7 @@ def test_garbage_on_the_line_is_dropped_and_the_stream_goes_on() -> None:
         for garbage in (b"\x20", b"\x20\x4e\x20", b"\x00" * 33, half, bytes(broken)):
             device.put(garbage)
             for _ in range(5):
-                assert np.allclose(next_reading(sensor).wrench, Felt().wrench, atol=0.01)
+                assert np.allclose(next_reading(sensor).wrench, Reaction().wrench, atol=0.01)
         assert sensor.dropped >= 33
 
 
@@ -194,14 +196,14 @@ def flood(wire: Wire, stop: threading.Event, rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize("kind", ["robotous_rft", "ati_netcanoem"])
 def test_foreign_and_broken_frames_on_the_bus_never_make_a_sample(kind: str) -> None:
-    wire, stop = make_wire(kind, Felt()), threading.Event()
+    wire, stop = make_wire(kind, Reaction()), threading.Event()
     noise = threading.Thread(target=flood, args=(wire, stop, np.random.default_rng(1)))
     with wire.device, make_sensor(wire.settings()) as sensor:
         noise.start()
         try:
             for _ in range(60):
                 found = next_reading(sensor).wrench
-                assert np.all(np.abs(found - Felt().wrench) <= tolerance(kind))
+                assert np.all(np.abs(found - Reaction().wrench) <= tolerance(kind))
         finally:
             stop.set()
             noise.join()
@@ -209,9 +211,9 @@ def test_foreign_and_broken_frames_on_the_bus_never_make_a_sample(kind: str) -> 
 
 
 def test_a_second_robotous_on_the_bus_is_another_pair_of_ids() -> None:
-    wire = make_wire("robotous_rft", Felt())
+    wire = make_wire("robotous_rft", Reaction())
     assert isinstance(wire.device, RobotousNode)
-    other = RobotousNode(Felt((0.0,) * 6), wire.device._settings, 0x65, (0x11, 0x12))
+    other = RobotousNode(Reaction((0.0,) * 6), wire.device._settings, 0x65, (0x11, 0x12))
     second = wire.settings(command_id=0x65, reply_ids=(0x11, 0x12))
     with wire.device, other, make_sensor(wire.settings()) as a, make_sensor(second) as b:
         assert next_reading(a).wrench[2] == pytest.approx(12.25, abs=0.02)
@@ -219,7 +221,7 @@ def test_a_second_robotous_on_the_bus_is_another_pair_of_ids() -> None:
 
 
 @pytest.mark.parametrize(
-    ("keys", "words"),
+    ("keys", "phrase"),
     [
         ({"driver": "robotous_rft", "reply_ids": (1, 1)}, "different"),
         ({"driver": "robotous_rft", "reply_ids": (1, 0x800)}, "11-bit"),
@@ -229,6 +231,6 @@ def test_a_second_robotous_on_the_bus_is_another_pair_of_ids() -> None:
         ({"driver": "robotiq_ft300", "channel": "can0"}, "channel"),
     ],
 )
-def test_settings_that_cannot_be_are_refused(keys: dict[str, Any], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
+def test_settings_that_cannot_be_are_refused(keys: dict[str, Any], phrase: str) -> None:
+    with pytest.raises(ValueError, match=phrase):
         settings_of(**keys)

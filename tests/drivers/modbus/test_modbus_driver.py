@@ -23,7 +23,7 @@ from gapbridge.drivers.modbus.driver import ModbusDriver
 from gapbridge.drivers.modbus.settings import SHIPPED
 from gapbridge.drivers.simulated.modbus.programs import MailboxProgram
 from gapbridge.drivers.simulated.modbus.server import ModbusServer
-from gapbridge.drivers.simulated.peer.bench import BenchError
+from gapbridge.drivers.simulated.server.bench import BenchError
 
 
 @pytest.fixture
@@ -147,21 +147,21 @@ def test_a_register_outside_the_allow_list_is_never_written(ur: ModbusCase) -> N
             driver.transport.write("coil", 236, [1])
 
 
-def test_a_stopped_robot_is_not_armed_and_says_why(ur: ModbusCase) -> None:
+def test_a_stopped_robot_is_not_armed_and_reports_why(ur: ModbusCase) -> None:
     with ur.driver() as driver:
         assert next_state(driver).safety_mode == 1
-        ur.peer.protective_stop()
+        ur.controller.protective_stop()
         wait_for(lambda: next_state(driver).safety_mode == 3, 1.0, "the stop")
         with pytest.raises(
             WriteError, match=r"security stopped \(holding 261\): found 1, expected"
         ):
             driver.arm(next_state(driver))
-        ur.peer.unlock()
-        ur.peer.emergency_stop()
+        ur.controller.unlock()
+        ur.controller.emergency_stop()
         wait_for(lambda: next_state(driver).safety_mode == 7, 1.0, "the button")
 
 
-def test_registers_too_coarse_for_the_offset_are_told_before_arming(tmp_path: Path) -> None:
+def test_registers_too_coarse_for_the_offset_are_reported_before_arming(tmp_path: Path) -> None:
     path = tmp_path / "cell.yaml"
     path.write_text(
         "robot: {model: ur10e}\npayload: {mass: 5.0}\n"
@@ -170,20 +170,20 @@ def test_registers_too_coarse_for_the_offset_are_told_before_arming(tmp_path: Pa
     with ModbusCase("niryo") as case:
         driver = ModbusDriver(case.settings, load_cell(path).model)
         with driver:
-            before = np.array(case.peer.q)
+            before = np.array(case.controller.q)
             with pytest.raises(
                 WriteError,
                 match=r"Niryo One's target registers are too coarse: one count \(1 mrad\) times "
                 r"the reach \(1\.\d+ m\) is 1\.\d+ mm, and the offset at hand is 0\.\d+ mm",
             ):
                 driver.arm(next_state(driver))
-            assert np.abs(before - case.peer.q).max() < 1e-9
+            assert np.abs(before - case.controller.q).max() < 1e-9
         coarse = case.settings.model_copy(update={"coarsest": 0.005})
         with ModbusDriver(coarse, load_cell(path).model) as driver:
             driver.arm(next_state(driver))
 
 
-def test_a_target_that_the_robot_refuses_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_target_that_the_robot_refuses_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     with ModbusCase("niryo") as case, case.driver() as driver:
         state = next_state(driver)
         driver.arm(state)
@@ -192,12 +192,12 @@ def test_a_target_that_the_robot_refuses_is_told(monkeypatch: pytest.MonkeyPatch
         def refuse(_: object) -> None:
             raise BenchError("move: outside what this controller allows")
 
-        monkeypatch.setattr(case.peer, "move_own", refuse)
+        monkeypatch.setattr(case.controller, "move_own", refuse)
         with pytest.raises(WriteError, match=r"last command .*found 2, expected 0 or 1"):
             stream(driver, lambda state, _: setpoint_of(state, q, q, (0.0,) * 6), 2.0)
 
 
-def test_the_wrong_controller_is_told_when_connecting() -> None:
+def test_the_wrong_controller_is_reported_when_connecting() -> None:
     with ModbusCase(str(INVENTED)) as case:
         server = case.servers[0]
         assert isinstance(server, ModbusServer)
@@ -208,7 +208,7 @@ def test_the_wrong_controller_is_told_when_connecting() -> None:
             case.driver().connect()
 
 
-def test_a_map_with_the_wrong_word_order_is_told_when_connecting(tmp_path: Path) -> None:
+def test_a_map_with_the_wrong_word_order_is_reported_when_connecting(tmp_path: Path) -> None:
     path = tmp_path / "wrong.yaml"
     text = (SHIPPED / "igus.yaml").read_text()
     path.write_text(text.replace("type: i32, word_order: low_first", "type: i32", 1))
@@ -218,7 +218,7 @@ def test_a_map_with_the_wrong_word_order_is_told_when_connecting(tmp_path: Path)
             ModbusDriver(wrong, case.model).connect()
 
 
-def test_a_register_that_is_not_there_is_told_when_connecting() -> None:
+def test_a_register_that_is_not_there_is_reported_when_connecting() -> None:
     with ModbusCase("xarm") as case:
         wide = ModbusDriver(case.settings, case.model)
         wide._first_block = dataclasses.replace(wide._first_block, count=12)

@@ -56,7 +56,7 @@ def read_by_mbpoll(case: ModbusCase, table: str, first: int, count: int) -> list
 
 def test_mbpoll_reads_the_joints_of_our_server(case: ModbusCase) -> None:
     values, turns = read_by_mbpoll(case, "4", 270, 6), read_by_mbpoll(case, "4", 320, 6)
-    assert np.abs(joints_of(values, turns) - case.peer.q).max() <= 6e-4
+    assert np.abs(joints_of(values, turns) - case.controller.q).max() <= 6e-4
 
 
 def test_mbpoll_writes_and_reads_back_a_general_register(case: ModbusCase) -> None:
@@ -74,7 +74,7 @@ def test_pymodbustcp_reads_registers_and_coils_of_our_server() -> None:
         words = client.read_input_registers(142, 12)
         assert words is not None
         counts = [np.int32(np.uint32(words[i] | words[i + 1] << 16)) for i in range(0, 12, 2)]
-        assert np.abs(np.radians(0.01 * np.array(counts)) - case.peer.q).max() <= 1e-4
+        assert np.abs(np.radians(0.01 * np.array(counts)) - case.controller.q).max() <= 1e-4
         assert client.read_coils(53, 8) == [True, *[False] * 6, True]  # motors on, referenced
         assert client.read_coils(112, 1) == [False]
         assert client.read_holding_registers(1, 1) is None  # no such register: an exception
@@ -94,17 +94,17 @@ def test_our_driver_reads_a_server_that_is_not_pymodbus() -> None:
 
     def fill() -> None:
         while not ended.is_set():
-            case.peer.cycle()
+            case.controller.cycle()
             bank = other.data_bank
             words = bank.get_holding_registers(234, 11)
-            server.program.cycle(case.peer, lambda *_, w=words: w)
-            found = image.state_registers(case.file, image.readings(case.peer))["holding"]
+            server.program.cycle(case.controller, lambda *_, w=words: w)
+            found = image.state_registers(case.file, image.readings(case.controller))["holding"]
             spots = image.condition_registers(case.file.status, frozenset())
-            spots += server.program.registers(case.peer)
+            spots += server.program.registers(case.controller)
             found.update({address: value for _, address, value in spots})
             for address, value in found.items():
                 bank.set_holding_registers(address, [value])
-            time.sleep(case.peer.period)
+            time.sleep(case.controller.period)
 
     thread = threading.Thread(target=fill, daemon=True)
     thread.start()
@@ -114,7 +114,7 @@ def test_our_driver_reads_a_server_that_is_not_pymodbus() -> None:
             check_reads(driver, case.model)
             driver.arm(next_state(driver))
             driver.release()
-            assert np.abs(next_state(driver).actual_q - case.peer.q).max() <= case.resolution
+            assert np.abs(next_state(driver).actual_q - case.controller.q).max() <= case.resolution
     finally:
         ended.set()
         thread.join(2.0)

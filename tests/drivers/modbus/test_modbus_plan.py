@@ -19,7 +19,7 @@ word = st.integers(0, 0xFFFF)
     st.lists(word, min_size=32, max_size=32), st.permutations(range(32)),
     st.sampled_from((1.0, 1e-3, -0.25)), st.none() | st.sampled_from(("i16", "u16", "sm16")),
 )  # fmt: skip
-def test_a_block_says_to_the_plan_what_its_codings_say(
+def test_a_block_gives_the_plan_what_its_codings_say(
     kind: str, order: str, registers: list[int], places: list[int], size: float, turns: str | None
 ) -> None:
     coding = Coding(kind, order)  # type: ignore[arg-type]
@@ -45,7 +45,7 @@ def test_a_block_says_to_the_plan_what_its_codings_say(
 @pytest.mark.parametrize(
     ("count", "fine"), [(10, True), (11, False), (0xFFF6, True), (0xFFF5, False)]
 )
-def test_a_number_beyond_its_bound_is_told(count: int, fine: bool) -> None:
+def test_a_number_beyond_its_bound_is_reported(count: int, fine: bool) -> None:
     plan = BlockPlan(2)
     plan.add("position", [0, 1], Coding("i16"), [0.1, 0.1], 1.0)
     plan.compile()

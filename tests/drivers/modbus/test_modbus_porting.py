@@ -28,7 +28,7 @@ def profile(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_map_of_the_page_reads_writes_and_is_told_when_wrong(profile: Path) -> None:
+def test_the_map_of_the_page_reads_writes_and_is_reported_when_wrong(profile: Path) -> None:
     with ModbusCase(str(profile)) as case:
         with case.driver() as driver:
             check_reads(driver, case.model)
@@ -42,9 +42,9 @@ def test_the_map_of_the_page_reads_writes_and_is_told_when_wrong(profile: Path) 
 
 def test_the_checksum_is_the_one_on_the_page() -> None:
     words = [7, 100, 65436, 3, 4, 65531, 6, 9, 2500, 1000]
-    said = re.search(r"\((\d+) \+ 1 w0 \+ 2 w1 .*modulo (\d+)", PORTING)
-    assert said is not None
-    seed, modulus = map(int, said.groups())
+    formula = re.search(r"\((\d+) \+ 1 w0 \+ 2 w1 .*modulo (\d+)", PORTING)
+    assert formula is not None
+    seed, modulus = map(int, formula.groups())
     total = seed + sum((i + 1) * word for i, word in enumerate(words))
     assert encode.checksum(words) == total % modulus
     assert encode.mailbox_words(7, [100, -100, 3, 4, -5, 6], 9, [2500, 1000]) == [

@@ -46,7 +46,7 @@ def written(tmp_path: Path, text: str) -> Path:
         ("scale: 0.01, unit: deg}\n  vel", "scale: 0, unit: deg}\n  vel", 4,
          "state.position.scale: found 0, expected a number other than zero"),
         ("joints: 6", "joints: 5", 2, "joints: found 5, expected 6: the arm has those"),
-        ("joints: 6\n", "", 1, "joints: found nothing, expected how many joints it tells"),
+        ("joints: 6\n", "", 1, "joints: found nothing, expected how many joints it reports"),
         ("unit: mrad/s", "unit: mrad", 5, "found 'mrad', expected a unit of speed: rad/s"),
         ("table: coil", "table: discrete", 12, "expected 'coil' or 'holding'"),
         ("value: 1}", "value: 2}", 12, "write.trigger.1.value: found 2, expected 0 to 1"),
@@ -62,7 +62,7 @@ def written(tmp_path: Path, text: str) -> Path:
         ("joints: 6", "joints: [", 4, "broken YAML"),
     ],
 )  # fmt: skip
-def test_a_mistake_is_told_with_its_line(
+def test_a_mistake_is_reported_with_its_line(
     tmp_path: Path, old: str, new: str, line: int, words: str
 ) -> None:
     assert old in GOOD

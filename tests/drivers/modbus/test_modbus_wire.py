@@ -23,7 +23,7 @@ from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
 from gapbridge.drivers.modbus.driver import ModbusDriver
 from gapbridge.drivers.modbus.settings import ModbusSettings
 from gapbridge.drivers.simulated.modbus.server import ModbusServer
-from gapbridge.drivers.simulated.peer.peer_server import PeerThread
+from gapbridge.drivers.simulated.server.protocol_server import ServerThread
 
 QUICK = {"timeout": 0.05, "state_timeout": 0.4}
 
@@ -92,7 +92,7 @@ def test_a_ruined_answer_is_never_taken_and_the_link_recovers(
         proxy.ruin = lambda answer: answer
         time.sleep(0.1)
         state = next_state(driver)
-        assert np.abs(state.actual_q - case.peer.q).max() <= case.resolution
+        assert np.abs(state.actual_q - case.controller.q).max() <= case.resolution
 
 
 def test_a_late_answer_is_never_taken_for_the_next_ones(case: ModbusCase, proxy: EvilProxy) -> None:
@@ -102,8 +102,8 @@ def test_a_late_answer_is_never_taken_for_the_next_ones(case: ModbusCase, proxy:
         with pytest.raises(StaleStateError, match="no new sample for"):
             driver.read_state()
         proxy.wait = 0.0
-        goal = (case.peer.q[0] + 0.2, *case.peer.q[1:])
-        case.peer.move_own(goal)
+        goal = (case.controller.q[0] + 0.2, *case.controller.q[1:])
+        case.controller.move_own(goal)
         time.sleep(1.5)
         assert np.abs(next_state(driver).actual_q - goal).max() <= case.resolution
 
@@ -137,7 +137,7 @@ def test_an_offset_whose_answer_is_lost_once_is_sent_once_more(
         proxy.ruin = lose_one
         stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), 1.0)
         assert lost
-        assert max(map(abs, case.peer.joint_offset)) > 1e-5
+        assert max(map(abs, case.controller.joint_offset)) > 1e-5
 
 
 def test_a_controller_that_hangs_up_each_time_is_a_link_error(
@@ -196,7 +196,7 @@ def test_the_contract_holds_over_mutual_tls(keys: Path) -> None:
         profile="ur", host=case.host, port=15802, transport="tls", rate=50.0,
         authority=keys / "ca.pem", certificate=keys / "client.pem", key=keys / "client.key",
     )  # fmt: skip
-    with PeerThread(case.peer, [server], case.host):
+    with ServerThread(case.controller, [server], case.host):
         with ModbusDriver(settings, case.model) as driver:
             check_reads(driver, case.model)
             driver.arm(next_state(driver))
@@ -217,7 +217,7 @@ def test_over_tls_only_the_named_or_the_pinned_controller_is_let_in(keys: Path) 
     context.load_cert_chain(keys / "other.pem", keys / "other.key")
     server = ModbusServer(case.file, case.host, 15802, tls=context)
     base = {"profile": "ur", "host": case.host, "port": 15802, "transport": "tls", "rate": 50.0}
-    with PeerThread(case.peer, [server], case.host):
+    with ServerThread(case.controller, [server], case.host):
         named = ModbusSettings(**base, authority=keys / "ca.pem")
         with pytest.raises(LinkError, match="certificate is refused: IP address mismatch"):
             ModbusDriver(named, case.model).connect()
@@ -274,9 +274,12 @@ def test_the_contract_holds_over_a_serial_line() -> None:
     settings = ModbusSettings(
         profile="ur", transport="rtu", serial=ours, baudrate=115200, rate=20.0, timeout=0.3
     )
-    with PeerThread(case.peer, [server], case.host), ModbusDriver(settings, case.model) as driver:
+    with (
+        ServerThread(case.controller, [server], case.host),
+        ModbusDriver(settings, case.model) as driver,
+    ):
         check_reads(driver, case.model)
-        assert np.abs(next_state(driver).actual_q - case.peer.q).max() <= case.resolution
+        assert np.abs(next_state(driver).actual_q - case.controller.q).max() <= case.resolution
         driver.arm(next_state(driver))
         stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), 0.5)
         driver.release()

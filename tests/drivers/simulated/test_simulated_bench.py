@@ -186,7 +186,7 @@ def test_an_emergency_stop_takes_the_power_and_coming_back_takes_every_step(
         ("move 0 0 0", "found 3 numbers, expected 6"),
     ],
 )
-def test_a_mistake_on_the_bench_is_told(bench: Bench, line: str, reason: str) -> None:
+def test_a_mistake_on_the_bench_is_reported(bench: Bench, line: str, reason: str) -> None:
     answer = bench.ask(line)
     assert answer.startswith("error: ")
     assert reason in answer

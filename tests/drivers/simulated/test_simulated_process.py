@@ -37,7 +37,7 @@ def test_the_command_serves_until_a_signal_and_exits_with_zero(number: signal.Si
     process.stdout.close()
 
 
-def test_an_unknown_arm_is_bad_input_told_in_one_line() -> None:
+def test_an_unknown_arm_is_bad_input_reported_in_one_line() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "gapbridge.drivers.simulated",
          "--arm", "ur10f", "--host", own_address()],
@@ -48,7 +48,7 @@ def test_an_unknown_arm_is_bad_input_told_in_one_line() -> None:
     assert "found 'ur10f'" in done.stderr
 
 
-def test_a_taken_port_is_told_and_nothing_is_left_running() -> None:
+def test_a_taken_port_is_reported_and_nothing_is_left_running() -> None:
     settings = cell_settings()
     with (
         SimulatedController(settings),

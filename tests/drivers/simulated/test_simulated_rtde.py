@@ -9,7 +9,7 @@ import pytest
 from rtde_client import RtdeClient
 from simulated_cell import cell_settings
 
-from gapbridge.drivers.simulated.peer.connection import listen
+from gapbridge.drivers.simulated.server.connection import listen
 from gapbridge.drivers.simulated.ur.process import SimulatedController
 from gapbridge.drivers.simulated.ur.rtde_names import INPUTS, OUTPUTS
 from gapbridge.drivers.simulated.ur.servers.rtde_server import RtdeServer

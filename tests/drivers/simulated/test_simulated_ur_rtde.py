@@ -300,7 +300,7 @@ def test_registers_written_by_io_are_seen_on_the_robot(controller: SimulatedCont
     assert out["analog"] == pytest.approx(3.0)
 
 
-def test_a_second_control_client_is_told_that_the_registers_are_in_use(
+def test_a_second_control_client_learns_that_the_registers_are_in_use(
     controller: SimulatedController,
 ) -> None:
     out = run_client(

@@ -145,7 +145,7 @@ def test_whoever_is_killed_is_withdrawn_at_the_rates_of_the_cell(
     assert out["armed"][1] == 0.0
 
 
-def test_rates_that_are_too_small_to_be_told_are_refused() -> None:
+def test_rates_that_are_too_small_to_be_sent_are_refused() -> None:
     assert registers.rates(0.05, 0.1) == 1250 << 16 | 1000
     with pytest.raises(ValueError, match="offset_rate: found 1e-05"):
         registers.rates(1e-5, 0.1)
@@ -167,7 +167,7 @@ def test_a_program_that_takes_no_rates_is_refused_when_arming(
     assert "gapbridge_offset.script of this version" in out["error"]
 
 
-def test_a_wrong_checksum_moves_nothing_and_is_told(offset_robot: SimulatedController) -> None:
+def test_a_wrong_checksum_moves_nothing_and_is_reported(offset_robot: SimulatedController) -> None:
     out = run(
         offset_robot.host,
         f"""
@@ -254,9 +254,9 @@ def test_sequence_numbers_go_round() -> None:
 def test_the_shipped_program_is_whole() -> None:
     text = offset_program()
     code = [line.split("#")[0].split() for line in text.splitlines()]
-    words = [line[0].rstrip(":") for line in code if line]
-    opened = sum(word in ("def", "if", "while", "thread") for word in words)
-    assert opened == words.count("end")
+    message = [line[0].rstrip(":") for line in code if line]
+    opened = sum(word in ("def", "if", "while", "thread") for word in message)
+    assert opened == message.count("end")
     for number in (18, 19, 20, 21, 22):
         assert str(number) in text
     for name in ("path_offset_enable", "path_offset_set(", "path_offset_disable", "sync()"):

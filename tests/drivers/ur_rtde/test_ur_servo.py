@@ -1,4 +1,4 @@
-"""Writing by servoJ: the plant follows, and whatever goes wrong is told."""
+"""Writing by servoJ: the plant follows, and whatever goes wrong is reported."""
 
 from __future__ import annotations
 

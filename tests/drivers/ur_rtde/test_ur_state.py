@@ -200,9 +200,9 @@ def test_states_that_cannot_be_are_refused_and_the_next_is_read(
             read_for(3)
         """,
     )
-    for values, words in wrong.items():
+    for values, message in wrong.items():
         assert out[values].startswith("InvalidStateError: ")
-        assert words in out[values]
+        assert message in out[values]
 
 
 def test_a_restarted_controller_is_noticed_by_its_clock(controller: SimulatedController) -> None:

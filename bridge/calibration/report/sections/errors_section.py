@@ -39,7 +39,7 @@ def _caption(material: Material) -> str:
         "most so large, errors in powers of ten."
     )
     if material.wild:
-        text += " The table counts wild readings too."
+        text += " The table counts outliers too."
     if len(material.axes) > 1:
         c = material.calibration
         text += f" The fit leaves {mm(c.noise)} along an axis (1 sigma)"

@@ -1,4 +1,4 @@
-"""What is left over: the diagnosis of the remainder, in words."""
+"""The residual: the diagnosis of the remainder, in words."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SHOWN = 8  # measurements proposed
 class LeftoverSection(Section[Material]):
     """Whether the calibration is complete."""
 
-    key, title = "leftover", "What is left over"
+    key, title = "leftover", "The residual"
     about = (
         "What the calibrated model still misses is examined again: does any further effect show?"
     )
@@ -41,7 +41,7 @@ class LeftoverSection(Section[Material]):
         """Return the verdict, what was found, and what would settle it."""
         c = material.calibration
         if c.diagnosis is None:
-            text = "These readings do not allow to examine what is left over."
+            text = "These readings do not allow to examine the residual."
             return [Verdict(Badge("Not examined", QUIET), text)]
         badge = Badge("Complete", GOOD) if c.complete else Badge("Not complete", DOUBTFUL)
         main = chosen_channel(c.diagnosis)

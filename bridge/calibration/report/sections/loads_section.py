@@ -19,7 +19,7 @@ class LoadsSection(Section[Material]):
     """How the errors go with the load."""
 
     key, title = "loads", "Over the load"
-    about = "Errors by what hung on the flange; wild readings are left out."
+    about = "Errors by what hung on the flange; outliers are left out."
 
     def blocks(self, material: Material) -> list[Block]:
         """Return a picture and a table, one column and one row a load."""

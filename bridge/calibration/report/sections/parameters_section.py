@@ -1,4 +1,4 @@
-"""The parameters: values with intervals, what the plan had promised, what cannot be told apart."""
+"""The parameters: values with intervals, what the plan had promised, what cannot be separated."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class ParametersSection(Section[Material]):
     about = "What this arm has beyond the model that the cell had; intervals of 95 %."
 
     def blocks(self, material: Material) -> list[Block]:
-        """Return the table and what the readings do not tell."""
+        """Return the table and what the readings do not determine."""
         c = material.calibration
         shown = [e for e in c.estimates if e.shown]
         hidden = [parameter_words(e.name) for e in c.estimates if not e.shown]
@@ -28,7 +28,7 @@ class ParametersSection(Section[Material]):
             text = "* stands on the bound of what is physically possible."
             blocks.append(Paragraph(text, "note"))
         if c.combinations or hidden:
-            blocks.append(Heading("What these readings cannot tell"))
+            blocks.append(Heading("What these readings cannot determine"))
             items = [spoken(text) for text in c.combinations]
             # the combinations speak of most of them
             items += [

@@ -99,19 +99,19 @@ class PayloadEstimates(Section[PayloadMaterial]):
 class PayloadRemainder(Section[PayloadMaterial]):
     """What the sensor read beyond load and zero."""
 
-    key, title = "remainder", "What is left over"
+    key, title = "remainder", "The residual"
     about = "Reading minus load and sensor zero, orientation by orientation."
 
     def blocks(self, material: PayloadMaterial) -> list[Block]:
         """Return the remainder as pictures, against the noise that was found."""
         found = material.found
         drawings = (
-            _remainder("Force left over", "N", found, slice(0, 3)),
-            _remainder("Torque left over", "Nm", found, slice(3, 6)),
+            _remainder("Residual force", "N", found, slice(0, 3)),
+            _remainder("Residual torque", "Nm", found, slice(3, 6)),
         )
         force, torque = found.noise
         rows = [["force", f"{fixed(force, 3)} N"], ["torque", f"{fixed(torque, 4)} Nm"]]
-        caption = "Length of what is left over; red: weighed down as wild."
+        caption = "Length of the residual; red: down-weighted as outlier."
         return [Pictures(drawings, caption),
                 Table(("noise of one axis, 1 sigma", "found"), rows, (2, 1), (1,))]  # fmt: skip
 

@@ -18,10 +18,10 @@ AXES = ("x, m", "y, m", "z, m")
 
 
 class PosesSection(Section[Material]):
-    """Where the arm stood, and what that was expected to tell."""
+    """Where the arm stood, and what that was expected to contribute."""
 
     key, title = "poses", "Poses"
-    about = "Chosen so that they tell the parameters best; those kept out of the fit judge it."
+    about = "Chosen so that they determine the parameters best; those kept out of the fit judge it."
 
     def blocks(self, material: Material) -> list[Block]:
         """Return the arm in its poses, and the plan's expectation beside what was reached."""

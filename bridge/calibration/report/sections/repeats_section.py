@@ -85,7 +85,7 @@ def _note(found: tuple[PoseAccuracy, ...]) -> str:
         "the instrument's noise."
     )
     if any(p.angles is not None for p in found):
-        text += " Of the three angles the largest is told."
+        text += " Of the three angles the largest is reported."
     if any(p.steered for p in found):
         text += (
             " Where the arm was brought back by hand, what the encoders showed of it was taken out."

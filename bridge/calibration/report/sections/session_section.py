@@ -115,7 +115,7 @@ def _readings_words(material: Material) -> str:
     if facts.undone:
         text += f"; {facts.undone} were taken back"
     if wild:
-        text += f"; {wild} {'was' if wild == 1 else 'were'} wild and weighed down"
+        text += f"; {wild} {'was' if wild == 1 else 'were'} outlying and down-weighted"
     return text
 
 

@@ -94,7 +94,7 @@ class ToolEstimates(Section[ToolMaterial]):
         place = f"The fixed place is at {_point(found.point)} mm in the axes of the base."
         caption = (
             "How far each touch is from the fixed place: with the tool that the cell had, and with "
-            "the one that was found. Red: weighed down as wild."
+            "the one that was found. Red: down-weighted as outlier."
         )
         return [
             estimates_table(list(found.estimates), planned=False), Paragraph(place),

@@ -38,7 +38,7 @@ TWICE = 2.0  # promised deviations that an error hardly exceeds
 
 @dataclass(frozen=True)
 class VerificationMaterial:
-    """A verification with the facts of its session; readings tell the poses where given."""
+    """A verification with the facts of its session; readings give the poses where given."""
 
     verification: Verification
     session: SessionFacts

@@ -47,7 +47,7 @@ class WorkspaceSection(Section[Material]):
 
 
 def _all(material: Material) -> str:
-    return "All readings but the wild ones." if material.wild else "All readings."
+    return "All readings but the outliers." if material.wild else "All readings."
 
 
 def _factor(errors: Errors, size: float) -> float:

@@ -138,7 +138,7 @@ def _step_time(r: Registers) -> None:
 
 
 def _joint_history(r: Registers) -> None:
-    """Answer joint positions of some cycles ago, as far back as the present speed tells."""
+    """Answer joint positions of some cycles ago, as far back as the present speed says."""
     q, qd, back = r.controller.plant.q, r.controller.plant.qd, max(r.integer(1), 0) * CYCLE
     r.answer_vector([a - v * back for a, v in zip(q, qd, strict=True)])
 

@@ -16,7 +16,7 @@ MOST_PROGRESS = 0x7FFF
 
 
 class Registers:
-    """Arguments in, results out, and the word that tells of asynchronous operations."""
+    """Arguments in, results out, and the register that reports asynchronous operations."""
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class Registers:
         return (a, b, c, d, e, f)
 
     def state(self, value: int) -> None:
-        """Tell the client: 1 ready, 2 done with the command."""
+        """Notify the client: 1 ready, 2 done with the command."""
         self._memory[self._out_int[0]] = value
 
     def answer(self, value: int) -> None:
@@ -81,19 +81,19 @@ class Registers:
     # -- asynchronous operations ------------------------------------------------------------------
 
     def start_operation(self, motion: Motion) -> None:
-        """Run a motion beside the script and tell of it."""
+        """Run a motion beside the script and report it."""
         self.controller.motion = motion
         self._running = motion
         self.progress(0)
 
     def follow_operation(self) -> None:
-        """Tell of the end of an asynchronous motion when it has come, or was replaced."""
+        """Report the end of an asynchronous motion when it has come, or was replaced."""
         running = self._running
         if running is not None and (running.done or self.controller.motion is not running):
             self.finish_operation()
 
     def finish_operation(self) -> None:
-        """Tell that no operation runs."""
+        """Report that no operation runs."""
         self._running = None
         self.progress(-1)
 

@@ -51,7 +51,7 @@ def read_control_text(script: ScriptText) -> ControlText | None:
 
 
 def control_script(controller: Controller, text: ControlText) -> Steps:
-    """Run the control script: one pass of its main loop per cycle, until it is told to stop."""
+    """Run the control script: one pass of its main loop per cycle, until it is asked to stop."""
     registers = Registers(controller, text.int_offset, text.float_offset, text.path)
     try:
         registers.finish_operation()

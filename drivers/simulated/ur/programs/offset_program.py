@@ -119,7 +119,7 @@ class OffsetRegisters:
         return REJECTED if self._rejected else RUNNING
 
     def _take(self, memory: Mapping[str, Any]) -> None:
-        """Accept a new offset whose checksum fits; a torn or wrong one is told and ignored."""
+        """Accept a new offset whose checksum fits; a torn or wrong one is reported and ignored."""
         sequence = int(memory["input_int_register_19"])
         x, y, z, rx, ry = (float(memory[name]) for name in _DOUBLES)
         offset: Vector6 = (x, y, z, rx, ry, memory["input_int_register_18"] * 1e-9)

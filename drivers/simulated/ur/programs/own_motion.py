@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from gapbridge.drivers.simulated.peer.bench import BenchError
 from gapbridge.drivers.simulated.plant.kinematics import Joints
 from gapbridge.drivers.simulated.plant.motion import MoveJoints
+from gapbridge.drivers.simulated.server.bench import BenchError
 from gapbridge.drivers.simulated.ur.controller import Controller
 from gapbridge.drivers.simulated.ur.programs.offset_program import OffsetMotion
 

@@ -51,7 +51,7 @@ def _move_from(controller: Controller, call: Call, start: Joints) -> Motion:
 def path_motion(
     controller: Controller, lines: tuple[str, ...], progress: Callable[[int], None]
 ) -> Motion:
-    """Return the motion of a path; `progress` is told the number of each waypoint begun."""
+    """Return the motion of a path; `progress` is called with the number of each waypoint begun."""
     makers: list[Callable[[Joints], Motion]] = []
     for line in lines:
         call = parse_call(line)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-from gapbridge.drivers.simulated.peer.connection import Connection
+from gapbridge.drivers.simulated.server.connection import Connection
 from gapbridge.drivers.simulated.ur import modes
 from gapbridge.drivers.simulated.ur.controller import Controller, Steps
 

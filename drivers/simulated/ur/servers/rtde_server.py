@@ -6,7 +6,7 @@ import logging
 import socket
 import struct
 
-from gapbridge.drivers.simulated.peer.connection import Connection
+from gapbridge.drivers.simulated.server.connection import Connection
 from gapbridge.drivers.simulated.ur.controller import Controller
 from gapbridge.drivers.simulated.ur.rtde_names import INPUTS
 from gapbridge.drivers.simulated.ur.servers import rtde_protocol as wire

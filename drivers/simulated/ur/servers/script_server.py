@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 
-from gapbridge.drivers.simulated.peer.connection import Connection
+from gapbridge.drivers.simulated.server.connection import Connection
 from gapbridge.drivers.simulated.ur.controller import Controller
 from gapbridge.drivers.simulated.ur.programs import offset_program
 from gapbridge.drivers.simulated.ur.programs.control_script import control_script, read_control_text

@@ -55,7 +55,7 @@ def test_a_point_is_understood_however_it_is_written(line: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "words"),
+    ("line", "phrase"),
     [
         ("1 2", "found 2 numbers in '1 2', expected 3"),
         ("1 2 3 4", "found 4 numbers"),
@@ -66,8 +66,8 @@ def test_a_point_is_understood_however_it_is_written(line: str) -> None:
         ("1e9 2 3", "is the unit right?"),
     ],
 )
-def test_what_is_no_point_is_told_with_the_reason(line: str, words: str) -> None:
-    with pytest.raises(ReadingError, match=words.replace("?", r"\?")):
+def test_what_is_no_point_is_reported_with_the_reason(line: str, phrase: str) -> None:
+    with pytest.raises(ReadingError, match=phrase.replace("?", r"\?")):
         instrument("typed", line, unit="mm").read(Where())
 
 
@@ -88,7 +88,9 @@ def test_numbers_read_back_exactly_whatever_stands_between_them(
         ({"rotation": "rpy", "angle_unit": "rad"}, f"1 2 3 0 0 {np.pi / 2}"),
     ],
 )
-def test_a_pose_is_the_same_however_its_rotation_is_told(keys: dict[str, str], line: str) -> None:
+def test_a_pose_is_the_same_however_its_rotation_is_reported(
+    keys: dict[str, str], line: str
+) -> None:
     found = instrument("typed", line, unit="m", pose=True, **keys).read(Where()).values[0]
     np.testing.assert_allclose(found, [1, 2, 3, 0, 0, np.pi / 2], atol=1e-9)
 
@@ -138,17 +140,17 @@ def test_a_file_with_stops_gives_each_stop_its_last_row(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "phrase"),
     [("1,2\n", "row 1: found 2 numbers"), ("x,y,z\n1,2,q\n", "row 2: found 'q'")],
 )
-def test_a_bad_row_is_named(tmp_path: Path, text: str, words: str) -> None:
+def test_a_bad_row_is_named(tmp_path: Path, text: str, phrase: str) -> None:
     file = tmp_path / "readings.csv"
     file.write_text(text, encoding="utf-8")
-    with pytest.raises(ReadingError, match=words):
+    with pytest.raises(ReadingError, match=phrase):
         instrument("file", unit="m", file=str(file)).read(Where())
 
 
-def test_columns_are_found_by_name_and_a_missing_one_is_told(tmp_path: Path) -> None:
+def test_columns_are_found_by_name_and_a_missing_one_is_reported(tmp_path: Path) -> None:
     file = tmp_path / "readings.csv"
     file.write_text("z,y,x,rms\n3,2,1,0.1\n", encoding="utf-8")
     keys = {"unit": "m", "file": str(file)}
@@ -190,7 +192,7 @@ def _serve(answers: list[bytes]) -> int:
     return int(listener.getsockname()[1])
 
 
-def test_a_line_feed_averages_lines_and_tells_when_it_hangs_up() -> None:
+def test_a_line_feed_averages_lines_and_shows_when_it_hangs_up() -> None:
     port = _serve([b"", b"1 2 3\r\n\n3 2 3\n", b"1 2 3\n"])
     found = instrument("line_feed", unit="m", port=port)
     found.open()
@@ -199,7 +201,7 @@ def test_a_line_feed_averages_lines_and_tells_when_it_hangs_up() -> None:
         found.read(Where(samples=2))
 
 
-def test_an_instrument_that_is_not_there_is_told(tmp_path: Path) -> None:
+def test_an_instrument_that_is_not_there_is_reported(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
     with pytest.raises(LinkError, match="expected the tracker's software"):

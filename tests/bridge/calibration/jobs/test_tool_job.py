@@ -19,13 +19,13 @@ from gapbridge.core.model import Model
 BEGIN = np.array([0.2, -1.4, 1.6, -1.8, -1.5, 0.3])
 
 
-def told(q: np.ndarray) -> str:
+def reported(q: np.ndarray) -> str:
     return " ".join(f"{v:.5f}" for v in np.degrees(q))
 
 
 def test_the_tip_of_a_new_tool_is_found_and_written_after_a_yes(tmp_path: Path) -> None:
     cell, session = write_cell(tmp_path, joints="typed"), tmp_path / "s"
-    played = play(cell, "--tool-only", "--plan-only", "--session", session, lines=[told(BEGIN)])
+    played = play(cell, "--tool-only", "--plan-only", "--session", session, lines=[reported(BEGIN)])
     assert played.code == 0, played.err
     plan = plan_in(session)
     tool = np.eye(4)
@@ -40,7 +40,7 @@ def test_the_tip_of_a_new_tool_is_found_and_written_after_a_yes(tmp_path: Path) 
     )
     lines = [""]
     for pose in touching:
-        lines += ["", told(pose)]
+        lines += ["", reported(pose)]
     new = tmp_path / "new.yaml"
     played = play(
         cell, "--tool-only", "--session", session, "--apply", new,
@@ -56,8 +56,8 @@ def test_joints_in_radians_are_taken_for_a_mistake(tmp_path: Path) -> None:
     cell = write_cell(tmp_path, joints="typed")
     radians = " ".join(f"{v:.4f}" for v in BEGIN)
     played = play(
-        cell, "--tool-only", "--session", tmp_path / "s", lines=["1 2 3", "", told(BEGIN), "", "",
-                                                                  radians, "quit"],
+        cell, "--tool-only", "--session", tmp_path / "s", lines=["1 2 3", "", reported(BEGIN), "",
+                                                                  "", radians, "quit"],
     )  # fmt: skip
     assert played.code == 0
     assert "found 3 numbers" in played.out

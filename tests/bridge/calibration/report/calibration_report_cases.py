@@ -80,7 +80,7 @@ def _readings(model: Model, seed: int) -> Readings:
 
 @cache
 def calibration(diagnose: bool = False) -> Calibration:
-    """Return the calibration of a simulated session, with a wild reading in it."""
+    """Return the calibration of a simulated session, with an outlier in it."""
     tool = np.eye(4)
     tool[:3, 3] = 0.08, 0.0, 0.15
     nominal = Model(builtin_arm("ur10e"), tool_in_flange=tool)

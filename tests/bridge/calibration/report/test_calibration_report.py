@@ -27,37 +27,37 @@ def text_of(path):
 def test_two_files_hold_every_section(written):
     page, paper = written
     assert sorted(p.name for p in page.parent.iterdir()) == ["calibration.html", "calibration.pdf"]
-    html, words = page.read_text("utf-8"), text_of(paper)
+    html, phrase = page.read_text("utf-8"), text_of(paper)
     for section in CALIBRATION:
         assert f'<section id="{section.key}"><h2>{section.title}</h2>' in html
-        assert section.title in words
+        assert section.title in phrase
 
 
 def test_the_figures_of_the_calibration_stand_in_both(written):
     page, paper = written
-    html, words = page.read_text("utf-8"), text_of(paper)
+    html, phrase = page.read_text("utf-8"), text_of(paper)
     for errors in (calibration().held_out_before, calibration().held_out_after):
         for figure in (errors.mean, errors.max, errors.rms):
             assert mm(figure) in html
-            assert mm(figure) in words
+            assert mm(figure) in phrase
 
 
 def test_names_are_written_as_they_are_and_nothing_of_them_is_markup(written):
     page, paper = written
     assert "Beispiel &amp; Söhne &lt;Werk 2&gt;" in page.read_text("utf-8")
-    words = text_of(paper)
-    assert "Beispiel & Söhne <Werk 2>" in words
-    assert "M. Łukasik" in words
+    phrase = text_of(paper)
+    assert "Beispiel & Söhne <Werk 2>" in phrase
+    assert "M. Łukasik" in phrase
 
 
 def test_names_in_other_scripts_are_not_lost(tmp_path):
     names = {"customer": "株式会社ロボット", "operator": "Елена Ψαρρά", "place": "서울 2"}
     facts = session(cell="机器人 3", **names)
     page, paper = write_report(calibration(), None, facts, tmp_path)
-    html, words = page.read_text("utf-8"), text_of(paper)
+    html, phrase = page.read_text("utf-8"), text_of(paper)
     for name in (*names.values(), "机器人 3"):
         assert name in html
-        assert name in words
+        assert name in phrase
 
 
 def test_nothing_is_loaded_from_outside(written):
@@ -71,12 +71,12 @@ def test_every_kind_of_reading_has_its_report(kind, tmp_path):
     c = calibration_of(kind)
     facts = session(instrument=InstrumentFacts("an instrument", kind=kind), temperature=None)
     page, paper = write_report(c, None, facts, tmp_path)
-    html, words = page.read_text("utf-8"), text_of(paper)
+    html, phrase = page.read_text("utf-8"), text_of(paper)
     assert mm(c.held_out_after.mean) in html
-    assert "expanded uncertainty" in words
+    assert "expanded uncertainty" in phrase
     assert "nan" not in re.sub(r"<[^>]*>", " ", html).split()
-    assert "unknown" not in words
+    assert "unknown" not in phrase
     shows_places = kind in ("position", "pose")
-    assert ("AP before" in words) == shows_places
+    assert ("AP before" in phrase) == shows_places
     # no public name of a parameter is left untranslated
-    assert not re.findall(r"joint_offset|axial_compliance|tool_frame", words)
+    assert not re.findall(r"joint_offset|axial_compliance|tool_frame", phrase)

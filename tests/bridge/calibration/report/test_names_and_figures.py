@@ -1,4 +1,4 @@
-"""Names of parameters in words, and figures as a certificate tells them."""
+"""Names of parameters in words, and figures as a certificate reports them."""
 
 import math
 

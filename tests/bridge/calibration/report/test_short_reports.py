@@ -17,14 +17,14 @@ from gapbridge.bridge.calibration.report.figures import estimate_words, mm
 def read(paths):
     """Return the text of the page and the words of the PDF."""
     pages = pypdfium2.PdfDocument(paths[1])
-    words = "\n".join(page.get_textpage().get_text_bounded() for page in pages)
-    return paths[0].read_text("utf-8"), words
+    phrase = "\n".join(page.get_textpage().get_text_bounded() for page in pages)
+    return paths[0].read_text("utf-8"), phrase
 
 
-def test_a_calibration_that_holds_is_told_so_and_accuses_nothing(tmp_path):
+def test_a_calibration_that_holds_says_so_and_accuses_nothing(tmp_path):
     found, readings = verification(moved=False)
-    html, words = read(write_verification(found, session(), tmp_path, readings))
-    for text in (html, words):
+    html, phrase = read(write_verification(found, session(), tmp_path, readings))
+    for text in (html, phrase):
         assert "Still holds" in text
         assert "What may have moved" not in text
         assert mm(found.errors.rms) in text
@@ -33,8 +33,8 @@ def test_a_calibration_that_holds_is_told_so_and_accuses_nothing(tmp_path):
 
 def test_a_calibration_that_no_longer_holds_names_what_moved(tmp_path):
     found, readings = verification(moved=True)
-    html, words = read(write_verification(found, session(), tmp_path, readings))
-    for text in (html, words):
+    html, phrase = read(write_verification(found, session(), tmp_path, readings))
+    for text in (html, phrase):
         assert "No longer holds" in text
         assert "another zero of joint 3" in text
         assert "joint_offset" not in text
@@ -47,7 +47,7 @@ def test_a_verification_without_its_readings_leaves_only_the_angles_out(tmp_path
 
 
 @pytest.mark.parametrize(("kind", "unit"), [("payload", "kg"), ("tool", "mm")])
-def test_a_short_session_tells_each_number_with_its_interval(kind, unit, tmp_path):
+def test_a_short_session_shows_each_number_with_its_interval(kind, unit, tmp_path):
     instrument = InstrumentFacts("on board", kind={"payload": "wrench", "tool": "touch"}[kind])
     facts = session(instrument=instrument)
     if kind == "payload":
@@ -56,21 +56,21 @@ def test_a_short_session_tells_each_number_with_its_interval(kind, unit, tmp_pat
     else:
         found, nominal = tool()
         paths = write_tool(found, facts, tmp_path, nominal)
-    html, words = read(paths)
+    html, phrase = read(paths)
 
     for estimate in found.estimates:
         value, interval, _, _ = estimate_words(estimate)
         assert f"<div>{value}</div>" in html
         assert f"<div>{interval}</div>" in html
-        assert interval in words
-    assert unit in words
+        assert interval in phrase
+    assert unit in phrase
     # an instrument that measures no lengths has no noise in mm
     assert "noise, declared" not in html
 
 
-def test_a_wild_reading_of_the_sensor_is_remarked(tmp_path):
+def test_a_outlier_reading_of_the_sensor_is_remarked(tmp_path):
     found, nominal = payload()
     assert list(found.outliers) == [5]
     html, _ = read(write_payload(found, session(), tmp_path, nominal))
     assert "Found, see remarks" in html
-    assert "Weighed down as wild: reading 6." in html
+    assert "Down-weighted as outlier: reading 6." in html

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gapbridge.bridge.calibration.session.first_readings import first_doubt
-from gapbridge.bridge.calibration.session.reading_check import Foresight, Verdict
+from gapbridge.bridge.calibration.session.reading_check import ReadingCheck, Verdict
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.calibration.parameters import DEFAULT
 from gapbridge.core.calibration.plan import Payload
@@ -57,7 +57,7 @@ def judged(
     readings: Readings, metrology: Metrology = METROLOGY, typed: bool = True, joints: bool = False
 ) -> Verdict:
     """Judge the last of some readings by those before it."""
-    found = Foresight(NOMINAL, metrology, "position", metrology.sigma, DEFAULT, LOADS)
+    found = ReadingCheck(NOMINAL, metrology, "position", metrology.sigma, DEFAULT, LOADS)
     last = np.arange(len(readings)) == len(readings) - 1
     return found.judge(readings[~last], readings[last], typed, joints)
 
@@ -69,9 +69,9 @@ def with_last(readings: Readings, value: list[float] | np.ndarray) -> Readings:
 
 
 @pytest.mark.parametrize("registered", [True, False])
-def test_good_readings_are_not_doubted(registered: bool) -> None:
+def test_good_readings_are_not_rejected(registered: bool) -> None:
     metrology = replace(METROLOGY, registered=registered)
-    found = Foresight(NOMINAL, metrology, "position", 2e-5, DEFAULT, LOADS)
+    found = ReadingCheck(NOMINAL, metrology, "position", 2e-5, DEFAULT, LOADS)
     seen = []
     for seed in range(3):
         readings = session(12, seed, registered)
@@ -83,13 +83,13 @@ def test_good_readings_are_not_doubted(registered: bool) -> None:
 
 
 @pytest.mark.parametrize(
-    ("factor", "words"), [(1e3, "millimetres"), (1e-3, "metres"), (25.4, "25.4")]
+    ("factor", "phrase"), [(1e3, "millimetres"), (1e-3, "metres"), (25.4, "25.4")]
 )
-def test_a_wrong_unit_is_named_and_put_right(factor: float, words: str) -> None:
+def test_a_wrong_unit_is_named_and_put_right(factor: float, phrase: str) -> None:
     readings = session(10, 1)
     found = judged(with_last(readings, readings.value[-1] * factor))
     assert found.doubted
-    assert words in found.reasons[0]
+    assert phrase in found.reasons[0]
     np.testing.assert_allclose(found.instead, readings.value[-1])
 
 
@@ -138,7 +138,7 @@ def test_a_mistyped_joint_is_named() -> None:
     assert any("joint 3" in reason for reason in found.reasons)
 
 
-def test_the_first_readings_of_an_unregistered_instrument_tell_nothing_yet() -> None:
+def test_the_first_readings_of_an_unregistered_instrument_show_nothing_yet() -> None:
     assert not np.isfinite(judged(session(2, 0)).off)
 
 

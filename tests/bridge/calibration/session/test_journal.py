@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 
 from gapbridge.bridge.calibration.session.journal import FILE, Journal, plain, read_entries
 from gapbridge.bridge.calibration.session.plan_document import plan_entry, plan_of
-from gapbridge.bridge.calibration.session.reading import Taken
-from gapbridge.bridge.calibration.session.session import Book
+from gapbridge.bridge.calibration.session.session import Reading, Session
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
 from gapbridge.core.errors import InputError
 
@@ -32,13 +31,13 @@ def small_plan(stops: int = 4) -> Plan:
     return Plan(loads, poses, expected, ((6, 1e-4),), 12.0, ("a note",))
 
 
-def taken(stop: int, **changed: object) -> Taken:
+def taken(stop: int, **changed: object) -> Reading:
     given: dict[str, object] = {
         "stop": stop, "q": np.full(6, 0.1 * stop), "value": np.array([1.0, 2.0, 3.0 + stop]),
         "scatter": float("nan"), "samples": 1, "load": stop // 2, "station": 0, "target": 0,
         "approach": np.zeros(6),
     }  # fmt: skip
-    return Taken(**{**given, **changed})  # type: ignore[arg-type]
+    return Reading(**{**given, **changed})  # type: ignore[arg-type]
 
 
 def test_a_plan_reads_back_as_it_was_written(tmp_path: Path) -> None:
@@ -54,18 +53,18 @@ def test_a_plan_reads_back_as_it_was_written(tmp_path: Path) -> None:
 
 def test_a_book_stands_where_its_journal_left_it(tmp_path: Path) -> None:
     with Journal(tmp_path) as journal:
-        book = Book.of(journal)
-        book.add("begun", version=1)
-        book.keep_plan(small_plan())
-        book.add("mounted", load=0)
+        session = Session.of(journal)
+        session.add("begun", version=1)
+        session.keep_plan(small_plan())
+        session.add("mounted", load=0)
         for stop in (0, 1, 2):
-            book.add("reading", **taken(stop, source=f"row {stop}").entry())
-        book.add("undo", stop=2)
-        book.add("skip", stop=3)
-        book.add("rejected", stop=2, source="row 9")
-        book.add("note", text="door opened")
+            session.add("reading", **taken(stop, source=f"row {stop}").entry())
+        session.add("undo", stop=2)
+        session.add("skip", stop=3)
+        session.add("rejected", stop=2, source="row 9")
+        session.add("note", text="door opened")
     with Journal(tmp_path) as journal:
-        again = Book.of(journal)
+        again = Session.of(journal)
     assert [t.stop for t in again.taken] == [0, 1]
     assert again.next == 2
     assert (again.left, again.undone, again.mounted) == (1, 1, 0)
@@ -79,13 +78,13 @@ def test_a_book_stands_where_its_journal_left_it(tmp_path: Path) -> None:
 
 def test_readings_after_a_knock_belong_to_the_new_place(tmp_path: Path) -> None:
     with Journal(tmp_path) as journal:
-        book = Book.of(journal)
-        book.keep_plan(small_plan())
+        session = Session.of(journal)
+        session.keep_plan(small_plan())
         for stop in (0, 1, 2):
-            book.add("reading", **taken(stop).entry())
-        book.add("moved", station=1, target=0, since=1)
+            session.add("reading", **taken(stop).entry())
+        session.add("moved", station=1, target=0, since=1)
     with Journal(tmp_path) as journal:
-        again = Book.of(journal)
+        again = Session.of(journal)
     assert [t.station for t in again.taken] == [0, 1, 1]
 
 
@@ -122,11 +121,11 @@ def test_two_terminals_do_not_share_a_session(tmp_path: Path) -> None:
         Journal(tmp_path).open()
 
 
-def _write_forever(folder: str, told: int) -> None:
+def _write_forever(folder: str, reported: int) -> None:
     with Journal(Path(folder)) as journal:
         for i in range(10**6):
             journal.add("note", number=i)
-            os.write(told, b".")  # the next step: only now may anybody rely on it
+            os.write(reported, b".")  # the next step: only now may anybody rely on it
 
 
 def test_what_was_acknowledged_before_a_kill_is_there_afterwards(tmp_path: Path) -> None:

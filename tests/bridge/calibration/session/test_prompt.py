@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from gapbridge.bridge.calibration.session.prompt import Talk, Word
+from gapbridge.bridge.calibration.session.prompt import Prompt, SessionCommand
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def test_what_was_typed_before_a_question_does_not_answer_it(
     os.write(keyboard, b"yes\n1.0 2.0 3.0\nhalf a li")
     time.sleep(0.1)
     typed_later(keyboard, "no")
-    assert not Talk().confirm("Write the cell?")
+    assert not Prompt().confirm("Write the cell?")
     assert (
         "dropped what was typed before the question: yes ⏎ 1.0 2.0 3.0" in capsys.readouterr().out
     )
@@ -49,7 +49,7 @@ def test_what_was_typed_before_a_question_does_not_answer_it(
 
 def test_enter_is_enter_and_nothing_else(keyboard: int, capsys: pytest.CaptureFixture[str]) -> None:
     typed_later(keyboard, "no", "wait", "")
-    Talk().enter("Enter when it hangs there")
+    Prompt().enter("Enter when it hangs there")
     said = capsys.readouterr().out
     assert "found 'no', expected Enter" in said
     assert "found 'wait', expected Enter" in said
@@ -57,5 +57,5 @@ def test_enter_is_enter_and_nothing_else(keyboard: int, capsys: pytest.CaptureFi
 
 def test_words_of_the_session_work_where_enter_is_asked(keyboard: int) -> None:
     typed_later(keyboard, "undo")
-    with pytest.raises(Word, match="undo"):
-        Talk().enter("Enter when it hangs there")
+    with pytest.raises(SessionCommand, match="undo"):
+        Prompt().enter("Enter when it hangs there")

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gapbridge.bridge.calibration.joints.move import PERIOD, write_move
-from gapbridge.bridge.calibration.session.route import all_free, route
+from gapbridge.bridge.calibration.session.positioning import all_free, route
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.model import Model
 from gapbridge.core.planning.capsules import Box
@@ -20,7 +20,7 @@ ABOVE, LEFT, RIGHT = np.array([0.0, 2.0]), np.array([-1.0, 1.5]), np.array([1.0,
 
 
 def wall(q: np.ndarray) -> np.ndarray:
-    """Tell what is not in a wall between BEGIN and END, one unit high."""
+    """Report what is not in a wall between BEGIN and END, one unit high."""
     return np.asarray((np.abs(q[:, 0]) > 0.3) | (q[:, 1] > 1.0), dtype=float)
 
 
@@ -40,7 +40,7 @@ def test_two_poses_are_gone_by_where_one_is_not_enough() -> None:
     np.testing.assert_array_equal(by, [LEFT, RIGHT])
 
 
-def test_where_no_pose_leads_round_no_way_is_told() -> None:
+def test_where_no_pose_leads_round_no_way_is_reported() -> None:
     assert route(wall, BEGIN, END, [LEFT]) is None
     assert route(wall, BEGIN, END, []) is None
 

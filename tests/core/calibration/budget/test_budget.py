@@ -69,7 +69,7 @@ def test_few_readings_ask_for_a_larger_factor():
     assert few.coverage < 0.9
 
 
-def test_enough_repeats_tell_the_arms_scatter_by_themselves():
+def test_enough_repeats_show_the_arms_scatter_by_themselves():
     alone = budget(session(repeatability=7e-6), Stated())
     repeated = budget(
         session(repeatability=7e-6, pose=[0, 0, 0, 1, 1, 1, 2, 2, 2, *range(3, 24)]), Stated()
@@ -80,9 +80,9 @@ def test_enough_repeats_tell_the_arms_scatter_by_themselves():
 
 
 def test_what_held_out_poses_show_beyond_the_rest_is_an_input():
-    calm = budget(session(scatter=2e-5), Stated())
+    inlier = budget(session(scatter=2e-5), Stated())
     off = budget(session(scatter=2e-4), Stated())
-    assert named(calm, "what the model").std < 1e-5
+    assert named(inlier, "what the model").std < 1e-5
     left = named(off, "what the model").std
     assert left == pytest.approx(2e-4, rel=0.25)
     assert off.inside / off.looked_at > 0.85
@@ -96,7 +96,7 @@ def test_one_blunder_is_named_and_no_uncertainty():
     error = np.vstack([good.after.vector, held])
     found = budget(hand_made(error, held_out=HELD), Stated())
     assert found.combined < 1e-4
-    assert "without wild ones (reading 25)" in named(found, "what the model").source
+    assert "without outliers (reading 25)" in named(found, "what the model").source
     assert found.looked_at == 27
 
 

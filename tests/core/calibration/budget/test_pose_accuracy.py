@@ -44,11 +44,11 @@ def test_accuracy_before_is_against_the_nominal_model():
     assert found.accuracy == pytest.approx((2 * MM, 0.0), abs=1e-12)
 
 
-def test_single_visits_and_wild_ones_are_left_out():
+def test_single_visits_and_outlier_ones_are_left_out():
     error = np.zeros((5, 3))
     assert pose_accuracies(hand_made(error)) == ()
-    wild = replace(hand_made(error, pose=[0, 0, 1, 1, 1]), outliers=np.array([0]))
-    (found,) = pose_accuracies(wild)
+    outlier = replace(hand_made(error, pose=[0, 0, 1, 1, 1]), outliers=np.array([0]))
+    (found,) = pose_accuracies(outlier)
     assert (found.pose, found.visits) == (1, 3)
 
 

@@ -89,19 +89,19 @@ def test_columns_foretell_how_the_residual_changes(model, kind, options) -> None
 
 
 @pytest.mark.parametrize(("kind", "options"), KINDS)
-def test_slopes_are_differences_of_the_gap(model, kind, options) -> None:
+def test_jacobians_are_differences_of_the_gap(model, kind, options) -> None:
     observable = make_observable(kind, **options)
     readings, nuisance = two_places(model, observable)
     poses = model.predict(readings.q, readings.loads)
-    said = observable.slopes(poses, readings, nuisance)
-    expected = Observable.slopes(observable, poses, readings, nuisance)
-    assert said.shape == (len(readings), observable.equations, 6)
-    assert np.abs(said).max() > 0.1
-    assert np.abs(said - expected).max() < 1e-8
+    found = observable.jacobian(poses, readings, nuisance)
+    expected = Observable.jacobian(observable, poses, readings, nuisance)
+    assert found.shape == (len(readings), observable.equations, 6)
+    assert np.abs(found).max() > 0.1
+    assert np.abs(found - expected).max() < 1e-8
 
 
 @pytest.mark.parametrize(("kind", "options"), KINDS)
-def test_start_finds_instruments_and_targets_among_wild_readings(model, kind, options) -> None:
+def test_start_finds_instruments_and_targets_among_outlier_readings(model, kind, options) -> None:
     observable = make_observable(kind, **options)
     readings, nuisance = two_places(model, observable, 120)
     if observable.width:
@@ -109,9 +109,9 @@ def test_start_finds_instruments_and_targets_among_wild_readings(model, kind, op
         value[::17, :3] += 0.4
         readings = replace(readings, value=value)
     found = observable.start(model, readings)
-    calm = np.ones(len(readings), dtype=bool)
-    calm[::17] = not observable.width
-    gap = observable.residual(model, readings, found)[calm]
+    inlier = np.ones(len(readings), dtype=bool)
+    inlier[::17] = not observable.width
+    gap = observable.residual(model, readings, found)[inlier]
     assert np.abs(gap).max() < 1e-6
     if observable.unknown:
         for one, other in zip(found.stations, nuisance.stations, strict=True):
@@ -137,7 +137,7 @@ def test_a_sphere_is_touched_where_the_arm_is_brought(model) -> None:
     assert np.linalg.norm(tip - [0.5, 0.2, 0.3], axis=1) == pytest.approx(0.04, abs=1e-8)
 
 
-def test_two_ball_readings_tell_nothing_of_the_tools_place(model) -> None:
+def test_two_ball_readings_show_nothing_of_the_tools_place(model) -> None:
     observable = make_observable("relative")
     readings, nuisance = two_places(model, observable)
     shifted = replace(model, tool_in_flange=model.tool_in_flange.copy())

@@ -39,9 +39,9 @@ def test_a_cause_is_named_with_its_joint_and_its_size(effect, registered):
     assert (found.verdict, channel.verdict) == ("explained", "explained")
     (cause,) = channel.causes
     assert (cause.effect, cause.joints) == (effect, JOINTS.get(effect, ()))
-    told = {p.name: p for p in cause.parameters}
+    reported = {p.name: p for p in cause.parameters}
     for name, value in TRUE[effect].items():
-        assert abs(told[name].value - value) < 4 * told[name].std
+        assert abs(reported[name].value - value) < 4 * reported[name].std
     assert cause.shrink.shrink > 0.3 or effect == "gravity_direction"
     assert cause.shrink.interval[0] < cause.shrink.shrink < cause.shrink.interval[1]
     assert channel.remaining_rms_held_out < 1.2 * small.FLOOR
@@ -108,7 +108,7 @@ def test_the_found_model_predicts_the_real_arm_elsewhere():
     assert np.abs(after).max() < 0.05 * np.abs(before).max()
 
 
-def test_where_the_gap_lies_is_told_in_shares():
+def test_where_the_gap_lies_is_reported_in_shares():
     (channel,) = small.diagnosed("joint_offset").channels
     shares = dict(channel.where.joints)
     assert max(shares, key=lambda j: shares[j]) == 2
@@ -118,9 +118,9 @@ def test_where_the_gap_lies_is_told_in_shares():
 
 def test_the_json_holds_the_same_figures_and_nothing_that_is_no_number():
     found = small.diagnosed("payload")
-    told = document(found)
-    (channel,) = told["channels"]
-    assert told["schema"] == "gapbridge.diagnosis/1"
+    reported = document(found)
+    (channel,) = reported["channels"]
+    assert reported["schema"] == "gapbridge.diagnosis/1"
     assert channel["causes"][0]["parameters"][0]["value"] == found.terms[0].values[0]
     assert channel["gap_rms"] == found.channels[0].gap_rms
     considered = {c["effect"]: c for c in channel["considered"]}
@@ -133,7 +133,7 @@ def test_the_json_holds_the_same_figures_and_nothing_that_is_no_number():
             walk(child)
         assert not (isinstance(value, float) and not np.isfinite(value))
 
-    walk(told)
+    walk(reported)
 
 
 def test_rows_without_a_reading_are_left_out():

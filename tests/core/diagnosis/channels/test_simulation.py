@@ -46,11 +46,11 @@ def test_a_simulator_that_knows_everything_leaves_no_gap():
 def test_only_what_the_simulator_does_not_know_is_a_cause():
     named, found = causes_of(BOTH, small.REAL["tool_frame"])
     assert named == ["backlash"]
-    (told,) = found.channels[0].causes[0].parameters
-    assert abs(told.value - 9e-4) < 4 * told.std
+    (reported,) = found.channels[0].causes[0].parameters
+    assert abs(reported.value - 9e-4) < 4 * reported.std
 
 
-def test_a_simulator_that_says_what_the_model_says_changes_nothing():
+def test_a_simulator_that_predicts_what_the_model_predicts_changes_nothing():
     named, found = causes_of(small.REAL["backlash"], small.NOMINAL)
     plain = small.diagnosed("backlash")
     assert named == ["backlash"]
@@ -84,15 +84,15 @@ def test_rows_stay_together_where_some_have_no_reading():
 
 
 @pytest.mark.parametrize(
-    ("columns", "words"),
+    ("columns", "phrase"),
     [
         ({"measured_position": np.zeros((4, 3))}, "sim.csv: found 4 rows, expected 60"),
         ({"payload": np.zeros(60)}, "found no prediction, expected one of measured_position_0"),
         ({"measured_position": np.full((60, 3), np.nan)}, "sim.csv: row 2, .* found nan"),
     ],
 )
-def test_a_simulators_log_that_does_not_fit_is_refused(columns, words):
-    with pytest.raises(LogError, match=words):
+def test_a_simulators_log_that_does_not_fit_is_refused(columns, phrase):
+    with pytest.raises(LogError, match=phrase):
         diagnose(small.model_of(), log_of(BOTH), METROLOGY, simulated=Log("sim.csv", columns, 3))
 
 

@@ -174,7 +174,7 @@ def test_readings_that_are_missing_are_left_out(plant, recorded):
     assert not np.isin(np.arange(100, 200), seen.rows).any()
 
 
-def test_what_is_lacking_is_named(plant):
+def test_what_is_missing_is_named(plant):
     q = np.zeros((3, N))
     none = observe(plant.model(), truth.log_of(N, actual_q=q), METROLOGY)
     assert none == NotObservable("torque", ("actual_current_as_torque",))

@@ -46,7 +46,7 @@ def test_a_latency_of_all_joints_is_recovered_joint_by_joint(rate):
 
 
 @pytest.mark.parametrize("rate", [500, 125, 25])
-def test_lag_and_latency_are_told_apart_on_one_joint(rate):
+def test_lag_and_latency_are_separated_on_one_joint(rate):
     t = times(rate)
     lag = 0.02 * (np.arange(N) == 1)
     log = log_of(COURSE.lagged(t - 0.008, lag), COURSE.at(t), t)
@@ -109,7 +109,7 @@ def test_poses_at_rest_are_observed_without_delays():
     assert len(seen.measured) == 30
 
 
-def test_what_is_lacking_is_named():
+def test_what_is_missing_is_named():
     q = np.zeros((30, N))
     assert observe(MODEL, truth.log_of(N, actual_q=q), METROLOGY) == NotObservable(
         "tracking", ("target_q",)

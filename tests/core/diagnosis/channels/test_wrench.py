@@ -84,7 +84,7 @@ def test_a_clean_session_leaves_the_noise_with_comparable_axes(plant, session):
     assert len(np.unique(seen.groups)) == ROWS
 
 
-def test_pairs_that_look_alike_are_told_apart_by_pulls_and_payloads(plant, session):
+def test_pairs_that_look_alike_are_separated_by_pulls_and_payloads(plant, session):
     q, mass, pull, _ = session
     heavier = plant.dynamics(q, 0 * q, 0 * q, pull, mass + 0.4)[1]
     reading = (heavier @ np.diag(1 + GAIN)) + BIAS
@@ -137,7 +137,7 @@ def test_readings_without_noise_get_a_usual_weight():
     assert torque_weight(np.repeat([0.5, 0.01], 3), np.ones((5, 6))) == pytest.approx(50)
 
 
-def test_what_is_lacking_is_named(plant):
+def test_what_is_missing_is_named(plant):
     q = np.zeros((3, N))
     assert observe(plant.model(), truth.log_of(N, actual_q=q), METROLOGY) == NotObservable(
         "wrench", ("ft_raw_wrench",)

@@ -31,7 +31,7 @@ Q = RNG.uniform(-2.5, 2.5, (40, 6))
 INSTRUMENT = transform(rpy_matrix(np.array([0.3, 0.2, 1.4])), np.array([2.0, -1.0, 0.4]))
 
 
-def told(model: Model, q: np.ndarray, **more: np.ndarray) -> list[str]:
+def reported(model: Model, q: np.ndarray, **more: np.ndarray) -> list[str]:
     position = TRUE.rigid_pose(Q).position @ INSTRUMENT[:3, :3].T + INSTRUMENT[:3, 3]
     position += RNG.normal(0, 2e-5, position.shape)
     columns = {"actual_q": q, "measured_position": position} | more
@@ -44,11 +44,11 @@ def with_rows(**changed: float) -> Model:
 
 
 def test_the_arm_itself_is_not_suspected() -> None:
-    assert told(TRUE, Q) == []
+    assert reported(TRUE, Q) == []
 
 
 @pytest.mark.parametrize(
-    ("model", "order", "words"),
+    ("model", "order", "phrase"),
     [
         (TRUE, [2, 1, 0, 3, 4, 5], "joints 1 and 3 look swapped (a UR's elbow and shoulder pan"),
         (TRUE, [0, 1, 2, 4, 3, 5], "joints 4 and 5 look swapped: then 0.0 mm"),
@@ -61,14 +61,14 @@ def test_the_arm_itself_is_not_suspected() -> None:
         (replace(TRUE, tool_in_flange=transform(TOOL[:3, :3], -TOOL[:3, 3])), None, "tool.tcp"),
     ],
 )
-def test_what_fits_is_named(model: Model, order: list[int] | None, words: str) -> None:
-    (line,) = told(model, Q if order is None else Q[:, order])
+def test_what_fits_is_named(model: Model, order: list[int] | None, phrase: str) -> None:
+    (line,) = reported(model, Q if order is None else Q[:, order])
     assert "do not follow the arm" in line
-    assert words in line
+    assert phrase in line
 
 
-def test_another_arm_is_told_without_a_guess() -> None:
-    (line,) = told(Model(builtin_arm("ur3e")), Q)
+def test_another_arm_is_reported_without_a_guess() -> None:
+    (line,) = reported(Model(builtin_arm("ur3e")), Q)
     assert line.endswith("is it the right arm, tool and order of joints and rows?")
 
 

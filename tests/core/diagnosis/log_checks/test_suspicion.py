@@ -28,7 +28,7 @@ def with_columns(**more) -> Log:
     return small.log_of(SESSION, READ, **more)
 
 
-def told(log: Log, metrology: Metrology = REGISTERED) -> str:
+def reported(log: Log, metrology: Metrology = REGISTERED) -> str:
     return "\n".join(findings(log, MODEL, metrology))
 
 
@@ -87,11 +87,11 @@ def test_an_arm_without_rated_payload_knows_grams_by_its_own_weight():
     check_units(weightless, with_columns(payload=SESSION.payload_mass * 1e3))
 
 
-def test_fahrenheit_is_told():
-    assert "Fahrenheit" in told(with_columns(joint_temperatures=SESSION.temperature * 1.8 + 70))
+def test_fahrenheit_is_reported():
+    assert "Fahrenheit" in reported(with_columns(joint_temperatures=SESSION.temperature * 1.8 + 70))
 
 
-def test_a_misspelt_column_is_told_with_what_it_may_mean():
+def test_a_misspelt_column_is_reported_with_what_it_may_mean():
     log = replace(with_columns(payload=None), unknown=("paylod", "comment", "payload_mass"))
     (line,) = findings(log, MODEL, REGISTERED)
     assert "paylod" in line
@@ -108,7 +108,7 @@ def test_repeated_and_backward_timestamps_are_counted():
     ]
 
 
-def test_the_clock_of_a_recording_that_repeats_is_told():
+def test_the_clock_of_a_recording_that_repeats_is_reported():
     t = np.arange(500) / 100
     q = np.outer(np.sin(t), [0.3, 0.2, 0.1])
     columns = {"timestamp": np.round(t, 1), "actual_q": q}
@@ -117,26 +117,28 @@ def test_the_clock_of_a_recording_that_repeats_is_told():
 
 
 @pytest.mark.parametrize(
-    ("name", "words"),
+    ("name", "phrase"),
     [("measured_position", "measured position"), ("ft_raw_wrench", "wrench")],
 )
-def test_rows_without_a_reading_are_counted(name, words):
+def test_rows_without_a_reading_are_counted(name, phrase):
     values = READ.copy() if name == "measured_position" else np.zeros((len(READ), 6))
     values[[3, 7], 0] = np.nan
-    assert f"2 row(s) have no {words} and were left out" in findings(with_columns(**{name: values}))
+    assert f"2 row(s) have no {phrase} and were left out" in findings(
+        with_columns(**{name: values})
+    )
 
 
-def test_positions_that_stand_still_and_few_poses_are_told():
-    assert "hardly move" in told(with_columns(measured_position=np.ones_like(READ)))
+def test_positions_that_stand_still_and_few_poses_are_reported():
+    assert "hardly move" in reported(with_columns(measured_position=np.ones_like(READ)))
     few = LOG.select(np.arange(5))
-    assert "5 different pose(s) are few" in told(few)
-    assert "are few" not in told(LOG.select(np.arange(40)))
+    assert "5 different pose(s) are few" in reported(few)
+    assert "are few" not in reported(LOG.select(np.arange(40)))
 
 
-def test_joints_beyond_the_limits_are_told():
+def test_joints_beyond_the_limits_are_reported():
     q = SESSION.q.copy()
     q[0, 1] = 3.0
-    assert "joint(s) 2 stand beyond" in told(with_columns(actual_q=q))
+    assert "joint(s) 2 stand beyond" in reported(with_columns(actual_q=q))
 
 
 def flipped(joint: int):
@@ -158,25 +160,25 @@ FRAMES = {
 
 
 @pytest.mark.parametrize("mistake", FRAMES)
-def test_poses_that_cannot_be_the_arms_are_told_with_the_likely_mistake(mistake):
-    columns, words = FRAMES[mistake]
-    assert words in told(with_columns(**columns), FREE)
+def test_poses_that_cannot_be_the_arms_are_reported_with_the_likely_mistake(mistake):
+    columns, phrase = FRAMES[mistake]
+    assert phrase in reported(with_columns(**columns), FREE)
 
 
-def test_positions_in_another_frame_than_declared_are_told():
+def test_positions_in_another_frame_than_declared_are_reported():
     elsewhere = small.readings(AXIAL, SESSION, registered=False)
     log = with_columns(measured_position=elsewhere)
-    assert "set metrology.registered to false" in told(log)
-    assert told(log, FREE) == ""
+    assert "set metrology.registered to false" in reported(log)
+    assert reported(log, FREE) == ""
 
 
-def test_angles_in_place_of_rotation_vectors_are_told():
+def test_angles_in_place_of_rotation_vectors_are_reported():
     euler = rotations().as_euler("xyz")
-    assert "roll, pitch and yaw" in told(with_columns(measured_rotation=euler))
+    assert "roll, pitch and yaw" in reported(with_columns(measured_rotation=euler))
     shuffled = rotations().as_rotvec()[::-1]
-    assert "rotations do not follow" in told(with_columns(measured_rotation=shuffled))
+    assert "rotations do not follow" in reported(with_columns(measured_rotation=shuffled))
     aside = (rotations() * Rotation.from_euler("x", 90, degrees=True)).as_rotvec()
-    assert "turned by 1.57 rad" in told(with_columns(measured_rotation=aside))
+    assert "turned by 1.57 rad" in reported(with_columns(measured_rotation=aside))
 
 
 def in_tool(pull):

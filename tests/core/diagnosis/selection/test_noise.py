@@ -1,4 +1,4 @@
-"""Noise: the instrument's and the arm's are told apart, and whitening makes gaps alike."""
+"""Noise: the instrument's and the arm's are separated, and whitening makes gaps alike."""
 
 from __future__ import annotations
 

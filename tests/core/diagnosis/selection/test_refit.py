@@ -90,7 +90,7 @@ def test_where_the_instrument_stands_changes_nothing(seed):
     assert np.abs(residual).max() < 1e-7
 
 
-def test_the_told_deviation_is_the_scatter_over_sessions():
+def test_the_reported_deviation_is_the_scatter_over_sessions():
     real = replace(offset(2, 0.01), axial=np.array([0.0, 5e-6, 0.0]))
     effects = [("joint_offset", 2), ("axial_compliance", 2)]
     scores = []

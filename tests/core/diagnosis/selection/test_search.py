@@ -112,7 +112,7 @@ def test_equal_columns_are_rivals_and_a_stranger_is_none():
     space = toy.space_of(FAMILIES, space.y, X)
     found = search(space)
     own = next(c for c in found.chosen if c in (0, 2))
-    told = rivals(space, found, own, within=5.0)
-    assert [c for _, c in told] == [2 if own == 0 else 0]
-    assert told[0][0] == pytest.approx(0, abs=1e-6)
+    reported = rivals(space, found, own, within=5.0)
+    assert [c for _, c in reported] == [2 if own == 0 else 0]
+    assert reported[0][0] == pytest.approx(0, abs=1e-6)
     assert rivals(space, found, 13, within=5.0) == []

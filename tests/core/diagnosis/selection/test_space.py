@@ -91,11 +91,11 @@ def test_a_gain_is_what_a_fit_would_take(seed, chosen):
 @given(seed=seeds)
 def test_children_come_best_first_with_the_score_of_the_joint_set(seed):
     space = toy.random_space(seed, FAMILIES, planted=(2,))
-    told = children(space, (0,), 10)
-    scores = [score for score, _ in told]
+    reported = children(space, (0,), 10)
+    scores = [score for score, _ in reported]
     assert scores == sorted(scores)
-    assert told[0][1] == 2
-    for score, c in told:
+    assert reported[0][1] == 2
+    for score, c in reported:
         assert score == pytest.approx(fit(space, (0, c)).score)
 
 

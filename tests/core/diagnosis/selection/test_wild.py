@@ -1,4 +1,4 @@
-"""Wild readings: a tracker's glitch is set aside and told, and becomes no cause."""
+"""Outliers: a tracker's glitch is excluded and reported, and becomes no cause."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ def with_glitches(effect: str, glitches=GLITCHES, registered: bool = True):
 @pytest.mark.parametrize(
     ("effect", "registered"), [("none", True), ("none", False), ("backlash", True)]
 )
-def test_glitches_become_no_cause_and_are_told_with_their_rows(effect, registered):
+def test_glitches_become_no_cause_and_are_reported_with_their_rows(effect, registered):
     found = with_glitches(effect, registered=registered)
     (channel,) = found.channels
     assert [c.effect for c in channel.causes] == ([] if effect == "none" else [effect])
     assert not channel.structured
     assert set(np.flatnonzero(~channel.selection.kept)) == set(GLITCHES)
-    (told,) = [f for f in found.findings if "wild" in f]
-    assert "2 wild reading(s) set aside (row 13, 42 of the file)" in told
+    (reported,) = [f for f in found.findings if "outlier" in f]
+    assert "2 outlier(s) excluded (row 13, 42 of the file)" in reported
     assert channel.remaining_rms_held_out == pytest.approx(small.FLOOR, rel=0.2)
     assert channel.gap_max < 2e-3  # the glitches are no part of the gap
 
 
 def test_parameters_are_those_without_the_glitches():
     plain = small.diagnosed("backlash").channels[0].causes[0].parameters[0]
-    wild = with_glitches("backlash").channels[0].causes[0].parameters[0]
-    assert abs(wild.value - plain.value) < 1.5 * plain.std
-    assert wild.std == pytest.approx(plain.std, rel=0.3)
+    outlier = with_glitches("backlash").channels[0].causes[0].parameters[0]
+    assert abs(outlier.value - plain.value) < 1.5 * plain.std
+    assert outlier.std == pytest.approx(plain.std, rel=0.3)
 
 
 def test_a_third_of_the_readings_is_no_bad_luck():
-    """What befalls every third pose is a gap, not wild readings."""
+    """What befalls every third pose is a gap, not outliers."""
     rows = np.arange(0, 60, 3)
     rng = np.random.default_rng(0)
     found = with_glitches("none", dict(zip(rows, rng.normal(0, 3e-3, (20, 3)), strict=True)))

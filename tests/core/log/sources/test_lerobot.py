@@ -89,7 +89,7 @@ def test_one_episode_can_be_taken(dataset: Path) -> None:
         source_of(dataset).read(dataset, JOINTS, SourceOptions(units="rad", episode=7))
 
 
-def test_units_that_nobody_says_are_asked_for(dataset: Path) -> None:
+def test_units_that_nobody_states_are_asked_for(dataset: Path) -> None:
     with pytest.raises(LogError, match=r"--calibration FILE.*--units"):
         source_of(dataset).read(dataset, JOINTS, SourceOptions())
 

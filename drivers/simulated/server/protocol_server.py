@@ -1,4 +1,4 @@
-"""Running a Peer: one select() loop with absolute deadlines, its protocol servers and the bench."""
+"""Running an ArmController with its protocol servers and the bench: one select() loop."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from gapbridge.core.errors import LinkError
-from gapbridge.drivers.simulated.peer.bench import BenchServer, Command
-from gapbridge.drivers.simulated.peer.connection import Connection, listen
-from gapbridge.drivers.simulated.peer.peer import Peer
-from gapbridge.drivers.simulated.peer.real_time import become_punctual
+from gapbridge.drivers.simulated.server.arm_controller import ArmController
+from gapbridge.drivers.simulated.server.bench import BenchServer, Command
+from gapbridge.drivers.simulated.server.connection import Connection, listen
+from gapbridge.drivers.simulated.server.real_time import become_punctual
 
 LATE = 0.1  # s: behind by more than this, the missed cycles are left out
 COLLECT_EVERY = 2.0  # s
@@ -31,25 +31,25 @@ class Waitable(Protocol):
         ...
 
 
-class PeerServer:
+class ProtocolServer:
     """One protocol of a peer. Every method is called from the peer's loop, and must not block."""
 
     name = "server"
 
-    def open(self, peer: Peer) -> None:
+    def open(self, controller: ArmController) -> None:
         """Open ports. Raises OSError or LinkError where that fails."""
 
-    def cycle(self, peer: Peer) -> None:
+    def cycle(self, controller: ArmController) -> None:
         """Take what clients have sent, command the peer, publish its state; after each cycle."""
 
     def sockets(self) -> Iterable[Waitable]:
         """Return what to wait for between cycles; none where ``cycle`` polls."""
         return ()
 
-    def serve(self, ready: Waitable, peer: Peer) -> None:
+    def serve(self, ready: Waitable, controller: ArmController) -> None:
         """Serve one of ``sockets()`` that is readable."""
 
-    def commands(self, peer: Peer) -> Mapping[str, Command]:
+    def commands(self, controller: ArmController) -> Mapping[str, Command]:
         """Return further bench commands, for faults of this protocol."""
         return {}
 
@@ -60,20 +60,24 @@ class PeerServer:
         """Close everything; may be repeated."""
 
 
-class PeerLoop:
+class ServerLoop:
     """A peer with its servers and its bench port, cycled at absolute deadlines."""
 
     def __init__(
-        self, peer: Peer, servers: Sequence[PeerServer], host: str, bench_port: int
+        self,
+        controller: ArmController,
+        servers: Sequence[ProtocolServer],
+        host: str,
+        bench_port: int,
     ) -> None:
-        self.peer, self.servers, self.host = peer, servers, host
+        self.controller, self.servers, self.host = controller, servers, host
         self._port = bench_port
         self._listener: socket.socket | None = None
         self._clients: list[Connection] = []
         further: dict[str, Command] = {}
         for server in servers:
-            further.update(server.commands(peer))
-        self._bench = BenchServer(peer, self._drop, peer.move_own, further)
+            further.update(server.commands(controller))
+        self._bench = BenchServer(controller, self._drop, controller.move_own, further)
 
     @property
     def bench_port(self) -> int:
@@ -85,7 +89,7 @@ class PeerLoop:
         try:
             self._listener = listen(self.host, self._port)
             for server in self.servers:
-                server.open(self.peer)
+                server.open(self.controller)
         except OSError as error:
             self.close()
             raise LinkError(
@@ -97,18 +101,18 @@ class PeerLoop:
 
     def run(self, stop: Callable[[], bool]) -> None:
         """Serve until `stop()` is true; it is asked once per cycle."""
-        peer = self.peer
+        controller = self.controller
         deadline = time.monotonic()
         while not stop():
-            deadline += peer.period
+            deadline += controller.period
             self._serve_until(deadline)
             now = time.monotonic()
             if now - deadline > LATE:
                 deadline = now
-            peer.cycle()
+            controller.cycle()
             for server in self.servers:
-                server.cycle(peer)
-            peer.sensors.after_cycle(peer.clock)
+                server.cycle(controller)
+            controller.sensors.after_cycle(controller.clock)
 
     def _serve_until(self, deadline: float) -> None:
         while True:
@@ -120,7 +124,7 @@ class PeerLoop:
             for number in ready:
                 if number in owners:
                     server, waited = owners[number]
-                    server.serve(waited, self.peer)
+                    server.serve(waited, self.controller)
                 elif number in clients:
                     clients[number].read()
                     self._bench.handle(clients[number])
@@ -150,9 +154,9 @@ class PeerLoop:
             self._listener = None
 
 
-def serve_peer(
-    peer: Peer,
-    servers: Sequence[PeerServer],
+def serve_controller(
+    controller: ArmController,
+    servers: Sequence[ProtocolServer],
     host: str,
     bench_port: int,
     stop: Callable[[], bool] | None = None,
@@ -161,7 +165,7 @@ def serve_peer(
 
     Prints ``ready <host>`` to stdout when every port listens. Raises LinkError where one is taken.
     """
-    loop = PeerLoop(peer, servers, host, bench_port)
+    loop = ServerLoop(controller, servers, host, bench_port)
     loop.open()
     become_punctual()  # from here on nothing is collected by itself
     collected = time.monotonic()
@@ -181,14 +185,18 @@ def serve_peer(
         loop.close()
 
 
-class PeerThread:
+class ServerThread:
     """A peer served by a thread of this process while the `with` block lasts."""
 
     def __init__(
-        self, peer: Peer, servers: Sequence[PeerServer], host: str, bench_port: int = 0
+        self,
+        controller: ArmController,
+        servers: Sequence[ProtocolServer],
+        host: str,
+        bench_port: int = 0,
     ) -> None:
-        self.peer = peer
-        self.loop = PeerLoop(peer, servers, host, bench_port)
+        self.controller = controller
+        self.loop = ServerLoop(controller, servers, host, bench_port)
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -197,7 +205,7 @@ class PeerThread:
         self.loop.open()
         self._ended.clear()
         self._thread = threading.Thread(
-            target=self.loop.run, args=(self._ended.is_set,), daemon=True, name="simulated peer"
+            target=self.loop.run, args=(self._ended.is_set,), daemon=True, name="controller"
         )
         self._thread.start()
 

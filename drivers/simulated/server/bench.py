@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from gapbridge.drivers.simulated.peer.connection import Connection
 from gapbridge.drivers.simulated.plant.kinematics import pose_of
 from gapbridge.drivers.simulated.plant.plant import Load, Plant
 from gapbridge.drivers.simulated.plant.plant_arm import place
 from gapbridge.drivers.simulated.plant.rotations import compose, from_vector, to_vector
+from gapbridge.drivers.simulated.server.connection import Connection
 
 if TYPE_CHECKING:
     from gapbridge.drivers.simulated.plant.plant_arm import Frame
@@ -37,7 +37,7 @@ class BenchError(ValueError):
 
 
 class BenchSubject(Protocol):
-    """The controller beside the bench: a UR controller or a Peer."""
+    """The controller beside the bench: a UR controller or an ArmController."""
 
     plant: Plant
     memory: dict[str, Any]
@@ -111,13 +111,13 @@ class BenchServer:
                 connection.send(self.answer(line).encode() + b"\n")
 
     def answer(self, line: str) -> str:
-        """Return the reply to one command; a mistake is told as ``error: ...``."""
-        name, *words = line[:LONGEST_LINE].split()
+        """Return the reply to one command; a mistake is reported as ``error: ...``."""
+        name, *arguments = line[:LONGEST_LINE].split()
         try:
             if name not in self._commands:
                 raise BenchError(f"unknown command {name!r}, try help")
             count, action, _ = self._commands[name]
-            return action(_numbers(name, words, count))
+            return action(_numbers(name, arguments, count))
         except BenchError as error:
             return f"error: {error}"
 
@@ -234,14 +234,14 @@ def tcp_scatter(controller: BenchSubject) -> float:
     return math.sqrt(total)
 
 
-def _numbers(name: str, words: list[str], count: int) -> list[float]:
+def _numbers(name: str, arguments: list[str], count: int) -> list[float]:
     """Return exactly `count` finite numbers."""
-    if len(words) != count:
-        raise BenchError(f"{name}: found {len(words)} numbers, expected {count}")
+    if len(arguments) != count:
+        raise BenchError(f"{name}: found {len(arguments)} numbers, expected {count}")
     try:
-        found = [float(word) for word in words]
+        found = [float(word) for word in arguments]
     except ValueError:
-        raise BenchError(f"{name}: found {' '.join(words)!r}, expected numbers") from None
+        raise BenchError(f"{name}: found {' '.join(arguments)!r}, expected numbers") from None
     if not all(map(math.isfinite, found)):
-        raise BenchError(f"{name}: found {' '.join(words)!r}, expected finite numbers")
+        raise BenchError(f"{name}: found {' '.join(arguments)!r}, expected finite numbers")
     return found

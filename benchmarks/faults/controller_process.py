@@ -24,7 +24,7 @@ main()
 """
 
 
-class Peer:
+class ControllerProcess:
     """``gapbridge simulate CELL``: start, stand still, go on, die, come back."""
 
     def __init__(self, cell: Path, host: str, bench_port: int, log: Path) -> None:
@@ -51,16 +51,16 @@ class Peer:
         go_first(self._process.pid)
         self._still = False
         until = time.monotonic() + START_LIMIT
-        said = b""
+        output = b""
         assert self._process.stdout is not None
-        while b"ready" not in said:
+        while b"ready" not in output:
             if not select.select([self._process.stdout], [], [], until - time.monotonic())[0]:
-                raise TimeoutError(f"the simulated controller did not start: {said!r}")
+                raise TimeoutError(f"the simulated controller did not start: {output!r}")
             more = os.read(self._process.stdout.fileno(), 4096)
             if not more:
-                words = self._log.read_text(errors="replace")[-300:]
-                raise RuntimeError(f"the simulated controller ended: {words}")
-            said += more
+                message = self._log.read_text(errors="replace")[-300:]
+                raise RuntimeError(f"the simulated controller ended: {message}")
+            output += more
 
     def stand_still(self) -> None:
         """SIGSTOP. Raises ProcessLookupError where it is dead."""

@@ -110,7 +110,7 @@ def _of_joint(w, u, B, n, i, p, c2):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def _felt(w, u, push, turned, record):  # type: ignore[no-untyped-def]
+def _reaction(w, u, push, turned, record):  # type: ignore[no-untyped-def]
     """Add a record's push to the sum, and its push crossed with its origin to the other sum."""
     a, b = record * RECORD * _L, record * OWN * _L
     for k in range(_L):
@@ -193,9 +193,9 @@ def _slopes(chain, w, v, u, B, push, turned, axis, turning):  # type: ignore[no-
     B[gravity * _L : (gravity + 3) * _L] = 0.0
     push[:] = 0.0
     turned[:] = 0.0
-    _felt(w, u, push, turned, 0)
+    _reaction(w, u, push, turned, 0)
     for i in range(n):
-        _felt(w, u, push, turned, i + 1)
+        _reaction(w, u, push, turned, i + 1)
         _weighed(w, B, push, turned, i + 1, chain.mass[i], chain.cog[i], gravity)
         _of_joint(w, u, B, n, i, chain.position[i + 1], chain.compliance[i, 2])
     _of_tool(w, v, B, n, 6 * (n + 1), push, axis, turning)
@@ -230,7 +230,7 @@ def _columns(B, rates, varying, first, count, J, column):  # type: ignore[no-unt
 
 
 @njit(**JIT)
-def slope_blocks(chain, rows, rates, varying, first, last, position, rotation, J):  # type: ignore[no-untyped-def]
+def jacobian_blocks(chain, rows, rates, varying, first, last, position, rotation, J):  # type: ignore[no-untyped-def]
     """Write TCP poses of rows first..last, and their derivatives J (3 or 6, p, N).
 
     Derivatives by p parameters, of the position (m) and of the turn (rad), base axes. ``rates``:
@@ -243,9 +243,9 @@ def slope_blocks(chain, rows, rates, varying, first, last, position, rotation, J
     u, s = np.empty((n + 2) * OWN * _L), np.empty(BESIDE * _L)
     B, column = np.zeros(slots(n) * _L), np.empty(_L)
     push, turned = np.empty(3 * _L), np.empty(3 * _L)
-    bent = bends(chain)
+    deflected = bends(chain)
     for r in range(first, last, _L):
-        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, bent)):
+        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, deflected)):
             return r
         count = min(_L, last - r)
         for k in range(count):
@@ -256,7 +256,7 @@ def slope_blocks(chain, rows, rates, varying, first, last, position, rotation, J
         prepare(chain, w, v, u, s)
         for coordinate in range(J.shape[0]):
             axis, turning = coordinate % 3, coordinate >= 3
-            if not solve(w, v, u, s, n, axis, turning, bent):
+            if not solve(w, v, u, s, n, axis, turning, deflected):
                 return r
             _slopes(chain, w, v, u, B, push, turned, axis, turning)
             _columns(B, rates, varying, r, count, J[coordinate], column)

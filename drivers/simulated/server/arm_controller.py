@@ -1,6 +1,7 @@
 """What every simulated controller shares, whatever its protocol: plant, clock, sensors, own motion.
 
-A Peer knows no wire. Protocol servers read its state and command it; ``peer_server.py`` runs them.
+An ArmController knows no wire. Protocol servers read its state and command it;
+``protocol_server.py`` runs them.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ import logging
 from collections.abc import Sequence
 from typing import Any
 
-from gapbridge.drivers.simulated.peer.bench import BenchError
 from gapbridge.drivers.simulated.plant.declared import Declared
 from gapbridge.drivers.simulated.plant.kinematics import Joints, within_limits
 from gapbridge.drivers.simulated.plant.motion import Hold, Motion, MoveJoints, Stop
@@ -17,6 +17,7 @@ from gapbridge.drivers.simulated.plant.plant import Plant
 from gapbridge.drivers.simulated.plant.plant_arm import PlantArm
 from gapbridge.drivers.simulated.plant.plant_settings import PlantSettings
 from gapbridge.drivers.simulated.plant.sensors import Sensors
+from gapbridge.drivers.simulated.server.bench import BenchError
 
 log = logging.getLogger("drivers.simulated")
 
@@ -25,7 +26,7 @@ BRAKING = 24.0  # rad/s^2, of a stop
 HOLD = Hold()
 
 
-class Peer:
+class ArmController:
     """A controller without a protocol, for an arm of any number of joints.
 
     The robot's own program moves ``own_q`` (the bench's ``move``); ``command`` takes the arm over;
@@ -205,19 +206,19 @@ class Peer:
             self.protective_stop()
 
 
-def make_peer(
+def make_controller(
     arm: PlantArm,
     plant: PlantSettings,
     start_q: Sequence[float],
     period: float,
     declare: bool = True,
-) -> Peer:
+) -> ArmController:
     """Return a peer at rest at `start_q` (n, rad) that is cycled every `period` s.
 
-    With `declare` the controller is told the plant's true TCP and payload.
+    With `declare` the controller is given the plant's true TCP and payload.
     """
     declared = Declared()
     if declare:
         declared.set_tcp(plant.tcp)
         declared.payload_mass, declared.payload_cog = plant.payload_mass, plant.payload_cog
-    return Peer(Plant(arm, plant, start_q), declared, period)
+    return ArmController(Plant(arm, plant, start_q), declared, period)

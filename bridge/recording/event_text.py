@@ -17,12 +17,12 @@ def level_of(event: Mapping[str, Any]) -> str:
     return "warning" if grave or event.get("to") == "HOLDING" else "info"
 
 
-def words_of(event: Mapping[str, Any]) -> str:
+def text_of(event: Mapping[str, Any]) -> str:
     """Return an event in words."""
     if "from" in event and "to" in event:
         text = f"{event['from']} -> {event['to']} ({event.get('cause', '')})"
         return f"{text}: {event['detail']}" if event.get("detail") else text
     if event.get("detail"):
         return str(event["detail"])
-    said = [f"{key} {value}" for key, value in event.items() if key not in _PLAIN]
-    return f"{event.get('kind', '')}: {', '.join(said)}"
+    parts = [f"{key} {value}" for key, value in event.items() if key not in _PLAIN]
+    return f"{event.get('kind', '')}: {', '.join(parts)}"
