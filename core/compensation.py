@@ -74,7 +74,7 @@ def _pose_error(shape, position, rotation, lever, error):  # type: ignore[no-unt
 
 
 @njit(**JIT)
-def next_offset(chain, rows, r, shape, position, rotation, lever, offset):  # type: ignore[no-untyped-def]
+def next_offset(chain, rows, r, shape, position, rotation, lever, offset):  # type: ignore[no-untyped-def]  # noqa: PLR0913 (compiled)
     """Write the next joint offset of row r, given the one that its q holds; returns the distance.
 
     The distance (m) is that of the present shape from the wanted pose; -1 where the arm has no

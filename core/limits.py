@@ -223,7 +223,7 @@ def _share(vector, first, last, most):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
-def _check(numbers, bounds, nominal, corrected, offset, ramp, actual, dt, q, before):  # type: ignore[no-untyped-def]
+def _check(numbers, bounds, nominal, corrected, offset, ramp, actual, dt, q, before):  # type: ignore[no-untyped-def]  # noqa: PLR0913 (compiled)
     """Return the reason why nothing may leave, or _FINE."""
     n = q.shape[0]
     fine = np.isfinite(ramp) and np.isfinite(dt)

@@ -11,7 +11,7 @@ from gapbridge.core.arm import Arm, JointLimits, arm_from_dh, builtin_arm
 from gapbridge.core.calibration.plan import Payload
 from gapbridge.core.model import Model
 from gapbridge.core.planning.capsules import Box
-from gapbridge.core.planning.workspace import Place, Space, reach
+from gapbridge.core.planning.workspace import Place, Reflector, Space, reach
 from gapbridge.core.rotation import rotation_matrix
 
 Array = NDArray[np.float64]
@@ -61,7 +61,9 @@ def _room(model: Model, random: np.random.Generator) -> Space:
     box = Box((at[0] - size, at[1] - size, -1.0), (at[0] + size, at[1] + size, 0.2 * long))
     return Space.of(
         model, floor=0.0, keep_out=(box,), places=(Place(place, nearest=0.3),),
-        looks=(0.3, 0.0, 1.0), acceptance=np.radians(random.uniform(30, 80)),
+        reflector=Reflector(
+            looks=(0.3, 0.0, 1.0), acceptance=np.radians(random.uniform(30, 80))
+        ),
     )  # fmt: skip
 
 

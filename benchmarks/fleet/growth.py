@@ -21,13 +21,13 @@ from threadpoolctl import threadpool_limits
 from benchmarks.fleet.simulating import write_fleet
 from gapbridge.bridge.fleet import fitting
 from gapbridge.bridge.fleet.cell_source import OneCell
-from gapbridge.bridge.fleet.dask_workers import DaskWorkers
 from gapbridge.bridge.fleet.journal import Journal
-from gapbridge.bridge.fleet.local_workers import LocalWorkers
 from gapbridge.bridge.fleet.runner import run, tasks_of
 from gapbridge.bridge.fleet.session import find_sessions
 from gapbridge.bridge.fleet.task import DONE, Outcome, Task, perform
-from gapbridge.bridge.fleet.workers import Workers
+from gapbridge.bridge.fleet.workers.dask_workers import DaskWorkers
+from gapbridge.bridge.fleet.workers.local_workers import LocalWorkers
+from gapbridge.bridge.fleet.workers.workers import Workers
 
 WORKERS = 2
 POSES = 10

@@ -22,8 +22,8 @@ from gapbridge.core.calibration.plan import Payload, Plan
 from gapbridge.core.errors import CellError
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.planning.capsules import Box
-from gapbridge.core.planning.design import far_end, plan
-from gapbridge.core.planning.workspace import Place, Space
+from gapbridge.core.planning.design import Wish, far_end, plan
+from gapbridge.core.planning.workspace import Place, Reflector, Space
 
 REPEATABILITY = 5e-5  # m, 1 sigma of one coordinate, where the cell does not tell it
 NEEDS_PLACE = {"distance": "fixed end", "sphere": "sphere", "point": "point"}
@@ -79,13 +79,15 @@ def planned(cell: Cell, order: Order, tell: Callable[[str, float], None]) -> Pla
         observable,
         loads_of(cell),
         space,
-        poses=order.poses or given.poses,
-        held_out=given.held_out,
-        repeats=given.repeats,
-        seed=order.seed,
-        sigma=float(np.hypot(instrument.sigma or cell.metrology.sigma,
-                             cell.metrology.repeatability or REPEATABILITY)),
-        progress=tell,
+        Wish(
+            poses=order.poses or given.poses,
+            held_out=given.held_out,
+            repeats=given.repeats,
+            seed=order.seed,
+            sigma=float(np.hypot(instrument.sigma or cell.metrology.sigma,
+                                 cell.metrology.repeatability or REPEATABILITY)),
+        ),
+        tell,
     )  # fmt: skip
 
 
@@ -97,8 +99,7 @@ def space_of(cell: Cell, kind: str) -> Space:
     return Space.of(
         cell.model, lower=lower, upper=upper, floor=given.floor, places=places,
         keep_out=[Box(_three(b.lower), _three(b.upper)) for b in _boxes(cell, given)],
-        looks=None if seen is None else seen.looks,
-        acceptance=np.pi if seen is None else seen.acceptance,
+        reflector=None if seen is None else Reflector(looks=seen.looks, acceptance=seen.acceptance),
     )  # fmt: skip
 
 

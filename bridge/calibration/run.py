@@ -178,10 +178,7 @@ def _measure(job: Job, joints: JointSource, instrument: AnyInstrument) -> None:
         )
     talk.say(f"instrument: {instrument.name}; joints: {_told(joints, order)}")
     talk.say("at every question: Enter goes on, `undo`, `back`, `skip`, `quit`, `?`")
-    bringing = Bringing(
-        talk, job.book, joints, _clear(job), given.speed, given.minutes_per_load, instrument,
-        [given.instrument_at or [], *given.further_places],
-    )  # fmt: skip
+    bringing = Bringing(talk, job.book, joints, instrument, _clear(job), given)
     sigma = metrology_of(job.cell, order.instrument).sigma
     Conversation(talk, job.book, bringing, instrument, job.foresight(), sigma, given.samples).lead()
 

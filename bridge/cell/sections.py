@@ -20,7 +20,7 @@ from pydantic import (
 )
 
 from gapbridge.bridge.cell.settings.recording import RecordingSettings as RecordingSettings
-from gapbridge.core.addresses import is_loopback
+from gapbridge.drivers.addresses import is_loopback
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.modbus.settings import ModbusSettings

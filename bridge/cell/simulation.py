@@ -14,9 +14,9 @@ import numpy as np
 
 from gapbridge.bridge.cell.cell import Cell
 from gapbridge.bridge.cell.robot import calibration_of
-from gapbridge.core.addresses import is_loopback
 from gapbridge.core.errors import CellError
 from gapbridge.core.rotation import rotation_vector
+from gapbridge.drivers.addresses import is_loopback
 from gapbridge.drivers.driver import DriverSettings
 from gapbridge.drivers.simulated.ft_sensor.serving import served_sensor
 from gapbridge.drivers.simulated.peer.peer import Peer, make_peer

@@ -4,56 +4,59 @@ from __future__ import annotations
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": (
-        "gapbridge.bridge.cli.demo:demo",
+        "gapbridge.bridge.cli.robot.demo:demo",
         "Do the whole job on a simulated cell, no hardware.",
     ),
     "init": (
-        "gapbridge.bridge.cli.init:init",
+        "gapbridge.bridge.cli.cell.init:init",
         "Write a cell from what a controller says of itself.",
     ),
-    "check": ("gapbridge.bridge.cli.check:check", "Say whether a cell is fit to be used."),
-    "diff": ("gapbridge.bridge.cli.diff:diff", "Say what changed from one cell to another."),
+    "check": ("gapbridge.bridge.cli.cell.check:check", "Say whether a cell is fit to be used."),
+    "diff": ("gapbridge.bridge.cli.cell.diff:diff", "Say what changed from one cell to another."),
     "simulate": (
-        "gapbridge.bridge.cli.simulate:simulate",
+        "gapbridge.bridge.cli.robot.simulate:simulate",
         "Serve the simulated controller of a cell.",
     ),
-    "run": ("gapbridge.bridge.cli.run:run", "Run the on-cell daemon."),
-    "status": ("gapbridge.bridge.cli.status:status", "Tell what the daemon of a cell does."),
-    "arm": ("gapbridge.bridge.cli.arm:arm", "Have the daemon of a cell write setpoints."),
+    "run": ("gapbridge.bridge.cli.robot.run:run", "Run the on-cell daemon."),
+    "status": ("gapbridge.bridge.cli.robot.status:status", "Tell what the daemon of a cell does."),
+    "arm": ("gapbridge.bridge.cli.robot.arm:arm", "Have the daemon of a cell write setpoints."),
     "disarm": (
-        "gapbridge.bridge.cli.arm:disarm",
+        "gapbridge.bridge.cli.robot.arm:disarm",
         "Have the daemon of a cell ramp out and observe.",
     ),
     "calibrate": (
-        "gapbridge.bridge.cli.calibrate:calibrate",
+        "gapbridge.bridge.cli.robot.calibrate:calibrate",
         "Lead a field calibration session; it can be resumed.",
     ),
     "export": (
-        "gapbridge.bridge.cli.export:export_recording",
+        "gapbridge.bridge.cli.log.export:export_recording",
         "Turn a recording of the daemon into a log.",
     ),
     "convert": (
-        "gapbridge.bridge.cli.convert:convert",
+        "gapbridge.bridge.cli.log.convert:convert",
         "Turn a recording of another program into a log.",
     ),
-    "fit": ("gapbridge.bridge.cli.fit:fit", "Identify the compliance of a cell from a log."),
+    "fit": ("gapbridge.bridge.cli.log.fit:fit", "Identify the compliance of a cell from a log."),
     "predict": (
-        "gapbridge.bridge.cli.predict:predict",
+        "gapbridge.bridge.cli.log.predict:predict",
         "Predict the TCP pose of every row of a log.",
     ),
     "compensate": (
-        "gapbridge.bridge.cli.compensate:compensate",
+        "gapbridge.bridge.cli.log.compensate:compensate",
         "Correct the setpoint of every row of a log.",
     ),
     "diagnose": (
-        "gapbridge.bridge.cli.diagnose:diagnose",
+        "gapbridge.bridge.cli.log.diagnose:diagnose",
         "Diagnose the sim-to-real gap of a log.",
     ),
     "patch": (
-        "gapbridge.bridge.cli.patch:patch",
+        "gapbridge.bridge.cli.cell.patch:patch",
         "Write a cell's effects into a simulator's model.",
     ),
-    "fleet": ("gapbridge.bridge.cli.fleet:fleet", "Diagnose or fit many arms over many sessions."),
-    "blind": ("gapbridge.bridge.cli.blind:blind", "Run the blind benchmark of the diagnosis."),
-    "explain": ("gapbridge.bridge.cli.explain:explain", "Explain an effect of the catalogue."),
+    "fleet": (
+        "gapbridge.bridge.cli.log.fleet:fleet",
+        "Diagnose or fit many arms over many sessions.",
+    ),
+    "blind": ("gapbridge.bridge.cli.log.blind:blind", "Run the blind benchmark of the diagnosis."),
+    "explain": ("gapbridge.bridge.cli.cell.explain:explain", "Explain an effect of the catalogue."),
 }

@@ -14,7 +14,7 @@ from gapbridge.bridge.fleet.cell_source import CellSource
 from gapbridge.bridge.fleet.journal import Journal
 from gapbridge.bridge.fleet.session import Session, natural
 from gapbridge.bridge.fleet.task import BAD, Outcome, Task, Work, outcome
-from gapbridge.bridge.fleet.workers import Workers
+from gapbridge.bridge.fleet.workers.workers import Workers
 from gapbridge.core.errors import InputError
 
 FORM = 1  # of the results: another form is another key

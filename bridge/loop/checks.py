@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections import deque
 
+import numpy as np
 from numpy import float64
 from numpy.typing import NDArray
 
 from gapbridge.bridge.ipc.counts import Count
-from gapbridge.bridge.ipc.shared_memory import Page
-from gapbridge.bridge.loop.frozen_watch import FrozenWatch
 from gapbridge.bridge.loop.link_monitor import hold_time
-from gapbridge.bridge.loop.overrun_watch import OverrunWatch
-from gapbridge.bridge.loop.readiness import RateCheck
-from gapbridge.bridge.loop.saturation_watch import SaturationWatch
+from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
+from gapbridge.core.limits import ENVELOPE, JOINT_LIMIT, JOINT_OFFSET
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.robot_modes import NORMAL, REDUCED, RUNNING
 
+Vector = NDArray[np.float64]
 SAFE = (NORMAL, REDUCED)  # safety_mode
 STOPS = 0b111_1111_1100  # safety_status_bits: all but normal and reduced mode
 PLAYING = 2  # runtime_state
@@ -27,8 +25,129 @@ SLOWED = 0.95  # speed_scaling: slower, an arm that we move falls behind its set
 FASTEST = 2.0  # speed_scaling: more is a mistake
 LONG_GAP = 10.0  # cycles: after a longer one, what was before means nothing
 SETTINGS_EVERY = 1.0  # s between two looks at how the controller is set
+STILL = 1.0  # s for which joints may be the same to the last bit while they should move
+AWAY = 2e-3  # rad: the command has come this far meanwhile
+TURNING = 0.02  # rad/s: or a joint says that it turns this fast
+OVERRUN_SPAN = 1.0  # s over which missed cycles are counted
+MOST_MISSED = 0.05  # share of a span's cycles that may be missed
+LONGEST_SATURATION = 1.0  # s that an offset may stand at its limits
+_AT_LIMIT = 1 << ENVELOPE | 1 << JOINT_OFFSET | 1 << JOINT_LIMIT
+GAPS = 5  # between states, before the controller's rate counts as known
+GAPS_KEPT = 50  # gaps between states that are remembered
+SLOWER = 1.5  # times the cell's cycle: the shortest gap between states is not longer
 # bits of a cycle's flags
 DEGRADED, LATE, RESYNC, RAMPING_OUT, UNSOLVED, NOTHING = 1, 2, 4, 8, 16, 32
+
+
+class FrozenWatch:
+    """Watches the joints; an arm at rest under a command at rest is not frozen."""
+
+    def __init__(self) -> None:
+        self._q: Vector | None = None
+        self._since = 0.0  # s, controller clock
+        self._target: Vector | None = None  # commanded when the joints were last seen to move
+        self._turning = 0.0  # s, controller clock: since when the velocity says so
+
+    def update(self, state: RobotState, commanded: Vector) -> str | None:
+        """Return in words that the values are frozen, None where they are not."""
+        q, now = state.actual_q, state.timestamp
+        if self._q is None or now < self._since or not np.array_equal(q, self._q):
+            self._q, self._since, self._turning = q.copy(), now, now
+            self._target = commanded.copy()
+            return None
+        if now - self._since < STILL:
+            return None
+        assert self._target is not None
+        away = float(np.abs(commanded - self._target).max())
+        turning = float(np.abs(state.actual_qd).max())
+        if away < AWAY and turning < TURNING:
+            return None
+        return (
+            f"joints are the same to the last bit for {now - self._since:.2f} s, while the command "
+            f"went {away:.4f} rad and they are said to turn at {turning:.3f} rad/s"
+        )
+
+
+class OverrunWatch:
+    """Counts the cycles that the loop's own work took from those after it, within a span."""
+
+    def __init__(self, rate: float) -> None:
+        self._rate = rate
+        self._missed: deque[tuple[float, int]] = deque()  # s, cycles
+        self._sum = 0
+
+    def forget(self) -> None:
+        """Begin anew: the loop did something else meanwhile."""
+        self._missed.clear()
+        self._sum = 0
+
+    def update(self, now: float, missed: int) -> str | None:
+        """Take the cycles missed before this one; return in words that they are too many."""
+        queue = self._missed
+        while queue and now - queue[0][0] > OVERRUN_SPAN:
+            self._sum -= queue.popleft()[1]
+        if not missed:
+            return None
+        queue.append((now, missed))
+        self._sum += missed
+        if self._sum <= MOST_MISSED * OVERRUN_SPAN * self._rate or len(queue) < 2:
+            return None  # a single long one is judged by the gap that it leaves
+        cycles = OVERRUN_SPAN * self._rate
+        words = f"{self._sum} of {cycles:.0f} cycles missed within {OVERRUN_SPAN:g} s"
+        self.forget()
+        return words
+
+
+class SaturationWatch:
+    """Watches the limiter's bits."""
+
+    def __init__(self) -> None:
+        self._since: float | None = None
+
+    def update(self, now: float, clamped: int) -> str | None:
+        """Return in words that the offset has stood at a limit for too long."""
+        if not clamped & _AT_LIMIT:
+            self._since = None
+            return None
+        if self._since is None or now < self._since:
+            self._since = now
+        if now - self._since <= LONGEST_SATURATION:
+            return None
+        return f"the offset has been held back by its limits for {now - self._since:.2f} s"
+
+
+class RateCheck:
+    """Compares the cell's rate with the one at which the controller has new states."""
+
+    def __init__(self, rate: float) -> None:
+        self._rate = rate
+        self._last: float | None = None  # s, controller clock
+        self._gaps: deque[float] = deque(maxlen=GAPS_KEPT)
+
+    def take(self, timestamp: float) -> None:
+        """Take a state's time, s, controller clock."""
+        if self._last is not None and timestamp > self._last:
+            self._gaps.append(timestamp - self._last)
+        self._last = timestamp
+
+    @property
+    def known(self) -> bool:
+        """Return whether enough states have come to judge by."""
+        return len(self._gaps) >= GAPS
+
+    @property
+    def doubt(self) -> str:
+        """Return in words that the cell asks for more than the controller has; empty: it does not.
+
+        The shortest gap is the controller's own: whatever is late on the way only lengthens gaps.
+        """
+        shortest = min(self._gaps, default=0.0)
+        if shortest <= SLOWER / self._rate:
+            return ""
+        return (
+            f"link.rate: found {self._rate:g} Hz, expected at most {1.0 / shortest:.4g} Hz: the "
+            f"controller has a new state every {1e3 * shortest:.3g} ms"
+        )
 
 
 class LoopChecks:
@@ -38,12 +157,11 @@ class LoopChecks:
         self,
         rate: float,
         supervisor: Supervisor,
-        page: Page,
-        tell: Callable[[dict[str, Any]], None],
+        reports: Reports,
         stale_after: float = 0.0,
         moves_arm: bool = False,
     ) -> None:
-        self._supervisor, self._page, self._tell = supervisor, page, tell
+        self._supervisor, self._reports = supervisor, reports
         self._period = 1.0 / rate
         self._longest_gap = max(LONG_GAP / rate, hold_time(rate), stale_after)
         self._frozen, self._overrun = FrozenWatch(), OverrunWatch(rate)
@@ -56,25 +174,27 @@ class LoopChecks:
         self._last: float | None = None  # s, controller clock
         self.fine = False  # the robot can move
         self.robot = ""  # what is wrong with it
-        self.flags = 0  # of this cycle
 
     def forget(self) -> None:
         """Begin anew: the loop did something else meanwhile."""
         self._last = None
         self._overrun.forget()
 
-    def begin(self, state: RobotState, missed: int) -> bool:
-        """Check a state before it is used; returns whether what was before means nothing now."""
-        self.flags = (LATE if missed else 0) | (DEGRADED if state.sensor_lost else 0)
+    def begin(self, state: RobotState, missed: int) -> int:
+        """Check a state before it is used; returns the cycle's flags.
+
+        RESYNC among them: what was before means nothing now.
+        """
+        flags = (LATE if missed else 0) | (DEGRADED if state.sensor_lost else 0)
         if missed:
-            self._page.count(Count.LATE, missed)
+            self._reports.count(Count.LATE, missed)
         gap = 0.0 if self._last is None else state.timestamp - self._last
         self._last = state.timestamp
         resync = gap > self._longest_gap
         words = f"found a gap of {gap:.3f} s between two states: begun anew" if resync else None
         self._judge(Count.RESYNC, words, Cause.RESYNC)
         if resync:
-            self.flags |= RESYNC
+            flags |= RESYNC
             self._overrun.forget()
         else:
             self._judge(Count.OVERRUN, self._overrun.update(state.timestamp, missed), Cause.OVERRUN)
@@ -82,7 +202,7 @@ class LoopChecks:
         self.rate.take(state.timestamp)
         self._check_robot(state)
         self._check_following(state)
-        return resync
+        return flags
 
     def judge_loads(self, words: str | None) -> None:
         """Hold where a payload or a force is none that the arm can bear."""
@@ -146,13 +266,15 @@ class LoopChecks:
             if what in self._lasting:
                 self._lasting.discard(what)
                 if what == Count.SENSOR_LOST:
-                    self._tell({"kind": "degraded", "what": "", "detail": "the sensor is back"})
+                    self._reports.emit(
+                        {"kind": "degraded", "what": "", "detail": "the sensor is back"}
+                    )
             return
         changed = cause is not None and self._supervisor.take(cause, words)
         if what in self._lasting:
             return
         self._lasting.add(what)
-        self._page.count(what)
+        self._reports.count(what)
         if not changed and self._supervisor.state != State.FAULT:
             kind = "degraded" if what == Count.SENSOR_LOST else "warning"
-            self._tell({"kind": kind, "what": what.words, "detail": words})
+            self._reports.emit({"kind": kind, "what": what.words, "detail": words})

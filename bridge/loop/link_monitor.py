@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 
 from gapbridge.bridge.ipc.counts import Count
-from gapbridge.bridge.ipc.shared_memory import Page
-from gapbridge.bridge.loop.sample_check import SampleCheck
+from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.supervisor import Cause, Supervisor
 from gapbridge.core.arm import Arm
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.state_check import FASTEST, LARGEST, JointCheck
 
+Vector = NDArray[np.float64]
+DRIFT = 5e-3  # s per s: how fast the bound follows a clock that drifts or stumbles
+HASTE = 1.5  # times its velocity limit: a joint that moved faster is a mistake
+_WRENCH = np.array([LARGEST["force"]] * 3 + [LARGEST["moment"]] * 3)
 INVALID_IN_A_ROW = 3  # states that cannot be believed, after which they count as silence
 OLD_IN_A_ROW = 2  # states too old to write by, after which they count as none
 SILENCE = 0.2  # s without a state: a fault
@@ -30,10 +36,116 @@ def hold_time(rate: float) -> float:
     return min(max(5.0 / rate, 0.04), SILENCE)
 
 
+class ControllerClock:
+    """Ties controller time to this machine's monotonic clock by the quickest sample seen.
+
+    The age of a state counts from when its sample could have been here at the earliest, so that
+    late packets, late wake-ups and long computing all count. The shortest way over the wire, which
+    one clock alone cannot tell, does not. ``hold``: s after which a state is too old to write by.
+    What a stalled link hands on at once is old for a moment only. Where all samples are older than
+    that for as long, either the controller's clock has stood still or the way has become longer,
+    which no clock tells: the two are tied anew only while nothing is written.
+    """
+
+    def __init__(self, rate: float, hold: float = 1.0) -> None:
+        self._rate, self._hold = rate, hold
+        self._lead: float | None = None  # s: monotonic minus controller time, quickest sample
+        self._last: float | None = None  # s, controller clock
+        self._old_since: float | None = None  # s, monotonic: all samples have been old since
+
+    def take(self, state: RobotState, writes: bool = False) -> int:
+        """Take a new sample; returns the cycles missed since the one before.
+
+        ``writes``: setpoints are made of the samples, so that old ones stay old.
+        """
+        lead, before = state.received - state.timestamp, self._last
+        self._last = state.timestamp
+        gap = 0.0 if before is None else state.timestamp - before
+        if self._lead is None or (self._stood_still(lead, state.received) and not writes):
+            self._lead, self._old_since = lead, None
+        else:
+            self._lead = min(lead, self._lead + DRIFT * gap)
+        return 0 if before is None else max(round(gap * self._rate) - 1, 0)
+
+    def _stood_still(self, lead: float, now: float) -> bool:
+        """Return whether samples have come too old for long enough."""
+        if self._lead is None or lead - self._lead <= self._hold:
+            self._old_since = None
+        elif self._old_since is None:
+            self._old_since = now
+        return self._old_since is not None and now - self._old_since > self._hold
+
+    def skip(self) -> None:
+        """Do not count what the loop does not see now as missed: it does something else."""
+        self._last = None
+
+    def age(self, state: RobotState) -> float:
+        """Return how old a state is now, s."""
+        return time.monotonic() - self._due(state)
+
+    def expiry(self, state: RobotState) -> float:
+        """Return when a state becomes too old for a setpoint to be made of it, s monotonic."""
+        return self._due(state) + self._hold
+
+    def _due(self, state: RobotState) -> float:
+        return state.timestamp + (self._lead or 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """Why a sample was not believed."""
+
+    count: Count
+    words: str
+
+
+class SampleCheck:
+    """Checks each sample against the last one that was believed."""
+
+    def __init__(self, arm: Arm) -> None:
+        speed = arm.limits.velocity
+        self._joints = JointCheck(arm, HASTE * np.where(np.isfinite(speed), speed, FASTEST))
+        self._q: Vector | None = None
+        self._timestamp = 0.0
+
+    def forget(self) -> None:
+        """Take the next sample without comparing it to the ones before."""
+        self._q = None
+
+    def doubt(self, state: RobotState) -> Doubt | None:
+        """Return why a sample cannot be believed; None: it can, and is remembered."""
+        q = state.actual_q
+        force = state.actual_TCP_force
+        sound = bool(np.isfinite(q).all() and np.isfinite(state.target_q).all())
+        sound = sound and bool(np.isfinite(state.actual_qd).all())
+        if not sound or not (state.sensor_lost or np.isfinite(force).all()):
+            return Doubt(Count.DROPPED_NOT_FINITE, "found a number that is not finite in the state")
+        outside = self._joints.outside(q)
+        if outside is not None:
+            return Doubt(Count.DROPPED_IMPLAUSIBLE, outside)
+        if (np.abs(force) > _WRENCH).any():
+            return Doubt(Count.DROPPED_IMPLAUSIBLE, f"found a force of {np.abs(force).max():.3g}")
+        return self._doubt_motion(state)
+
+    def _doubt_motion(self, state: RobotState) -> Doubt | None:
+        before, gap = self._q, state.timestamp - self._timestamp
+        if before is not None:
+            if gap <= 0.0:
+                return Doubt(
+                    Count.DROPPED_BACKWARDS,
+                    f"the controller's clock went back by {-gap:.4f} s",
+                )
+            jumped = self._joints.jumped(state.actual_q - before, gap)
+            if jumped is not None:
+                return Doubt(Count.DROPPED_STEP, jumped)
+        self._q, self._timestamp = state.actual_q, state.timestamp
+        return None
+
+
 class StateWatch:
     """Takes states from a driver and tells the supervisor when they fail to come.
 
-    ``lose`` is called with the reason when the link must be given up.
+    ``lost`` says why the link must be given up, from then on.
     """
 
     def __init__(
@@ -41,13 +153,11 @@ class StateWatch:
         driver: Driver,
         arm: Arm,
         supervisor: Supervisor,
-        page: Page,
-        tell: Callable[[dict[str, Any]], None],
-        lose: Callable[[str], None],
+        reports: Reports,
         patience: float = 0.0,
     ) -> None:
-        self._driver, self._supervisor, self._page = driver, supervisor, page
-        self._tell, self._lose = tell, lose
+        self._driver, self._supervisor, self._reports = driver, supervisor, reports
+        self.lost: str | None = None
         self._hold = hold_time(driver.rate)
         self._patience = max(patience, self._hold)  # s that one reading takes at most
         self._check = SampleCheck(arm)
@@ -56,10 +166,14 @@ class StateWatch:
         self._stale = self._silent = False  # has been told since the last believable state
         self._told: dict[Count, float] = {}  # s, monotonic
         self._heard = time.monotonic()  # s, of the last believable state
-        self.has_written = False  # the library's writing half exists in this process
+        self._has_armed = False
 
-    def next(self) -> RobotState | None:
-        """Return the next state, or None where none came that can be used."""
+    def next(self, has_armed: bool = False) -> RobotState | None:
+        """Return the next state, or None where none came that can be used.
+
+        ``has_armed``: the writing half of the robot's library exists in this process.
+        """
+        self._has_armed = has_armed
         begun, self._left = time.monotonic(), self._left or time.monotonic()
         away = begun - self._left > self._hold
         try:
@@ -74,13 +188,13 @@ class StateWatch:
         except StaleStateError as error:
             if away or time.monotonic() - begun > self._patience + SUSPENDED:
                 self._heard = time.monotonic()  # it was this process that slept: ask once more
-                self._page.count(Count.LATE)
+                self._reports.count(Count.LATE)
             else:
                 self._stand_still(str(error))
         except InvalidStateError as error:
             self.doubt(str(error))
         except LinkError as error:
-            self._lose(str(error))
+            self.lost = str(error)
         else:
             doubt = self._check.doubt(state)
             if doubt is None:
@@ -101,7 +215,7 @@ class StateWatch:
             self._stand_still(f"states are {now - expiry + self._hold:.3f} s old as they come")
             return False
         if self._old:
-            self._page.count(Count.LATE)
+            self._reports.count(Count.LATE)
             return False
         self._heard = now
         self._stale = self._silent = False
@@ -115,23 +229,23 @@ class StateWatch:
     def _stand_still(self, detail: str) -> None:
         """Judge a clock that stands still: late at first, then stale, then silent."""
         if time.monotonic() - self._heard <= self._hold:
-            self._page.count(Count.LATE)
+            self._reports.count(Count.LATE)
             return
         if not self._stale:
             self._stale = True
-            self._page.count(Count.STALE)
+            self._reports.count(Count.STALE)
             if not self._supervisor.take(Cause.STALE, detail):
-                self._tell({"kind": "link", "what": "stale", "detail": detail})
+                self._reports.emit({"kind": "link", "what": "stale", "detail": detail})
         self._fall_silent(detail)
 
     def doubt(self, detail: str, reason: Count = Count.DROPPED_TORN) -> None:
         """Drop a state that cannot be believed; several in a row end the compensation."""
-        self._page.count(reason)
+        self._reports.count(reason)
         self._invalid += 1
         now = time.monotonic()
         if now - self._told.get(reason, -TELL_EVERY) >= TELL_EVERY:
             self._told[reason] = now
-            self._tell({"kind": "dropped", "what": reason.words, "detail": detail})
+            self._reports.emit({"kind": "dropped", "what": reason.words, "detail": detail})
         if self._invalid >= INVALID_IN_A_ROW:
             self._supervisor.take(Cause.IMPLAUSIBLE, detail)
             self._check.forget()  # the arm may well be there: judge what comes by itself
@@ -142,7 +256,7 @@ class StateWatch:
         if silent > SILENCE:
             if not self._silent:
                 self._silent = True
-                self._page.count(Count.SILENCE)
+                self._reports.count(Count.SILENCE)
             self._supervisor.take(Cause.SILENCE, detail)
-        if silent > (LOST_AFTER_WRITING if self.has_written else LOST):
-            self._lose(detail)
+        if silent > (LOST_AFTER_WRITING if self._has_armed else LOST):
+            self.lost = detail

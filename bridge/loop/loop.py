@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from enum import IntEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +19,12 @@ from gapbridge.bridge.ipc.command_page import Command, Commands
 from gapbridge.bridge.ipc.counts import Count
 from gapbridge.bridge.ipc.cycle_row import fill_row
 from gapbridge.bridge.ipc.shared_memory import Page, Phase
-from gapbridge.bridge.loop.checks import NOTHING, RAMPING_OUT, UNSOLVED, LoopChecks
-from gapbridge.bridge.loop.controller_clock import ControllerClock
-from gapbridge.bridge.loop.link_monitor import StateWatch, hold_time
+from gapbridge.bridge.loop.checks import NOTHING, RAMPING_OUT, RESYNC, UNSOLVED, LoopChecks
+from gapbridge.bridge.loop.link_monitor import ControllerClock, StateWatch, hold_time
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
 from gapbridge.bridge.loop.readiness import ModelCheck
+from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream, longest_withdrawal
 from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
 from gapbridge.bridge.loop.writing import Writing
@@ -56,6 +56,16 @@ class Exit(IntEnum):
     CRASH = 4
 
 
+class CycleInput(NamedTuple):
+    """What one cycle begins with."""
+
+    state: RobotState
+    missed: int  # cycles before it
+    own: Vector  # (n,) rad: nominal joints of the robot's own program
+    loads: Loads
+    flags: int
+
+
 class Loop:
     """One run of the loop in its process; ``run`` returns when it is over."""
 
@@ -80,29 +90,32 @@ class Loop:
         self._acting = Loads()  # of the last cycle
         self._model_check = ModelCheck(model, settings.setpoints.use_force)
         self._clock = ControllerClock(driver.rate, hold_time(driver.rate))
-        self._supervisor = Supervisor(self._changed)
+        reports = Reports(page, tell)
+        self._supervisor = Supervisor(reports.transition)
         patience = settings.link.state_timeout
-        self._watch = StateWatch(
-            driver, model.arm, self._supervisor, page, tell, self._lose, patience
-        )
+        self._watch = StateWatch(driver, model.arm, self._supervisor, reports, patience)
         self._checks = LoopChecks(
-            driver.rate, self._supervisor, page, tell, patience, driver.moves_arm
+            driver.rate, self._supervisor, reports, patience, driver.moves_arm
         )
         self._in_force = self._kept_offset()
         self._writing = Writing(
-            settings.setpoints, driver, source, self._stream, self._supervisor, page, tell,
-            self._skip, self._lose, self._in_force,
+            settings.setpoints, driver, source, self._stream, self._supervisor, reports,
+            self._in_force,
         )  # fmt: skip
         self._acknowledged = False  # a person has seen the fault; it ends when the robot is fine
         self._stop_by: float | None = None  # s, monotonic
         self._exit: Exit | None = None
-        self.stop_requested = False  # set by signal handlers
+        self._stop_requested = False
 
     def _kept_offset(self) -> OffsetInForce:
         """Return where the offset that an arm is left with is kept."""
         if not self._driver.moves_arm:  # the robot's own program takes it out
             return OffsetInForce(self._driver.n, None)
         return OffsetInForce.of_link(self._driver.n, self._settings.link)
+
+    def request_stop(self) -> None:
+        """Have the loop ramp out and end; for signal handlers."""
+        self._stop_requested = True
 
     # -- the frame --------------------------------------------------------------------------------
 
@@ -133,7 +146,7 @@ class Loop:
                     self._disarm(command == Command.DISARM)
             if asked:
                 self._page.tell_taken(commands.taken)
-            if self.stop_requested or commands.stop:
+            if self._stop_requested or commands.stop:
                 self._stop()
             seen = self._page.seen and self._checks.rate.known
             if wanted and may_write and seen and self._stop_by is None:
@@ -155,6 +168,7 @@ class Loop:
             words = not_ready
         else:
             self._supervisor.take(Cause.ARM)
+            self._skip()
             return
         self._tell({"kind": "refused", "what": "arm", "detail": words})
 
@@ -183,17 +197,6 @@ class Loop:
         else:
             self._supervisor.take(Cause.DISARM)
 
-    def _changed(self, before: State, after: State, cause: Cause, detail: str) -> None:
-        self._page.tell_state(after)
-        self._tell(
-            {"kind": "transition", "from": before.name, "to": after.name, "cause": cause.value,
-             "detail": detail, "cycle": self._page.written}
-        )  # fmt: skip
-        if after == State.FAULT:
-            self._acknowledged = False
-        if after == State.ARMED:
-            self._skip()
-
     def _skip(self) -> None:
         """Do not count what the loop does not see now: it does something else."""
         self._clock.skip()
@@ -208,12 +211,24 @@ class Loop:
             self._stream.hasten(HASTY_RAMP)
             self._supervisor.take(Cause.STOP)
         if not self._supervisor.state.writes or time.monotonic() > self._stop_by:
-            self._writing.release()
+            self._release()
             self._supervisor.take(Cause.RAMPED_OUT, "not at rest in time")
             self._exit = Exit.DONE
 
-    def _lose(self, detail: str) -> None:
-        """Give the process up: a link that broke is only safe in a new one."""
+    def _release(self) -> None:
+        self._writing.release()
+        self._look_after_writing()
+
+    def _look_after_writing(self) -> None:
+        """Act on what writing came to: states not looked at meanwhile, or a link that broke."""
+        if self._writing.paused():
+            self._skip()
+        self._give_up(self._writing.lost)
+
+    def _give_up(self, detail: str | None) -> None:
+        """Give the process up where a link broke (``detail``): it is only safe in a new one."""
+        if detail is None or self._exit is not None:
+            return
         self._page.count(Count.LINK_LOST)
         self._supervisor.take(Cause.LINK_LOST, detail)
         self._tell({"kind": "failure", "detail": detail})
@@ -222,46 +237,54 @@ class Loop:
     # -- one cycle --------------------------------------------------------------------------------
 
     def _cycle(self) -> None:
-        self._watch.has_written = self._writing.has_armed
-        state = self._watch.next()
+        state = self._watch.next(self._writing.has_armed)
         if state is None:
+            self._give_up(self._watch.lost)
             return
         try:
             own = self._driver.nominal_q(state)
         except InvalidStateError as error:
             self._watch.doubt(str(error))
+            self._give_up(self._watch.lost)
             return
         missed = self._clock.take(state, self._supervisor.state.writes)
         expiry = self._clock.expiry(state)
         is_fresh = self._watch.believe(expiry)
+        self._give_up(self._watch.lost)
         self._page.tell_seen()
-        if self._checks.begin(state, missed):
+        flags = self._checks.begin(state, missed)
+        if flags & RESYNC:
             self._loads.forget()
         self._acknowledge()
         supervisor, writing = self._supervisor, self._writing
         if supervisor.state == State.FAULT:
-            writing.ready = False  # its own watchdog, or a person, has the robot
+            writing.abandon()
         loads = self._acting = self._loads.update(state)
         self._checks.judge_loads(self._loads.doubt)
         self._checks.judge_settings(state, self._driver)
         seen = time.monotonic()
-        if is_fresh and supervisor.state == State.ARMED and writing.start(state, own):
-            self._record(state, missed, own, loads, None, at=seen)
-            return  # the state is old by now
+        if is_fresh and supervisor.state == State.ARMED:
+            used_up = writing.start(state, own)
+            self._look_after_writing()
+            if used_up:  # the state is old by now
+                self._record(CycleInput(state, missed, own, loads, flags), None, at=seen)
+                return
         holding = supervisor.state == State.HOLDING
         writes = supervisor.state.writes
         written = None
         if writes:
             written = writing.write(state, own, loads, expiry if is_fresh else -np.inf)
+            self._look_after_writing()
         if writes and writing.ramps_out:
-            self._checks.flags |= RAMPING_OUT
+            flags |= RAMPING_OUT
         setpoint = writing.unsent if writes and written is None else written
-        self._record(state, missed, own, loads, setpoint, writes, written is not None)
+        given = CycleInput(state, missed, own, loads, flags)
+        self._record(given, setpoint, writes, written is not None)
         clamped = 0 if written is None else self._stream.clamped
         commanded = own if written is None else written.q
         self._checks.end(state, commanded, clamped, time.monotonic() - state.received)
         if written is not None and holding and writing.at_rest(written, state):
-            writing.release()  # takes a moment: after the cycle has been timed
+            self._release()  # takes a moment: after the cycle has been timed
             supervisor.take(Cause.RAMPED_OUT)
 
     def _acknowledge(self) -> None:
@@ -272,10 +295,7 @@ class Loop:
 
     def _record(
         self,
-        state: RobotState,
-        missed: int,
-        own: Vector,
-        loads: Loads,
+        given: CycleInput,
         setpoint: Setpoint | None,
         attempted: bool = False,
         left: bool = False,
@@ -283,17 +303,18 @@ class Loop:
     ) -> None:
         """Publish a cycle: ``setpoint`` was computed for writing, and has ``left`` or not."""
         page, stream = self._page, self._stream
+        state, missed, own, loads, flags = given
         if setpoint is None:
             correction = stream.correct(own, loads)
             nominal, corrected, offset = own, correction.q, correction.offset_in_base
             if not stream.finite:
                 self._supervisor.take(Cause.BAD_OUTPUT, "the model's correction is no number")
             elif not self._model_check.corrects(loads):
-                self._checks.flags |= NOTHING
+                flags |= NOTHING
         else:
             nominal, corrected, offset = setpoint.nominal_q, setpoint.q, setpoint.offset_in_base
         if stream.unsolved:
-            self._checks.flags |= UNSOLVED
+            flags |= UNSOLVED
         clamped = stream.clamped if setpoint is not None else 0
         late = 0.0 if at is None else time.monotonic() - at  # arming: no part of the cycle
         row, slices = page.next_row(), page.slices
@@ -306,7 +327,7 @@ class Loop:
         row[7] = clamped
         row[8] = stream.residual
         row[slices["own_q"]] = own
-        row[slices["flags"].start] = self._checks.flags
+        row[slices["flags"].start] = flags
         last = slices["attempted"].start
         kind = UNSENT if setpoint is not None and not left else int(attempted)
         row[last : last + 4] = (kind, stream.ramp_time, self._driver.rate, self._number)

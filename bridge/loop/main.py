@@ -80,7 +80,7 @@ def _run(order: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Exit:
     source = _make_source(settings, model, driver)
     loop = _make_loop(settings, model, driver, source, page, tell, order["number"])
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: setattr(loop, "stop_requested", True))
+        signal.signal(number, lambda *_: loop.request_stop())
     _end_with_parent(order["parent"])
     _compile(settings, model)
     if order["may_write"]:

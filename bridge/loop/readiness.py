@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,9 +13,6 @@ Vector = NDArray[np.float64]
 LEAST = 1e-9  # m, rad: a smaller offset is none
 PULL = 10.0  # N: a model that bends under a pull corrects something
 POSES, SEED = 16, 14  # tried beside the present one
-GAPS = 5  # between states, before the controller's rate counts as known
-KEPT = 50  # gaps between states that are remembered
-SLOWER = 1.5  # times the cell's cycle: the shortest gap between states is not longer
 
 
 class ModelCheck:
@@ -59,37 +54,3 @@ class ModelCheck:
             if not found.residual < np.inf or np.abs(found.offset_in_base).max() > LEAST:
                 return True
         return False
-
-
-class RateCheck:
-    """Compares the cell's rate with the one at which the controller has new states."""
-
-    def __init__(self, rate: float) -> None:
-        self._rate = rate
-        self._last: float | None = None  # s, controller clock
-        self._gaps: deque[float] = deque(maxlen=KEPT)
-
-    def take(self, timestamp: float) -> None:
-        """Take a state's time, s, controller clock."""
-        if self._last is not None and timestamp > self._last:
-            self._gaps.append(timestamp - self._last)
-        self._last = timestamp
-
-    @property
-    def known(self) -> bool:
-        """Return whether enough states have come to judge by."""
-        return len(self._gaps) >= GAPS
-
-    @property
-    def doubt(self) -> str:
-        """Return in words that the cell asks for more than the controller has; empty: it does not.
-
-        The shortest gap is the controller's own: whatever is late on the way only lengthens gaps.
-        """
-        shortest = min(self._gaps, default=0.0)
-        if shortest <= SLOWER / self._rate:
-            return ""
-        return (
-            f"link.rate: found {self._rate:g} Hz, expected at most {1.0 / shortest:.4g} Hz: the "
-            f"controller has a new state every {1e3 * shortest:.3g} ms"
-        )

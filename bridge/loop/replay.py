@@ -13,7 +13,7 @@ import numpy as np
 
 from gapbridge.bridge.loop.checks import RAMPING_OUT, RESYNC
 from gapbridge.bridge.loop.live_loads import LiveLoads
-from gapbridge.bridge.loop.loop import UNSENT, Exit, Loop
+from gapbridge.bridge.loop.loop import UNSENT, CycleInput, Exit, Loop
 from gapbridge.bridge.loop.offset_in_force import InForce, OffsetInForce
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream
 from gapbridge.bridge.loop.supervisor import Cause, State
@@ -62,11 +62,11 @@ class ReplayedLoop(Loop):
         if cycle.flags & RESYNC:
             self._loads.forget()
         loads = self._loads.update(state)
-        self._checks.flags = cycle.flags
         self._follow(State(cycle.state))
         setpoint = self._write_again(cycle, state, loads)
         left = cycle.written and setpoint is not None
-        self._record(state, missed, cycle.own_q, loads, setpoint, cycle.attempted > 0, left)
+        given = CycleInput(state, missed, cycle.own_q, loads, cycle.flags)
+        self._record(given, setpoint, cycle.attempted > 0, left)
 
     def _renew(self, process: int) -> None:
         """Begin as a new process of the loop begins, knowing nothing of the former."""
@@ -83,10 +83,9 @@ class ReplayedLoop(Loop):
         self._streaming = False
 
     def _follow(self, state: State) -> None:
-        before = self._supervisor.state
-        if state != before:
-            self._supervisor.state = state
-            self._changed(before, state, cast("Cause", _Followed.RECORDED), "")
+        changed = self._supervisor.follow(state, cast("Cause", _Followed.RECORDED))
+        if changed and state == State.ARMED:
+            self._skip()
 
     def _began_with(self, cycle: Cycle) -> InForce | None:
         """Return the offset in force that a stream began with: nominal joints are without it."""

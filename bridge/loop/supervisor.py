@@ -116,3 +116,25 @@ class Supervisor:
         self.state = after
         self._listener(before, after, cause, detail)
         return True
+
+    def follow(self, state: State, cause: Cause) -> bool:
+        """Be in the state that a recording was in; returns whether it is another."""
+        before, self.state = self.state, state
+        if state != before:
+            self._listener(before, state, cause, "")
+        return state != before
+
+
+def states_table() -> str:
+    """Return the table of transitions in Markdown: what each cause leads to from each state."""
+    names = [state.name.lower() for state in State]
+    lines = [f"| cause | {' | '.join(names)} |", "| --- " * (len(names) + 1) + "|"]
+    for cause in Cause:
+        after = [TRANSITIONS.get((state, cause)) for state in State]
+        cells = ["" if state is None else state.name.lower() for state in after]
+        lines.append(f"| {cause.value} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    print(states_table())

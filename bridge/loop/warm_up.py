@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gapbridge.bridge.loop.nominal_stream import NominalStream
+from gapbridge.bridge.loop.setpoint_stream import NominalStream
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.compensation import correct
 from gapbridge.core.estimation.pose_jacobian import pose_columns

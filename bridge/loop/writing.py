@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.ipc.counts import Count
-from gapbridge.bridge.ipc.shared_memory import Page, Phase
+from gapbridge.bridge.ipc.shared_memory import Phase
 from gapbridge.bridge.loop.link_monitor import hold_time
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
+from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream
 from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
 from gapbridge.bridge.setpoint_source.source import Source, SourceDryError
@@ -46,22 +45,29 @@ class Writing:
         source: Source,
         stream: SetpointStream,
         supervisor: Supervisor,
-        page: Page,
-        tell: Callable[[dict[str, Any]], None],
-        skip: Callable[[], None],
-        lose: Callable[[str], None],
+        reports: Reports,
         in_force: OffsetInForce | None = None,
     ) -> None:
         self._settings, self._driver, self._source = settings, driver, source
-        self._stream, self._supervisor, self._page = stream, supervisor, page
-        self._tell, self._skip, self._lose = tell, skip, lose
+        self._stream, self._supervisor, self._reports = stream, supervisor, reports
         self._in_force = in_force or OffsetInForce(driver.n, None)
         self.ready = False  # the driver is armed
         self.has_armed = False  # it was, at some time in this process
         self.unsent: Setpoint | None = None  # computed in the last cycle, and not (wholly) sent
         self.ramps_out = False  # the last one's offset was to go
+        self.lost: str | None = None  # why the link must be given up
+        self._paused = False  # see ``paused``
         self._failed = 0  # setpoints in a row that left in part only
         self._settling = 0.0  # s, monotonic: since when the last setpoint stands
+
+    def paused(self) -> bool:
+        """Return, once, whether arming or letting go kept the loop from looking at states."""
+        paused, self._paused = self._paused, False
+        return paused
+
+    def abandon(self) -> None:
+        """Take note that the driver is not armed any more: its watchdog, or a person, has it."""
+        self.ready = False
 
     def start(self, state: RobotState, own: Vector) -> bool:
         """Begin writing once the source has a first setpoint and the driver is ready.
@@ -90,7 +96,7 @@ class Writing:
             nominal = self._stream.start(own, state.timestamp, in_force=in_force)
         except (WriteError, LimitError) as error:
             if isinstance(error, ForeignCommandError):
-                self._page.count(Count.FOREIGN)
+                self._reports.count(Count.FOREIGN)
             self._refuse_start(str(error))
             return True
         self._source.begin(state.timestamp, nominal)
@@ -100,15 +106,15 @@ class Writing:
 
     def _arm_driver(self, state: RobotState) -> None:
         """Make the driver ready, which takes a moment: a fresh state is needed after it."""
-        self._page.enter(Phase.ARMING)
+        self._reports.page.enter(Phase.ARMING)
         self.has_armed = True
         try:
             self._check_way()
             self._driver.arm(state)
             self.ready = True
         finally:
-            self._page.enter(Phase.RUNNING)
-            self._skip()
+            self._reports.page.enter(Phase.RUNNING)
+            self._paused = True
 
     def _check_way(self) -> None:
         """Refuse a link on which no state can be fresh. Raises WriteError."""
@@ -143,7 +149,7 @@ class Writing:
             setpoint = stream.advance(state, source_q, loads, goal, expiry)
         except StaleStateError:
             stream.forget()
-            self._page.count(Count.LATE)
+            self._reports.count(Count.LATE)
             return None
         except WriteError as error:
             stream.forget()
@@ -160,7 +166,7 @@ class Writing:
                 self._end(Count.BAD_OUTPUT, Cause.BAD_OUTPUT, words)
             elif time.monotonic() > expiry:  # the system stopped this process since it was judged
                 self.unsent = _copied(setpoint)
-                self._page.count(Count.LATE)
+                self._reports.count(Count.LATE)
             else:
                 self._driver.write_setpoint(setpoint)
                 self._in_force.note(setpoint.q, stream.joint_offset, setpoint.offset_in_base)
@@ -177,14 +183,14 @@ class Writing:
         """End the motion where the model has no correction; the offset is on its way out."""
         words = self._stream.unsolved
         if words and self._supervisor.take(Cause.UNSOLVED, words):
-            self._page.count(Count.UNSOLVED)
+            self._reports.count(Count.UNSOLVED)
 
     def _judge_sending(self, expiry: float) -> None:
         """End the motion where the system stopped this process between judging and sending."""
         late = time.monotonic() - expiry
         if late > 0.0:
             words = f"a setpoint left {1e3 * late:.0f} ms after its state was too old"
-            self._page.count(Count.OVERRUN)
+            self._reports.count(Count.OVERRUN)
             self._supervisor.take(Cause.OVERRUN, words)
 
     def _fail(self, error: WriteError) -> None:
@@ -198,14 +204,14 @@ class Writing:
         elif isinstance(error, ForeignCommandError):
             self._end(Count.FOREIGN, Cause.FOREIGN, str(error))
         else:
-            self._page.count(Count.WRITE_FAILED)
+            self._reports.count(Count.WRITE_FAILED)
             self._supervisor.take(Cause.WRITE_FAILED, str(error))
             self.ready = False
-            self._lose(str(error))
+            self.lost = str(error)
 
     def _repeat(self, detail: str) -> None:
         """Leave it to the next cycle, whose setpoint goes out whole; after some, end the motion."""
-        self._page.count(Count.WRITE_PARTIAL)
+        self._reports.count(Count.WRITE_PARTIAL)
         self._failed += 1
         if self._failed >= PARTS_IN_A_ROW:
             self._failed = 0
@@ -213,7 +219,7 @@ class Writing:
 
     def _end(self, what: Count, cause: Cause, detail: str) -> None:
         """End the motion as the table says; let go where it says that nothing more is written."""
-        self._page.count(what)
+        self._reports.count(what)
         self._supervisor.take(cause, detail)
         if not self._supervisor.state.writes:
             self.release()
@@ -242,13 +248,13 @@ class Writing:
         try:
             found = self._source.sample(state.timestamp, own)
         except SourceDryError as error:
-            self._page.count(Count.SOURCE_DRY)
+            self._reports.count(Count.SOURCE_DRY)
             self._supervisor.take(Cause.SOURCE_DRY, str(error))
             return None if self._driver.moves_arm else own
-        if self._source.ended and not self._page.ended:
-            self._page.tell_ended()
+        if self._source.ended and not self._reports.page.ended:
+            self._reports.page.tell_ended()
             words = "the source has come to its end; the arm stays there"
-            self._tell({"kind": "source", "what": "ended", "detail": words})
+            self._reports.emit({"kind": "source", "what": "ended", "detail": words})
         return found
 
     def release(self) -> None:
@@ -257,13 +263,13 @@ class Writing:
         if not self.ready:
             return
         self.ready = False
-        self._page.enter(Phase.ARMING)
+        self._reports.page.enter(Phase.ARMING)
         try:
             self._driver.release()
         except WriteError as error:
-            self._tell({"kind": "link", "what": "release", "detail": str(error)})
-        self._page.enter(Phase.RUNNING)
-        self._skip()
+            self._reports.emit({"kind": "link", "what": "release", "detail": str(error)})
+        self._reports.page.enter(Phase.RUNNING)
+        self._paused = True
 
 
 def _copied(setpoint: Setpoint) -> Setpoint:

@@ -14,7 +14,7 @@ from gapbridge.bridge.report.words import effect_words
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.effects import CATALOGUE, CHANNELS, Effect
 
-PAGE = Path(__file__).parents[2] / "docs" / "catalogue.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "catalogue.md"
 HEAD = """\
 # The catalogue of effects
 

@@ -20,6 +20,8 @@ from gapbridge.core.errors import InputError, RunError
 Vector = NDArray[np.float64]
 WRITTEN, LIMITED = 1, 2  # flags
 
+SERVER = "gapbridge.bridge.setpoint_source.modbus_server"  # module that the PLC talks to
+
 
 class ModbusSource(Source):
     """Listens, in a process of its own, for a PLC; tells it what became of its setpoints.
@@ -45,7 +47,7 @@ class ModbusSource(Source):
         page = self._page = PlcPage(self.n)
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
         server = self._server = subprocess.Popen(
-            [sys.executable, "-m", "gapbridge.bridge.setpoint_source.modbus_server"],
+            [sys.executable, "-m", SERVER],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment,
             pass_fds=page.fds,
         )  # fmt: skip

@@ -52,7 +52,7 @@ class SessionFit:
         return estimates_of(self.parameters, self.rest, expected)
 
 
-def calibrate(
+def calibrate(  # noqa: PLR0913 (the public call: what is left out has its default)
     model: Model,
     readings: Readings,
     parameters: Parameters,

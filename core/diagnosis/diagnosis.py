@@ -48,7 +48,7 @@ CHANNELS: Mapping[str, Observe] = {
 
 
 # samples that a diagnosis looks at: more cost time and tell hardly more
-MOST = {"position": 1200, "wrench": 300, "tracking": 300, "torque": 300}
+MOST = {"position": 1200, "wrench": 300, "tracking": 300, "torque": 900}
 
 
 @dataclass(frozen=True)
@@ -295,7 +295,7 @@ def _channel(
         gap_max=float(np.linalg.norm(gap[kept][:, :k], axis=1).max()),
         noise_floor_rms=floor.rms, remaining_rms=left, remaining_rms_held_out=held_rms,
         where=where, causes=causes, considered=considered,
-        unexplained_rms=_beyond(left, floor.rms, structured), structured=structured,
+        unexplained_rms=_unexplained(left, floor.rms, verdict), structured=structured,
         p_value=verdict.p_value, depends_on=verdict.depends_on, verdict=word,
         selection=selection, judgement=verdict, gap=gap, remaining=remaining,
         held_out=np.sqrt(held.squares(chosen)) if held.possible else None,
@@ -355,10 +355,19 @@ def gaps(selection: Selection, chosen: Sequence[int]) -> tuple[Array, Array]:
     return found[0], found[1]
 
 
-def _beyond(left: float, floor: float | None, structured: bool) -> float:
-    if not structured or floor is None:
+def _unexplained(left: float, floor: float | None, verdict: Judgement) -> float:
+    """Return the rms of what is left beyond the noise; of a residual without structure 0.
+
+    Where no floor is known, or one no lower than what is left, what the residual depends on says
+    its share; where nothing does either, no part of it is known to be noise.
+    """
+    if not verdict.structured:
         return 0.0
-    return float(np.sqrt(max(left**2 - floor**2, 0.0)))
+    beyond = float(np.sqrt(max(left**2 - floor**2, 0.0))) if floor is not None else 0.0
+    if beyond > 0:
+        return beyond
+    share = max((share for _, share in verdict.depends_on), default=1.0)
+    return left * float(np.sqrt(np.clip(share, 0.0, 1.0)))
 
 
 def _overall(channels: Sequence[ChannelDiagnosis]) -> str:

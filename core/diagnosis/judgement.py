@@ -20,7 +20,6 @@ from gapbridge.core.diagnosis.criteria import (
     GAIN,
     HINT,
     INSTRUMENTS,
-    OWN_SIGMAS,
     REPEATED,
     STAND_IN_GAIN,
     STATED,
@@ -33,8 +32,10 @@ from gapbridge.core.diagnosis.regions import parts
 from gapbridge.core.diagnosis.remainder import links_withstand, withstanding
 from gapbridge.core.diagnosis.residual_structure import dependence, structure_p_value
 from gapbridge.core.diagnosis.selection.bent import not_bent
+from gapbridge.core.diagnosis.selection.candidate import shows_alone
 from gapbridge.core.diagnosis.selection.local_search import rivals
 from gapbridge.core.diagnosis.selection.problem import Found, Space
+from gapbridge.core.diagnosis.selection.refit import may_be_none
 from gapbridge.core.diagnosis.selection.selection import Selection
 
 Array = NDArray[np.float64]
@@ -74,6 +75,9 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
     ]  # fmt: skip
     stays, beside = withstanding(selection, believed)
     withdrawn |= {c: BESIDE for c in believed if c not in stays}
+    for c in _without_mass(selection, stays):
+        withdrawn[c] = "no load is declared, and none is accused"
+        stays.remove(c)
     fallen = bool(withdrawn)
     stays = [*stays, *selection.block]
     for c in _gainless(selection, stays, held):
@@ -123,10 +127,21 @@ def _no_value(selection: Selection) -> dict[int, str]:
             for p, v in zip(candidate.parameters, term.values, strict=False)
         ):
             found[position] = "its value stands on its bound"
-        value = np.array(term.values[: len(spread)])
-        if value @ np.linalg.pinv(spread, hermitian=True) @ value < len(value) * OWN_SIGMAS**2:
+        if may_be_none(term, spread):
             found[position] = "its value may as well be none"
     return found
+
+
+def _without_mass(selection: Selection, stays: Sequence[int]) -> list[int]:
+    """Return the candidates that show nothing without an effect that is not accused beside them."""
+    space = selection.space
+    families = {space.candidates[c].family for c in stays}
+    return [
+        c for c in stays
+        if (needed := space.candidates[c].effect.shown_by) is not None
+        and needed.effect not in families
+        and not shows_alone(selection.observation, space.candidates[c])
+    ]  # fmt: skip
 
 
 def _gainless(selection: Selection, stays: Sequence[int], held: HeldOut) -> list[int]:

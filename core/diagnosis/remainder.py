@@ -26,6 +26,8 @@ from gapbridge.core.diagnosis.selection.smooth import targets
 Array = NDArray[np.float64]
 TAKEN = 1e-5  # eigenvalue of unit columns below which a direction is the unnamed functions' own
 SHOWN = 0.3  # share of a number that may lie in such directions
+HELD_WHOLLY = 0.98  # share of an effect's column in an unnamed rival's span that makes it a part
+MOSTLY = 0.9  # share of what the rival takes that has to be this part
 LARGE = 900  # rows of the sample space from which several accusations go at a time
 HOPELESS = 0.6  # strength below which they do
 
@@ -88,7 +90,7 @@ class _Remainder:
         asked = self.beside = self.asked_for(accused, 1 if large else UNKNOWNS)
         if len(self.space.y) > LARGE:
             self._asked = asked
-        beside = self._beside(asked)
+        beside = self._beyond(accused, asked)
         value, spread, shown = self._values(accused, beside)
         found = np.hstack([self._unit(accused), self.space.columns(self._first)])
         alone = np.linalg.lstsq(found, self.space.y, rcond=1e-9)[0]
@@ -129,6 +131,28 @@ class _Remainder:
         moved = dict.fromkeys(self.space.candidates[c].target for c in asked)
         constants = [self._constant[t] for t in moved if t in self._constant]
         return np.hstack([self.space.columns(asked), *constants])
+
+    def _beyond(self, accused: Sequence[int], asked: Sequence[int]) -> Array:
+        """Return the unnamed columns, of those that hold an accused effect what they do beyond it.
+
+        A pull in any direction holds every weight; one that points nearly down is a weight.
+        """
+        space, X, beside = self.space, self._unit(accused), self._beside(asked)
+        for c in asked:
+            if not space.candidates[c].of_no_quantity:
+                continue
+            U = basis_of(space.columns([c]))
+            inside = np.einsum("ij,ij->j", U.T @ X, U.T @ X) > HELD_WHOLLY
+            if not inside.any():
+                continue
+            others = self._beside([o for o in asked if o != c])
+            rest = basis_of(np.hstack([X[:, ~inside], others]))
+            own, whole = (basis_of(A - rest @ (rest.T @ A)) for A in (X[:, inside], U))
+            if np.sum((own.T @ space.y) ** 2) < MOSTLY * np.sum((whole.T @ space.y) ** 2):
+                continue
+            V = basis_of(X[:, inside])
+            beside = np.hstack([others, U - V @ (V.T @ U)])
+        return beside
 
     def _unit(self, accused: Sequence[int]) -> Array:
         X = self.space.columns(accused)

@@ -35,6 +35,7 @@ class PayloadCog(Effect):
     needs_softness = True
     carried = True
     felt_by_all = True
+    shown_by = Term("payload", Site(), (1.0,))  # values are then first moments, of 1 kg
     corrects = "payload"
     channels = ("position", "wrench", "torque")
     motion = "a payload, and poses that turn the flange against gravity"

@@ -42,8 +42,8 @@ class Wish:
     repeats: int = 3  # visits to a pose a second time
     seed: int = 0
     sigma: float = 3e-5  # m, 1 sigma of one coordinate: instrument and arm together
-    travel_weight: float = 0.02  # a usual leg more at every pose is worth this share of the std
-    stops: int = STOPS  # candidates
+    travel_weight: float = 0.02  # share of the TCP's std that a usual leg more at every pose costs
+    stops: int = STOPS  # candidate poses that are looked at
 
 
 def plan(
@@ -51,25 +51,15 @@ def plan(
     observable: Observable,
     loads: Sequence[Payload],
     space: Space,
-    *,
-    poses: int = 30,
-    held_out: int = 8,
-    repeats: int = 3,
-    seed: int = 0,
-    sigma: float = 3e-5,
-    travel_weight: float = 0.02,
-    stops: int = STOPS,
+    wish: Wish,
     progress: Progress | None = None,
 ) -> Plan:
     """Return the poses, loads and approaches that tell most, in the order of travel.
 
     Chosen so that the TCP predicted by the calibrated model is known best over the whole reachable
-    space and under all ``loads``, the worst places before the others. ``sigma`` (m) is 1 sigma of
-    one coordinate of a reading; ``travel_weight`` the share of the TCP's deviation that a usual leg
-    more at every pose is worth; ``stops`` how many candidate poses are looked at.
+    space and under all ``loads``, the worst places before the others.
     Raises PlanError where no pose is reachable and seen, or where the poses cannot be enough.
     """
-    wish = Wish(poses, held_out, repeats, seed, sigma, travel_weight, stops)
     with threadpool_limits(1, "blas"):  # matrices of this size gain nothing from threads
         return _planned(parameters, observable, loads, space, wish, progress or _silent)
 

@@ -8,7 +8,7 @@ looked at before the arm is moved there.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,6 +32,15 @@ class Place:
     position: tuple[float, float, float]  # m
     nearest: float = 0.0  # m, range of the instrument
     farthest: float = np.inf  # m
+
+
+@dataclass(frozen=True)
+class Reflector:
+    """What an instrument looks at, in TCP axes."""
+
+    targets: ArrayLike = ((0.0, 0.0, 0.0),)  # (T, 3) m: balls on the tool; the first is the TCP
+    looks: ArrayLike | None = None  # (3,) for all targets, or (T, 3) one each; None: all ways
+    acceptance: float = np.pi  # rad, half the cone in which a reflector is seen
 
 
 @dataclass(frozen=True)
@@ -60,9 +69,8 @@ class Space:
     acceptance: float  # rad, half the cone in which a reflector is seen
     radius: Array  # (n+1,) m: links 0 (base to joint 1) to n (last joint to flange)
     tool_radius: float  # m, of the tool and of what hangs on it
-    hung: tuple[tuple[float, float, float], ...]  # m, flange axes: how far the loads reach
-    singular: float
-    pairs: tuple[tuple[int, int], ...] = field(default=())  # capsules that may hit each other
+    hung: tuple[tuple[float, float, float], ...] = ()  # m, flange axes: how far the loads reach
+    pairs: tuple[tuple[int, int], ...] = ()  # capsules that may hit each other
 
     @classmethod
     def of(
@@ -74,18 +82,13 @@ class Space:
         keep_out: Sequence[Box] = (),
         floor: float | None = None,
         places: Sequence[Place] = (),
-        targets: ArrayLike = ((0.0, 0.0, 0.0),),
-        looks: ArrayLike | None = None,
-        acceptance: float = np.pi,
-        link_radius: float | None = None,
-        tool_radius: float | None = None,
-        hung: Sequence[tuple[float, float, float]] = (),
-        singular: float = NEAR_SINGULAR,
+        reflector: Reflector | None = None,
     ) -> Space:
         """Return the space of an arm in its cell.
 
-        ``lower``, ``upper`` (n, rad) tighten the arm's own joint limits; ``looks`` is one direction
-        for all targets or one each. Raises PlanError where limits or boxes leave nothing.
+        ``lower``, ``upper`` (n, rad) tighten the arm's own joint limits; without a ``reflector``
+        the one target is the TCP, seen from all around.
+        Raises PlanError where limits or boxes leave nothing.
         """
         low, high = _limits(model, lower, upper)
         for number, box in enumerate(keep_out, 1):
@@ -95,19 +98,18 @@ class Space:
                     "expected lower below upper in x, y and z"
                 )
         stretched = reach(model)
-        radius = np.full(model.arm.n + 1, THICK * stretched if link_radius is None else link_radius)
-        thick = TOOL_THICK * stretched if tool_radius is None else tool_radius
-        points = np.atleast_2d(np.array(targets, dtype=float))
-        seen_from = None
-        if looks is not None:
-            axes = np.broadcast_to(np.atleast_2d(np.array(looks, dtype=float)), points.shape)
-            seen_from = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+        radius = np.full(model.arm.n + 1, THICK * stretched)
+        seen = reflector or Reflector()
+        points = np.atleast_2d(np.array(seen.targets, dtype=float))
+        axes = None
+        if seen.looks is not None:
+            axes = np.broadcast_to(np.atleast_2d(np.array(seen.looks, dtype=float)), points.shape)
+            axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
         space = cls(
-            model, low, high, tuple(keep_out), floor, tuple(places), points, seen_from, acceptance,
-            radius, thick, tuple(hung), singular,
+            model, low, high, tuple(keep_out), floor, tuple(places), points, axes, seen.acceptance,
+            radius, TOOL_THICK * stretched,
         )  # fmt: skip
-        object.__setattr__(space, "pairs", _pairs(space))
-        return space
+        return replace(space, pairs=_pairs(space))
 
     def frames(self, q: Array) -> Frames:
         """Return where everything is at joints ``q`` (N, n), rigid."""
@@ -178,7 +180,7 @@ class Space:
         lever = (frames.tcp[:, None] - frames.origin[:, 1:-1]) / reach(self.model)
         J = np.concatenate([np.cross(frames.axis, lever), frames.axis], axis=2)
         smallest = np.linalg.svd(J, compute_uv=False)[:, min(6, self.model.arm.n) - 1]
-        return np.asarray(smallest < self.singular)
+        return np.asarray(smallest < NEAR_SINGULAR)
 
     def hindrances(self, q: Array) -> dict[str, Mask]:
         """Return by reason what stands against poses (N, n), whatever the instrument."""

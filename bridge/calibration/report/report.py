@@ -8,11 +8,11 @@ from typing import TypeVar
 
 from gapbridge.bridge.calibration.report.facts import SessionFacts
 from gapbridge.bridge.calibration.report.material import Material
-from gapbridge.bridge.calibration.report.payload_sections import PAYLOAD, PayloadMaterial
-from gapbridge.bridge.calibration.report.sections import CALIBRATION
-from gapbridge.bridge.calibration.report.signature_section import signature
-from gapbridge.bridge.calibration.report.tool_sections import TOOL, ToolMaterial
-from gapbridge.bridge.calibration.report.verification_sections import (
+from gapbridge.bridge.calibration.report.sections.calibration_sections import CALIBRATION
+from gapbridge.bridge.calibration.report.sections.payload_sections import PAYLOAD, PayloadMaterial
+from gapbridge.bridge.calibration.report.sections.signature_section import signature
+from gapbridge.bridge.calibration.report.sections.tool_sections import TOOL, ToolMaterial
+from gapbridge.bridge.calibration.report.sections.verification_sections import (
     VERIFICATION,
     VerificationMaterial,
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from gapbridge.bridge.calibration.joints.joint_source import JointSource, Planne
 from gapbridge.bridge.calibration.session.prompt import Talk
 from gapbridge.bridge.calibration.session.route import route
 from gapbridge.bridge.calibration.session.session import Book
+from gapbridge.bridge.cell.settings.calibration import CalibrationSettings
 from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.errors import RunError
 
@@ -30,14 +31,13 @@ class Bringing:
     """
 
     def __init__(
-        self, talk: Talk, book: Book, joints: JointSource, clear: Callable[[Array], Array],
-        speed: float, minutes_per_load: float, instrument: AnyInstrument,
-        places: Sequence[Sequence[float]] = (),
+        self, talk: Talk, book: Book, joints: JointSource, instrument: AnyInstrument,
+        clear: Callable[[Array], Array], settings: CalibrationSettings,
     ) -> None:  # fmt: skip
         self.talk, self.book, self.joints = talk, book, joints
-        self.minutes_per_load = minutes_per_load
-        self._clear, self._speed = clear, speed
-        self._instrument, self._places = instrument, places
+        self.minutes_per_load = settings.minutes_per_load
+        self._instrument, self._clear, self._speed = instrument, clear, settings.speed
+        self._places = [settings.instrument_at or [], *settings.further_places]
         self._asked: int | None = None  # load for which driving was asked about
         self._driven = False
         self._warned: set[int] = set()

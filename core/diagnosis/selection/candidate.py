@@ -179,6 +179,20 @@ def named_columns(observation: Observation, candidate: Candidate, base: Sequence
             return by_angle
     if candidate.curve is not None:
         return _bent_columns(observation, candidate)
+    columns = _differences(observation, candidate, base)
+    mass = candidate.effect.shown_by
+    if mass is not None and not columns.any():  # a load without mass has no centre of gravity
+        columns = _differences(observation, candidate, [*base, mass])
+    return columns
+
+
+def shows_alone(observation: Observation, candidate: Candidate) -> bool:
+    """Return whether an effect changes predictions where no other is in the model."""
+    return bool(_differences(observation, candidate, ()).any())
+
+
+def _differences(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> Array:
+    """Return central differences (N, k, d) of the whole prediction at ``base``."""
     columns = []
     for k, parameter in enumerate(candidate.parameters):
         h = STEP * parameter.scale

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
+from gapbridge.core.diagnosis.criteria import OWN_SIGMAS
 from gapbridge.core.diagnosis.selection.candidate import Candidate, angle_columns
 from gapbridge.core.diagnosis.selection.problem import Found, Space
 from gapbridge.core.diagnosis.selection.state import Work, flat
@@ -82,6 +83,13 @@ def refit(
     if nuisance.shape[2]:
         gap = gap - nuisance @ _along(extra, flat(nuisance, work), gap, work)
     return terms, index, tuple(covariance), gap
+
+
+def may_be_none(term: Term, spread: Array) -> bool:
+    """Return whether a term's fitted values, of covariance (d, d), may as well be zero."""
+    value = np.array(term.values[: len(spread)])
+    least = len(value) * OWN_SIGMAS**2
+    return bool(value @ np.linalg.pinv(spread, hermitian=True) @ value < least)
 
 
 def _step(

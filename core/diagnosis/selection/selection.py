@@ -39,6 +39,7 @@ from gapbridge.core.diagnosis.selection.smooth import smooth_candidates
 from gapbridge.core.diagnosis.selection.state import Raw, Work, flat, locate, sample_space
 from gapbridge.core.effects import Term
 from gapbridge.core.errors import InputError
+from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
@@ -301,7 +302,7 @@ def _bounded(candidate: Candidate, model: Model, observation: Observation) -> Ca
 def _loads_that_can_be(model: Model, observation: Observation) -> tuple[float, float]:
     """Return how far a payload may be off: the true one is no less than nothing, and no giant."""
     declared = observation.quantities.get("payload", np.array([model.payload_mass]))
-    most = HEAVIEST * max(float(declared.max()), model.arm.payload)
+    most = HEAVIEST * max(float(declared.max()), LoadBounds.of(model).rated)
     return -float(declared.min()), most
 
 

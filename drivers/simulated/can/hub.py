@@ -15,7 +15,7 @@ import time
 from types import TracebackType
 from typing import Self
 
-from gapbridge.core.addresses import is_loopback
+from gapbridge.drivers.addresses import is_loopback
 from gapbridge.drivers.simulated.can.frame import Frame
 from gapbridge.drivers.simulated.can.port import Port, SerialPort, SocketcandPort
 

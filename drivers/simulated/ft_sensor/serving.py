@@ -7,8 +7,8 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from gapbridge.core.addresses import is_loopback
 from gapbridge.core.errors import InputError, LinkError
+from gapbridge.drivers.addresses import is_loopback
 from gapbridge.drivers.can_bus.bus import BusSettings
 from gapbridge.drivers.ft_sensor.settings import (
     AtiSettings,

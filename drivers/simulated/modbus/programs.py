@@ -16,7 +16,12 @@ from gapbridge.drivers.simulated.peer.peer import BRAKING, HOLD, Peer
 from gapbridge.drivers.simulated.plant.kinematics import Joints, offset_frame, solve, tcp_in_base
 from gapbridge.drivers.simulated.plant.motion import Hold, Stop
 from gapbridge.drivers.simulated.plant.plant_settings import Vector6
-from gapbridge.drivers.simulated.ur.offset_program import NOTHING, SHIFT_STEP, TURN_STEP, approach
+from gapbridge.drivers.simulated.ur.programs.offset_program import (
+    NOTHING,
+    SHIFT_STEP,
+    TURN_STEP,
+    approach,
+)
 
 log = logging.getLogger("drivers.simulated")
 

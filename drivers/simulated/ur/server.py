@@ -18,11 +18,11 @@ from gapbridge.drivers.simulated.peer.bench import BenchServer
 from gapbridge.drivers.simulated.peer.connection import Connection, listen
 from gapbridge.drivers.simulated.peer.real_time import become_punctual
 from gapbridge.drivers.simulated.ur.controller import CYCLE, Controller
-from gapbridge.drivers.simulated.ur.dashboard_server import DashboardServer
-from gapbridge.drivers.simulated.ur.own_motion import move_own
-from gapbridge.drivers.simulated.ur.primary_server import PrimaryServer
-from gapbridge.drivers.simulated.ur.rtde_server import RtdeServer, RtdeSession
-from gapbridge.drivers.simulated.ur.script_server import ScriptServer
+from gapbridge.drivers.simulated.ur.programs.own_motion import move_own
+from gapbridge.drivers.simulated.ur.servers.dashboard_server import DashboardServer
+from gapbridge.drivers.simulated.ur.servers.primary_server import PrimaryServer
+from gapbridge.drivers.simulated.ur.servers.rtde_server import RtdeServer, RtdeSession
+from gapbridge.drivers.simulated.ur.servers.script_server import ScriptServer
 from gapbridge.drivers.simulated.ur.settings import ServerSettings, make_controller
 
 log = logging.getLogger("drivers.simulated")

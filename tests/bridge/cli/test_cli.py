@@ -119,7 +119,7 @@ def test_help_names_every_command_and_imports_none(desk: Desk) -> None:
 @pytest.mark.parametrize("name", ["predict", "diagnose", "fit", "run"])
 def test_a_command_waits_for_no_solver_before_it_has_work(desk: Desk, name: str) -> None:
     code = (
-        f"import sys\nimport gapbridge.bridge.cli.{name}\n"
+        f"import sys\nimport {COMMANDS[name][0].split(':')[0]}\n"
         "found = {'scipy.optimize', 'scipy.linalg', 'scipy.stats'} & set(sys.modules)\n"
         "assert not found, found\n"
     )
@@ -305,7 +305,7 @@ def test_an_unforeseen_failure_is_one_line_and_a_file(
     def broken(*_: object) -> None:
         raise ZeroDivisionError("by nothing")
 
-    monkeypatch.setattr("gapbridge.bridge.cli.predict.open_cell", broken)
+    monkeypatch.setattr("gapbridge.bridge.cli.log.predict.open_cell", broken)
     ran = desk.run("predict", "@log.csv", "--cell", "@cell.yaml", "--out", "@o.csv")
     assert ran.code == 1
     assert ran.err.startswith("error: ZeroDivisionError: by nothing (details: ")

@@ -22,7 +22,7 @@ from cli_runs import (
     table_of,
 )
 
-import gapbridge.bridge.cli.diagnose as command
+import gapbridge.bridge.cli.log.diagnose as command
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.effects import Site, Term

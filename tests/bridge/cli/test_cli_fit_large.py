@@ -11,7 +11,7 @@ from cli_runs import bent_model, cell_in, columns_of, gapbridge, measured, poses
 from pyarrow import parquet
 
 from gapbridge.bridge.cell import load_cell
-from gapbridge.bridge.cli import large_log
+from gapbridge.bridge.cli.log import large_log
 from gapbridge.core.log.pieces import LogPieces
 
 Columns = dict[str, np.ndarray]

@@ -10,7 +10,7 @@ import pytest
 from cli_runs import cell_in, gapbridge, refused
 
 from gapbridge.bridge.cell import Cell
-from gapbridge.bridge.cli.blind import benchmark
+from gapbridge.bridge.cli.log.blind import benchmark
 from gapbridge.bridge.cli.optional import member
 from gapbridge.core.errors import LinkError, RunError
 

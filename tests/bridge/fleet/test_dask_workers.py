@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from distributed import LocalCluster
 
-from gapbridge.bridge.fleet.dask_workers import DaskWorkers
 from gapbridge.bridge.fleet.task import BAD, DIED, DONE
+from gapbridge.bridge.fleet.workers.dask_workers import DaskWorkers
 from gapbridge.core.errors import RunError
 from tests.bridge.fleet.fleet_in import tasks_in
 from tests.bridge.fleet.jobs import count_rows, kill_itself

@@ -12,7 +12,7 @@ from gapbridge.bridge.fleet.journal import Journal
 from gapbridge.bridge.fleet.runner import run, tasks_of
 from gapbridge.bridge.fleet.session import find_sessions
 from gapbridge.bridge.fleet.task import BAD, DIED, DONE, Outcome, Task, perform
-from gapbridge.bridge.fleet.workers import Workers
+from gapbridge.bridge.fleet.workers.workers import Workers
 from gapbridge.core.errors import RunError
 from tests.bridge.fleet.fleet_in import tasks_in
 from tests.bridge.fleet.jobs import count_rows

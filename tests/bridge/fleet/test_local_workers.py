@@ -7,8 +7,8 @@ import signal
 from collections import Counter
 from pathlib import Path
 
-from gapbridge.bridge.fleet.local_workers import LocalWorkers
 from gapbridge.bridge.fleet.task import CRASHED, DIED, DONE
+from gapbridge.bridge.fleet.workers.local_workers import LocalWorkers
 from tests.bridge.fleet.fleet_in import tasks_in
 from tests.bridge.fleet.jobs import count_rows, fail, kill_itself
 

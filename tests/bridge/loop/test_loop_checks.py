@@ -12,12 +12,17 @@ from hypothesis import strategies as st
 
 from gapbridge.bridge.ipc.counts import Count
 from gapbridge.bridge.ipc.shared_memory import Page
-from gapbridge.bridge.loop.checks import DEGRADED, LATE, LoopChecks
-from gapbridge.bridge.loop.frozen_watch import FrozenWatch
-from gapbridge.bridge.loop.link_monitor import StateWatch, hold_time
-from gapbridge.bridge.loop.overrun_watch import OverrunWatch
-from gapbridge.bridge.loop.sample_check import SampleCheck
-from gapbridge.bridge.loop.saturation_watch import SaturationWatch
+from gapbridge.bridge.loop.checks import (
+    DEGRADED,
+    LATE,
+    RESYNC,
+    FrozenWatch,
+    LoopChecks,
+    OverrunWatch,
+    SaturationWatch,
+)
+from gapbridge.bridge.loop.link_monitor import SampleCheck, StateWatch, hold_time
+from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.supervisor import State, Supervisor
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import InvalidStateError, StaleStateError
@@ -139,7 +144,7 @@ class Bench:
         self.supervisor = Supervisor(lambda *change: self.changes.append(change))
         self.changes: list[Any] = []
         self.supervisor.state = at
-        self.checks = LoopChecks(500.0, self.supervisor, page, self.told.append)
+        self.checks = LoopChecks(500.0, self.supervisor, Reports(page, self.told.append))
 
 
 @pytest.fixture
@@ -165,12 +170,12 @@ def test_a_stop_of_the_robot_is_a_fault_counted_and_told_once(page: Page) -> Non
 
 def test_a_gap_of_more_than_ten_cycles_and_the_hold_time_begins_anew(page: Page) -> None:
     bench = Bench(page, State.COMPENSATING)
-    assert not bench.checks.begin(state(1.0), 0)
-    assert not bench.checks.begin(state(1.03), 14)
+    assert bench.checks.begin(state(1.0), 0) == 0
+    assert bench.checks.begin(state(1.03), 14) == LATE
     assert bench.supervisor.state == State.COMPENSATING
-    assert bench.checks.begin(state(1.10), 34)
+    assert bench.checks.begin(state(1.10), 34) == LATE | RESYNC
     assert bench.supervisor.state == State.HOLDING
-    assert not bench.checks.begin(state(1.102), 0)
+    assert bench.checks.begin(state(1.102), 0) == 0
     assert page.counts()["resync"] == 1
     assert page.counts()["late"] == 48
 
@@ -178,9 +183,9 @@ def test_a_gap_of_more_than_ten_cycles_and_the_hold_time_begins_anew(page: Page)
 def test_a_lost_sensor_is_flagged_in_every_cycle_and_told_twice(page: Page) -> None:
     bench = Bench(page, State.COMPENSATING)
     for k in range(10):
-        bench.checks.begin(state(1.0 + k * T, sensor_lost="silent" if 3 <= k < 7 else ""), k == 5)
+        sample = state(1.0 + k * T, sensor_lost="silent" if 3 <= k < 7 else "")
         flags = (DEGRADED if 3 <= k < 7 else 0) | (LATE if k == 5 else 0)
-        assert bench.checks.flags == flags
+        assert bench.checks.begin(sample, k == 5) == flags
     assert [event["detail"] for event in bench.told] == ["silent", "the sensor is back"]
     assert bench.supervisor.state == State.COMPENSATING
     assert page.counts()["sensor_lost"] == 1
@@ -219,7 +224,7 @@ def watched(page: Page) -> tuple[Scripted, Supervisor, StateWatch, list[dict[str
     told: list[dict[str, Any]] = []
     driver, supervisor = Scripted(), Supervisor(lambda *_: None)
     supervisor.state = State.COMPENSATING
-    watch = StateWatch(driver, ARM, supervisor, page, told.append, lambda _: None)
+    watch = StateWatch(driver, ARM, supervisor, Reports(page, told.append))
     return driver, supervisor, watch, told
 
 
@@ -299,7 +304,9 @@ def test_a_robot_that_does_not_follow_for_the_hold_time_is_held(
     page: Page, found: dict[str, Any], moves_arm: bool, holds: bool
 ) -> None:
     bench = Bench(page, State.COMPENSATING)
-    bench.checks = LoopChecks(500.0, bench.supervisor, page, bench.told.append, moves_arm=moves_arm)
+    bench.checks = LoopChecks(
+        500.0, bench.supervisor, Reports(page, bench.told.append), moves_arm=moves_arm
+    )
     for k in range(40):
         bench.checks.begin(state(1.0 + k * T, **(found if k >= 10 else {})), 0)
         if k == 10 + round(0.9 * hold_time(500.0) / T):

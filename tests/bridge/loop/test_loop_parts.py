@@ -12,7 +12,7 @@ import pytest
 
 from gapbridge.bridge.ipc.cycle_row import fill_row
 from gapbridge.bridge.ipc.shared_memory import ROWS, Page, Phase, RunPage
-from gapbridge.bridge.loop.controller_clock import ControllerClock
+from gapbridge.bridge.loop.link_monitor import ControllerClock
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.state import RobotState

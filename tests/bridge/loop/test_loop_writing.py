@@ -17,6 +17,7 @@ from gapbridge.bridge.cell.sections import LimitSettings, SetpointSettings
 from gapbridge.bridge.ipc.shared_memory import Page
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
+from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream
 from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
 from gapbridge.bridge.loop.writing import PARTS_IN_A_ROW, Writing
@@ -88,7 +89,7 @@ class Bench:
     """A loop's writing half, compensating."""
 
     def __init__(self, page: Page) -> None:
-        self.page, self.driver, self.lost = page, Failing(), list[str]()
+        self.page, self.driver = page, Failing()
         self.changes: list[tuple[str, str]] = []  # cause and detail
         self.supervisor = Supervisor(lambda *change: self.changes.append(change[2:]))
         self.supervisor.state = State.ARMED
@@ -96,11 +97,8 @@ class Bench:
         self.loads = LiveLoads(6, True, 0.0)
         settings = SetpointSettings()
         source = make_source(settings, 6, True, Path())
-        told: list[dict[str, Any]] = []
-        self.writing = Writing(
-            settings, self.driver, source, self.stream, self.supervisor, page, told.append,
-            lambda: None, self.lost.append,
-        )  # fmt: skip
+        reports = Reports(page, lambda _: None)
+        self.writing = Writing(settings, self.driver, source, self.stream, self.supervisor, reports)
         self.at, self.q = 1.0, Q
         self.writing.start(self.state(), Q)
         self.writing.start(self.state(), Q)
@@ -259,7 +257,7 @@ def test_what_a_live_link_does_not_take_holds_and_then_is_a_fault(
     bench.cycles(cycles)
     assert bench.supervisor.state == State.FAULT
     assert bench.driver.released == 1
-    assert bench.lost == []
+    assert bench.writing.lost is None
     bench.cycles(10)
     assert bench.driver.sent == []
 
@@ -268,7 +266,7 @@ def test_a_write_that_fails_gives_the_link_up(bench: Bench) -> None:
     bench.driver.error = WriteError("the script has ended")
     bench.cycles(3)
     assert bench.supervisor.state == State.FAULT
-    assert bench.lost == ["the script has ended"]
+    assert bench.writing.lost == "the script has ended"
     assert bench.count("write_failed") == 1
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gapbridge.bridge.loop.readiness import GAPS, ModelCheck, RateCheck
+from gapbridge.bridge.loop.checks import GAPS, RateCheck
+from gapbridge.bridge.loop.readiness import ModelCheck
 from gapbridge.core.arm import arm_from_dh, builtin_arm
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model

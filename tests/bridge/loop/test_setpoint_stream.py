@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 
 from gapbridge.bridge.cell.sections import LimitSettings
-from gapbridge.bridge.loop.nominal_stream import DECELERATION, NominalStream
-from gapbridge.bridge.loop.setpoint_stream import SetpointStream, limits_of
+from gapbridge.bridge.loop.setpoint_stream import (
+    DECELERATION,
+    NominalStream,
+    SetpointStream,
+    limits_of,
+)
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.compensation import correct
 from gapbridge.core.errors import LimitError

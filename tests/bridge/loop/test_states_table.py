@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from gapbridge.bridge.ipc.counts import Count
-from gapbridge.bridge.loop.states_table import states_table
-from gapbridge.bridge.loop.supervisor import TRANSITIONS, State
+from gapbridge.bridge.loop.supervisor import TRANSITIONS, State, states_table
 
 PAGE = (Path(__file__).parents[3] / "docs" / "daemon.md").read_text(encoding="utf-8")
 ELSEWHERE = {Count.SILENCE, Count.LINK_LOST}  # what stale comes to, told in its row

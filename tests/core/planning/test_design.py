@@ -26,12 +26,12 @@ from gapbridge.core.planning.candidates import candidates_of
 from gapbridge.core.planning.design import reference_of
 from gapbridge.core.planning.exchange import Choice, exchanged, grown, shrunk
 from gapbridge.core.planning.information import blocks, gathered, inverse
-from gapbridge.core.planning.workspace import Place, Space
+from gapbridge.core.planning.workspace import Place, Reflector, Space
 
 
-def plan(*given, **wishes) -> Plan:
+def plan(*given, progress=None, **wishes) -> Plan:
     """Plan from few candidates: a test need not find the very best."""
-    return design.plan(*given, **({"stops": 150} | wishes))
+    return design.plan(*given, design.Wish(**{"stops": 150} | wishes), progress)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def model() -> Model:
 
 @pytest.fixture(scope="module")
 def space(model: Model) -> Space:
-    return small_space(model, looks=[(0, 0, 1)], acceptance=np.radians(60))
+    return small_space(model, reflector=Reflector(looks=[(0, 0, 1)], acceptance=np.radians(60)))
 
 
 @pytest.fixture(scope="module")
@@ -234,7 +234,7 @@ def test_two_places_and_two_balls_are_visited_one_place_after_the_other(
     parameters: Parameters, model: Model
 ) -> None:
     places = [Place((2.0, 0.5, 0.6), 0.3), Place((-1.5, 1.5, 0.8), 0.3)]
-    space = small_space(model, places=places, targets=[(0, 0, 0), (0.1, 0.05, 0)])
+    space = small_space(model, places=places, reflector=Reflector([(0, 0, 0), (0.1, 0.05, 0)]))
     planned = plan(parameters, POSITION, LOADS, space, poses=16, held_out=2, repeats=2)
     stations = [pose.station for pose in planned.poses]
     assert stations == sorted(stations) and set(stations) == {0, 1}

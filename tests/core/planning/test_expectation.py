@@ -12,7 +12,7 @@ from benchmarks.calibration.repeated import repeated_sessions
 from gapbridge.core.calibration.observables import Nuisance
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.loads import Loads
-from gapbridge.core.planning.design import plan
+from gapbridge.core.planning.design import Wish, plan
 from gapbridge.core.planning.expectation import expectation
 
 
@@ -24,7 +24,8 @@ def parameters() -> Parameters:
 @pytest.fixture(scope="module")
 def planned(parameters: Parameters):
     space = small_space(parameters.nominal)
-    return plan(parameters, POSITION, LOADS, space, poses=24, held_out=3, sigma=SIGMA, stops=200)
+    wish = Wish(poses=24, held_out=3, sigma=SIGMA, stops=200)
+    return plan(parameters, POSITION, LOADS, space, wish)
 
 
 def test_scatter_over_sessions_is_what_was_expected(parameters, planned) -> None:

@@ -13,7 +13,7 @@ from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import PlanError
 from gapbridge.core.model import Model
 from gapbridge.core.planning.capsules import Box, segment_distance
-from gapbridge.core.planning.workspace import Place, Space
+from gapbridge.core.planning.workspace import Place, Reflector, Space
 
 UP = np.array([[0.0, -np.pi / 2, 0.0, -np.pi / 2, 0.0, 0.0]])  # a UR stretched upwards
 OUT = np.zeros((1, 6))  # a UR stretched out along -x
@@ -99,7 +99,9 @@ def test_a_reflector_is_seen_within_its_cone_and_the_instruments_range(model: Mo
     tip = model.rigid_pose(OUT)
     axis = tip.rotation[0] @ [0, 0, 1.0]
     place = Place(tuple(tip.position[0] + 2.0 * axis), nearest=0.5, farthest=3.0)
-    space = Space.of(model, places=[place], looks=[(0, 0, 1)], acceptance=np.radians(30))
+    space = Space.of(
+        model, places=[place], reflector=Reflector(looks=[(0, 0, 1)], acceptance=np.radians(30))
+    )
     turned = "turn the reflector away from place 1"
     assert not space.sees(space.frames(OUT), 0, 0)[turned].any()
     away = replace(space, looks=-space.looks)

@@ -11,8 +11,8 @@ import pytest
 from rtde_client import RtdeClient
 from simulated_cell import Bench
 
-from gapbridge.drivers.simulated.ur.offset_program import checksum
 from gapbridge.drivers.simulated.ur.process import SimulatedController
+from gapbridge.drivers.simulated.ur.programs.offset_program import checksum
 
 OUT = ",".join(
     ["timestamp", "output_int_register_12", "output_int_register_13"]

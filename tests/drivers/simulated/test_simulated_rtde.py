@@ -12,7 +12,7 @@ from simulated_cell import cell_settings
 from gapbridge.drivers.simulated.peer.connection import listen
 from gapbridge.drivers.simulated.ur.process import SimulatedController
 from gapbridge.drivers.simulated.ur.rtde_names import INPUTS, OUTPUTS
-from gapbridge.drivers.simulated.ur.rtde_server import RtdeServer
+from gapbridge.drivers.simulated.ur.servers.rtde_server import RtdeServer
 from gapbridge.drivers.simulated.ur.settings import make_controller
 
 

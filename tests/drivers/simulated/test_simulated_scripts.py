@@ -9,7 +9,7 @@ from rtde_client import RtdeClient
 from simulated_cell import Bench, cell_settings
 
 from gapbridge.drivers.simulated.ur.process import SimulatedController
-from gapbridge.drivers.simulated.ur.script_text import (
+from gapbridge.drivers.simulated.ur.programs.script_text import (
     Pose,
     parse_assignment,
     parse_call,

@@ -235,7 +235,7 @@ def test_another_tcp_in_the_controller_is_refused(offset_robot: SimulatedControl
 
 
 def test_the_checksum_is_what_both_sides_compute() -> None:
-    from gapbridge.drivers.simulated.ur.offset_program import checksum
+    from gapbridge.drivers.simulated.ur.programs.offset_program import checksum
 
     for sequence in (1, 77, registers.LAST_SEQUENCE):
         units = registers.counts(OFFSET)

@@ -20,7 +20,6 @@ from gapbridge.drivers.simulated.plant.motion import (
 from gapbridge.drivers.simulated.plant.plant_arm import BASE, Frame, place
 from gapbridge.drivers.simulated.plant.rotations import Vector3
 from gapbridge.drivers.simulated.plant.stream_motion import Servo, SpeedJoints, SpeedTool
-from gapbridge.drivers.simulated.ur.control_registers import Registers
 from gapbridge.drivers.simulated.ur.controller import (
     CYCLE,
     DEFAULT_STOP,
@@ -28,7 +27,8 @@ from gapbridge.drivers.simulated.ur.controller import (
     ScriptError,
     Steps,
 )
-from gapbridge.drivers.simulated.ur.path_program import path_motion
+from gapbridge.drivers.simulated.ur.programs.control_registers import Registers
+from gapbridge.drivers.simulated.ur.programs.path_program import path_motion
 
 CONTACT_FORCE = 10.0  # N: a pull against the way that is taken for a touch
 JOG_ACCELERATION = 0.5  # m/s^2

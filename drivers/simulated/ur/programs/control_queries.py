@@ -18,9 +18,9 @@ from gapbridge.drivers.simulated.plant.kinematics import (
 )
 from gapbridge.drivers.simulated.plant.plant_arm import place
 from gapbridge.drivers.simulated.plant.rotations import Vector3
-from gapbridge.drivers.simulated.ur.control_motions import touches
-from gapbridge.drivers.simulated.ur.control_registers import Registers
 from gapbridge.drivers.simulated.ur.controller import CYCLE, ScriptError
+from gapbridge.drivers.simulated.ur.programs.control_motions import touches
+from gapbridge.drivers.simulated.ur.programs.control_registers import Registers
 
 STEADY = 1e-4  # rad/s
 

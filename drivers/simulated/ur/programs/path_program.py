@@ -12,7 +12,7 @@ from functools import partial
 from gapbridge.drivers.simulated.plant.kinematics import Joints, frame_of, solve, tcp_in_base
 from gapbridge.drivers.simulated.plant.motion import Motion, MoveJoints, MoveLine, MovePath
 from gapbridge.drivers.simulated.ur.controller import Controller, ScriptError
-from gapbridge.drivers.simulated.ur.script_text import Call, Pose, parse_call
+from gapbridge.drivers.simulated.ur.programs.script_text import Call, Pose, parse_call
 
 log = logging.getLogger("drivers.simulated")
 

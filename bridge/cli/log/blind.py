@@ -10,7 +10,7 @@ import click
 
 from gapbridge.core.errors import RunError
 
-CHECKOUT = Path(__file__).resolve().parents[2]
+CHECKOUT = Path(__file__).resolve().parents[3]
 BENCHMARK = "benchmarks.blind.__main__"
 
 

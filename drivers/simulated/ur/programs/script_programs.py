@@ -11,8 +11,8 @@ from typing import Any
 from gapbridge.drivers.simulated.plant.kinematics import frame_of
 from gapbridge.drivers.simulated.plant.motion import Stop
 from gapbridge.drivers.simulated.ur.controller import CYCLE, Controller, Steps
-from gapbridge.drivers.simulated.ur.path_program import MOVES, make_move
-from gapbridge.drivers.simulated.ur.script_text import Call, parse_assignment, parse_call
+from gapbridge.drivers.simulated.ur.programs.path_program import MOVES, make_move
+from gapbridge.drivers.simulated.ur.programs.script_text import Call, parse_assignment, parse_call
 
 log = logging.getLogger("drivers.simulated")
 

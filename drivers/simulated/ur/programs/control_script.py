@@ -12,10 +12,10 @@ import logging
 import re
 from dataclasses import dataclass
 
-from gapbridge.drivers.simulated.ur.control_commands import COMMANDS, REALTIME
-from gapbridge.drivers.simulated.ur.control_registers import Registers
 from gapbridge.drivers.simulated.ur.controller import Controller, Steps
-from gapbridge.drivers.simulated.ur.script_text import ScriptText
+from gapbridge.drivers.simulated.ur.programs.control_commands import COMMANDS, REALTIME
+from gapbridge.drivers.simulated.ur.programs.control_registers import Registers
+from gapbridge.drivers.simulated.ur.programs.script_text import ScriptText
 
 log = logging.getLogger("drivers.simulated")
 

@@ -6,7 +6,7 @@ from gapbridge.drivers.simulated.peer.bench import BenchError
 from gapbridge.drivers.simulated.plant.kinematics import Joints
 from gapbridge.drivers.simulated.plant.motion import MoveJoints
 from gapbridge.drivers.simulated.ur.controller import Controller
-from gapbridge.drivers.simulated.ur.offset_program import OffsetMotion
+from gapbridge.drivers.simulated.ur.programs.offset_program import OffsetMotion
 
 DEFAULT_SPEED = 0.5  # rad/s
 

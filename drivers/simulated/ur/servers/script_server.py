@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 
 from gapbridge.drivers.simulated.peer.connection import Connection
-from gapbridge.drivers.simulated.ur import offset_program
-from gapbridge.drivers.simulated.ur.control_script import control_script, read_control_text
 from gapbridge.drivers.simulated.ur.controller import Controller
-from gapbridge.drivers.simulated.ur.script_programs import script_program
-from gapbridge.drivers.simulated.ur.script_text import ScriptText, take_script
+from gapbridge.drivers.simulated.ur.programs import offset_program
+from gapbridge.drivers.simulated.ur.programs.control_script import control_script, read_control_text
+from gapbridge.drivers.simulated.ur.programs.script_programs import script_program
+from gapbridge.drivers.simulated.ur.programs.script_text import ScriptText, take_script
 
 log = logging.getLogger("drivers.simulated")
 

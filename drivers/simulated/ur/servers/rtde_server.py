@@ -7,9 +7,9 @@ import socket
 import struct
 
 from gapbridge.drivers.simulated.peer.connection import Connection
-from gapbridge.drivers.simulated.ur import rtde_protocol as wire
 from gapbridge.drivers.simulated.ur.controller import Controller
 from gapbridge.drivers.simulated.ur.rtde_names import INPUTS
+from gapbridge.drivers.simulated.ur.servers import rtde_protocol as wire
 
 log = logging.getLogger("drivers.simulated")
 

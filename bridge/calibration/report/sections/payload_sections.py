@@ -9,8 +9,8 @@ import numpy as np
 from gapbridge.bridge.calibration.report.facts import SessionFacts
 from gapbridge.bridge.calibration.report.figures import fixed
 from gapbridge.bridge.calibration.report.names import sentence
-from gapbridge.bridge.calibration.report.parameters_section import estimates_table
-from gapbridge.bridge.calibration.report.session_section import facts_blocks
+from gapbridge.bridge.calibration.report.sections.parameters_section import estimates_table
+from gapbridge.bridge.calibration.report.sections.session_section import facts_blocks
 from gapbridge.bridge.document.axes import Chart, named, scale
 from gapbridge.bridge.document.blocks import (
     DOUBTFUL,

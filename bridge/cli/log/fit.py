@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gapbridge.bridge.cell import Cell, save_cell
-from gapbridge.bridge.cli.large_log import LargeLog, has_sessions, is_large
+from gapbridge.bridge.cli.log.large_log import LargeLog, has_sessions, is_large
 from gapbridge.bridge.cli.options import (
     cell_option,
     logs_argument,

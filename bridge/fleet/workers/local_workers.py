@@ -16,7 +16,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
 from gapbridge.bridge.fleet.task import DEATHS, Outcome, Task, died, perform
-from gapbridge.bridge.fleet.workers import Workers
+from gapbridge.bridge.fleet.workers.workers import Workers
 from gapbridge.core.errors import RunError
 
 # matrices of this size gain nothing from threads, which only get in each other's way

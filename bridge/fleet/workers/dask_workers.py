@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from gapbridge.bridge.fleet.task import CRASHED, DEATHS, Outcome, Task, died, outcome, perform
-from gapbridge.bridge.fleet.workers import Workers
+from gapbridge.bridge.fleet.workers.workers import Workers
 from gapbridge.core.errors import RunError
 
 if TYPE_CHECKING:

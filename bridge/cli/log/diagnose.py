@@ -12,7 +12,7 @@ import click
 from gapbridge.bridge.api.found_spread import spread_of
 from gapbridge.bridge.cell import Cell, save_cell
 from gapbridge.bridge.cell.opened_log import open_log
-from gapbridge.bridge.cli.answer import answer
+from gapbridge.bridge.cli.log.answer import answer
 from gapbridge.bridge.cli.options import (
     cell_option,
     logs_argument,

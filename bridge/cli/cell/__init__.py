@@ -1,0 +1,1 @@
+"""Commands about a cell and its model."""

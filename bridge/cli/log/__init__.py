@@ -1,0 +1,1 @@
+"""Commands that read logs: one, many, or the benchmark's."""

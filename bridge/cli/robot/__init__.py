@@ -1,0 +1,1 @@
+"""Commands that reach a robot: real, simulated, or led by a person."""

@@ -1,0 +1,1 @@
+"""Who does the tasks: processes of this machine, or a Dask cluster."""

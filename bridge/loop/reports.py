@@ -1,0 +1,31 @@
+"""How the loop reports to the daemon: counts and state in shared memory, events over a socket."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from gapbridge.bridge.ipc.counts import Count
+from gapbridge.bridge.ipc.shared_memory import Page
+from gapbridge.bridge.loop.supervisor import Cause, State
+
+
+@dataclass(frozen=True)
+class Reports:
+    """What every part of the loop reports by."""
+
+    page: Page
+    emit: Callable[[dict[str, Any]], None]  # one event; never blocks
+
+    def count(self, what: Count, times: int = 1) -> None:
+        """Count an event."""
+        self.page.count(what, times)
+
+    def transition(self, before: State, after: State, cause: Cause, detail: str) -> None:
+        """Report a change of state: listener of a Supervisor."""
+        self.page.tell_state(after)
+        self.emit(
+            {"kind": "transition", "from": before.name, "to": after.name, "cause": cause.value,
+             "detail": detail, "cycle": self.page.written}
+        )  # fmt: skip
