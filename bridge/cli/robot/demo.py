@@ -36,7 +36,10 @@ def demo(seed: int, out: Path, link: str) -> None:  # fmt: skip
 
     Connect, measure, calibrate, compensate, diagnose, report: over the real protocol, against a
     simulated controller whose flexibilities are drawn from the seed and hidden. A UR10e over RTDE,
-    a soft AgileX PiPER on CAN, or a UR10e whose own program moves it, over Modbus.
+    a soft AgileX PiPER on CAN, or a UR10e whose own program moves it, over Modbus. The UR10e over
+    RTDE has a bent tool too, which no fit of flexibilities knows: the diagnosis has to name it, it
+    is applied, and the same poses are visited again. The demo fails where the diagnosis accuses
+    anything that the simulated arm does not have.
 
     Example: gapbridge demo --seed 3
     Example: gapbridge demo --link can --out out/demo_can

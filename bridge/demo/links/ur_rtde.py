@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from gapbridge.bridge.cell.simulation import server_settings
 from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.demo.bench import Bench, UrBench
+from gapbridge.bridge.demo.hidden import Hidden
 from gapbridge.bridge.demo.links.link import DemoLink
 from gapbridge.bridge.demo.poses import UR10E
 from gapbridge.bridge.demo.result import Resolution
@@ -37,7 +39,10 @@ class UrRtdeLink(DemoLink):
 
     def __init__(self, out: Path, seed: int) -> None:
         super().__init__(out, seed)
-        self._settings = server_settings(self.cell, seed=seed)
+        self.hidden = Hidden.drawn(seed)
+        settings = server_settings(self.cell, seed=seed)
+        plant = replace(settings.plant, tool_shift=self.hidden.shift)
+        self._settings = replace(settings, plant=plant)
         self._folder = out
 
     @property

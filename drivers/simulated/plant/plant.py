@@ -65,7 +65,8 @@ class Plant:
         self.settings = settings
         self.q: tuple[float, ...] = tuple(float(v) for v in q)  # rad, joint encoders
         self.qd: tuple[float, ...] = (0.0,) * len(q)  # rad/s
-        self.tool = Frame(from_vector(settings.tcp[3:]), settings.tcp[:3])
+        tip = add(settings.tcp[:3], settings.tool_shift)
+        self.tool = Frame(from_vector(settings.tcp[3:]), tip)
         cog, wrench = settings.payload_cog, settings.wrench
         self.load = Load(settings.payload_mass, cog, wrench[:3], wrench[3:])
         self.placements = 0  # times that the arm has come to rest
@@ -121,8 +122,9 @@ class Plant:
                 self.placements += 1
 
     def true_angles(self) -> tuple[float, ...]:
-        """Return what the joints really stand at (rad): encoders and the unseen placement error."""
-        return tuple(a + b for a, b in zip(self.q, self.scatter, strict=True))
+        """Return what the joints really stand at (rad): encoders, zeros, the placement error."""
+        zero = self.settings.zero or (0.0,) * len(self.q)
+        return tuple(a + b + c for a, b, c in zip(self.q, self.scatter, zero, strict=True))
 
     def shape(self, angles: Sequence[float], load: Load | None = None) -> Shape:
         """Return the equilibrium of the arm at joint `angles` (n, rad)."""

@@ -25,6 +25,8 @@ class PlantSettings:
     gravity: in base, m/s^2.
     droop: how far each servo rests from its target per torque that it holds (n,), rad/Nm; empty:
         none gives way.
+    zero: what each joint's true angle has more than its encoder says (n,), rad; empty: nothing.
+    tool_shift: where the TCP really is beyond `tcp`, m, flange axes.
     servo_lag: time constant with which the joints follow the command, s.
     acceleration_limit: of every joint, rad/s^2.
     joint_scatter: placement error of each joint (n,), 1 sigma, rad, unseen by the encoder and
@@ -47,6 +49,8 @@ class PlantSettings:
     wrench: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     gravity: Vector3 = (0.0, 0.0, -9.80665)
     droop: tuple[float, ...] = ()
+    zero: tuple[float, ...] = ()
+    tool_shift: Vector3 = (0.0, 0.0, 0.0)
     servo_lag: float = 0.008
     acceleration_limit: float = 60.0
     joint_scatter: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
