@@ -40,7 +40,10 @@ def on_every_row(
 
     Its space holds the named terms found, at their positions, and the accused ones' rivals.
     """
-    candidates = [selection.space.candidates[c] for c in selection.term_index]
+    candidates = [
+        _shaped_as(selection.space.candidates[c], term)
+        for c, term in zip(selection.term_index, selection.terms, strict=True)
+    ]
     candidates += _rivals(selection, accused)
     terms = tuple(selection.terms[p] for p in accused)
     placed = _placed(whole, terms)
@@ -61,6 +64,13 @@ def on_every_row(
         work.observation, space, found, tuple(values), tuple(range(len(values))),
         tuple(covariance), work.kept, noise, residual, terms, raw, links,
     )  # fmt: skip
+
+
+def _shaped_as(candidate: Candidate, term: Term) -> Candidate:
+    """Return the candidate with the shape that the term's last refit came to."""
+    if not candidate.effect.shapes:
+        return candidate
+    return replace(candidate, fixed=(*candidate.fixed[:-1], term.values[-1]))
 
 
 def still_accused(
