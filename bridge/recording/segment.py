@@ -53,7 +53,7 @@ class _File:
         self._waiting += data
         return len(data)
 
-    def emit(self) -> int:
+    def tell(self) -> int:
         return self.good + len(self._waiting)
 
     def flush(self) -> None:
