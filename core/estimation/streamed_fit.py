@@ -9,11 +9,12 @@ rows is folded (core.kernels). What is kept does not grow with the rows; the gap
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.estimation import compliance_fit
 from gapbridge.core.estimation.compliance_fit import (
     CONVERGED,
     NUISANCE_ROUNDS,
@@ -30,7 +31,7 @@ from gapbridge.core.estimation.compliance_fit import (
     stepped,
     weights_at,
 )
-from gapbridge.core.estimation.registration import IDENTITY, register_robustly
+from gapbridge.core.estimation.registration import IDENTITY
 from gapbridge.core.estimation.spool import Spool
 from gapbridge.core.kernels.factor import factor_blocks
 from gapbridge.core.kernels.threads import in_ranges
@@ -58,17 +59,6 @@ class Stream:
     width: int  # numbers per row: 3, or 6 with rotations
     nuisances: int
 
-    def part(self, chosen: Callable[[NDArray[np.int64]], Mask], share: float) -> Stream:
-        """Return the rows for which ``chosen(rows)`` holds, about a ``share`` of them."""
-
-        def pieces() -> Iterator[Piece]:
-            for piece in self.pieces():
-                mask = chosen(piece.rows)
-                if mask.any():
-                    yield Piece(piece.data.part(mask), piece.rows[mask])
-
-        return replace(self, pieces=pieces, count=int(self.count * share))
-
 
 @dataclass(frozen=True)
 class FitState:
@@ -84,9 +74,8 @@ def fit_nuisances(model: Model, stream: Stream) -> FitState:
         fit = Fit(model, IDENTITY, NONE)
         with _gaps(fit, stream) as gaps:
             return FitState(fit, _scale(gaps))
-    sample = stream.sample
-    frame = register_robustly(sample.position, model.predict(sample.q, sample.loads).position)
-    fit = Fit(model, frame, NONE)
+    begin = compliance_fit.fit_nuisances(model, stream.sample)
+    fit = Fit(begin.model, begin.frame, NONE)
     for _ in range(NUISANCE_ROUNDS):
         scale, R = weighed(fit, stream)
         step = np.linalg.lstsq(R[:, :9], R[:, -1], rcond=RANK)[0]
@@ -126,6 +115,37 @@ def weighed(fit: Fit, stream: Stream) -> tuple[Array, Array]:
             cells = per_cell_of(weights_at(gap, scale), scale, stream.width)
             add_rows(fit.model, piece.data, gap, cells, R)
     return scale, R
+
+
+def factors(
+    settled: FitState,
+    stream: Stream,
+    part_of: Callable[[NDArray[np.int64]], NDArray[np.int64]],
+    parts: int,
+) -> Array:
+    """Return the R factors (parts, k, k) of the rows of each part, at a fit's shape and weights.
+
+    ``part_of`` returns the part, from 0, of rows by their numbers.
+    """
+    fit, scale = settled.fit, settled.scale
+    k = stream.nuisances + 2 * fit.model.arm.n + 1
+    found = np.zeros((parts, k, k))
+    for piece in stream.pieces():
+        gap, _ = residual(fit.model, piece.data, fit.frame)
+        cells = per_cell_of(weights_at(gap, scale), scale, stream.width)
+        part = part_of(piece.rows)
+        for p in range(parts):
+            own = np.flatnonzero(part == p)
+            if len(own):
+                add_rows(fit.model, piece.data.part(own), gap[own], cells[own], found[p])
+    return found
+
+
+def joined(factors: Array) -> Array:
+    """Return the R factor (k, k) of all rows of several R factors (parts, k, k)."""
+    R = np.zeros(factors.shape[1:])
+    _fold(R, *factors)
+    return R
 
 
 def add_rows(model: Model, data: Data, gap: Array, cells: Array, R: Array) -> None:

@@ -20,6 +20,7 @@ from gapbridge.drivers import modbus
 
 PROFILES = Path(modbus.__path__[0]) / "profiles"
 LONGEST_END = 1.8  # s from SIGTERM to the end, on a busy machine: 1 s of ramp, 0.4 s of patience
+ON_THE_WIRE = 0.1  # s in which what has left reaches the tap
 AFTER = 0.5  # s of compensating before the signal
 
 
@@ -56,6 +57,7 @@ def ended_by(number: signal.Signals) -> Apart:
             _wait(rig, lambda: run.exit_code is not None, END_LIMIT, moment)
             if number == signal.SIGTERM and run.exit_code != 0:
                 wrong.append(f"it ended with {run.exit_code}: {run.output[-200:]}")
+            rig.pass_time(ON_THE_WIRE)
             found = rig.found
             left = math.hypot(*rig.checker.last_offset[:3])
             # where joints are written, an arm that stays where it is is all that is wanted

@@ -57,6 +57,8 @@ def check_units(model: Model, log: Log) -> None:
             if name == "measured_rotation"
             else np.abs(rows).max(axis=1)
         )
+        if not (size > most).any():  # whatever the share
+            continue
         # one slip of a digit is no unit: three quarters of what is not zero have to be too large
         high = size[np.isfinite(size) & (size != 0)]
         worst = float(np.quantile(high, 0.25)) if len(high) else 0.0
@@ -86,9 +88,12 @@ def _check_positions(model: Model, log: Log) -> None:
     measured = log.get("measured_position")
     if measured is None or not np.isfinite(measured).any():
         return
+    reach = _reach(model)
+    widest = np.nanmax(measured, axis=0) - np.nanmin(measured, axis=0)
+    if np.linalg.norm(widest) <= REACHES * reach:  # no median can lie farther away
+        return
     spread = measured - np.nanmedian(measured, axis=0)
     size = float(np.nanmedian(np.linalg.norm(spread, axis=1)))
-    reach = _reach(model)
     if size > REACHES * reach:
         raise LogError(
             f"{log.path}: columns measured_position_*: found positions {size:g} apart for an arm "

@@ -73,7 +73,7 @@ def test_pieces_give_what_the_whole_gives(rotations, shifted, outlier):
         )
     np.testing.assert_allclose(found.std_axial, whole.std_axial, rtol=1e-6)
     np.testing.assert_allclose(found.tool_offset, whole.tool_offset, atol=1e-11)
-    np.testing.assert_allclose(found.gap_rms, whole.gap_rms, rtol=1e-8)
+    np.testing.assert_allclose(found.gap_rms, whole.gap_rms, rtol=1e-6)  # stop at small steps
     np.testing.assert_allclose(found.remaining_rms, whole.remaining_rms, rtol=1e-8)
     assert found.remaining_rms_held_out == pytest.approx(whole.remaining_rms_held_out, rel=0.05)
     assert (found.outliers == whole.outliers).all()
