@@ -54,6 +54,8 @@ def structure_p_value(
     np.random.default_rng(seed).standard_normal(out=left[1:])
     left -= (left @ fitted) @ fitted.T
     whole = np.einsum("ij,ij->i", left, left)
+    if not whole[0]:  # nothing is left that could have structure
+        return 1.0
     worst = []
     for columns, sizes in _families(space, fitted):
         # sums of squares along the family's directions, as a share of everything left
@@ -157,6 +159,8 @@ def _held_out_shares(columns: Array, r: Array, fold: NDArray[np.int64]) -> Array
     """Return the share of r (m,) that each block of columns (B, m, d) predicts held out (B,)."""
     by_fold = np.argsort(fold, kind="stable")
     ends = np.searchsorted(fold[by_fold], np.arange(FOLDS + 1))
+    if not r.any():  # nothing is left to be explained
+        return np.zeros(len(columns))
     unit, r = columns[:, by_fold], r[by_fold]
     unit = unit / (np.sqrt(np.einsum("bij,bij->bj", unit, unit))[:, None] + 1e-300)
     flipped = unit.transpose(0, 2, 1)
