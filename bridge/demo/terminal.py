@@ -22,22 +22,18 @@ def bar(share: float, width: int = WIDTH) -> str:
 def show(result: Result, console: Console | None = None) -> None:
     """Print what the demo has shown."""
     console = console or Console()
-    series = [(name, error * 1e3) for name, error in result.series]
-    before = series[0][1]
+    before, after = result.error_without * 1e3, result.error_with * 1e3
     table = Table(title="distance of the TCP from where it was wanted, mm", title_justify="left")
-    names = [name for name, _ in series]
-    for name in ("pose", "load", *names, ""):
+    for name in ("pose", "load", "without", "with", ""):
         table.add_column(name, justify="left" if name in ("load", "") else "right")
     longest = float(before.max())
     for row in visits_of_poses(result):
-        means = [float(values[row].mean()) for _, values in series]
-        styles = ("red", "yellow", "green") if len(means) == 3 else ("red", "green")
-        bars = Text()
-        for k, (mean, style) in enumerate(zip(means, styles, strict=True)):
-            bars.append(("\n" if k else "") + bar(mean / longest), style=style)
+        bars = Text(bar(before[row].mean() / longest), style="red")
+        bars.append("\n" + bar(after[row].mean() / longest), style="green")
         table.add_row(
-            str(len(table.rows) + 1), result.loads[row[0]], *(f"{m:.3f}" for m in means), bars
-        )
+            str(len(table.rows) + 1), result.loads[row[0]], f"{before[row].mean():.3f}",
+            f"{after[row].mean():.3f}", bars,
+        )  # fmt: skip
     console.print(table)
     figures = result.summary()
     errors, loop = figures["tcp_error_mm"], figures["loop"]
@@ -47,8 +43,6 @@ def show(result: Result, console: Console | None = None) -> None:
         f"with compensation: {ratio:.0f} times smaller; the arm repeats to "
         f"{figures['repeatability_mm']:.3f} mm"
     )
-    for line in truth_lines(result):
-        console.print(line, highlight=False)
     if result.resolution.written:
         console.print(
             f"one count written is {figures['resolution_mm']:.3g} mm at the TCP, one count of the "
@@ -59,18 +53,3 @@ def show(result: Result, console: Console | None = None) -> None:
         f"written at {loop['rate_hz']:.1f} Hz, {loop['missed']} of {loop['cycles']} cycles missed, "
         f"state behind a setpoint {loop['p99_us']:.0f} us old (p99)"
     )
-
-
-def truth_lines(result: Result) -> list[str]:
-    """Return what was hidden beside what was found, a line each; none where nothing was hidden."""
-    if result.hidden is None:
-        return []
-    fitted = result.summary()["tcp_error_mm"]["fitted"]["rms"]
-    found = {name: (value, std) for c in result.accused for name, value, std, _ in c.parameters}
-    lines = [f"the fitted flexibilities alone left {fitted:.3f} mm: the tool was bent, too"]
-    for name, true in result.hidden.truth().items():
-        value, std = found.get(name, (float("nan"), float("nan")))
-        lines.append(
-            f"  {name}: truly {true * 1e3:+.3f} mm, found {value * 1e3:+.3f} ± {std * 1e3:.3f} mm"
-        )
-    return lines

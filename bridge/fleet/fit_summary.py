@@ -102,7 +102,9 @@ def _type(name: str, arms: dict[str, list[Outcome]]) -> FittedType:
 
 def _evidence(outcome: Outcome) -> Evidence:
     given = dict(outcome.result["evidence"])
-    return Evidence(**(given | {k: np.array(given[k]) for k in ("matrix", "right")}))
+    outliers = given.pop("wild")  # as journals of former versions have it
+    arrays = {k: np.array(given[k]) for k in ("matrix", "right")}
+    return Evidence(**(given | arrays), outliers=outliers)
 
 
 def _session(

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.demo.bench import Bench
-from gapbridge.bridge.demo.hidden import Hidden
 from gapbridge.bridge.demo.poses import Load, Scene
 from gapbridge.bridge.demo.rests import SETTLING
 from gapbridge.bridge.demo.result import Resolution
@@ -36,7 +35,6 @@ class DemoLink(ABC):
     ports: ClassVar[tuple[int, ...]]  # of the simulated controller
     scene: ClassVar[Scene]
     settling: ClassVar[float] = SETTLING  # s from standing still until readings count
-    hidden: Hidden | None = None  # beside the arm's flexibilities
     tells_joints: ClassVar[bool] = True  # joints as read are good enough to fit on
 
     def __init__(self, out: Path, seed: int) -> None:

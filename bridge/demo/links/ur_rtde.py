@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ from numpy.typing import NDArray
 from gapbridge.bridge.cell.simulation import server_settings
 from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.demo.bench import Bench, UrBench
-from gapbridge.bridge.demo.hidden import Hidden
 from gapbridge.bridge.demo.links.link import DemoLink
 from gapbridge.bridge.demo.poses import UR10E
 from gapbridge.bridge.demo.result import Resolution
@@ -39,10 +37,7 @@ class UrRtdeLink(DemoLink):
 
     def __init__(self, out: Path, seed: int) -> None:
         super().__init__(out, seed)
-        self.hidden = Hidden.drawn(seed)
-        settings = server_settings(self.cell, seed=seed)
-        plant = replace(settings.plant, tool_shift=self.hidden.shift)
-        self._settings = replace(settings, plant=plant)
+        self._settings = server_settings(self.cell, seed=seed)
         self._folder = out
 
     @property

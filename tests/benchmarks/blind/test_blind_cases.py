@@ -198,6 +198,6 @@ def test_the_cramer_rao_bound_of_an_offset_is_that_of_its_only_number():
 
 def test_the_command_is_found_without_an_activated_environment(monkeypatch):
     monkeypatch.setenv("PATH", "/nowhere")
-    first = Path(Command.parse("gapbridge diagnose").words[0])
+    first = Path(Command.parse("gapbridge diagnose").command[0])
     assert first.parent == Path(sys.executable).parent
-    assert Command.parse("./mine diagnose").words == ("./mine", "diagnose")
+    assert Command.parse("./mine diagnose").command == ("./mine", "diagnose")

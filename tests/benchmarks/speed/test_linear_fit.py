@@ -51,7 +51,7 @@ def test_rows_that_hardly_differ_are_factored_and_reported():
     loads = Loads(wrench=1e-3 * loads.wrench)
     found = fit_linear(model_of(), q, loads, gap)
     assert found.factored
-    assert "hardly determine" in found.note
+    assert "hardly separate" in found.note
     stored = model_of().linear_form(q, loads).regressor[:, :3].reshape(-1, 12)
     unit = 1 / np.linalg.norm(stored, axis=0)
     expected = unit * lstsq(stored * unit, gap.ravel())[0]

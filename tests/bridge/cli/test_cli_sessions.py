@@ -95,6 +95,9 @@ def test_provenance_stands_in_the_json_and_in_the_cell(answered) -> None:
         assert entry["sha256"] == hashlib.sha256(bytes_).hexdigest()
     written = yaml.safe_load((folder / "new.yaml").read_text(encoding="utf-8"))["provenance"]
     fitted = written.pop("fitted")
+    parameters, covariance = written.pop("parameters"), np.array(written.pop("covariance"))
+    assert covariance.shape == (len(parameters),) * 2
+    assert (np.diag(covariance) > 0).all()
     assert written == origin
     assert set(fitted) >= {"actual_q_0", "actual_q_5", "payload"}
     assert load_cell(folder / "new.yaml").fitted_range["payload"] == tuple(fitted["payload"])

@@ -69,7 +69,7 @@ class Here(Workers):
 
     def stop(self) -> None: ...
 
-    def phrase(self) -> str:
+    def words(self) -> str:
         return "this process"
 
     def run(self, tasks: Iterable[Task]) -> Iterator[Outcome]:

@@ -150,9 +150,8 @@ def test_what_the_data_do_not_show_stays_exactly_at_the_models_value(own):
     np.testing.assert_array_equal(values[held], own)
     assert (values[found.identifiable] != own).sum() > 6
     for i in held:
-        reported = [
-            line for line in found.combinations if line.startswith(f"{name(i, 12)}: not sh")
-        ]
+        begin = f"{name(i, 12)}: not identifiable"
+        reported = [line for line in found.combinations if line.startswith(begin)]
         assert len(reported) == 1
         assert "stays at the model's value" in reported[0]
 

@@ -114,11 +114,11 @@ def test_compiled_functions_stand_only_where_they_are_looked_for() -> None:
 
 
 def test_each_compiled_function_of_ours_is_kept_so() -> None:
-    from gapbridge.bridge.loop import nominal_stream
+    from gapbridge.bridge.loop import setpoint_stream
     from gapbridge.core import interpolation, limits
     from gapbridge.core.kernels import single
 
-    compiled = (single.correct, limits._limit, interpolation._follow, nominal_stream._followed)
+    compiled = (single.correct, limits._limit, interpolation._follow, setpoint_stream._followed)
     for function in compiled:
         stamp = function._cache._impl.locator.get_source_stamp()
         assert stamp[1] == machine_code.fingerprint(), function
