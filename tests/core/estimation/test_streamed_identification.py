@@ -12,7 +12,8 @@ from pyarrow import parquet
 
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import ExcitationError, LogError
-from gapbridge.core.estimation.identification import identify_compliance
+from gapbridge.core.estimation.identification import data_of, identify_compliance
+from gapbridge.core.estimation.row_store import RowStore
 from gapbridge.core.estimation.spool import Spool
 from gapbridge.core.estimation.streamed import fold_of, identify_streamed
 from gapbridge.core.log.log import Log, read_log
@@ -160,3 +161,18 @@ def test_folds_are_alike_in_size_and_the_same_at_every_pass():
     folds = fold_of(rows)
     assert np.bincount(folds).min() > 0.97 * len(rows) / 5
     np.testing.assert_array_equal(fold_of(rows[777:1000]), folds[777:1000])
+
+
+def test_rows_that_wait_in_a_file_are_those_that_came():
+    log = measured_log(True, False)
+    data, rows = data_of(log, Metrology(registered=True))
+    store = RowStore(kept=0)
+    store.append(data, rows)
+    ((kept, numbers),) = store
+    assert store.count == len(rows)
+    assert isinstance(kept.position, np.memmap)
+    assert isinstance(kept.q, np.memmap)
+    np.testing.assert_array_equal(numbers, rows)
+    for name in ("q", "position", "rotation"):
+        np.testing.assert_array_equal(getattr(kept, name), getattr(data, name))
+    np.testing.assert_array_equal(kept.loads.wrench, data.loads.wrench)
