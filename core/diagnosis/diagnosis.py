@@ -263,7 +263,7 @@ def _channel(
     held = HeldOut(searched)
     verdict = with_stand_ins(searched, judge(searched, held))
     stood_in = _stood_in(searched, verdict, held, model)
-    searched = standing(searched, model.arm, verdict.accused, verdict.beside)
+    searched = standing(searched, model.arm, verdict.accused, verdict.remainder)
     considered = considered_of(searched, verdict, held, model.arm, withhold)
     chosen = [searched.term_index[p] for p in verdict.accused]
     where = locate(searched, gaps(searched, chosen)[0][searched.kept], chosen)

@@ -34,7 +34,7 @@ from gapbridge.core.diagnosis.residual_structure import dependence, structure_p_
 from gapbridge.core.diagnosis.selection.bent import not_bent
 from gapbridge.core.diagnosis.selection.local_search import rivals
 from gapbridge.core.diagnosis.selection.problem import Found, Space
-from gapbridge.core.diagnosis.selection.refit import worth
+from gapbridge.core.diagnosis.selection.refit import Remainder, worth
 from gapbridge.core.diagnosis.selection.selection import Selection
 
 Array = NDArray[np.float64]
@@ -53,7 +53,7 @@ class Judgement:
     ]  # quantity, held-out share of what is not accounted for
     ties: dict[int, tuple[str, ...]]  # position -> effects that would do as well
     withdrawn: tuple[tuple[int, str], ...]  # position, reason
-    beside: tuple[int, ...] = ()  # unnamed functions that account for what is left
+    remainder: Remainder | None = None  # unnamed functions that account for what is left
     stand_ins: tuple[
         int, ...
     ] = ()  # positions not accused that shrink the gap in regions not fitted
@@ -72,7 +72,7 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
     believed = [
         c for c in selection.term_index if c not in withdrawn and c not in selection.block
     ]  # fmt: skip
-    stays, beside = withstanding(selection, believed)
+    stays, remainder = withstanding(selection, believed)
     withdrawn |= {c: BESIDE for c in believed if c not in stays}
     for c in _without_mass(selection, stays):
         withdrawn[c] = "no load is declared, and none is accused"
@@ -83,7 +83,7 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
         withdrawn[c] = "it does not shrink the gap on samples that its fit did not see"
         stays.remove(c)
     judgement = _told(whole, selection, stays, withdrawn, fallen)
-    return replace(judgement, beside=tuple(beside))
+    return replace(judgement, remainder=remainder)
 
 
 def _told(

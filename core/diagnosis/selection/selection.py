@@ -34,7 +34,7 @@ from gapbridge.core.diagnosis.selection.outliers import (
     with_wild_explained,
 )
 from gapbridge.core.diagnosis.selection.problem import Found, Space, fit
-from gapbridge.core.diagnosis.selection.refit import refit, worth
+from gapbridge.core.diagnosis.selection.refit import Remainder, refit, worth
 from gapbridge.core.diagnosis.selection.search import LARGE, screened_search
 from gapbridge.core.diagnosis.selection.smooth import smooth_candidates
 from gapbridge.core.diagnosis.selection.state import Raw, Work, flat, locate, sample_space
@@ -88,10 +88,14 @@ class Selection:
 
     def rows_of(self, columns: Array) -> Array:
         """Return columns (N, k, d) as rows (m, d) of the working space."""
+        rows = self.plain_rows_of(columns)
+        return rows if self.links is None else self.links.whitened(rows)
+
+    def plain_rows_of(self, columns: Array) -> Array:
+        """Return columns (N, k, d) as rows (m, d) of the space in which the links are no noise."""
         kept, B = self.kept, self.nuisance_basis
         rows = (self.noise.whitener[kept] @ columns[kept]).reshape(len(B), -1)
-        rows = rows - B @ (B.T @ rows)
-        return np.asarray(rows if self.links is None else self.links.whitened(rows))
+        return np.asarray(rows - B @ (B.T @ rows))
 
     def pull(self, chosen: Sequence[int]) -> Array:
         """Return one over the prior sigma of each number of a set of candidates; 0: none."""
@@ -259,25 +263,24 @@ def _less_smooth(
 
 
 def standing(
-    selection: Selection, arm: Arm, accused: Sequence[int], beside: Sequence[int] = ()
+    selection: Selection, arm: Arm, accused: Sequence[int], remainder: Remainder | None = None
 ) -> Selection:
     """Return the selection with some of its terms (positions) refitted as all there is.
 
-    Values that were fitted beside a withdrawn term are not those that stand without it. ``beside``
-    are unnamed functions that account for what is left: in a short log it would bias the values; a
-    long one averages over it, and its model has to predict without them.
+    Values that were fitted beside a withdrawn term are not those that stand without it. The
+    ``remainder`` accounts for what is left: in a short log it would bias the values; a long one
+    averages over it, and its model has to predict without it.
     """
-    short = len(selection.space.y) < LARGE
-    if not accused or (len(accused) == len(selection.terms) and not (short and beside)):
+    if not accused or (len(accused) == len(selection.terms) and remainder is None):
         return selection
+    if remainder is not None and len(selection.space.y) >= LARGE:
+        remainder = remainder.scatter_alone()
     work = Work(selection.observation, arm, [], selection.noise, selection.kept)
     chosen = [selection.term_index[p] for p in accused]
     links = selection.prior if set(chosen) & set(selection.prior) else {}
     space = selection.working if links else selection.space
-    if short:
-        chosen += beside
     alone = fit(space, [c for c in chosen if c not in links])
-    fitted, index, spread, residual = refit(work, selection.space, alone, links)
+    fitted, index, spread, residual = refit(work, selection.space, alone, links, remainder)
     terms, covariance = list(selection.terms), list(selection.covariance)
     for c, term, own in zip(index, fitted, spread, strict=True):
         position = selection.term_index.index(c)
