@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincc
 
+from gapbridge.core.arm import Arm
 from gapbridge.core.diagnosis.bump import bumps
 from gapbridge.core.diagnosis.criteria import (
     ENOUGH_REPEATS,
@@ -29,13 +30,18 @@ from gapbridge.core.diagnosis.criteria import (
 )
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.regions import parts
-from gapbridge.core.diagnosis.remainder import links_withstand, withstanding
+from gapbridge.core.diagnosis.remainder import (
+    closes_everywhere,
+    links_withstand,
+    withstanding,
+)
 from gapbridge.core.diagnosis.residual_structure import dependence, structure_p_value
 from gapbridge.core.diagnosis.selection.bent import not_bent
 from gapbridge.core.diagnosis.selection.local_search import rivals
 from gapbridge.core.diagnosis.selection.problem import Found, Space
 from gapbridge.core.diagnosis.selection.refit import Remainder, worth
 from gapbridge.core.diagnosis.selection.selection import Selection
+from gapbridge.core.errors import InputError
 
 Array = NDArray[np.float64]
 BESIDE = "it does not keep its value beside the unknown that is left"
@@ -84,6 +90,28 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
         stays.remove(c)
     judgement = _told(whole, selection, stays, withdrawn, fallen)
     return replace(judgement, remainder=remainder)
+
+
+def judge_geometry(
+    selection: Selection, judgement: Judgement, arm: Arm
+) -> tuple[Selection, Judgement]:
+    """Return selection and judgement with all links' geometry accused, where no single link is.
+
+    It has to close the gap in every part of the log, each predicted by a fit that did not see it.
+    """
+    own = [selection.space.candidates[selection.term_index[p]] for p in judgement.accused]
+    fallen = [selection.space.candidates[selection.term_index[p]] for p, _ in judgement.withdrawn]
+    if any(c.effect.together for c in own) or not any(c.effect.together for c in fallen):
+        return selection, judgement
+    try:
+        whole = selection.with_all_links(arm)
+    except InputError:  # no arm of such links stands
+        return selection, judgement
+    if whole is None or not closes_everywhere(whole):
+        return selection, judgement
+    again = judge(whole, HeldOut(whole))
+    accused = {whole.term_index[p] for p in again.accused}
+    return (whole, again) if accused & set(whole.block) else (selection, judgement)
 
 
 def _told(

@@ -13,7 +13,14 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.diagnosis.criteria import DRIFT, SIBLING, SIGMAS, STAND_IN_GAIN, UNKNOWNS
+from gapbridge.core.diagnosis.criteria import (
+    CLOSED,
+    DRIFT,
+    SIBLING,
+    SIGMAS,
+    STAND_IN_GAIN,
+    UNKNOWNS,
+)
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.regions import parts, regions
@@ -66,6 +73,22 @@ def links_withstand(selection: Selection) -> bool:
         return False
     links = [*named, *selection.block]
     return held.shrink(links, named).interval[0] > STAND_IN_GAIN
+
+
+def closes_everywhere(selection: Selection) -> bool:
+    """Return whether the geometry of all links closes the gap in every part of the log.
+
+    Each part is predicted by a fit that did not see it. What is no geometry at all reaches that in
+    some part by chance, never in all.
+    """
+    part = parts(selection.observation, selection.kept)
+    held = HeldOut(selection, parts=part)
+    if not held.possible:
+        return False
+    count = np.bincount(part)
+    left, gap = (np.bincount(part, held.squares(c)) for c in (list(selection.block), ()))
+    alive = count > 0
+    return bool(np.all(left[alive] < CLOSED**2 * gap[alive]))
 
 
 class _Beside:

@@ -24,7 +24,13 @@ from gapbridge.core.diagnosis.selection.candidate import (
     with_what_it_needs,
 )
 from gapbridge.core.diagnosis.selection.following import exact_columns, one_delay
-from gapbridge.core.diagnosis.selection.geometry import Links, links_of, with_links
+from gapbridge.core.diagnosis.selection.geometry import (
+    Links,
+    links_of,
+    members,
+    prior,
+    with_links,
+)
 from gapbridge.core.diagnosis.selection.local_search import pruned
 from gapbridge.core.diagnosis.selection.moments import step_candidates
 from gapbridge.core.diagnosis.selection.noise import Noise, estimate_noise
@@ -121,6 +127,25 @@ class Selection:
             terms=tuple(self.terms[p] for p in index),
             term_index=tuple(self.term_index[p] for p in index),
             covariance=tuple(self.covariance[p] for p in index),
+        )  # fmt: skip
+
+    def with_all_links(self, arm: Arm) -> Selection | None:
+        """Return the selection with the links' geometry as a whole in the place of single links.
+
+        What else was found stays as far as it pays beside them; None where the arm has no links.
+        """
+        space, block = self.space, members(self.space)
+        if len(block) < 2:
+            return None
+        sigma = {c: prior(space.candidates[c]) for c in block}
+        near = links_of(space, sigma).beside(space, block)
+        chosen = [c for c in self.found.chosen if c not in block]
+        found = pruned(near, fit(near, chosen))
+        work = Work(self.observation, arm, [], self.noise, self.kept)
+        terms, index, covariance, residual = refit(work, space, found, sigma)
+        return replace(
+            self, observation=work.observation, prior=sigma, found=found, terms=terms,
+            term_index=index, covariance=covariance, residual=residual,
         )  # fmt: skip
 
     @property
