@@ -33,6 +33,7 @@ from gapbridge.core.diagnosis.regions import parts
 from gapbridge.core.diagnosis.remainder import (
     closes_everywhere,
     links_withstand,
+    with_the_links,
     withstanding,
 )
 from gapbridge.core.diagnosis.residual_structure import dependence, structure_p_value
@@ -79,6 +80,7 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
         c for c in selection.term_index if c not in withdrawn and c not in selection.block
     ]  # fmt: skip
     stays, remainder = withstanding(selection, believed)
+    stays += with_the_links(selection, stays, [c for c in believed if c not in stays])
     withdrawn |= {c: BESIDE for c in believed if c not in stays}
     for c in _without_mass(selection, stays):
         withdrawn[c] = "no load is declared, and none is accused"

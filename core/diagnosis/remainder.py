@@ -75,6 +75,22 @@ def links_withstand(selection: Selection) -> bool:
     return held.shrink(links, named).interval[0] > STAND_IN_GAIN
 
 
+def with_the_links(selection: Selection, stays: Sequence[int], fallen: Sequence[int]) -> list[int]:
+    """Return the joints' zeros and tool points, of those fallen, that stand with the links.
+
+    Where all links are a cause these are numbers of the same geometry: none is sure beside unnamed
+    functions, so they are judged by what they do together in regions that their fit did not see.
+    """
+    space = selection.space
+    own = [c for c in fallen if space.candidates[c].effect.beside_links]
+    if not (selection.block and own):
+        return []
+    held = HeldOut(selection, parts=parts(selection.observation, selection.kept))
+    rest = [*stays, *selection.block]
+    gains = held.possible and held.shrink([*rest, *own], rest).interval[0] > STAND_IN_GAIN
+    return own if gains else []
+
+
 def closes_everywhere(selection: Selection) -> bool:
     """Return whether the geometry of all links closes the gap in every part of the log.
 
