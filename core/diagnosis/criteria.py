@@ -17,6 +17,7 @@ DRIFT = 1.5  # times: how far its value may move; 2 gives one false more, 1.3 lo
 UNKNOWNS = 6  # unnamed functions asked for at a time: more span the short logs
 # An accusation by itself
 OWN_SIGMAS = 3.0  # of at least one of its numbers: what an engineer calls a finding
+MINUTE = 1e-3  # of its parameters' usual sizes: the tail of a servo is a dead band of 5e-9 rad
 GAIN = 0.0  # lower end of the held-out gain of a cause
 STAND_IN_GAIN = 0.02  # the same of a stand-in, in regions that its fit did not see
 HEAVIEST = 3.0  # times the largest declared payload (or the rated one): a load is not off by more

@@ -20,6 +20,7 @@ from gapbridge.core.diagnosis.judgement import (
     Judgement,
     judge,
     judge_geometry,
+    still_sure,
     with_stand_ins,
 )
 from gapbridge.core.diagnosis.location import Where, locate
@@ -269,7 +270,7 @@ def _channel(
     held = HeldOut(searched)
     verdict = with_stand_ins(searched, verdict)
     stood_in = _stood_in(searched, verdict, held, model)
-    searched = standing(searched, model.arm, verdict.accused, verdict.remainder)
+    searched, verdict = still_sure(searched, verdict, model.arm)
     considered = considered_of(searched, verdict, held, model.arm, withhold)
     chosen = [searched.term_index[p] for p in verdict.accused]
     where = locate(searched, gaps(searched, chosen)[0][searched.kept], chosen)
@@ -277,7 +278,7 @@ def _channel(
     if whole is not seen:
         if progress:
             progress(f"{seen.channel}: all {len(whole.rows)} rows")
-        selection = on_every_row(searched, verdict.accused, whole, model)
+        selection = on_every_row(searched, verdict, whole, model)
         held = HeldOut(selection)
         selection, verdict = still_accused(selection, verdict, held, model)
         chosen = [selection.term_index[p] for p in verdict.accused]

@@ -21,6 +21,7 @@ from gapbridge.core.diagnosis.criteria import (
     GAIN,
     HINT,
     INSTRUMENTS,
+    MINUTE,
     REPEATED,
     STAND_IN_GAIN,
     STATED,
@@ -41,7 +42,7 @@ from gapbridge.core.diagnosis.selection.bent import not_bent
 from gapbridge.core.diagnosis.selection.local_search import rivals
 from gapbridge.core.diagnosis.selection.problem import Found, Space
 from gapbridge.core.diagnosis.selection.refit import Remainder, worth
-from gapbridge.core.diagnosis.selection.selection import Selection
+from gapbridge.core.diagnosis.selection.selection import Selection, standing
 from gapbridge.core.errors import InputError
 
 Array = NDArray[np.float64]
@@ -91,7 +92,8 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
         withdrawn[c] = "it does not shrink the gap on samples that its fit did not see"
         stays.remove(c)
     judgement = _told(whole, selection, stays, withdrawn, fallen)
-    return replace(judgement, remainder=remainder)
+    unknown = judgement.structured or remainder.columns.shape[1] > 0
+    return replace(judgement, remainder=remainder if unknown else None)
 
 
 def judge_geometry(
@@ -158,7 +160,31 @@ def _no_value(selection: Selection) -> dict[int, str]:
             found[position] = "its value stands on its bound"
         if worth(term, spread) < 1:
             found[position] = "its value may as well be none"
+        usual = [p.scale for p in candidate.parameters]
+        if candidate.curve is None and all(
+            abs(v) < MINUTE * size for v, size in zip(term.values, usual, strict=False)
+        ):
+            found[position] = "its value is too small to matter"
     return found
+
+
+def still_sure(selection: Selection, judgement: Judgement, arm: Arm) -> tuple[Selection, Judgement]:
+    """Return what is accused refitted as all there is, and its judgement.
+
+    Beside the unknown, and over the regions of the log, a value may be less sure than it was.
+    """
+    while True:
+        found = standing(selection, arm, judgement.accused, judgement.remainder)
+        single = [p for p in judgement.accused if found.term_index[p] not in found.block]
+        share = [worth(found.terms[p], found.covariance[p]) for p in single]
+        if min(share, default=1.0) >= 1:
+            return found, judgement
+        weakest = single[int(np.argmin(share))]
+        judgement = replace(
+            judgement, accused=tuple(p for p in judgement.accused if p != weakest),
+            withdrawn=(*judgement.withdrawn, (weakest, BESIDE)), structured=True,
+            ties={p: names for p, names in judgement.ties.items() if p != weakest},
+        )  # fmt: skip
 
 
 def _without_mass(selection: Selection, stays: Sequence[int]) -> list[int]:

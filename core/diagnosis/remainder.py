@@ -40,13 +40,8 @@ LARGE = 900  # rows of the sample space from which several accusations go at a t
 HOPELESS = 0.6  # strength below which they do
 
 
-def withstanding(
-    selection: Selection, believed: Sequence[int]
-) -> tuple[list[int], Remainder | None]:
-    """Return the candidates, of those believed, that withstand, and the unnamed beside them.
-
-    None where the residual asks for no unnamed function.
-    """
+def withstanding(selection: Selection, believed: Sequence[int]) -> tuple[list[int], Remainder]:
+    """Return the candidates, of those believed, that withstand, and the unnamed beside them."""
     remainder = _Beside(selection)
     accused = list(believed)
     while accused:
@@ -197,14 +192,19 @@ class _Beside:
     def _sigma(self, accused: Sequence[int], asked: Sequence[int]) -> Array:
         """Return the prior 1 sigma of each constant; inf where it is wholly the function's.
 
-        Of a sensor's axis it is as large as all unnamed functions of that axis together.
+        Of a sensor's axis it is as large as all unnamed functions of that axis together; in units
+        in which the rows scatter by one.
         """
         targets_, space = self._targets(asked), self.space
         if not self._sensed:
             width = sum(self._constant[t].shape[1] for t in targets_)
             return np.full(width, np.inf)
-        A = np.hstack([self._unit(accused), self._beside(asked)])
-        x = np.linalg.lstsq(A, space.y, rcond=1e-9)[0][len(A[0]) - self._beside(asked).shape[1] :]
+        beside = self._beside(asked)
+        A = np.hstack([self._unit(accused), beside])
+        solution = np.linalg.lstsq(A, space.y, rcond=1e-9)[0]
+        rss = float(np.sum((space.y - A @ solution) ** 2))
+        scatter = np.sqrt(max(rss / max(space.freedom - A.shape[1], 1.0), space.floor))
+        x = solution[A.shape[1] - beside.shape[1] :]
         begin, made = 0, {t: np.zeros(len(space.y)) for t in targets_}
         for c in asked:
             own = slice(begin, begin + int(space.start[c + 1] - space.start[c]))
@@ -212,7 +212,7 @@ class _Beside:
             target = space.candidates[c].target
             if target in made:
                 made[target] += space.columns([c]) @ x[own]
-        size = [np.linalg.norm(self._constant[t]) for t in targets_]
+        size = [scatter * np.linalg.norm(self._constant[t]) for t in targets_]
         return np.array([np.linalg.norm(made[t]) / n for t, n in zip(targets_, size, strict=True)])
 
     def _beyond(self, accused: Sequence[int], asked: Sequence[int]) -> tuple[Array, Array]:
@@ -277,11 +277,9 @@ class _Beside:
         scatter = (len(without) - 1) / len(without) * away.T @ away
         return value, inverse * max(rss / freedom, self.space.floor) + scatter, taken < SHOWN
 
-    def beside_refit(self, accused: Sequence[int]) -> Remainder | None:
-        """Return what stands beside the accused in their last refit; None: nothing is asked for."""
+    def beside_refit(self, accused: Sequence[int]) -> Remainder:
+        """Return what stands beside the accused in their last refit."""
         asked, selection = self.beside, self._selection
-        if not asked:
-            return None
         constants = [selection.plain_rows_of(self._moved[t]) for t in self._targets(asked)]
         columns = np.hstack([selection.space.columns(asked), *constants])
         sigma = self._sigma(accused, asked)

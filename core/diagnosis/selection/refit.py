@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri, stdtrit
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.diagnosis.criteria import OWN_SIGMAS
@@ -28,7 +29,7 @@ class Remainder:
     """Unnamed functions that stand beside the causes, and the regions that scatter is judged by."""
 
     columns: Array  # (m, d) rows of the sample space
-    sigma: Array  # (d,) prior 1 sigma of the value of each; inf: free
+    sigma: Array  # (d,) prior 1 sigma of each value over the scatter of the rows; inf: free
     region: NDArray[np.int64]  # (m,) region or stretch of each row
 
     def rows(self) -> Array:
@@ -128,7 +129,9 @@ def _widened(
         inverse = np.linalg.pinv(rest, rcond=1e-12, hermitian=True)
         without[k] = unit * (inverse @ (g - A[out].T @ b[out]))
     away = without - without.mean(axis=0)
-    scatter = (len(names) - 1) / len(names) * away.T @ away
+    # few regions: as wide as a normal distribution of the same 95 % interval
+    few = float(stdtrit(max(len(names) - 1, 1), 0.975) / ndtri(0.975))
+    scatter = few**2 * (len(names) - 1) / len(names) * away.T @ away
     wide, narrow = np.sqrt(np.diag(scatter)), np.sqrt(np.maximum(np.diag(white), 0.0))
     share = np.maximum(narrow / np.maximum(wide, 1e-300), 1.0)
     return np.asarray(scatter * np.outer(share, share))
