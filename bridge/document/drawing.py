@@ -1,12 +1,33 @@
-"""Drawings: a few shapes in a plane, which the HTML writes as SVG and the PDF as its own lines."""
+"""Drawings: a few shapes in a plane, described once; HTML writes them as SVG, PDF as its lines.
+
+Colours are names of PALETTE, so that a page can show them dark.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-INK, SOFT, GRID, EDGE = "#1c2730", "#5b6770", "#e3e8ec", "#9aa5b1"
-BEFORE, AFTER, LIMIT, BAD_DOT = "#d9822b", "#1f77b4", "#2f9e62", "#c43d3d"
+INK, SOFT, GRID, EDGE = "ink", "soft", "grid", "edge"
+BEFORE, AFTER, LIMIT, BAD_DOT, PALE, VIOLET = (
+    "before",
+    "after",
+    "limit",
+    "bad-dot",
+    "pale",
+    "violet",
+)
+ON_BAR = "on-bar"  # text on a filled bar
+PALETTE = {
+    INK: "#1c2730", SOFT: "#5b6770", GRID: "#e3e8ec", EDGE: "#9aa5b1", BEFORE: "#d9822b",
+    AFTER: "#1f77b4", ON_BAR: "#ffffff", LIMIT: "#2f9e62", BAD_DOT: "#c43d3d", PALE: "#a9cbe6", VIOLET: "#8e5bb5",
+}  # fmt: skip
+"""Colours of a drawing by name, on paper and on a light screen."""
+DARK = {
+    INK: "#e6edf3", SOFT: "#9aa9b6", GRID: "#2a3641", EDGE: "#6f7f8d", BEFORE: "#f0a35e",
+    AFTER: "#6ea8ff", ON_BAR: "#0e151b", LIMIT: "#4fd093", BAD_DOT: "#ff7b72", PALE: "#36557a", VIOLET: "#b98be0",
+}  # fmt: skip
+"""The same on a dark screen."""
 
 Point = tuple[float, float]
 
@@ -54,6 +75,16 @@ class Circle:
 
 
 @dataclass(frozen=True)
+class Dots:
+    """Many filled circles of one size."""
+
+    points: tuple[Point, ...]
+    radius: float
+    fill: str
+    opacity: float = 1.0
+
+
+@dataclass(frozen=True)
 class Text:
     """A line of text; ``anchor`` is start, middle or end; ``turned`` reads upwards."""
 
@@ -67,7 +98,7 @@ class Text:
     turned: bool = False
 
 
-Shape = Line | Rectangle | Circle | Text
+Shape = Line | Rectangle | Circle | Dots | Text
 
 
 @dataclass

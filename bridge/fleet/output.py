@@ -15,7 +15,7 @@ from gapbridge.bridge.fleet.report.page import write_diagnosed_report, write_fit
 from gapbridge.bridge.fleet.report.parameter_words import type_words
 from gapbridge.bridge.fleet.runner import Done
 from gapbridge.bridge.fleet.session import Found
-from gapbridge.bridge.report.words import effect_words, joints_words, told
+from gapbridge.bridge.report.labels import effect_title, joint_list, with_unit
 
 SHOWN = 8  # lines of a kind on the terminal; all are in the tables
 
@@ -55,9 +55,9 @@ def write_fitted(
 def _diagnosed_lines(together: Diagnosed) -> list[str]:
     lines = []
     for one in together.recurrences[:SHOWN]:
-        joints = joints_words(tuple(sorted(j for j, _ in one.joints[:3])))
+        joints = joint_list(tuple(sorted(j for j, _ in one.joints[:3])))
         lines.append(
-            f"{effect_words(one.effect)} ({one.effect}{', ' + joints if joints else ''}): "
+            f"{effect_title(one.effect)} ({one.effect}{', ' + joints if joints else ''}): "
             f"{one.sessions} of {counted(one.looked, 'session')}, "
             f"{one.arms} of {counted(one.arms_looked, 'arm')}"
         )
@@ -78,7 +78,7 @@ def _fitted_lines(together: Fitted) -> list[str]:
         lines.append(
             f"{type_words(kind.name)}: {counted(len(kind.arms), 'arm')}, "
             f"{int(shown.sum())} of {len(shown)} flexibilities shown, scatter between arms "
-            f"{_percent(spread)}; gap {told(before, 'm')} with the cells, {told(after, 'm')} as "
+            f"{_percent(spread)}; gap {with_unit(before, 'm')} with the cells, {with_unit(after, 'm')} as "
             "the other sessions foretell"
         )
     return lines + _unlike(together)
@@ -90,12 +90,12 @@ def _percent(spread: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> str:
 
 def _unlike(together: Diagnosed | Fitted) -> list[str]:
     lines = [
-        f"drifts: {d.arm}, {d.quantity}: {told(d.slope, d.unit)} a {d.per}"
+        f"drifts: {d.arm}, {d.quantity}: {with_unit(d.slope, d.unit)} a {d.per}"
         for d in together.drifts[:SHOWN]
     ]
     lines += [
-        f"stands out: {o.session or o.arm}, {o.what}: {told(o.value, o.unit)}, usual "
-        f"{told(o.usual, o.unit)}"
+        f"stands out: {o.session or o.arm}, {o.what}: {with_unit(o.value, o.unit)}, usual "
+        f"{with_unit(o.usual, o.unit)}"
         for o in together.outliers[:SHOWN]
     ]
     return lines

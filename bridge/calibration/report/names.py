@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from gapbridge.bridge.report.words import effect_words
+from gapbridge.bridge.report.labels import effect_title
 from gapbridge.core.effects import CATALOGUE
 
 OF_SESSIONS = {  # what sessions find that is no effect
@@ -34,7 +34,7 @@ def parameter_words(name: str) -> str:
     """Return a parameter's public name in words; the name itself where there are none."""
     effect = effect_of(name)
     if name == effect and effect in CATALOGUE and "{" in patterns().get(effect, "{"):
-        return effect_words(effect)
+        return effect_title(effect)
     match = re.fullmatch(r"(?:_(\d+))?(?:_(.+))?", name.removeprefix(effect))
     if not effect or match is None:
         return name
@@ -43,7 +43,7 @@ def parameter_words(name: str) -> str:
     pattern = patterns().get(effect)
     if pattern is None:
         where = f", joint {joint}" if joint else ""
-        return f"{effect_words(effect)}{where}{', ' + part if part else ''}"
+        return f"{effect_title(effect)}{where}{', ' + part if part else ''}"
     return pattern.format(joint=joint, part=part).replace(" ()", "").strip()
 
 

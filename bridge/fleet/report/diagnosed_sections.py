@@ -5,12 +5,6 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 
-from gapbridge.bridge.fleet.diagnosis_summary import Diagnosed, Onset, Recurrence
-from gapbridge.bridge.fleet.outcome_words import counted
-from gapbridge.bridge.fleet.report.shared_sections import unbroken
-from gapbridge.bridge.fleet.runner import Done
-from gapbridge.bridge.fleet.session import natural
-from gapbridge.bridge.fleet.task import DONE, Outcome
 from gapbridge.bridge.report.fragment import (
     AFTER,
     EXPLAINED,
@@ -24,14 +18,21 @@ from gapbridge.bridge.report.fragment import (
     paragraph,
     table,
 )
-from gapbridge.bridge.report.words import (
+
+from gapbridge.bridge.fleet.diagnosis_summary import Diagnosed, Onset, Recurrence
+from gapbridge.bridge.fleet.outcome_words import counted
+from gapbridge.bridge.fleet.report.shared_sections import unbroken
+from gapbridge.bridge.fleet.runner import Done
+from gapbridge.bridge.fleet.session import natural
+from gapbridge.bridge.fleet.task import DONE, Outcome
+from gapbridge.bridge.report.labels import (
     CHANNELS,
     VERDICTS,
-    effect_words,
-    joints_words,
+    effect_title,
+    joint_list,
     listed,
     percent,
-    told,
+    with_unit,
 )  # fmt: skip
 
 KINDS = {"no_gap": "good", "explained": "good", "partly_explained": "doubtful",
@@ -66,7 +67,7 @@ def _recurs(together: Diagnosed) -> str:
         return "No effect is accused in any session."
     if not often:
         return "No effect recurs: none is accused in more than a tenth of the sessions."
-    told_ = [f"{effect_words(r.effect)} ({r.arms} of {counted(r.arms_looked, 'arm')})"
+    told_ = [f"{effect_title(r.effect)} ({r.arms} of {counted(r.arms_looked, 'arm')})"
              for r in often]  # fmt: skip
     return f"What recurs most: {listed(told_)}."
 
@@ -106,7 +107,7 @@ def _row(one: Recurrence) -> list[Cell]:
     joints = [f"{j} ({n})" for j, n in one.joints[:JOINTS]]
     tied = f", {one.tied} tied" if one.tied else ""
     return [
-        Raw(f"<b>{html_of(effect_words(one.effect))}</b><br>"
+        Raw(f"<b>{html_of(effect_title(one.effect))}</b><br>"
             f"<code>{html_of(one.effect)}</code> · {html_of(CHANNELS[one.channel].lower())}"),
         bar(one.sessions / one.looked, f"{one.sessions} of {one.looked}{tied}", AFTER),
         bar(one.arms / one.arms_looked, f"{one.arms} of {one.arms_looked}", AFTER),
@@ -140,7 +141,7 @@ def _picture(found: Sequence[Recurrence]) -> Figure:
 
 def _label(one: Recurrence) -> str:
     """Return an effect's name in lines that a phone has room for."""
-    words = effect_words(one.effect) + ("" if one.channel == "position" else f" ({one.channel})")
+    words = effect_title(one.effect) + ("" if one.channel == "position" else f" ({one.channel})")
     return "<br>".join(textwrap.wrap(words, 20))
 
 
@@ -149,7 +150,7 @@ def onsets(found: Sequence[Onset]) -> str:
     if not found:
         return ""
     rows: list[list[Cell]] = [
-        [Raw(f"<b>{html_of(o.arm)}</b>"), effect_words(o.effect),
+        [Raw(f"<b>{html_of(o.arm)}</b>"), effect_title(o.effect),
          o.since.removeprefix(f"{o.arm}/"),
          f"{counted(o.before, 'session')} without, {o.after} with"]
         for o in found
@@ -162,9 +163,9 @@ def session_cells(outcome: Outcome) -> list[Cell]:
     result = outcome.result
     channel = result["channels"][0]
     causes = {(r["effect"], tuple(r["joints"])) for r in result["rows"] if r["accused"]}
-    words = [f"{effect_words(e)}{', ' + joints_words(j) if j else ''}" for e, j in sorted(causes)]
+    words = [f"{effect_title(e)}{', ' + joint_list(j) if j else ''}" for e, j in sorted(causes)]
     return [
         badge(VERDICTS[result["verdict"]], KINDS[result["verdict"]]),
-        str(channel["samples"]), unbroken(told(channel["gap_rms"], channel["unit"])),
-        unbroken(told(channel["remaining_rms"], channel["unit"])), "; ".join(words) or "–",
+        str(channel["samples"]), unbroken(with_unit(channel["gap_rms"], channel["unit"])),
+        unbroken(with_unit(channel["remaining_rms"], channel["unit"])), "; ".join(words) or "–",
     ]  # fmt: skip

@@ -6,12 +6,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-
-from gapbridge.bridge.fleet.fit_summary import Fitted, FittedArm, FittedSession, FittedType
-from gapbridge.bridge.fleet.outcome_words import counted
-from gapbridge.bridge.fleet.report.parameter_words import parameter_words, type_words
-from gapbridge.bridge.fleet.report.shared_sections import MOST, unbroken
-from gapbridge.bridge.fleet.task import Outcome
 from gapbridge.bridge.report.fragment import (
     AFTER,
     BEFORE,
@@ -26,7 +20,13 @@ from gapbridge.bridge.report.fragment import (
     paragraph,
     table,
 )
-from gapbridge.bridge.report.words import number, percent, told
+
+from gapbridge.bridge.fleet.fit_summary import Fitted, FittedArm, FittedSession, FittedType
+from gapbridge.bridge.fleet.outcome_words import counted
+from gapbridge.bridge.fleet.report.parameter_words import parameter_words, type_words
+from gapbridge.bridge.fleet.report.shared_sections import MOST, unbroken
+from gapbridge.bridge.fleet.task import Outcome
+from gapbridge.bridge.report.labels import number, percent, with_unit
 
 SESSION_HEADS = ("poses", "gap with the cell", "with the fit", "fopredicted by the others")
 MICRO = 1e6
@@ -47,9 +47,9 @@ def answer(together: Fitted) -> str:
         parts.append(paragraph(
             f"{type_words(kind.name)}: {counted(len(kind.arms), 'arm')}, "
             f"{counted(len(sessions), 'session')}. With the flexibilities of the cells the gap is "
-            f"{told(before, 'm')} a coordinate; with those found {told(after, 'm')}; a session is "
-            f"predicted by the others, which did not see it, to {told(held, 'm')}. The noise of "
-            f"one coordinate is {told(kind.scatter.noise, 'm')}."
+            f"{with_unit(before, 'm')} a coordinate; with those found {with_unit(after, 'm')}; a session is "
+            f"predicted by the others, which did not see it, to {with_unit(held, 'm')}. The noise of "
+            f"one coordinate is {with_unit(kind.scatter.noise, 'm')}."
             + (f" Arms of the type scatter by {percent(float(np.median(spread)))}." if len(spread)
                else " No session shows any flexibility."), "lead",
         ))  # fmt: skip
@@ -184,6 +184,6 @@ def session_cells(together: Fitted) -> Callable[[Outcome], Sequence[Cell]]:
         one = fits[outcome.session]
         gaps = (one.gap_before, one.gap_after, one.gap_held_out)
         poses = str(outcome.result["evidence"]["poses"])
-        return [poses, *(unbroken(told(gap, "m")) for gap in gaps)]
+        return [poses, *(unbroken(with_unit(gap, "m")) for gap in gaps)]
 
     return cells

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from gapbridge.bridge.report.words import CHANNELS, effect_words
+from gapbridge.bridge.report.labels import CHANNELS, effect_title
 from gapbridge.core.effects import CATALOGUE
 
 
@@ -24,7 +24,7 @@ def parameter_words(name: str) -> str:
         return CATALOGUE[effect].label_words.format(joint=joint[1])
     if joint:
         rest = f"joint {joint[1]}{joint[2]}"
-    return f"{effect_words(effect)}{': ' + rest if rest else ''}"
+    return f"{effect_title(effect)}{': ' + rest if rest else ''}"
 
 
 def type_words(name: str) -> str:

@@ -6,12 +6,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-
-from gapbridge.bridge.fleet.drift import Drift
-from gapbridge.bridge.fleet.outlying import Outlier
-from gapbridge.bridge.fleet.report.parameter_words import parameter_words
-from gapbridge.bridge.fleet.runner import Done
-from gapbridge.bridge.fleet.task import DONE, Outcome
 from gapbridge.bridge.report.fragment import (
     AFTER,
     Cell,
@@ -23,7 +17,13 @@ from gapbridge.bridge.report.fragment import (
     paragraph,
     table,
 )
-from gapbridge.bridge.report.words import number, told, unit_of
+
+from gapbridge.bridge.fleet.drift import Drift
+from gapbridge.bridge.fleet.outlying import Outlier
+from gapbridge.bridge.fleet.report.parameter_words import parameter_words
+from gapbridge.bridge.fleet.runner import Done
+from gapbridge.bridge.fleet.task import DONE, Outcome
+from gapbridge.bridge.report.labels import number, unit_of, with_unit
 
 MOST = 40  # rows of a table: the Parquet files have all
 DRAWN = 6  # drifts in the picture
@@ -38,8 +38,8 @@ def drifts(found: Sequence[Drift]) -> str:
     rows: list[list[Cell]] = [
         [
             Raw(f"<b>{html_of(d.arm)}</b>"), parameter_words(d.quantity),
-            f"{told(d.slope, d.unit)} a {d.per}", f"± {told(d.std, d.unit)}",
-            f"{told(d.change, d.unit)} over {len(d.at)} sessions", _surely(d.p_value),
+            f"{with_unit(d.slope, d.unit)} a {d.per}", f"± {with_unit(d.std, d.unit)}",
+            f"{with_unit(d.change, d.unit)} over {len(d.at)} sessions", _surely(d.p_value),
         ]
         for d in found[:MOST]
     ]  # fmt: skip
@@ -87,7 +87,7 @@ def outliers(found: Sequence[Outlier]) -> str:
     rows: list[list[Cell]] = [
         [
             Raw(f"<b>{unbroken(o.arm).html}</b>"), unbroken(_short(o)), parameter_words(o.what),
-            unbroken(told(o.value, o.unit)), unbroken(told(o.usual, o.unit)),
+            unbroken(with_unit(o.value, o.unit)), unbroken(with_unit(o.usual, o.unit)),
             f"{abs(o.deviations):.1f}",
         ]
         for o in found[:MOST]

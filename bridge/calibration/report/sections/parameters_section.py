@@ -7,7 +7,7 @@ from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.calibration.report.names import parameter_words, spoken
 from gapbridge.bridge.document.blocks import Block, Bullets, Cell, Heading, Paragraph, Table
 from gapbridge.bridge.document.section import Section
-from gapbridge.bridge.report.words import unit_of
+from gapbridge.bridge.report.labels import unit_of
 from gapbridge.core.calibration.result import Estimate
 
 

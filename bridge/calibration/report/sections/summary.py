@@ -19,7 +19,7 @@ from gapbridge.bridge.document.blocks import (
     Verdict,
 )
 from gapbridge.bridge.document.section import Section
-from gapbridge.bridge.report.words import listed
+from gapbridge.bridge.report.labels import listed
 
 FEWEST_HELD_OUT = 8  # poses kept out of the fit by which an accuracy can be decided
 

@@ -28,7 +28,7 @@ from gapbridge.bridge.document.blocks import (
 )
 from gapbridge.bridge.document.drawing import AFTER, EDGE, Drawing
 from gapbridge.bridge.document.section import Section
-from gapbridge.bridge.report.words import effect_words, likelihood
+from gapbridge.bridge.report.labels import effect_title, likelihood
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.verify import Suspect, Verification
 from gapbridge.core.effects import CATALOGUE
@@ -152,7 +152,7 @@ def suspect_words(suspect: Suspect) -> str:
     if kind == "reading":
         return f"reading {number} alone is wrong"
     if suspect.name in CATALOGUE:
-        return effect_words(suspect.name)
+        return effect_title(suspect.name)
     if suspect.name == "instrument":
         return "the instrument stands elsewhere"
     return f"another {parameter_words(suspect.name)}"
