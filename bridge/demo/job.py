@@ -24,6 +24,7 @@ from gapbridge.bridge.demo.result import Result
 from gapbridge.bridge.demo.session import Session
 from gapbridge.bridge.demo.terminal import show
 from gapbridge.bridge.document.output_file import write_text
+from gapbridge.bridge.document.svg import svg_file
 from gapbridge.bridge.loop.warm_up import warm_up
 from gapbridge.core.errors import RunError
 from gapbridge.core.estimation.identification import identify_compliance
@@ -127,7 +128,7 @@ def free_address() -> str:
 
 def _write(result: Result, diagnosis: str, out: Path) -> None:
     write_text(out / "summary.json", json.dumps(result.summary(), indent=1) + "\n")
-    write_text(out / "picture.svg", picture(result))
+    write_text(out / "picture.svg", svg_file(picture(result)))
     write_text(out / "report.html", page(result, diagnosis))
 
 

@@ -63,6 +63,11 @@ class Result:
         return tcp_error(self.model, self.compensated)
 
     @property
+    def series(self) -> tuple[tuple[str, Array], ...]:
+        """Return the errors (M,) of each round of visits, by what corrected them."""
+        return (("without", self.error_without), ("with compensation", self.error_with))
+
+    @property
     def repeatability(self) -> float:
         """Return how far (m, rms) the arm comes back from where it was: measured on revisits."""
         return repeatability([self.without, self.compensated], self.loads)

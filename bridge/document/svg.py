@@ -53,7 +53,8 @@ def _shape(shape: Shape) -> str:
     if isinstance(shape, Rectangle):
         return (
             f'<rect x="{_number(shape.x)}" y="{_number(shape.y)}" width="{_number(shape.width)}" '
-            f'height="{_number(shape.height)}" fill="var(--{shape.fill})">{_hint(shape.hint)}</rect>'
+            f'height="{_number(shape.height)}" fill="var(--{shape.fill})">'
+            f"{_hint(shape.hint)}</rect>"
         )
     if isinstance(shape, Dots):
         places = "".join(f"M{_number(x)} {_number(y)}h0" for x, y in shape.points)

@@ -117,7 +117,7 @@ def _pictures(channel: ChannelDiagnosis, before: Array, after: Array) -> Picture
     ]
     floor = channel.noise_floor_rms
     level = None if floor is None else floor * factor
-    share = distribution("How many samples have which gap", f"gap per coordinate, {name}", series)
+    share = distribution("Distribution of the gap", f"gap per coordinate, {name}", series)
     if level is not None and share.x.low <= level <= share.x.high:
         share.upright(level, "noise", EDGE)
     keep = thinned(before)

@@ -115,7 +115,7 @@ def _scatter(across: tuple[str, Array], upwards: tuple[str, Series]) -> Drawing:
     y_title, series = upwards
     every = np.concatenate([values for _, values, _ in series])
     chart = Chart("", scale(x_title, [*x], tight=True, zero=False),
-                  scale(y_title, [*every], tight=True), width=520, height=300)  # fmt: skip
+                  scale(y_title, [*every], tight=True), width=430, height=270)  # fmt: skip
     for _, values, colour in series:
         chart.points([*x], [*values], colour, radius=2.0, opacity=0.7)
     chart.legend([(name, colour) for name, _, colour in series])

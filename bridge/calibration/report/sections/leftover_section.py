@@ -6,7 +6,6 @@ import re
 
 from gapbridge.bridge.calibration.report.figures import degrees
 from gapbridge.bridge.calibration.report.material import Material
-from gapbridge.bridge.calibration.report.names import sentence
 from gapbridge.bridge.document.axes import plain
 from gapbridge.bridge.document.blocks import (
     DOUBTFUL,
@@ -24,6 +23,7 @@ from gapbridge.bridge.document.section import Section
 from gapbridge.bridge.report.answer import one_line, sentences
 from gapbridge.bridge.report.labels import CHANNELS, effect_title, listed
 from gapbridge.bridge.report.material import chosen_channel
+from gapbridge.bridge.report.names import sentence
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 
 SHOWN = 8  # measurements proposed

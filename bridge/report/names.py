@@ -30,7 +30,7 @@ def effect_of(name: str) -> str:
     return max((e for e in (*CATALOGUE, *OF_SESSIONS) if name.startswith(e)), key=len, default="")
 
 
-def parameter_words(name: str) -> str:
+def parameter_title(name: str) -> str:
     """Return a parameter's public name in words; the name itself where there are none."""
     effect = effect_of(name)
     if name == effect and effect in CATALOGUE and "{" in patterns().get(effect, "{"):
@@ -47,7 +47,7 @@ def parameter_words(name: str) -> str:
     return pattern.format(joint=joint, part=part).replace(" ()", "").strip()
 
 
-def spoken(text: str) -> str:
+def with_titles(text: str) -> str:
     """Return a text with public names of parameters and effects in words instead."""
     names = "|".join(sorted((*CATALOGUE, *OF_SESSIONS), key=len, reverse=True))
     return re.sub(rf"\b(?:{names})(?:_[A-Za-z0-9_.]*\w)?\b", _in_words, text)
@@ -55,11 +55,11 @@ def spoken(text: str) -> str:
 
 def sentence(text: str) -> str:
     """Return a text that begins with a capital and ends with a full stop."""
-    text = spoken(text).strip()
+    text = with_titles(text).strip()
     end = "" if text.endswith((".", "!", "?")) else "."
     return text[:1].upper() + text[1:] + end
 
 
 def _in_words(match: re.Match[str]) -> str:
     # words of the language are names too ("payload", "backlash"): only what has a _ is a name
-    return parameter_words(match[0]) if "_" in match[0] else match[0]
+    return parameter_title(match[0]) if "_" in match[0] else match[0]
