@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from gapbridge.bridge.demo.picture import arm_drawing, bars_drawing, coloured
@@ -21,7 +24,7 @@ from gapbridge.bridge.document.blocks import (
 )
 from gapbridge.bridge.document.drawing import AFTER, BEFORE, EDGE, INK, Drawing
 from gapbridge.bridge.document.html import html
-from gapbridge.bridge.document.provenance import installed_version
+from gapbridge.bridge.document.provenance import origin_blocks, origin_line
 
 NEXT_STEPS = (
     "Write a cell for your own robot: gapbridge init HOST --out CELL, or copy "
@@ -31,21 +34,21 @@ NEXT_STEPS = (
 )
 
 
-def page(result: Result, diagnosis: str) -> str:
-    """Return the page; ``diagnosis`` is the diagnosis in plain sentences."""
-    return html(document(result, diagnosis))
+def page(result: Result, diagnosis: str, origin: Mapping[str, Any] | None = None) -> str:
+    """Return the page; ``diagnosis`` is in plain sentences, ``origin`` the run's provenance."""
+    return html(document(result, diagnosis, origin or {}))
 
 
-def document(result: Result, diagnosis: str) -> Document:
+def document(result: Result, diagnosis: str, origin: Mapping[str, Any]) -> Document:
     """Return the report as blocks."""
     parts: list[tuple[str, str, list[Block]]] = [
         ("result", "The result", _result(result)),
         ("visits", "Every visit", [Pictures((_errors(result),))]),
         ("flexibilities", "What was found of the arm", _flexibilities(result)),
         ("diagnosis", "What the diagnosis says", _diagnosis(diagnosis)),
-        ("figures", "How it was done", [_figures(result)]),
+        ("figures", "How it was done", [_figures(result), *origin_blocks(origin)]),
     ]
-    software = f"Gapbridge {installed_version()}"
+    software = origin_line(origin)
     return Document(
         f"The whole job on a simulated {result.model.arm.name}",
         f"Link {result.link}, seed {result.seed} · {software}",

@@ -94,8 +94,8 @@ def bars_drawing(result: Result) -> Drawing:
             value = float(error[rows].mean())
             length, top = max(width * value / longest, 1.0), y + k * height
             drawing.add(Rectangle(left, top, length, height - 0.8, colour))
-            text = Text(left + length + 5, top + height - 1.5, f"{value * 1e3:.2f}", 9, colour)
-            drawing.add(text)
+            figure = f"{value * 1e3:.2f}"
+            drawing.add(Text(left + length + 5, top + height - 1.5, figure, 9, colour))
     lines = [
         (f"{name}: {np.sqrt(np.mean(error**2)) * 1e3:.3f} mm rms", colour)
         for name, error, colour in rounds

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gapbridge.bridge.document.drawing import (
     EDGE,
@@ -233,7 +234,7 @@ def _widened(given: Scale, span: float) -> Scale:
 
 
 def distribution(
-    title: str, quantity: str, series: Sequence[tuple[str, Sequence[float], str]]
+    title: str, quantity: str, series: Sequence[tuple[str, NDArray[np.float64], str]]
 ) -> Chart:
     """Return the share of values that are at most so large, per series of (name, values, colour).
 
@@ -242,12 +243,9 @@ def distribution(
     every = [float(v) for _, values, _ in series for v in values]
     chart = Chart(title, logarithmic(quantity, visible(every)), scale("share, %", [0, 100]))
     for _, values, colour in series:
-        ordered = sorted(float(v) for v in values)
-        ordered = (
-            [ordered[round(k)] for k in np.linspace(0, len(ordered) - 1, 400)]
-            if len(ordered) > 400
-            else ordered
-        )  # a finer step is no wider than a line
+        ordered = np.sort(values)
+        if len(ordered) > 400:  # a finer step is no wider than a line
+            ordered = ordered[np.linspace(0, len(ordered) - 1, 400).astype(int)]
         x = [v for v in ordered for _ in (0, 1)]
         share = [100.0 * k / len(ordered) for k in range(len(ordered) + 1)]
         y = [v for v in share for _ in (0, 1)]

@@ -46,7 +46,7 @@ def origin_blocks(origin: Mapping[str, Any]) -> list[Block]:
     """Return version, time, arguments and files with their SHA-256 as blocks; none for none."""
     if not origin:
         return []
-    arguments = ", ".join(f"{name} {value}" for name, value in origin["arguments"].items())
+    arguments = ", ".join(f"{k} {_argument(v)}" for k, v in origin["arguments"].items())
     pairs = [("software", f"Gapbridge {origin['version']}"), ("time (UTC)", origin["time"]),
              ("command", f"gapbridge {origin['command']}" if origin["command"] else ""),
              ("arguments", arguments)]  # fmt: skip
@@ -55,6 +55,10 @@ def origin_blocks(origin: Mapping[str, Any]) -> list[Block]:
         Heading("Origin"), Columns((Pairs(tuple((k, v) for k, v in pairs if v)),)),
     ]  # fmt: skip
     return [*blocks, Table(("file", "name", "SHA-256"), rows, (0.7, 2, 4))] if rows else blocks
+
+
+def _argument(value: Any) -> str:
+    return " ".join(str(v) for v in value) if isinstance(value, list) else str(value)
 
 
 def fitted(

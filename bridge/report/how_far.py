@@ -11,6 +11,7 @@ from gapbridge.bridge.document.section import Section
 from gapbridge.bridge.report.labels import CHANNELS, effect_title, percent, unit_of, with_unit
 from gapbridge.bridge.report.material import (
     Array,
+    Index,
     Material,
     before_and_after,
     channel_heading,
@@ -132,7 +133,7 @@ def _pictures(channel: ChannelDiagnosis, before: Array, after: Array) -> Picture
 
 
 def _by_sample(
-    rows: Array, series: list[tuple[str, Array, str]], unit: str, level: float | None
+    rows: Index, series: list[tuple[str, Array, str]], unit: str, level: float | None
 ) -> Drawing:
     highest = [level or 0.0, *(float(values.max()) for _, values, _ in series)]
     chart = Chart("Every sample", scale("row of the log", [*rows], tight=True),
