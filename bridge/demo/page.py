@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from gapbridge.bridge.demo.picture import GREEN, RED, picture
+from gapbridge.bridge.demo.picture import AMBER, GREEN, RED, picture
 from gapbridge.bridge.demo.result import Result
+from gapbridge.bridge.demo.terminal import truth_lines
 
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #1f2933; max-width: 980px; margin: 2rem auto;
@@ -34,9 +35,10 @@ def page(result: Result, diagnosis: str) -> str:
         f"<h1>The whole job on a simulated {escape(result.model.arm.name)}</h1>",
         _lead(result),
         picture(result),
+        _truth(result),
         "<h2>Every visit</h2>", charts[0],
         "<h2>What was found of the arm</h2>", charts[1], _flexibility_table(result),
-        "<h2>What the diagnosis says of the calibration log</h2>",
+        "<h2>What the diagnosis says of what the fit leaves</h2>",
         f"<pre>{escape(diagnosis)}</pre>",
         '<p>In pictures: <a href="diagnosis/report.html">the diagnosis</a>.</p>',
         "<h2>How it was done</h2>", _figures(result),
@@ -53,6 +55,17 @@ def _lead(result: Result) -> str:
         f"({errors['with']['max']:.3f}): {ratio:.0f} times less. The arm comes back to a place "
         f"within {result.repeatability * 1e3:.3f} mm. The arm's flexibilities are drawn from seed "
         f"{result.seed}; nothing that corrects the arm knows them.</p>"
+    )
+
+
+def _truth(result: Result) -> str:
+    """Return what was hidden beside what was found."""
+    lines = truth_lines(result)
+    if not lines:
+        return ""
+    items = "".join(f"<li>{escape(line.strip())}</li>" for line in lines[1:])
+    return (
+        f"<h2>The hidden truth, and what was found</h2><p>{escape(lines[0])}.</p><ul>{items}</ul>"
     )
 
 
@@ -79,9 +92,9 @@ def _errors(result: Result) -> str:
     traces: list[Any] = [
         go.Scatter(x=visit, y=error * 1e3, mode="markers", name=name, text=told,
                    marker={"color": colour, "size": 10})
-        for name, error, colour in (
-            ("without", result.error_without, RED),
-            ("with compensation", result.error_with, GREEN),
+        for (name, error), colour in zip(
+            result.series, (RED, AMBER, GREEN) if len(result.series) == 3 else (RED, GREEN),
+            strict=True,
         )
     ]  # fmt: skip
     traces.append(

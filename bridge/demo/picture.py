@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 WIDTH, HEIGHT = 960, 420
 MAGNIFIED = 60  # times the bending is drawn larger
 INK, FAINT, RED, GREEN = "#1f2933", "#9aa5b1", "#d64545", "#2f9e5b"
+AMBER = "#d9902f"
 
 
 def skeleton(model: Model, q: Array, load: Load) -> Array:
@@ -87,26 +88,27 @@ def _bars(result: Result) -> str:
     """Draw error without and with compensation for each test pose."""
     left, top, width = 560, 58, 300
     poses = visits_of_poses(result)
-    before, after = result.error_without * 1e3, result.error_with * 1e3
-    longest = float(before.max())
-    step = min(300 / len(poses), 34)
+    colours = (RED, AMBER, GREEN) if len(result.series) == 3 else (RED, GREEN)
+    series = [(e * 1e3, c) for (_, e), c in zip(result.series, colours, strict=True)]
+    longest = float(series[0][0].max())
+    step = min(284 / len(poses), 34)
     parts = [_bold(490, 34, "Distance of the TCP from where it was wanted, mm", size=16)]
     for number, rows in enumerate(poses):
         y = top + number * step
         parts.append(_text(490, y + step * 0.55, f"pose {number + 1}", 12, FAINT))
-        for k, (values, colour) in enumerate(((before, RED), (after, GREEN))):
+        for k, (values, colour) in enumerate(series):
             value = float(values[rows].mean())
-            height = step * 0.36
+            height = step * 0.72 / len(series)
             length = max(width * value / longest, 1.0)
             y_bar = y + k * (height + 1)
             parts.append(f'<rect x="{left}" y="{y_bar:.1f}" width="{length:.1f}" '
                          f'height="{height:.1f}" fill="{colour}"/>')  # fmt: skip
             parts.append(_text(left + length + 5, y_bar + height - 1, f"{value:.2f}", 10, colour))
-    figures = result.summary()
-    errors = figures["tcp_error_mm"]
-    without, with_it = errors["without"]["rms"], errors["with"]["rms"]
-    repeats = figures["repeatability_mm"]
-    parts.append(_bold(490, 370, f"without compensation {without:.2f} mm rms", RED))
-    parts.append(_bold(490, 388, f"with compensation {with_it:.3f} mm rms", GREEN))
-    parts.append(_bold(490, 406, f"the arm repeats to {repeats:.3f} mm", "#6b7785"))
+    lines = [
+        (f"{name} {np.sqrt(np.mean(error**2)) * 1e3:.3f} mm rms", colour)
+        for (name, error), colour in zip(result.series, colours, strict=True)
+    ]
+    lines.append((f"the arm repeats to {result.repeatability * 1e3:.3f} mm", "#6b7785"))
+    for k, (text, colour) in enumerate(reversed(lines)):
+        parts.append(_bold(490, 410 - 17 * k, text, colour))
     return "\n".join(parts)
