@@ -25,13 +25,14 @@ COLUMNS: dict[str, int | None] = {
     "approach": None,
     "measured_position": 3,
     "measured_rotation": 3,
+    "actual_TCP_pose": 6,  # of a simulator: what the controller takes its TCP for, no measurement
 }
 INDEXED = re.compile(r"(.+)_(\d+)$")
 ALIKE = 0.85  # likeness of two names from which one may be the other misspelt
 # RTDE fields that look like a log's columns and are none of them: never a slip of the pen
 OTHERS = {
     "target_qd", "target_qdd", "target_moment", "target_current", "target_TCP_pose",
-    "target_TCP_speed", "actual_current", "actual_current_window", "actual_TCP_pose",
+    "target_TCP_speed", "actual_current", "actual_current_window",
     "actual_TCP_speed", "payload_mass", "payload_inertia", "joint_mode", "joint_control_output",
 }  # fmt: skip
 
