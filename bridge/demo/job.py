@@ -77,8 +77,8 @@ def _job(
     save_cell(cell, out / "calibrated.yaml", found.model)
     calibrated = load_cell(out / "calibrated.yaml")
     console.print(
-        f"fitted on {found.samples} poses: gap {found.gap_rms * 1e3:.3f} mm per coordinate before, "
-        f"{found.remaining_rms * 1e3:.3f} mm after"
+        f"fitted on {found.samples} poses: gap in space {3**0.5 * found.gap_rms * 1e3:.3f} mm rms "
+        f"before, {3**0.5 * found.remaining_rms * 1e3:.3f} mm after"
     )
     seen = _Visits()
     explained: list[Rests] = []

@@ -55,6 +55,14 @@ def written(name: str, n: int) -> str:
     return f"{name}_0..{len(ends) - 1}" if ends[0] else name
 
 
+def label(column: str) -> str:
+    """Return a column as people read it: joints from 1 and its name, ``joint 2 (actual_q_1)``."""
+    match = INDEXED.match(column)
+    if match and COLUMNS.get(match[1], 0) is None:
+        return f"joint {int(match[2]) + 1} ({column})"
+    return column
+
+
 def misspelt(unknown: Sequence[str], names: Sequence[str], n: int) -> str:
     """Return which of the ``unknown`` columns may mean one of ``names``, as a question, or ''."""
     likeness = [
