@@ -51,6 +51,7 @@ class DaemonStatus:
         self._residual_at = slices["residual"].start
         self._correction = (0, 0.0)  # flags and residual, m, of the last cycle
         self.configured: Event = {}  # the last attempt to reload
+        self._compiling = ""  # what the loop's process is at before its first cycle
 
     def take(self, rows: NDArray[np.float64]) -> None:
         """Take note of cycles."""
@@ -68,8 +69,13 @@ class DaemonStatus:
             self.configured = event
         if event["kind"] == "request" and event["command"] == "arm":
             self._asked_by = event["by"]
+        if event["kind"] == "compiling":
+            self._compiling = event["detail"]
+        if event["kind"] == "granted":  # compiled, and about to connect
+            self._compiling = ""
         if event["kind"] != "transition":
             return
+        self._compiling = ""
         to, cause, detail = event["to"], event["cause"], event["detail"]
         self._since = event["time"]
         self._why = f"{cause}: {detail}" if detail else cause
@@ -85,8 +91,17 @@ class DaemonStatus:
         if to not in (State.ARMED.name, State.COMPENSATING.name, State.HOLDING.name):
             self.armed_by = ""
 
+    def named(self, state: State) -> str:
+        """Return the state as the document names it: compiling is one of its own."""
+        return (
+            self._compiling
+            if state == State.DISCONNECTED and self._compiling
+            else (state.name.lower())
+        )
+
     def lost_loop(self) -> None:
         """Take note that link and loop are gone: faults of the link end with them."""
+        self._compiling = ""
         if self._heals:
             self.latched, self._heals = "", False
         self.armed_by = ""
