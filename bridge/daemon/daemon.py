@@ -56,6 +56,8 @@ Say = Callable[[str], None]
 class Daemon:
     """One run. ``stop``, ``reload``, ``arm`` and ``disarm`` may be called from other threads."""
 
+    loop_process: type[LoopProcess] = LoopProcess  # a simulation has one of its own
+
     def __init__(
         self,
         given: DaemonSettings | Configuration,
@@ -381,7 +383,7 @@ class Daemon:
             self._request(Command.ARM, armed_by)
             self._pass_on()
         self._loops += 1
-        return LoopProcess(
+        return self.loop_process(
             self.configuration, self.page, self._commands, order, self._output, self._clock
         )
 
