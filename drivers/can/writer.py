@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import PartialWriteError, WriteError
-from gapbridge.drivers.can.codec import Writing
 from gapbridge.drivers.can.profile import Action, CanProfile, Key, Outgoing
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.can_bus.bus import first_line
@@ -26,7 +25,6 @@ class FrameWriter:
         self._now = clock.monotonic
         self._settings, self._profile = settings, profile
         self._bus: Any = None
-        self._plan = Writing(profile)
         self._last: Frames | None = None  # the setpoint that got out whole
         self.target: Vector | None = None  # rad, the same as joints
         self.mended = 0  # setpoints that had to be taken back
@@ -77,9 +75,6 @@ class FrameWriter:
 
     def _encode(self, q: Vector) -> Frames:
         """Return all frames before any is sent. Raises WriteError."""
-        plan = self._plan
-        if plan.able and q.shape == (self._profile.n,) and (frames := plan.frames(q)) is not None:
-            return frames
         if q.shape != (self._profile.n,) or not np.isfinite(q).all():
             raise WriteError(f"{self._profile.name}: found {q}, expected finite joints")
         wire: list[float] = self._profile.joints.to_wire(q).tolist()
