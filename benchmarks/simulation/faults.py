@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks.simulation import can, modbus, ur
 from benchmarks.simulation.can import CanLink
 from benchmarks.simulation.modbus import ModbusLink
-from benchmarks.simulation.processes import Run
+from benchmarks.simulation.processes import PLANNED_JOINT, Run
 from benchmarks.simulation.ur import UrLink
 from benchmarks.simulation.wires import WAY
 
@@ -249,10 +249,10 @@ def _planner_silent(run: Run, draw: Draw) -> str:
 def _planner_nonsense(run: Run, draw: Draw) -> str:
     if run.planner is None:
         return "no planner"
-    step, joint = draw.choice((0.02, 0.3, 1.5, 9.0, float("nan"))), draw.randrange(6)
+    step = draw.choice((0.02, 0.3, 1.5, 9.0, float("nan")))
 
     def nonsense(q: Any) -> Any:
-        q[joint] += step
+        q[PLANNED_JOINT] += step
         return q
 
     planner = run.planner

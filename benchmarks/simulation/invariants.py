@@ -7,16 +7,14 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
-from benchmarks.faults.invariants import ZEROS, Checker
+from benchmarks.faults.invariants import Checker
 from benchmarks.faults.wire.seen import Fresh, Numbers, Write
 from gapbridge.bridge.loop.link_monitor import DRIFT, hold_time
 from gapbridge.bridge.loop.supervisor import HEALED_BY_RECONNECTING, TRANSITIONS, Cause, State
 from gapbridge.core.setpoint import Setpoint
-from gapbridge.drivers.simulated.plant.kinematics import gap, tcp_in_base
 
 MARGIN = 0.01  # s: a cycle of the controller and what computing takes
 LONGEST_LIST = 20
-STAYED = 0.02  # rad: an arm so near to its last setpoint still has the offset in it
 
 INVARIANTS: dict[str, str] = {
     "envelope": "no offset on the wire is larger than the cell's, counted from where the arm was "
@@ -67,25 +65,6 @@ _KINDS = (
 """What benchmarks/faults/invariants.py says -> which invariant that is."""
 
 
-class PlannedChecker(Checker):
-    """The checker of a link whose nominal setpoint moves: offsets count from where it is."""
-
-    nominal_q: Numbers = ()  # rad, of the setpoint that leaves
-    _left: tuple[Numbers, Numbers] = ((), ZEROS)  # joints and offset of the last one
-
-    def _offset_of(self, write: Write) -> Numbers:
-        begins = self._stream.nominal is None
-        super()._offset_of(write)  # where a stream may begin is judged there
-        q, offset = self._left
-        if begins:
-            stayed = len(q) > 0 and math.dist(q, write.values) < STAYED
-            self._stream.offset = offset if stayed else ZEROS
-        arm, tool = self.bounds.arm, self.bounds.tool
-        now = gap(tcp_in_base(arm, self.nominal_q, tool), tcp_in_base(arm, write.values, tool))
-        self._left = (write.values, now)
-        return now
-
-
 class Judge:
     """Watches a run; ``violations`` are what it has found."""
 
@@ -99,6 +78,7 @@ class Judge:
         self._acknowledged = False  # since the fault began
         self._fault: str | None = None  # that is latched
         self._heals = False
+        self._last: Numbers = ()  # the values of the last write
         self.writes_noted = 0  # setpoints seen on the wire
         self.oldest = 0.0  # s
 
@@ -117,10 +97,13 @@ class Judge:
         checker.take([seen])
         if checker.doubts:  # the loop's state is known exactly here
             doubt = checker.doubts.pop()
-            self.violate("state", f"write in state {State(doubt.state).name}")
             checker.doubts.clear()
+            holds = isinstance(seen, Write) and seen.values == self._last  # as it lets go
+            if not holds:
+                self.violate("state", f"write in state {State(doubt.state).name}")
         if isinstance(seen, Write) and seen.kind in ("offset", "joints"):
             self.writes_noted += 1
+            self._last = seen.values
         found = checker.found
         if found.violated > self._known:
             for words in found.violations[self._known - found.violated :]:
@@ -130,8 +113,6 @@ class Judge:
     def sent(self, setpoint: Setpoint, sampled: float, now: float) -> None:
         """Take a setpoint as it is handed to the driver, and when its state was sampled, s."""
         self._now = now
-        if isinstance(self._checker, PlannedChecker):
-            self._checker.nominal_q = tuple(setpoint.nominal_q.tolist())
         if math.isnan(sampled):
             self.violate("age", "a setpoint of a state that no controller has sampled")
             return

@@ -19,6 +19,7 @@ from gapbridge.bridge.ipc.command_page import CommandPage, Commands
 from gapbridge.bridge.ipc.shared_memory import Phase, RunPage, SharedMemory
 from gapbridge.bridge.loop.loop import Exit, Loop
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
+from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.setpoint_source.glide import Glide
 from gapbridge.bridge.setpoint_source.source import Source
 from gapbridge.bridge.setpoint_source.target import TargetSource
@@ -31,7 +32,7 @@ Vector = NDArray[np.float64]
 STARTING = (0.05, 0.3)  # s that a process takes until it runs
 KILLED = -9
 COMPUTING = 1e-4  # s: of a cycle
-PLANNED = 0.02  # s between two setpoints of the planner
+PLANNED, PLANNED_JOINT = 0.02, 0  # s between two setpoints of the planner; what it moves
 
 
 class Run:
@@ -213,14 +214,13 @@ class Planner:
         world.every(lambda: PLANNED, self._send)
 
     def _send(self) -> None:
-        now = np.array(self._link.controller.q)
-        if self._at is None or float(np.abs(self._at - now).max()) > 0.05:
-            self._at, self._time = now, 0.0  # somebody has moved the arm: begin there
+        if self._at is None or self._link.supervisor_state() != State.COMPENSATING:
+            self._at, self._time = np.array(self._link.controller.q), 0.0  # begins there
         if self._world.now < self.silent_until:
             return
         self._time += PLANNED
         q = self._at.copy()
-        q[0] += 0.02 * np.sin(0.5 * self._time) ** 2
+        q[PLANNED_JOINT] += 0.02 * np.sin(0.5 * self._time) ** 2
         if self.nonsense is not None:
             q = self.nonsense(q)
         self.take(q)

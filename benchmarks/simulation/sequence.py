@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from benchmarks.faults.invariants import Checker
 from benchmarks.simulation.can import CanLink
-from benchmarks.simulation.faults import drawn
-from benchmarks.simulation.invariants import Judge, PlannedChecker, Violation
+from benchmarks.simulation.faults import FAULTS, Fault, drawn
+from benchmarks.simulation.invariants import Judge, Violation
 from benchmarks.simulation.links import SimulatedLink, setting_of
 from benchmarks.simulation.modbus import ModbusLink
-from benchmarks.simulation.processes import Run
+from benchmarks.simulation.processes import PLANNED_JOINT, Run
 from benchmarks.simulation.ur import UrLink, library
 from benchmarks.simulation.world import BEGIN, Process, SimulatedClock, World
 from gapbridge.bridge.ipc.control_socket import Peer
@@ -27,6 +28,7 @@ FIRST, SPAN = 1.6, 1.2  # s: when faults begin, over what time they are spread
 RECOVERY = 25.0  # s until a healed run compensates again
 ENDING = 8.0  # s until a stopped run is over
 LOOK = 0.02  # s
+Plan = list[tuple[float, Fault]]
 
 
 @dataclass
@@ -47,15 +49,21 @@ class Outcome:
         return "\n".join(lines)
 
 
-def run(seed: int, say: Any = None) -> Outcome:
-    """Run one seed; ``say`` gets every event."""
+def run(seed: int, say: Any = None, plan: Sequence[tuple[float, str]] | None = None) -> Outcome:
+    """Run one seed; ``say`` gets every event.
+
+    ``plan``: faults by name, each with its moment (s after the first could be), in place of those
+    that the seed draws.
+    """
     draw = random.Random(f"faults {seed}")
     name = list(LINKS)[seed % len(LINKS)]
     world = World(seed)
     clock = SimulatedClock(world)
     setting = setting_of(name)
     planned = setting.wired.moves_arm and draw.random() < 0.4
-    checker = (PlannedChecker if planned else Checker)(setting.bounds)
+    checker = Checker(setting.bounds)
+    if planned:  # offsets are what the other joints do
+        checker._planned = (PLANNED_JOINT, setting.wired.start_q[PLANNED_JOINT])
     judge = Judge(checker, BEGIN, setting.wired.rate)
     link = LINKS[name](world, clock, setting, judge.saw)
     modules = link.modules() if isinstance(link, UrLink) else {}
@@ -63,7 +71,7 @@ def run(seed: int, say: Any = None) -> Outcome:
     with library(modules):
         found = Run(world, clock, link, planned)
         _listen(found, judge, say)
-        person = Person(found, judge, draw, outcome)
+        person = Person(found, judge, draw, outcome, _planned(draw, name, plan))
         try:
             world.run(BEGIN + FIRST + SPAN + 3 * RECOVERY, lambda: person.done)
             _judge_end(found, judge, person)
@@ -74,6 +82,15 @@ def run(seed: int, say: Any = None) -> Outcome:
     outcome.violations, outcome.writes = judge.violations, judge.writes_noted
     outcome.oldest, outcome.seconds = judge.oldest, world.now - BEGIN
     return outcome
+
+
+def _planned(draw: random.Random, link: str, given: Sequence[tuple[float, str]] | None) -> Plan:
+    """Return which faults happen when, s after the first could."""
+    if given is not None:
+        by_name = {fault.name: fault for fault in FAULTS}
+        return [(moment, by_name[name]) for moment, name in given]
+    faults = drawn(draw, link, draw.randint(0, MOST_FAULTS))
+    return list(zip(sorted(draw.uniform(0.0, SPAN) for _ in faults), faults, strict=True))
 
 
 def _listen(run: Run, judge: Judge, say: Any) -> None:
@@ -98,7 +115,10 @@ def _listen(run: Run, judge: Judge, say: Any) -> None:
 class Person(Process):
     """Arms, has faults happen, heals, arms again, stops."""
 
-    def __init__(self, run: Run, judge: Judge, draw: random.Random, outcome: Outcome) -> None:
+    def __init__(
+        self, run: Run, judge: Judge, draw: random.Random, outcome: Outcome, plan: Plan
+    ) -> None:
+        self._plan = plan
         self._of, self._judge, self._draw, self._outcome = run, judge, draw, outcome
         self.done = False
         self.ended_in_time = True
@@ -108,10 +128,8 @@ class Person(Process):
         run, world, draw = self._of, self.world, self._draw
         self._wait_for(State.OBSERVING, RECOVERY)
         self._ask("arm")
-        faults = drawn(draw, run.link.setting.name, draw.randint(0, MOST_FAULTS))
-        moments = sorted(draw.uniform(0.0, SPAN) for _ in faults)
         begin = max(world.now, BEGIN + FIRST)
-        for moment, fault in zip(moments, faults, strict=True):
+        for moment, fault in self._plan:
             self._until(begin + moment)
             if self._over or not run.loops:
                 break
@@ -150,9 +168,9 @@ class Person(Process):
         """Ask as the control socket does, and see whether what is answered is so."""
         daemon = self._of.daemon
         answer = daemon.control.answer(command, Peer(1, 1000))
-        if answer["ok"] and str(answer["answer"]).endswith("observing"):
-            if daemon.state != State.OBSERVING or daemon.latched:
-                self._judge.violate("taken", f"{command}: {answer}, in {daemon.state.name}")
+        observes = answer["ok"] and str(answer["answer"]).endswith("observing")
+        if observes and (daemon.state != State.OBSERVING or daemon.latched):
+            self._judge.violate("taken", f"{command}: {answer}, in {daemon.state.name}")
         return answer
 
     def _recover(self) -> None:
