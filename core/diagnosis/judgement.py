@@ -177,12 +177,16 @@ def _no_value(selection: Selection) -> dict[int, str]:
 def still_sure(selection: Selection, judgement: Judgement, arm: Arm) -> tuple[Selection, Judgement]:
     """Return what is accused refitted as all there is, and its judgement.
 
-    Beside the unknown, and over the regions of the log, a value may be less sure than it was.
+    Beside the unknown, and over the regions of the log, a value may be less sure than it was, and a
+    stiffness curve straight.
     """
     while True:
         found = standing(selection, arm, judgement.accused, judgement.remainder)
         single = [p for p in judgement.accused if found.term_index[p] not in found.block]
-        share = [worth(found.terms[p], found.covariance[p]) for p in single]
+        straight = {p for p in not_bent(found.terms, found.covariance) if judgement.remainder}
+        share = [
+            0.0 if p in straight else worth(found.terms[p], found.covariance[p]) for p in single
+        ]
         if min(share, default=1.0) >= 1:
             return found, judgement
         weakest = single[int(np.argmin(share))]
