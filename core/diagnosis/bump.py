@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.diagnosis.criteria import SMOOTH_PRICE
 from gapbridge.core.diagnosis.residual_structure import basis_of
 from gapbridge.core.diagnosis.selection.candidate import joint_quantity
-from gapbridge.core.diagnosis.selection.problem import SMOOTH_PRICE
 from gapbridge.core.diagnosis.selection.selection import Selection
 
 Array = NDArray[np.float64]

@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
+from gapbridge.core.diagnosis.criteria import CHANCE, MATTERS
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import CATALOGUE, Reported
 
 Array = NDArray[np.float64]
-CHANCE = 0.001  # probability below which the values differ by more than chance
-MATTERS = 0.2  # share of a cause's size: sessions that differ by less are alike for a model
 DEAD = 1e-7  # share of a parameter's column that a session has: below, it shows nothing of it
 SHOWN = 3.0  # whitened length of an effect of usual size from which a session shows it
 

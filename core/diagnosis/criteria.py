@@ -1,4 +1,4 @@
-"""What decides an accusation: every constant of the judgement, and what set it.
+"""What decides an answer: the constants of search and judgement, and what set them.
 
 Figures are of the blind benchmark (cases of one to four known effects, of known effects beside an
 unknown one of comparable size, of an unknown one alone) unless a real log is named. The logs of
@@ -38,3 +38,33 @@ INSTRUMENTS = 5.0  # times the instrument's sigma, for coarse instruments
 # Ties
 TIE = 7.0  # score within which another explanation counts as equally good
 BENT = 10.8  # gain in -2 log likelihood of a bent stiffness curve over a straight one
+SAME = 1e-4  # of a cause's squares, left by another that does all it does: equal but for rounding
+# The search: what a hypothesis costs. These hold together; the blind tables of docs/evidence.md
+# are what supports them as a whole, none was measured by itself
+MARGIN = 6.0  # score that every accusation pays: keeps clean logs clean
+SMOOTH_PRICE = 18.0  # the same of an unnamed function beyond a named cause
+UNITED = 10.0  # score by which one cause is preferred that does the work of three
+GATHERED = 4.0  # score that one kind of effect at two places may cost beyond two kinds
+UNSEEN = 3.0  # score that play pays in a log without reversals: it stands behind the plain offset
+LINES = 4  # periodic lines a joint may have: more are the Fourier series of something else
+SMOOTH_TERMS = 2  # unnamed functions of a set: more add nothing
+LARGE = 450  # rows of the sample space from which many causes are looked for, one by one
+# Sizes of an arm, by what Effect.parameters calls usual
+ABSURD = 200.0  # times the usual size: beyond, a fit is no explanation
+SHARP = 6000.0  # times the usual softening of a stiffness curve
+WEAK = 100.0  # times the usual size: how far the data may take a number against nothing
+OPEN = 30.0  # times the usual size: with a wider spread nothing is known of a number
+# Unnamed functions against what they stand beside
+TAKEN = 1e-5  # eigenvalue of unit columns below which a direction is the unnamed functions' own
+HELD_WHOLLY = 0.98  # share of an effect's column in an unnamed rival's span that makes it a part
+MOSTLY = 0.9  # share of what the rival takes that has to be this part: a pull nearly down, a weight
+# Noise and outliers
+KNOWN_SHARE = 0.7  # of a stated repeatability, which is an average: less is not assumed
+NOT_WHITE = 0.001  # probability below which the residual of a recording is not white
+EXCESS = 0.5  # times the floor: a correlated part smaller than that changes no answer
+WILD_SHARE = 0.1  # of the samples: more outliers than that are structure, not bad luck
+WILD_SIGMA = 5.0  # from which on a sample is an outlier
+FORETOLD = 0.5  # share of an outlier that may be left where something else explains it
+# Several sessions
+CHANCE = 0.001  # probability below which the values of sessions differ by more than chance
+MATTERS = 0.2  # share of a cause's size: sessions that differ by less are alike for a model

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.diagnosis.criteria import WEAK
 from gapbridge.core.diagnosis.observation import Observation
-from gapbridge.core.diagnosis.selection.refit import WEAK
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.estimation.regions import joint_regions
 

@@ -23,6 +23,7 @@ from gapbridge.core.diagnosis.criteria import (
     INSTRUMENTS,
     MINUTE,
     REPEATED,
+    SAME,
     STAND_IN_GAIN,
     STATED,
     SURE,
@@ -51,7 +52,6 @@ from gapbridge.core.diagnosis.selection.selection import Selection, standing
 from gapbridge.core.errors import InputError
 
 Array = NDArray[np.float64]
-SAME = 1e-4  # of the squares of a cause, left by another that does all that it does
 BESIDE = "it does not keep its value beside the unknown that is left"
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.diagnosis.criteria import EXCESS, NOT_WHITE
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.selection import Selection
 
@@ -21,8 +22,6 @@ MANY = 400  # samples from which the residual's own rms is the better estimate
 BLOCK = 0.1  # s: what is correlated for less is the sensor's filter, not the arm
 LAGS = 5  # of block means
 FEWEST_BLOCKS = 40
-NOT_WHITE = 0.001  # probability below which a residual is not white
-EXCESS = 0.5  # times the floor: a correlated part smaller than that changes no answer
 
 
 @dataclass(frozen=True)

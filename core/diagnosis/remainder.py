@@ -16,9 +16,12 @@ from numpy.typing import NDArray
 from gapbridge.core.diagnosis.criteria import (
     CLOSED,
     DRIFT,
+    HELD_WHOLLY,
+    MOSTLY,
     SIBLING,
     SIGMAS,
     STAND_IN_GAIN,
+    TAKEN,
     UNKNOWNS,
 )
 from gapbridge.core.diagnosis.held_out import HeldOut
@@ -32,10 +35,7 @@ from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.smooth import targets
 
 Array = NDArray[np.float64]
-TAKEN = 1e-5  # eigenvalue of unit columns below which a direction is the unnamed functions' own
 SHOWN = 0.3  # share of a number that may lie in such directions
-HELD_WHOLLY = 0.98  # share of an effect's column in an unnamed rival's span that makes it a part
-MOSTLY = 0.9  # share of what the rival takes that has to be this part
 LARGE = 900  # rows of the sample space from which several accusations go at a time
 HOPELESS = 0.6  # strength below which they do
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
+from gapbridge.core.diagnosis.criteria import OPEN
 from gapbridge.core.diagnosis.held_out import HeldOut, Shrink
 from gapbridge.core.diagnosis.judgement import Judgement
 from gapbridge.core.diagnosis.selection.forward import children
@@ -19,7 +20,6 @@ from gapbridge.core.effects import CATALOGUE, Reported, Term
 
 Array = NDArray[np.float64]
 SHOWN = 3.0  # whitened length of an effect of usual size from which it counts as excited
-OPEN = 30.0  # usual sizes of a parameter: with a wider spread nothing is known of it
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.diagnosis.criteria import TIE
 from gapbridge.core.diagnosis.next_measurements import PREDICTED, Predict, Trials, draw_trials
 from gapbridge.core.diagnosis.selection.local_search import rivals
 from gapbridge.core.diagnosis.selection.problem import Found, Space, fit
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 EACH = 2  # measurements proposed per open question
 APART = 0.5  # rad, of some joint, between poses that are proposed together
-TIE = 7.0
 VISIBLE = 1.0  # times the noise: a smaller difference decides nothing
 POSED = 1e-6  # share of a difference that changes with the pose: less, and no pose decides
 

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.diagnosis.criteria import BENT
 from gapbridge.core.diagnosis.selection.problem import Space
 from gapbridge.core.effects import CATALOGUE, Term
 
 Array = NDArray[np.float64]
-BENT = 10.8  # gain of a bent stiffness curve over a straight one that makes it one
 
 
 def not_bent(terms: Sequence[Term], covariance: Sequence[Array]) -> list[int]:

@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.diagnosis.criteria import LINES, SMOOTH_TERMS
 from gapbridge.core.diagnosis.selection.problem import Found, Space, fit, gains
 
 Array = NDArray[np.float64]
 BEAM = 6
 DEPTH = 9
 PATIENCE = 2  # depths without a better set before the beam stops
-SMOOTH_TERMS = 2  # more unnamed functions than that add nothing
-LINES = 4  # periodic lines a joint may have: more are the Fourier series of something else
 DEPENDENT = 1e-5  # share of a block below which a direction counts as given by its others
 
 

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.diagnosis.criteria import ANGLE, GEOMETRIC, LENGTH, SHARES
+from gapbridge.core.diagnosis.criteria import ANGLE, GEOMETRIC, LENGTH, MARGIN, SHARES
 from gapbridge.core.diagnosis.selection.candidate import Candidate
-from gapbridge.core.diagnosis.selection.problem import MARGIN, Found, Space
+from gapbridge.core.diagnosis.selection.problem import Found, Space
 from gapbridge.core.diagnosis.selection.search import screened_search
 
 Array = NDArray[np.float64]

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.diagnosis.criteria import GATHERED
 from gapbridge.core.diagnosis.selection.forward import children, clash, grow, offspring, projected
 from gapbridge.core.diagnosis.selection.problem import Found, Space, fit, gains
 
 Array = NDArray[np.float64]
 MERGED = 9  # terms up to which every pair is tried against one
 GROWTH = 30  # terms added to a set at most
-GATHERED = 4.0  # score that one kind of effect at two places may cost beyond two kinds
 
 
 def improve(space: Space, found: Found, named_only: bool = False) -> Found:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.diagnosis.criteria import FORETOLD, WILD_SHARE, WILD_SIGMA
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.forward import children
 from gapbridge.core.diagnosis.selection.noise import estimate_noise
@@ -13,9 +14,6 @@ from gapbridge.core.diagnosis.selection.state import Raw, Work, sample_space
 from gapbridge.core.effects import Term
 
 Array = NDArray[np.float64]
-WILD_SHARE = 0.1  # of the samples: more of them is structure, not bad luck
-WILD_SIGMA = 5.0
-FORETOLD = 0.5  # share of an outlier that may be left where something else explains it
 RIDGE = 5.0  # usual sizes of a parameter: prior of the fit that only looks for outliers
 
 

@@ -10,17 +10,14 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.diagnosis.criteria import ABSURD, MARGIN, SHARP, SMOOTH_PRICE
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 
 Array = NDArray[np.float64]
 RANK = 1e-10  # share of a column's square below which it counts as already explained
 DEPENDENT = 1e-8  # the same of a direction among several columns
 AT_ONCE = 250_000  # numbers of a temporary: 2 MB
-SMOOTH_PRICE = 18.0  # what an unnamed function pays beyond a named cause
-MARGIN = 6.0  # what every accusation pays: keeps clean logs clean
-ABSURD = 200.0  # times a parameter's usual size: beyond, a fit is no explanation
 SENSED = ("N", "Nm", "N/s", "Nm/s")  # units of sensor biases, which may have any size
-SHARP = 6000.0  # times the usual softening of a stiffness curve
 USUAL_ORDERS = (1.0, 2.0, 3.0, 4.0)  # eccentricity and its kin
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri, stdtrit
 
 from gapbridge.core.arm import Arm
-from gapbridge.core.diagnosis.criteria import OWN_SIGMAS
+from gapbridge.core.diagnosis.criteria import OWN_SIGMAS, WEAK
 from gapbridge.core.diagnosis.selection.candidate import Candidate, angle_columns
 from gapbridge.core.diagnosis.selection.problem import Found, Space
 from gapbridge.core.diagnosis.selection.state import Work, flat
@@ -21,7 +21,6 @@ from gapbridge.core.errors import InputError
 Array = NDArray[np.float64]
 REFITS = 8
 NO_PRIOR: Mapping[int, Array] = {}
-WEAK = 100.0  # usual sizes of a parameter: how far the data may take it against nothing
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.diagnosis.criteria import LARGE, UNITED
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.forward import DEPTH, beam_search, children, projected
 from gapbridge.core.diagnosis.selection.local_search import (
@@ -29,9 +30,7 @@ from gapbridge.core.diagnosis.selection.problem import USUAL_ORDERS, Found, Spac
 
 BEST_LINES = 10  # lines of a joint that a search looks at
 BEST_SMOOTH = 60  # smooth functions that a search looks at
-LARGE = 450  # rows of the sample space from which many causes are looked for, one by one
 DEEP = 40  # terms that a large log may show
-UNITED = 10.0  # score by which one cause is preferred that does the work of three
 
 
 def screened_search(

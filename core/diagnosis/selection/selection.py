@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
-from gapbridge.core.diagnosis.criteria import HEAVIEST
+from gapbridge.core.diagnosis.criteria import HEAVIEST, LARGE
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.bent import straightened
 from gapbridge.core.diagnosis.selection.candidate import (
@@ -41,7 +41,7 @@ from gapbridge.core.diagnosis.selection.outliers import (
 )
 from gapbridge.core.diagnosis.selection.problem import Found, Space, fit
 from gapbridge.core.diagnosis.selection.refit import Remainder, refit, worth
-from gapbridge.core.diagnosis.selection.search import LARGE, screened_search
+from gapbridge.core.diagnosis.selection.search import screened_search
 from gapbridge.core.diagnosis.selection.smooth import smooth_candidates
 from gapbridge.core.diagnosis.selection.state import Raw, Work, flat, locate, sample_space
 from gapbridge.core.effects import Site, Term

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
+from gapbridge.core.diagnosis.criteria import KNOWN_SHARE, UNSEEN
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.noise import Noise
@@ -17,8 +18,6 @@ from gapbridge.core.effects import CATALOGUE, Term
 
 Array = NDArray[np.float64]
 DEAD = 1e-7  # share of a column that the nuisance leaves: below, nothing is left
-UNSEEN = 3.0
-KNOWN_SHARE = 0.7  # a stated repeatability is an average: less than this share of it is not assumed
 
 
 @dataclass
