@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.real import arms
-from benchmarks.real.geometry import rough_tool
+from benchmarks.real.geometry import rough_tool, rough_turn
 
 Array = NDArray[np.float64]
 Columns = dict[str, Array]
@@ -58,8 +58,9 @@ def _tracker(sigma: float) -> dict[str, Any]:
     return {"registered": False, "sigma": sigma}
 
 
-def _tool(point: Array) -> dict[str, Any]:
-    return {"tcp": {"xyz": [float(x) for x in point], "rpy": [0, 0, 0]}}
+def _tool(point: Array, turn: Array | None = None) -> dict[str, Any]:
+    rpy = [0, 0, 0] if turn is None else [float(x) for x in turn]
+    return {"tcp": {"xyz": [float(x) for x in point], "rpy": rpy}}
 
 
 # -- UR10e, currents ---------------------------------------------------------------------------
@@ -141,6 +142,7 @@ def _iiwa_log(raw: Array, mass: Array, about: dict[str, Any], more: Columns) -> 
     position = frame[:, :3, 3] * 1e-3
     first = slice(None) if "session" not in more else more["session"] == 0
     point = rough_tool(arms.IIWA7, q[first], position[first])
+    turn = rough_turn(arms.IIWA7, q[first], point, position[first], frame[first, :3, :3])
     columns = {
         "timestamp": np.arange(len(q)) * 30.0,
         "actual_q": q,
@@ -152,9 +154,9 @@ def _iiwa_log(raw: Array, mass: Array, about: dict[str, Any], more: Columns) -> 
     about = {
         "robot": "KUKA iiwa 7 R800", "instrument": "laser tracker with a six-dof probe",
         "timestamps": "only the order is known: 30 s steps were put in",
-        "tool": "the tool point is the best for the nominal arm, rounded to 1 mm",
+        "tool": "point and turn are the best for the nominal arm, rounded to 1 mm and 0.01 rad",
     } | about  # fmt: skip
-    cell = _cell(arms.IIWA7, tool=_tool(point), metrology=_tracker(2e-5))
+    cell = _cell(arms.IIWA7, tool=_tool(point, turn), metrology=_tracker(2e-5))
     return Converted(columns, cell, about)
 
 

@@ -145,3 +145,20 @@ def rough_tool(links: tuple[Link, ...], q: Array, measured: Array) -> Array:
     if least > 0.01:
         raise ValueError(f"the nominal arm misses the measured points by {least:.3g} m")
     return np.round(best, 3)
+
+
+def rough_turn(links: tuple[Link, ...], q: Array, tool: Array, p: Array, R: Array) -> Array:
+    """Return roll, pitch and yaw (3,) of the tool that suit the nominal arm best, to 0.01 rad.
+
+    ``p`` (N, 3) and ``R`` (N, 3, 3) were measured at the tool point ``tool`` (3,), flange axes, in
+    a frame of the instrument's own.
+    """
+    from scipy.spatial.transform import Rotation
+
+    at, turned = flange(links, q)
+    nominal = at + turned @ tool
+    a, b = nominal - nominal.mean(axis=0), p - p.mean(axis=0)
+    U, _, Vt = np.linalg.svd(a.T @ b)
+    frame = (U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt).T
+    mounted = Rotation.from_matrix(np.swapaxes(turned, 1, 2) @ frame.T @ R).mean()
+    return np.asarray(np.round(mounted.as_euler("xyz"), 2) + 0.0)

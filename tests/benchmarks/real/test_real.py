@@ -3,11 +3,19 @@ import json
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 
 from benchmarks.real import arms, rivals
 from benchmarks.real.absurd import absurdities
 from benchmarks.real.convert import SOURCES, main, write
-from benchmarks.real.geometry import Fit, fit_geometry, free_numbers, points, registered
+from benchmarks.real.geometry import (
+    Fit,
+    fit_geometry,
+    free_numbers,
+    points,
+    registered,
+    rough_turn,
+)
 from benchmarks.real.table import Table, halves, read_table
 
 RNG = np.random.default_rng(7)
@@ -159,3 +167,15 @@ def test_a_log_of_weight_alone_is_judged_beside_least_squares(tmp_path):
     assert outcome["rival"] < 0.1
     assert outcome["gap"] > 1.0
     assert outcome["ratio"] == pytest.approx(outcome["judged"] / outcome["rival"])
+
+
+def test_the_turn_of_a_probe_on_its_flange_is_found():
+    """An instrument that stands elsewhere, a probe that is mounted turned about the flange."""
+    rng = np.random.default_rng(4)
+    q = rng.uniform(-1.5, 1.5, (40, len(arms.IIWA7)))
+    at, turned = arms.flange(arms.IIWA7, q)
+    tool, mounted = np.array([0.0, 0.01, 0.03]), Rotation.from_euler("xyz", [0.02, 0, -0.39])
+    frame = Rotation.from_rotvec([0.3, -0.2, 1.0]).as_matrix()
+    p = (at + turned @ tool) @ frame.T + [1.0, 2.0, 0.5] + rng.normal(0, 1e-4, (40, 3))
+    found = rough_turn(arms.IIWA7, q, tool, p, frame @ turned @ mounted.as_matrix())
+    assert np.allclose(found, [0.02, 0, -0.39], atol=1e-9)
