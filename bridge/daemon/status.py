@@ -40,6 +40,7 @@ class DaemonStatus:
     def __init__(self, slices: dict[str, slice]) -> None:
         self.started = self._since = time.time()
         self._why = ""
+        self._down = False  # the loop has ended and no other is connected
         self.armed_by = ""
         self._asked_by = ""  # of the last request to arm
         self.latched = ""  # the fault that waits for being acknowledged
@@ -68,10 +69,14 @@ class DaemonStatus:
             self.configured = event
         if event["kind"] == "request" and event["command"] == "arm":
             self._asked_by = event["by"]
+        if event["kind"] in ("fault", "failure"):  # the loop's process ends
+            if not self._down:
+                self._since, self._down = event["time"], True
+            self._why = event["detail"]
         if event["kind"] != "transition":
             return
         to, cause, detail = event["to"], event["cause"], event["detail"]
-        self._since = event["time"]
+        self._since, self._down = event["time"], to == State.DISCONNECTED.name
         self._why = f"{cause}: {detail}" if detail else cause
         if to == State.FAULT.name:
             if cause != Cause.LATCHED:  # else it is the one that is known already
