@@ -37,7 +37,7 @@ def residual(material: Material) -> list[Block]:
     badge = Badge("Complete", GOOD) if c.complete else Badge("Not complete", DOUBTFUL)
     main = chosen_channel(c.diagnosis)
     blocks: list[Block] = [Verdict(badge, sentence(c.remaining))]
-    if not c.lacking and (c.complete or c.diagnosis.verdict != "no_gap"):
+    if not c.missing_effects and (c.complete or c.diagnosis.verdict != "no_gap"):
         blocks.append(Paragraph(" ".join(sentences(main))))
     others = [ch for ch in c.diagnosis.channels if ch is not main]
     blocks += [Paragraph(f"{CHANNELS[ch.channel]}: {one_line(ch)}") for ch in others]
