@@ -52,6 +52,7 @@ class DaemonStatus:
         self._residual_at = slices["residual"].start
         self._correction = (0, 0.0)  # flags and residual, m, of the last cycle
         self.configured: Event = {}  # the last attempt to reload
+        self._compiling = ""  # what the loop's process is at before its first cycle
 
     def take(self, rows: NDArray[np.float64]) -> None:
         """Take note of cycles."""
@@ -73,8 +74,13 @@ class DaemonStatus:
             if not self._down:
                 self._since, self._down = event["time"], True
             self._why = event["detail"]
+        if event["kind"] == "compiling":
+            self._compiling = event["detail"]
+        if event["kind"] == "granted":  # compiled, and about to connect
+            self._compiling = ""
         if event["kind"] != "transition":
             return
+        self._compiling = ""
         to, cause, detail = event["to"], event["cause"], event["detail"]
         self._since, self._down = event["time"], to == State.DISCONNECTED.name
         self._why = f"{cause}: {detail}" if detail else cause
@@ -90,8 +96,17 @@ class DaemonStatus:
         if to not in (State.ARMED.name, State.COMPENSATING.name, State.HOLDING.name):
             self.armed_by = ""
 
+    def named(self, state: State) -> str:
+        """Return the state as the document names it: compiling is one of its own."""
+        return (
+            self._compiling
+            if state == State.DISCONNECTED and self._compiling
+            else (state.name.lower())
+        )
+
     def lost_loop(self) -> None:
         """Take note that link and loop are gone: faults of the link end with them."""
+        self._compiling = ""
         if self._heals:
             self.latched, self._heals = "", False
         self.armed_by = ""
