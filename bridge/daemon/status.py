@@ -41,6 +41,7 @@ class DaemonStatus:
         self._now = clock.monotonic
         self.started = self._since = clock.time()
         self._why = ""
+        self._down = False  # the loop has ended and no other is connected
         self.armed_by = ""
         self._asked_by = ""  # of the last request to arm
         self.latched = ""  # the fault that waits for being acknowledged
@@ -74,11 +75,15 @@ class DaemonStatus:
             self._compiling = event["detail"]
         if event["kind"] == "granted":  # compiled, and about to connect
             self._compiling = ""
+        if event["kind"] in ("fault", "failure"):  # the loop's process ends
+            if not self._down:
+                self._since, self._down = event["time"], True
+            self._why = event["detail"]
         if event["kind"] != "transition":
             return
         self._compiling = ""
         to, cause, detail = event["to"], event["cause"], event["detail"]
-        self._since = event["time"]
+        self._since, self._down = event["time"], to == State.DISCONNECTED.name
         self._why = f"{cause}: {detail}" if detail else cause
         if to == State.FAULT.name:
             if cause != Cause.LATCHED:  # else it is the one that is known already
