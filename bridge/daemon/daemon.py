@@ -164,7 +164,7 @@ class Daemon:
             "cell": str(self.settings.cell),
             "configuration_hash": self.configuration.hash,
             "configured": status.configured,
-            "state": self.state.name.lower(),
+            "state": status.named(self.state),
             **status.history(),
             "may_write": self.may_write,
             "armed_by": status.armed_by,

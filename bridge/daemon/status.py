@@ -41,6 +41,7 @@ class DaemonStatus:
         self._now = clock.monotonic
         self.started = self._since = clock.time()
         self._why = ""
+        self._down = False  # the loop has ended and no other is connected
         self.armed_by = ""
         self._asked_by = ""  # of the last request to arm
         self.latched = ""  # the fault that waits for being acknowledged
@@ -52,6 +53,7 @@ class DaemonStatus:
         self._residual_at = slices["residual"].start
         self._correction = (0, 0.0)  # flags and residual, m, of the last cycle
         self.configured: Event = {}  # the last attempt to reload
+        self._compiling = ""  # what the loop's process is at before its first cycle
 
     def take(self, rows: NDArray[np.float64]) -> None:
         """Take note of cycles."""
@@ -69,10 +71,19 @@ class DaemonStatus:
             self.configured = event
         if event["kind"] == "request" and event["command"] == "arm":
             self._asked_by = event["by"]
+        if event["kind"] == "compiling":
+            self._compiling = event["detail"]
+        if event["kind"] == "granted":  # compiled, and about to connect
+            self._compiling = ""
+        if event["kind"] in ("fault", "failure"):  # the loop's process ends
+            if not self._down:
+                self._since, self._down = event["time"], True
+            self._why = event["detail"]
         if event["kind"] != "transition":
             return
+        self._compiling = ""
         to, cause, detail = event["to"], event["cause"], event["detail"]
-        self._since = event["time"]
+        self._since, self._down = event["time"], to == State.DISCONNECTED.name
         self._why = f"{cause}: {detail}" if detail else cause
         if to == State.FAULT.name:
             if cause != Cause.LATCHED:  # else it is the one that is known already
@@ -86,8 +97,17 @@ class DaemonStatus:
         if to not in (State.ARMED.name, State.COMPENSATING.name, State.HOLDING.name):
             self.armed_by = ""
 
+    def named(self, state: State) -> str:
+        """Return the state as the document names it: compiling is one of its own."""
+        return (
+            self._compiling
+            if state == State.DISCONNECTED and self._compiling
+            else (state.name.lower())
+        )
+
     def lost_loop(self) -> None:
         """Take note that link and loop are gone: faults of the link end with them."""
+        self._compiling = ""
         if self._heals:
             self.latched, self._heals = "", False
         self.armed_by = ""

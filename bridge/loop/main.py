@@ -37,6 +37,7 @@ from gapbridge.bridge.setpoint_source.source import Source
 from gapbridge.core.clock import SYSTEM
 from gapbridge.core.errors import GapbridgeError, InputError
 from gapbridge.core.files import read_only_from
+from gapbridge.core.kernels import compiling
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.drivers import make_driver
@@ -53,6 +54,7 @@ def main() -> None:
     order = json.loads(sys.stdin.readline())
     os.set_blocking(order["events"], False)
     tell = _teller(order["events"])
+    compiling.listeners.append(_tell_compiling(tell))
     code: int = Exit.CRASH
     try:
         code = _run(order, tell)
@@ -120,6 +122,17 @@ def _teller(events: int) -> Callable[[dict[str, Any]], None]:
             os.write(events, json.dumps({**now, **event}).encode())
 
     return tell
+
+
+def _tell_compiling(tell: Callable[[dict[str, Any]], None]) -> Callable[[int], None]:
+    """Return a listener that notifies the daemon of the first function and every tenth."""
+
+    def began(functions: int) -> None:
+        if functions % 10 == 1:
+            far = "" if functions == 1 else f" ({functions} functions)"
+            tell({"kind": "compiling", "detail": f"starting: {compiling.ABOUT}{far}"})
+
+    return began
 
 
 def _read_model(settings: DaemonSettings) -> Model:

@@ -10,7 +10,7 @@ from gapbridge.bridge.document.axes import Chart, scale
 from gapbridge.bridge.document.blocks import Block, Paragraph, Pictures
 from gapbridge.bridge.document.drawing import AFTER, EDGE, INK, LIMIT, Circle, Drawing
 from gapbridge.bridge.document.section import Section
-from gapbridge.bridge.report.arm_view import joint_origins
+from gapbridge.bridge.document.skeleton import skeleton
 from gapbridge.core.calibration.plan import Plan
 
 VIEWS = (("The poses, from above", 0, 1), ("The poses, from the side", 0, 2))
@@ -36,7 +36,8 @@ class PosesSection(Section[Material]):
 def _view(material: Material, title: str, i: int, j: int) -> Drawing:
     readings = material.calibration.readings
     _, first = np.unique(readings.pose, return_index=True)
-    shapes = [joint_origins(material.calibration.model, readings.q[k]) for k in first]
+    rigid = material.calibration.model.without_terms()
+    shapes = [skeleton(rigid, readings.q[k]) for k in first]
     points = np.concatenate(shapes)
     x, y = (scale(AXES[k], [*points[:, k]], tight=True) for k in (i, j))
     chart = Chart(title, x, y, height=300, equal=True)

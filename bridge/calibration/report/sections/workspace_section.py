@@ -11,6 +11,7 @@ from gapbridge.bridge.document.axes import Chart, scale
 from gapbridge.bridge.document.blocks import Block, Paragraph, Pictures, Table
 from gapbridge.bridge.document.drawing import AFTER, BEFORE, EDGE, INK, Circle, Drawing
 from gapbridge.bridge.document.section import Section
+from gapbridge.bridge.document.skeleton import round_factor
 from gapbridge.core.calibration.result import Errors
 
 Array = NDArray[np.float64]
@@ -53,8 +54,7 @@ def _all(material: Material) -> str:
 def _factor(errors: Errors, size: float) -> float:
     """Return a round factor that draws a large error as a tenth of the workspace or so."""
     rough = LONGEST * size / max(float(np.quantile(errors.norm, 0.95)), 1e-9)
-    power = 10 ** np.floor(np.log10(max(rough, 1.0)))
-    return float(max(np.floor(rough / power) * power, 1.0))
+    return round_factor(rough)
 
 
 def _view(

@@ -58,7 +58,7 @@ def test_what_is_left_is_the_same_statement_in_every_section(tmp_path: Path) -> 
         "to be added, with the share that each takes off what is left: transmission_error_2 (90 %)"
     )
     changed = {
-        "diagnosis": c.diagnosis, "complete": False, "lacking": ("transmission_error_2",),
+        "diagnosis": c.diagnosis, "complete": False, "missing_effects": ("transmission_error_2",),
         "remaining": left, "verdict": f"the error falls; not complete: {left}",
     }  # fmt: skip
     text = page(tmp_path, None, **changed)
