@@ -12,7 +12,7 @@ from pathlib import Path
 import click
 
 from benchmarks.mutants.mutant import read_mutants
-from benchmarks.mutants.trial import PASSED, Trial, Verdict
+from benchmarks.mutants.trial import Trial, Verdict
 from gapbridge.core.errors import InputError
 
 
@@ -22,7 +22,7 @@ from gapbridge.core.errors import InputError
 def main(only: str, out: Path | None) -> None:
     """Make each listed mistake in a copy of the checkout and run the tests that must notice it.
 
-    Before, all these tests have to pass without any. Exit 1 where a mistake goes unnoticed.
+    A test counts only where it passes without the mistake. Exit 1 where one goes unnoticed.
     """
     mutants = [m for m in read_mutants() if only in m.file or only in m.what]
     if not mutants:
@@ -30,11 +30,6 @@ def main(only: str, out: Path | None) -> None:
     begun, verdicts = time.monotonic(), []
     with tempfile.TemporaryDirectory() as folder:
         trial = Trial(Path(folder))
-        tests = tuple(sorted({test for mutant in mutants for test in mutant.tests}))
-        click.echo(f"{len(mutants)} mutants; their tests without any first", err=True)
-        code, detail = trial.try_tests(tests)
-        if code != PASSED:
-            raise InputError(f"the tests do not pass without a mutant: {detail}")
         for number, mutant in enumerate(mutants, 1):
             verdict = trial.judge(mutant)
             verdicts.append(verdict)
@@ -57,9 +52,8 @@ def table(verdicts: list[Verdict]) -> list[str]:
     by_folder["all"] = [verdict.killed for verdict in verdicts]
     rows = ["| folder | mutants | noticed |", "| --- | --- | --- |"]
     for folder, killed in sorted(by_folder.items(), key=lambda item: (item[0] == "all", item[0])):
-        rows.append(
-            f"| {folder} | {len(killed)} | {sum(killed)} ({100 * sum(killed) / len(killed):.0f} %) |"
-        )
+        share = f"{sum(killed)} ({100 * sum(killed) / len(killed):.0f} %)"
+        rows.append(f"| {folder} | {len(killed)} | {share} |")
     return rows
 
 

@@ -31,6 +31,7 @@ class Trial:
 
     def __init__(self, folder: Path) -> None:
         self.root = folder / "checkout"
+        self._pass: set[tuple[str, ...]] = set()  # tests that pass without any mistake
         self.root.mkdir(parents=True)
         for name in COPIED:
             if (ROOT / name).is_dir():
@@ -69,4 +70,12 @@ class Trial:
             os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
         if code not in (PASSED, FAILED):
             detail = f"pytest ended with {code}: {detail}"
+        elif code == FAILED and not self._are_sound(mutant.tests):
+            return Verdict(mutant, False, f"its tests fail without it too: {detail}")
         return Verdict(mutant, code == FAILED, detail)
+
+    def _are_sound(self, tests: tuple[str, ...]) -> bool:
+        """Return whether tests pass in the copy as it is."""
+        if tests not in self._pass and self.try_tests(tests)[0] == PASSED:
+            self._pass.add(tests)
+        return tests in self._pass

@@ -25,6 +25,8 @@ from gapbridge.bridge.demo.result import Result
 from gapbridge.bridge.demo.session import Session
 from gapbridge.bridge.demo.terminal import show
 from gapbridge.bridge.document.output_file import write_text
+from gapbridge.bridge.document.provenance import provenance
+from gapbridge.bridge.document.svg import svg_file
 from gapbridge.bridge.loop.warm_up import warm_up
 from gapbridge.core.errors import RunError
 from gapbridge.core.estimation.identification import identify_compliance
@@ -149,8 +151,9 @@ def free_address() -> str:
 
 def _write(result: Result, diagnosis: str, out: Path) -> None:
     write_text(out / "summary.json", json.dumps(result.summary(), indent=1) + "\n")
-    write_text(out / "picture.svg", picture(result))
-    write_text(out / "report.html", page(result, diagnosis))
+    write_text(out / "picture.svg", svg_file(picture(result)))
+    files = {"log": [out / "calibration.csv"], "cell": [out / "calibrated.yaml"]}
+    write_text(out / "report.html", page(result, diagnosis, provenance(files)))
 
 
 def _require_success(result: Result) -> None:

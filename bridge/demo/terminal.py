@@ -47,8 +47,8 @@ def show(result: Result, console: Console | None = None) -> None:
         f"with compensation: {ratio:.0f} times smaller; the arm repeats to "
         f"{figures['repeatability_mm']:.3f} mm"
     )
-    for line in truth_lines(result):
-        console.print(line, highlight=False)
+    for k, line in enumerate(truth_lines(result)):
+        console.print(f"  {line}" if k else line, highlight=False)
     if result.resolution.written:
         console.print(
             f"one count written is {figures['resolution_mm']:.3g} mm at the TCP, one count of the "
@@ -72,12 +72,12 @@ def truth_lines(result: Result) -> list[str]:
     lines = [f"the fitted flexibilities alone left {fitted:.3f} mm: {result.hidden.about}"]
     for name, true in result.hidden.truth.items():
         if name not in found:
-            lines.append(f"  {name}: truly {true:+.3g}, not found")
+            lines.append(f"{name}: truly {true:+.3g}, not found")
             continue
         value, std, unit = found[name]
         times, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
         lines.append(
-            f"  {name}: truly {true * times:+.3g} {unit}, found {value * times:+.3g} "
+            f"{name}: truly {true * times:+.3g} {unit}, found {value * times:+.3g} "
             f"± {std * times:.1g} {unit}"
         )
     return lines

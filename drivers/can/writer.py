@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.errors import PartialWriteError, WriteError
-from gapbridge.drivers.can.codec import Writing
 from gapbridge.drivers.can.profile import Action, CanProfile, Key, Outgoing
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.can_bus.bus import first_line
@@ -25,7 +24,6 @@ class FrameWriter:
     def __init__(self, settings: CanSettings, profile: CanProfile) -> None:
         self._settings, self._profile = settings, profile
         self._bus: Any = None
-        self._plan = Writing(profile)
         self._last: Frames | None = None  # the setpoint that got out whole
         self.target: Vector | None = None  # rad, the same as joints
         self.mended = 0  # setpoints that had to be taken back
@@ -76,9 +74,6 @@ class FrameWriter:
 
     def _encode(self, q: Vector) -> Frames:
         """Return all frames before any is sent. Raises WriteError."""
-        plan = self._plan
-        if plan.able and q.shape == (self._profile.n,) and (frames := plan.frames(q)) is not None:
-            return frames
         if q.shape != (self._profile.n,) or not np.isfinite(q).all():
             raise WriteError(f"{self._profile.name}: found {q}, expected finite joints")
         wire: list[float] = self._profile.joints.to_wire(q).tolist()

@@ -123,14 +123,13 @@ def diagnose(
     click.echo(answer(found))
     origin = provenance({"log": logs, "cell": [cell], "sim": [sim] if sim else []})
     reported = document(found) | {"provenance": origin}
-    text = json.dumps(reported, indent=1, allow_nan=False) + "\n"
     if json_file is not None:
-        write_text(json_file, text)
+        write_text(json_file, _json(reported))
     if new_cell is not None:
         applied = found.with_stand_ins if stand_ins else found.model
         spread = spread_of(found).beside(given.spread)
         save_cell(given, new_cell, applied, {"provenance": fitted(origin, range_of(rows), spread)})
-    written = [] if out is None else _write_folder(out, text, found, given, rows)
+    written = [] if out is None else _write_folder(out, reported, found, given, rows)
     for file in (*written, json_file, new_cell):
         if file is not None:
             click.echo(f"{file}: written")
@@ -173,13 +172,18 @@ def _folder(path: Path) -> None:
         raise InputError(f"{path}: folder cannot be made: {error.strerror}") from None
 
 
-def _write_folder(folder: Path, text: str, found: Diagnosis, cell: Cell, log: Log) -> list[Path]:
+def _json(reported: dict[str, Any]) -> str:
+    return json.dumps(reported, indent=1, allow_nan=False) + "\n"
+
+
+def _write_folder(
+    folder: Path, reported: dict[str, Any], found: Diagnosis, cell: Cell, log: Log
+) -> list[Path]:
     """Write diagnosis.json and report.html; returns their paths."""
-    from gapbridge.bridge.report import (
-        write_report,  # plotly takes its time, and only --out needs it
-    )
+    from gapbridge.bridge.report import write_report  # only --out needs it
 
     written = [folder / "diagnosis.json"]
-    write_text(written[0], text)
-    written.append(write_report(found, str(cell.path), log, cell.model, folder))
+    write_text(written[0], _json(reported))
+    origin = reported["provenance"]
+    written.append(write_report(found, str(cell.path), log, cell.model, folder, origin))
     return written

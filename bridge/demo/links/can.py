@@ -48,7 +48,7 @@ class CanLink(PeerLink):
             Load("1.4 kg", 1.4, (0.01, 0.0, 0.09)),
             Load("1.2 kg at the side", 1.2, (-0.04, 0.03, 0.07)),
         ),
-        calibrate=13,
+        calibrate=17,
     )  # fmt: skip
 
     def _hidden(self) -> str:

@@ -6,7 +6,6 @@ import math
 
 from gapbridge.bridge.calibration.report.figures import fine, mm
 from gapbridge.bridge.calibration.report.material import Material
-from gapbridge.bridge.calibration.report.names import parameter_words
 from gapbridge.bridge.document.blocks import (
     Bar,
     Block,
@@ -18,7 +17,8 @@ from gapbridge.bridge.document.blocks import (
     Table,
 )
 from gapbridge.bridge.document.section import Section
-from gapbridge.bridge.report.words import number, percent, told, unit_of
+from gapbridge.bridge.report.labels import number, percent, unit_of, with_unit
+from gapbridge.bridge.report.names import parameter_title
 from gapbridge.core.calibration.budget.budget import Budget, Input
 from gapbridge.core.calibration.budget.sensitivity import Sensitivities, Sensitivity
 
@@ -141,6 +141,6 @@ def _parameter(s: Sensitivity) -> list[Cell]:
     small = coefficient < 1e-3
     per = f"{number(coefficient * (1e3 if small else 1.0))} {'µm' if small else 'mm'} per {unit}"
     return [
-        parameter_words(s.name), told(s.std, s.unit), per,
+        parameter_title(s.name), with_unit(s.std, s.unit), per,
         fine(s.contribution),
     ]  # fmt: skip

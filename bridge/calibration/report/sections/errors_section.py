@@ -6,7 +6,7 @@ import numpy as np
 
 from gapbridge.bridge.calibration.report.figures import fixed, mm
 from gapbridge.bridge.calibration.report.material import Material
-from gapbridge.bridge.document.axes import Chart, logarithmic, named, scale, visible
+from gapbridge.bridge.document.axes import Chart, distribution, named, scale
 from gapbridge.bridge.document.blocks import Block, Paragraph, Pictures, Table
 from gapbridge.bridge.document.drawing import AFTER, BEFORE, Drawing
 from gapbridge.bridge.document.section import Section
@@ -68,18 +68,9 @@ def _row(name: str, errors: Errors) -> list[str]:
 
 
 def _distribution(material: Material) -> Drawing:
-    before, after = (np.sort(e.norm) * 1e3 for e in material.judged)
-    chart = Chart(
-        "Distribution of the error", logarithmic("error, mm", visible([*before, *after])),
-        scale("share of the readings, %", [0, 100]),
-    )  # fmt: skip
-    for values, colour in ((before, BEFORE), (after, AFTER)):
-        share = np.arange(len(values) + 1) / len(values) * 100
-        x = np.repeat(values, 2)
-        y = np.repeat(share, 2)[1:-1]
-        chart.line([chart.x.low, *x, chart.x.high], [0.0, *y, 100.0], colour, width=2.0)
-    chart.legend(LEGEND)
-    return chart.drawing
+    before, after = (e.norm * 1e3 for e in material.judged)
+    series = [("before", before, BEFORE), ("after", after, AFTER)]
+    return distribution("Distribution of the error", "error, mm", series).drawing
 
 
 def _axes(material: Material) -> Drawing:

@@ -6,7 +6,6 @@ import re
 
 from gapbridge.bridge.calibration.report.figures import degrees
 from gapbridge.bridge.calibration.report.material import Material
-from gapbridge.bridge.calibration.report.names import sentence
 from gapbridge.bridge.document.axes import plain
 from gapbridge.bridge.document.blocks import (
     DOUBTFUL,
@@ -22,8 +21,9 @@ from gapbridge.bridge.document.blocks import (
 )
 from gapbridge.bridge.document.section import Section
 from gapbridge.bridge.report.answer import one_line, sentences
+from gapbridge.bridge.report.labels import CHANNELS, effect_title, listed
 from gapbridge.bridge.report.material import chosen_channel
-from gapbridge.bridge.report.words import CHANNELS, effect_words, listed
+from gapbridge.bridge.report.names import sentence
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 
 SHOWN = 8  # measurements proposed
@@ -65,7 +65,7 @@ def _next(diagnosis: Diagnosis) -> list[Block]:
         return []
     rows = [
         [str(i), degrees(m.q), f"{plain(m.payload)} kg",
-         listed([effect_words(name) for name in m.separates], "or")]
+         listed([effect_title(name) for name in m.separates], "or")]
         for i, m in enumerate(diagnosis.next_measurements[:SHOWN], start=1)
     ]  # fmt: skip
     heads = ("", "joint angles, degrees", "load", "would settle")

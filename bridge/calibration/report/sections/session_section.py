@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from gapbridge.bridge.calibration.report.facts import SessionFacts
 from gapbridge.bridge.calibration.report.figures import load_words, mm
 from gapbridge.bridge.calibration.report.material import Material
-from gapbridge.bridge.calibration.report.names import sentence
 from gapbridge.bridge.document.axes import plain
 from gapbridge.bridge.document.blocks import Block, Bullets, Columns, Heading, Pairs
 from gapbridge.bridge.document.section import Section
+from gapbridge.bridge.report.names import sentence
 
 KINDS = {
     "position": "position of a target on the tool, three coordinates",

@@ -6,7 +6,6 @@ import numpy as np
 
 from gapbridge.bridge.calibration.report.figures import mm
 from gapbridge.bridge.calibration.report.material import Material
-from gapbridge.bridge.calibration.report.names import sentence
 from gapbridge.bridge.document.blocks import (
     BAD,
     DOUBTFUL,
@@ -19,7 +18,8 @@ from gapbridge.bridge.document.blocks import (
     Verdict,
 )
 from gapbridge.bridge.document.section import Section
-from gapbridge.bridge.report.words import listed
+from gapbridge.bridge.report.labels import listed
+from gapbridge.bridge.report.names import sentence
 
 FEWEST_HELD_OUT = 8  # poses kept out of the fit by which an accuracy can be decided
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from gapbridge.bridge.calibration.report.facts import SessionFacts
 from gapbridge.bridge.calibration.report.figures import fixed, mm
-from gapbridge.bridge.calibration.report.names import sentence
 from gapbridge.bridge.calibration.report.sections.parameters_section import estimates_table
 from gapbridge.bridge.calibration.report.sections.session_section import facts_blocks
 from gapbridge.bridge.document.axes import Chart, named, scale
@@ -25,6 +24,7 @@ from gapbridge.bridge.document.blocks import (
 )
 from gapbridge.bridge.document.drawing import AFTER, BAD_DOT, BEFORE, Drawing
 from gapbridge.bridge.document.section import Section
+from gapbridge.bridge.report.names import sentence
 from gapbridge.core.calibration.tool_session import ToolCalibration
 from gapbridge.core.model import Model
 

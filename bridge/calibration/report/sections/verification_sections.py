@@ -8,7 +8,6 @@ import numpy as np
 
 from gapbridge.bridge.calibration.report.facts import SessionFacts
 from gapbridge.bridge.calibration.report.figures import degrees, fixed, mm
-from gapbridge.bridge.calibration.report.names import parameter_words, sentence
 from gapbridge.bridge.calibration.report.sections.parameters_section import estimates_table
 from gapbridge.bridge.calibration.report.sections.session_section import facts_blocks
 from gapbridge.bridge.document.axes import Chart, named, scale
@@ -28,7 +27,8 @@ from gapbridge.bridge.document.blocks import (
 )
 from gapbridge.bridge.document.drawing import AFTER, EDGE, Drawing
 from gapbridge.bridge.document.section import Section
-from gapbridge.bridge.report.words import effect_words, likelihood
+from gapbridge.bridge.report.labels import effect_title, likelihood
+from gapbridge.bridge.report.names import parameter_title, sentence
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.verify import Suspect, Verification
 from gapbridge.core.effects import CATALOGUE
@@ -152,10 +152,10 @@ def suspect_words(suspect: Suspect) -> str:
     if kind == "reading":
         return f"reading {number} alone is wrong"
     if suspect.name in CATALOGUE:
-        return effect_words(suspect.name)
+        return effect_title(suspect.name)
     if suspect.name == "instrument":
         return "the instrument stands elsewhere"
-    return f"another {parameter_words(suspect.name)}"
+    return f"another {parameter_title(suspect.name)}"
 
 
 VERIFICATION: tuple[Section[VerificationMaterial], ...] = (Holds(), Facts(), Poses(), Moved())

@@ -1,4 +1,4 @@
-"""What a run says at its end."""
+"""What a run reports at its end."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gapbridge.bridge.fleet.task import BAD, CRASHED, DIED, DONE
 STATES = {
     BAD: "cannot be used",
     CRASHED: "failed",
-    DIED: "took their workers along",
+    DIED: "killed their workers",
 }
 
 

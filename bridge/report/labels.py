@@ -50,13 +50,13 @@ _VECTORS = {
 _AXES = ("x", "y", "z", "about x", "about y", "about z")
 
 
-def effect_words(identifier: str) -> str:
+def effect_title(identifier: str) -> str:
     """Return an effect in plain words; its identifier where there are none."""
     effect = CATALOGUE.get(identifier)
     return (effect.title if effect else "") or identifier.replace("_", " ")
 
 
-def quantity_words(name: str) -> str:
+def quantity_title(name: str) -> str:
     """Return a log column in plain words, joints counted from 1."""
     if name == "timestamp":
         return "time"
@@ -104,7 +104,7 @@ def number(value: float, digits: int = 3) -> str:
     return text.replace("-", "−")
 
 
-def told(value: float | None, unit: str) -> str:
+def with_unit(value: float | None, unit: str) -> str:
     """Return a value (SI) in the unit that people use; "unknown" for None."""
     if value is None:
         return "unknown"
@@ -137,7 +137,7 @@ def listed(items: list[str], last: str = "and") -> str:
     return f"{', '.join(items[:-1])} {last} {items[-1]}"
 
 
-def joints_words(joints: tuple[int, ...]) -> str:
+def joint_list(joints: tuple[int, ...]) -> str:
     """Return "joint 2" or "joints 2 and 3"; empty for none."""
     if not joints:
         return ""

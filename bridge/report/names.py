@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from gapbridge.bridge.report.words import effect_words
+from gapbridge.bridge.report.labels import effect_title
 from gapbridge.core.effects import CATALOGUE
 
 OF_SESSIONS = {  # what sessions find that is no effect
@@ -30,11 +30,11 @@ def effect_of(name: str) -> str:
     return max((e for e in (*CATALOGUE, *OF_SESSIONS) if name.startswith(e)), key=len, default="")
 
 
-def parameter_words(name: str) -> str:
+def parameter_title(name: str) -> str:
     """Return a parameter's public name in words; the name itself where there are none."""
     effect = effect_of(name)
     if name == effect and effect in CATALOGUE and "{" in patterns().get(effect, "{"):
-        return effect_words(effect)
+        return effect_title(effect)
     match = re.fullmatch(r"(?:_(\d+))?(?:_(.+))?", name.removeprefix(effect))
     if not effect or match is None:
         return name
@@ -43,11 +43,11 @@ def parameter_words(name: str) -> str:
     pattern = patterns().get(effect)
     if pattern is None:
         where = f", joint {joint}" if joint else ""
-        return f"{effect_words(effect)}{where}{', ' + part if part else ''}"
+        return f"{effect_title(effect)}{where}{', ' + part if part else ''}"
     return pattern.format(joint=joint, part=part).replace(" ()", "").strip()
 
 
-def spoken(text: str) -> str:
+def with_titles(text: str) -> str:
     """Return a text with public names of parameters and effects in words instead."""
     names = "|".join(sorted((*CATALOGUE, *OF_SESSIONS), key=len, reverse=True))
     return re.sub(rf"\b(?:{names})(?:_[A-Za-z0-9_.]*\w)?\b", _in_words, text)
@@ -55,11 +55,11 @@ def spoken(text: str) -> str:
 
 def sentence(text: str) -> str:
     """Return a text that begins with a capital and ends with a full stop."""
-    text = spoken(text).strip()
+    text = with_titles(text).strip()
     end = "" if text.endswith((".", "!", "?")) else "."
     return text[:1].upper() + text[1:] + end
 
 
 def _in_words(match: re.Match[str]) -> str:
     # words of the language are names too ("payload", "backlash"): only what has a _ is a name
-    return parameter_words(match[0]) if "_" in match[0] else match[0]
+    return parameter_title(match[0]) if "_" in match[0] else match[0]
