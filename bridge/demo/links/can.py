@@ -36,7 +36,7 @@ class CanLink(PeerLink):
     ports = (SOCKETCAND_PORT, BENCH_PORT)
     scene = Scene(
         workspace=Workspace(
-            lower=(-0.6, 1.0, -2.0, -0.6, 0.1, -0.8), upper=(0.6, 2.3, -0.6, 0.6, 1.1, 0.8),
+            lower=(-0.6, 1.0, -2.0, -1.0, 0.0, -1.6), upper=(0.6, 2.3, -0.6, 1.0, 1.1, 1.6),
             lowest=0.05, nearest=0.22, far=0.35, regular=0.02,
         ),
         calibration_loads=(
@@ -48,7 +48,7 @@ class CanLink(PeerLink):
             Load("1.4 kg", 1.4, (0.01, 0.0, 0.09)),
             Load("1.2 kg at the side", 1.2, (-0.04, 0.03, 0.07)),
         ),
-        calibrate=17,
+        calibrate=13,
     )  # fmt: skip
 
     def _hidden(self) -> str:
