@@ -27,6 +27,10 @@ from gapbridge.drivers.simulated.ur.settings import BENCH_PORT, SCRIPT_PORT
 ROOT = Path(__file__).resolve().parents[2]
 SEED = 3
 PATIENCE = 60.0  # s
+LOADS = {  # kg, m from the flange
+    "reflector alone": (1.5, (0.0, 0.0, 0.05)),
+    "with the 8 kg plate": (9.5, (0.0, 0.0, 0.09)),
+}
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 SECTION = """
 calibration:
@@ -40,10 +44,11 @@ calibration:
   joint_range:
     lower: [-1.2, -2.4, 0.4, -2.8, -2.4, -1.5]
     upper: [1.2, -0.6, 2.3, -0.6, -0.8, 1.5]
+  speed: 1.5                                  # rad/s; 0.4 where nothing is said
   settle: 0.3
 """
-ADDED = """What the controller cannot know is added to the cell by hand: that the tracker measures in
-base (`registered: true`), and what is calibrated."""
+ADDED = """What the controller cannot know is added to the cell by hand: that the tracker measures
+in base (`registered: true`), and what is calibrated."""
 INTRODUCTION = """# A first session, as the terminal shows it
 
     {command}
@@ -99,10 +104,9 @@ class Session:
             raise SystemExit(f"gapbridge {arguments}: ended with {child.exitstatus}\n{shown}")
 
     def _answer(self, shown: str, question: str) -> str:
-        if "8 kg plate" in shown:
-            self._hang(9.5, (0.0, 0.0, 0.09))
-        elif "reflector alone" in shown:
-            self._hang(1.5, (0.0, 0.0, 0.05))
+        if "hangs there" in question:
+            name = re.findall(r"load \d+ · ([^:\r\n]+):", shown)[-1]
+            self._hang(*LOADS[name])
         return "yes" if "yes" in question else ""
 
     def _hang(self, mass: float, cog: tuple[float, float, float]) -> None:
