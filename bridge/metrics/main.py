@@ -13,12 +13,12 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from gapbridge.bridge.ipc.side_main import Order
+from gapbridge.bridge.ipc.side_main import Order, run_side
 from gapbridge.bridge.metrics.counts import Counts
 from gapbridge.bridge.metrics.families import Families
 from gapbridge.bridge.served.credentials import read_token
 from gapbridge.bridge.served.guard import Guard
-from gapbridge.bridge.served.server import run_side, serve
+from gapbridge.bridge.served.server import serve
 
 TURN = 0.25  # s between two looks at the shared page
 TEXT = "text/plain; version=0.0.4; charset=utf-8"

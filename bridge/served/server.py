@@ -12,11 +12,10 @@ from collections.abc import Callable
 import uvicorn
 from starlette.types import ASGIApp
 
-from gapbridge.bridge.ipc.side_main import Order, take_order
 from gapbridge.bridge.served.credentials import tls_context
 from gapbridge.bridge.served.protocol import LARGEST_HEAD, MOST_CONNECTIONS, GuardedProtocol
 from gapbridge.bridge.served.settings import ServedSettings
-from gapbridge.core.errors import GapbridgeError, LinkError
+from gapbridge.core.errors import LinkError
 
 SEND_BUFFER = 64 * 1024  # bytes that the system holds for a client that is slow
 GONE = 20_000  # ms without a sign from the other side
@@ -32,18 +31,6 @@ class _Config(uvicorn.Config):
     def load(self) -> None:
         super().load()
         self.ssl = self.context
-
-
-def run_side(kind: str, run: Callable[[Order], None]) -> int:
-    """Run a serving process of the daemon's until the daemon is gone; returns the exit code."""
-    order = take_order()
-    try:
-        run(order)
-    except GapbridgeError as error:
-        order.emit({"kind": kind, "failure": str(error)})
-        sys.stderr.write(f"{error}\n")
-        return 1
-    return 0
 
 
 def listen(settings: ServedSettings) -> socket.socket:

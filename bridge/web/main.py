@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import sys
 
-from gapbridge.bridge.ipc.side_main import Order
+from gapbridge.bridge.ipc.side_main import Order, run_side
 from gapbridge.bridge.served.credentials import read_token
-from gapbridge.bridge.served.server import run_side, serve
+from gapbridge.bridge.served.server import serve
 from gapbridge.bridge.web.app import make_app
 from gapbridge.bridge.web.stream import Stream
 from gapbridge.bridge.web.watched import Watched, encoded
