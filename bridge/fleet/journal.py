@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from pydantic_core import from_json, to_json
 
-from gapbridge.bridge.document.output_file import private
+from gapbridge.bridge.document.output_file import private, sync_folder
 from gapbridge.bridge.fleet.task import Outcome
 from gapbridge.core.errors import InputError, RunError
 
@@ -25,6 +25,7 @@ class Journal:
         self._synced = 0.0
         try:
             self._file = open(path, "a+b", opener=private)  # noqa: SIM115
+            sync_folder(path.parent)
         except OSError as error:
             raise InputError(f"{path}: cannot be written: {error.strerror}") from None
         try:
