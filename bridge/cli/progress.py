@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import sys
-import time
 from collections.abc import Callable, Iterator
 
+from gapbridge.core.clock import SYSTEM
 from gapbridge.core.kernels.compiling import ABOUT
 
 AGAIN = 10.0  # s between two words on compiling
@@ -42,7 +42,7 @@ def status(label: str) -> Iterator[Callable[[str], None]]:
 class Compiling:
     """Says on stderr that functions are compiled, at once and then now and again."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, clock: Callable[[], float] = SYSTEM.monotonic) -> None:
         self._clock = clock
         self._begun: float | None = None  # s
         self._next = 0.0  # s: when it says so again

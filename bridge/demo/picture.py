@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.bridge.demo.poses import Load
 from gapbridge.bridge.demo.result import Result, visits_of_poses
 from gapbridge.bridge.document.drawing import (
     BAD_DOT,
@@ -20,22 +19,12 @@ from gapbridge.bridge.document.drawing import (
     Stroke,
     Text,
 )
-from gapbridge.core.kernels import reference as kernel
-from gapbridge.core.loads import Loads
-from gapbridge.core.model import Model
+from gapbridge.bridge.document.skeleton import skeleton
 
 Array = NDArray[np.float64]
 WIDTH, HEIGHT = 430.0, 380.0
 MAGNIFIED = 60  # times the bending is drawn larger
 COLOURS = {2: (BAD_DOT, LIMIT), 3: (BAD_DOT, BEFORE, LIMIT)}  # by the number of rounds of visits
-
-
-def skeleton(model: Model, q: Array, load: Load) -> Array:
-    """Return base, joint origins, flange and TCP (n+3, 3) in base, bent as the model says."""
-    shape = kernel.new_shape(model.arm.n)
-    rows = model.rows(q[None], load.rows(1) if model.terms else Loads())
-    kernel.equilibrium(model.chain(), rows, 0, shape)
-    return np.vstack([np.zeros(3), shape.origin, shape.tcp_position])
 
 
 def coloured(result: Result) -> list[tuple[str, Array, str]]:
@@ -49,8 +38,9 @@ def arm_drawing(result: Result) -> Drawing:
     visit = int(np.argmax(result.error_without))
     q = result.without.nominal_q[visit]
     load = next(known for known in result.test_loads if known.name == result.loads[visit])
-    rigid = skeleton(result.model.without_terms(), q, load)
-    bent = rigid + MAGNIFIED * (skeleton(result.model, q, load) - rigid)
+    rigid = skeleton(result.model.without_terms(), q)
+    loads = load.rows(1) if result.model.terms else None
+    bent = rigid + MAGNIFIED * (skeleton(result.model, q, loads) - rigid)
     ahead = rigid[-1, :2] / np.linalg.norm(rigid[-1, :2])
     side = np.array([[ahead[0], 0.0], [ahead[1], 0.0], [0.0, 1.0]])  # towards the tool, up
     flat = [points @ side for points in (rigid, bent)]

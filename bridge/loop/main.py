@@ -17,7 +17,6 @@ import os
 import pickle
 import signal
 import sys
-import time
 import traceback
 from collections.abc import Callable
 from typing import Any
@@ -35,6 +34,7 @@ from gapbridge.bridge.loop.replay import ReplayedLoop
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream, gate_bounds
 from gapbridge.bridge.setpoint_source import make_source
 from gapbridge.bridge.setpoint_source.source import Source
+from gapbridge.core.clock import SYSTEM
 from gapbridge.core.errors import GapbridgeError, InputError
 from gapbridge.core.files import read_only_from
 from gapbridge.core.kernels import compiling
@@ -117,7 +117,7 @@ def _teller(events: int) -> Callable[[dict[str, Any]], None]:
     def tell(event: dict[str, Any]) -> None:
         if len(event.get("detail", "")) > LONGEST_WORDS:
             event = {**event, "detail": event["detail"][:LONGEST_WORDS]}
-        now = {"time": time.time(), "monotonic": time.monotonic()}
+        now = {"time": SYSTEM.time(), "monotonic": SYSTEM.monotonic()}
         with contextlib.suppress(OSError):  # a message each: taken whole, or not at all
             os.write(events, json.dumps({**now, **event}).encode())
 

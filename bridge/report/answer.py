@@ -14,7 +14,6 @@ from gapbridge.bridge.document.blocks import (
     Pictures,
     Verdict,
 )
-from gapbridge.bridge.document.section import Section
 from gapbridge.bridge.report.answer_picture import CAPTION, picture
 from gapbridge.bridge.report.labels import (
     CHANNELS,
@@ -34,26 +33,21 @@ from gapbridge.core.diagnosis.result import Cause
 KINDS = {"no_gap": GOOD, "explained": GOOD, "partly_explained": DOUBTFUL, "unexplained": BAD}
 
 
-class Answer(Section[Material]):
-    """Verdict, three sentences, what to do now, one picture."""
-
-    key, title = "answer", "The answer"
-
-    def blocks(self, material: Material) -> list[Block]:
-        """Return the blocks; further channels have a line each."""
-        diagnosis = material.diagnosis
-        main = chosen_channel(diagnosis)
-        verdict = Badge(VERDICTS[diagnosis.verdict], KINDS[diagnosis.verdict])
-        others = [
-            Paragraph(f"{CHANNELS[c.channel]}: {one_line(c)}")
-            for c in diagnosis.channels
-            if c is not main
-        ]
-        return [
-            Verdict(verdict, " ".join(sentences(main))), *others,
-            Heading("What to do now"), Bullets(tuple(next_steps(diagnosis))),
-            Pictures(tuple(picture(c) for c in diagnosis.channels), CAPTION),
-        ]  # fmt: skip
+def answer(material: Material) -> list[Block]:
+    """Return the blocks; further channels have a line each."""
+    diagnosis = material.diagnosis
+    main = chosen_channel(diagnosis)
+    verdict = Badge(VERDICTS[diagnosis.verdict], KINDS[diagnosis.verdict])
+    others = [
+        Paragraph(f"{CHANNELS[c.channel]}: {one_line(c)}")
+        for c in diagnosis.channels
+        if c is not main
+    ]
+    return [
+        Verdict(verdict, " ".join(sentences(main))), *others,
+        Heading("What to do now"), Bullets(tuple(next_steps(diagnosis))),
+        Pictures(tuple(picture(c) for c in diagnosis.channels), CAPTION),
+    ]  # fmt: skip
 
 
 def next_steps(diagnosis: Diagnosis) -> list[str]:

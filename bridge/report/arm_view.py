@@ -7,6 +7,7 @@ import numpy as np
 from gapbridge.bridge.document.blocks import View
 from gapbridge.bridge.document.drawing import EDGE, SOFT
 from gapbridge.bridge.document.scene import Arrows, Path, Scene, base
+from gapbridge.bridge.document.skeleton import reach, round_factor, skeleton
 from gapbridge.bridge.report.material import (
     Array,
     Index,
@@ -16,27 +17,10 @@ from gapbridge.bridge.report.material import (
     thinned,
 )
 from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
-from gapbridge.core.model import Model
-from gapbridge.core.rotation import rotation_matrix
 
 ARROWS = 250
 DRAWN = 4  # poses in which the arm is drawn
 LENGTH = 0.18  # of the arm's reach: how long a large error's arrow is drawn
-
-
-def joint_origins(model: Model, q: Array) -> Array:
-    """Return base, joints, flange and TCP (n + 3, 3) of the effect-free arm at ``q`` (n,), m."""
-    at = np.eye(4)
-    points = [at[:3, 3]]
-    for i, link in enumerate(model.arm.link_in_link):
-        at = at @ link
-        points.append(at[:3, 3])
-        if i < model.arm.n:
-            turn = np.eye(4)
-            turn[:3, :3] = rotation_matrix(np.array([[0.0, 0.0, q[i]]]))[0]
-            at = at @ turn
-    points.append((at @ model.tool_in_flange)[:3, 3])
-    return np.array(points)
 
 
 def arm_view(channel: ChannelDiagnosis, material: Material) -> View:
@@ -47,16 +31,18 @@ def arm_view(channel: ChannelDiagnosis, material: Material) -> View:
     q = material.log.require("actual_q", "target_q")[rows]
     tip = selection.observation.measured[selection.kept][:, :3] - gap  # where the model puts it
     keep = thinned(per_sample(gap, 3), ARROWS)
-    factor = _factor(gap, material.model)
+    rigid = material.model.without_terms()
+    large = float(np.quantile(per_sample(gap, 3), 0.95))
+    factor = round_factor(LENGTH * reach(rigid) / max(large, 1e-9))
     chosen = _apart(tip, DRAWN)
     arms = [
-        Path(joint_origins(material.model, q[i]), EDGE if k else SOFT, 3.0 if k else 7.0, dots=True)
+        Path(skeleton(rigid, q[i]), EDGE if k else SOFT, 3.0 if k else 7.0, dots=True)
         for k, i in enumerate(chosen)
     ]  # fmt: skip
     errors = before_and_after(channel, gap, after)
     scene = Scene(
         "The arm with the tool's errors as arrows",
-        (*base(_reach(material.model)), *reversed(arms)),
+        (*base(reach(rigid)), *reversed(arms)),
         tuple(Arrows(tip[keep], tip[keep] + e[keep] * factor, colour) for _, e, colour in errors),
         (("arm", SOFT), *((f"error {name}", colour) for name, _, colour in errors)),
     )
@@ -67,17 +53,6 @@ def arm_view(channel: ChannelDiagnosis, material: Material) -> View:
         f"{factor:,.0f} times larger than they are. Drag to turn; click, then scroll to zoom. "
         f"Base frame, squares of the floor 0.1 or 0.25 m.{drawn}",
     )
-
-
-def _reach(model: Model) -> float:
-    return max(float(np.linalg.norm(model.arm.link_in_link[:, :3, 3], axis=1).sum()), 0.1)
-
-
-def _factor(gap: Array, model: Model) -> float:
-    large = float(np.quantile(per_sample(gap, 3), 0.95))
-    rough = LENGTH * _reach(model) / max(large, 1e-9)
-    size = 10 ** np.floor(np.log10(max(rough, 1.0)))
-    return float(max(np.floor(rough / size) * size, 1.0))
 
 
 def _apart(points: Array, count: int) -> Index:

@@ -100,7 +100,7 @@ def keep_by_all_sources() -> None:
     ours = [f"{__name__}.{one.__name__}" for one in (UserProvided, InTree, UserWide)]
     if ours[0] in settings.CACHE_LOCATOR_CLASSES:
         return
-    event.register("numba:compile", _Compiling())
+    event.register("numba:compile", _Compiling())  # type: ignore[no-untyped-call]
     names = [f"{name}CacheLocator" for name in USUAL]
     others = settings.CACHE_LOCATOR_CLASSES or ",".join(
         f"{caching.__name__}.{name}" for name in names if hasattr(caching, name)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import PartialWriteError, WriteError
 from gapbridge.drivers.can.profile import Action, CanProfile, Key, Outgoing
 from gapbridge.drivers.can.settings import CanSettings
@@ -21,7 +21,8 @@ Frames = list[tuple[Key, bytes]]
 class FrameWriter:
     """Sends setpoints and sequences over a bus that is open."""
 
-    def __init__(self, settings: CanSettings, profile: CanProfile) -> None:
+    def __init__(self, settings: CanSettings, profile: CanProfile, clock: Clock = SYSTEM) -> None:
+        self._now = clock.monotonic
         self._settings, self._profile = settings, profile
         self._bus: Any = None
         self._last: Frames | None = None  # the setpoint that got out whole
@@ -100,13 +101,13 @@ class FrameWriter:
         whether an ``until`` is there.
         """
         for action in actions:
-            end = time.monotonic() + action.within
+            end = self._now() + action.within
             while True:
                 self._do(action, hold)
                 listen(action.wait if action.until is None else action.every)
                 if action.until is None or reached(action.until):
                     break
-                if time.monotonic() > end:
+                if self._now() > end:
                     names = ", ".join(f.name for f in action.frames) or "hold"
                     raise WriteError(
                         f"{self._profile.name}: {names}: not {action.until} after "

@@ -13,7 +13,7 @@ from rich.console import Console
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.demo.hidden import Accused, Hidden
 from gapbridge.bridge.demo.page import page
-from gapbridge.bridge.demo.picture import coloured, picture
+from gapbridge.bridge.demo.picture import picture
 from gapbridge.bridge.demo.poses import CALIBRATION_LOADS, TEST_LOADS, candidates, plan
 from gapbridge.bridge.demo.rests import Rests, joined, rests, write_log
 from gapbridge.bridge.demo.result import LoopFigures, Result, repeatability
@@ -292,9 +292,9 @@ def test_three_rounds_of_visits_and_the_truth_are_shown(
     said = capsys.readouterr().out
     assert "fit and diagnosis" in said
     assert "tool_frame_x: truly +1 mm, found +1 ± 0.003 mm" in said
-    assert [name for name, _, _ in coloured(whole)] == ["without", "fit alone", "fit and diagnosis"]
-    assert "fit alone" in svg_file(picture(whole))
+    drawn = svg_file(picture(whole))
+    assert all(f'fill="var(--{c})"' in drawn for c in ("bad-dot", "before", "limit"))
     html = page(whole, "")
-    assert "truly +1 mm" in html
+    assert "+1 ± 0.003 mm" in html
     assert whole.summary()["tcp_error_mm"]["fitted"]["rms"] > 0
     assert whole.summary()["hidden"]["tool_frame_x"] == 1e-3

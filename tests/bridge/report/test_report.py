@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from report_cases import CASES, diagnosed
 
+from gapbridge.bridge.document.skeleton import skeleton
 from gapbridge.bridge.report import SECTIONS, write_report
-from gapbridge.bridge.report.arm_view import joint_origins
 from gapbridge.bridge.report.labels import (
     VERDICTS,
     joint_list,
@@ -105,7 +105,7 @@ def test_a_path_to_a_cell_is_reported_by_its_file(tmp_path):
 def test_the_drawn_arm_ends_at_the_rigid_tcp():
     model = Model(builtin_arm("ur10e"), transform(rpy_matrix(np.zeros(3)), np.array([0, 0, 0.2])))
     q = np.array([0.3, -1.2, 1.1, -0.4, 0.9, 0.2])
-    points = joint_origins(model, q)
+    points = skeleton(model, q)
     assert points.shape == (model.arm.n + 3, 3)
     np.testing.assert_allclose(points[-1], model.rigid_pose(q[None]).position[0], atol=1e-12)
 

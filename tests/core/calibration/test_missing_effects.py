@@ -22,7 +22,7 @@ from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import DEFAULT, Parameters
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.result import Estimate
-from gapbridge.core.calibration.telling import unsupported
+from gapbridge.core.calibration.summary import unsupported
 from gapbridge.core.metrology import Metrology
 
 KIND = ARMS["cobot10"]
@@ -48,7 +48,7 @@ def test_an_arm_without_further_effects_is_offered_none(
 ) -> None:
     for seed in range(3):
         readings, parameters = session(poses, seed, tuple(effects))
-        assert fit_session(readings, parameters, Metrology(False, 2e-5)).lacks == ()
+        assert fit_session(readings, parameters, Metrology(False, 2e-5)).missing == ()
 
 
 def test_what_is_chosen_does_not_depend_on_the_held_out_readings() -> None:
@@ -60,7 +60,7 @@ def test_what_is_chosen_does_not_depend_on_the_held_out_readings() -> None:
         for r in (readings, replace(readings, value=value))
     )
     np.testing.assert_array_equal(one.rest.values, other.rest.values)
-    assert one.lacks == other.lacks
+    assert one.missing == other.missing
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.calibration.descent import Standing, descended, standing
+from gapbridge.core.calibration.descent import FitState, descended, fit_state
 from gapbridge.core.calibration.noise import Noise, estimated, presumed
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
@@ -22,11 +22,11 @@ from gapbridge.core.metrology import Metrology
 Array = NDArray[np.float64]
 NOISES = 6  # times at most that the noise is estimated anew
 SAME = 0.02  # relative change of the noise that is none
-WILD = 0.1  # weight below which a reading counts as an outlier
+OUTLIER = 0.1  # weight below which a reading counts as an outlier
 
 
 @dataclass(frozen=True)
-class Rest:
+class ConvergedFit:
     """Where the fit stands."""
 
     values: Array  # (p,)
@@ -37,7 +37,7 @@ class Rest:
     covariance: Array  # (p, p)
     spent: float  # numbers that the fit spent
     system: System  # at rest, divided by the noise, weighed
-    settled: bool = True  # False: patience ended before the fit converged
+    converged: bool = True  # False: patience ended before the fit converged
 
     @property
     def freedom(self) -> float:
@@ -46,18 +46,18 @@ class Rest:
         return max(float(self.weights.sum()) * width - self.spent, 1.0)
 
     @property
-    def calm(self) -> Mask:
+    def inliers(self) -> Mask:
         """Return which readings count (N,)."""
-        return np.asarray(self.weights > WILD)
+        return np.asarray(self.weights > OUTLIER)
 
 
-def come_to_rest(
+def converged_fit(
     parameters: Parameters,
     observable: Observable,
     readings: Readings,
     metrology: Metrology,
     progress: Callable[[str], None],
-) -> tuple[Problem, Rest]:
+) -> tuple[Problem, ConvergedFit]:
     """Return the fit of all parameters to the readings.
 
     Raises ExcitationError where there are fewer readings than numbers to find, InputError where
@@ -71,7 +71,7 @@ def come_to_rest(
     noise, known = presumed(begin, readings, observable, nuisance, metrology)
     problem = Problem(parameters, observable, readings, bounds, stages, known)
     progress("fitting, look 1")
-    at = _staged(problem, standing(problem, values, nuisance, noise), noise)
+    at = _staged(problem, fit_state(problem, values, nuisance, noise), noise)
     at = descended(problem, at, noise)
     for look in range(NOISES):  # the noise is determined by what is left once the fit is at rest
         progress(f"fitting, look {look + 2}")
@@ -79,13 +79,13 @@ def come_to_rest(
         at = descended(problem, at, noise)
         if np.abs(noise.sizes / before.sizes - 1).max() < SAME:
             break
-    return problem, Rest(
+    return problem, ConvergedFit(
         at.values, at.nuisance, noise, at.weights, at.stuck, at.covariance, at.spent, at.system,
-        at.settled,
+        at.converged,
     )  # fmt: skip
 
 
-def _staged(problem: Problem, at: Standing, noise: Noise) -> Standing:
+def _staged(problem: Problem, at: FitState, noise: Noise) -> FitState:
     """Return the standing after the stages, where they lead down."""
     k = problem.observable.equations
     root = np.sqrt(at.weights)
@@ -94,17 +94,17 @@ def _staged(problem: Problem, at: Standing, noise: Noise) -> Standing:
     if problem.left(values, at.nuisance) is None:
         return at
     poses = problem.parameters.model(values).predict(problem.readings.q, problem.readings.loads)
-    nuisance = problem.observable.settled(poses, problem.readings, at.nuisance)
+    nuisance = problem.observable.refined(poses, problem.readings, at.nuisance)
     here, there = (problem.left(*p) for p in ((at.values, at.nuisance), (values, nuisance)))
     if here is None or there is None:
         return at
     gain = cost(here, noise, at.weights) - cost(there, noise, at.weights)
     if gain < problem.prior(values) - problem.prior(at.values):
         return at
-    return standing(problem, values, nuisance, noise, at.columns, at.anchor)
+    return fit_state(problem, values, nuisance, noise, at.columns, at.anchor)
 
 
-def _noise(problem: Problem, at: Standing, noise: Noise) -> Noise:
+def _noise(problem: Problem, at: FitState, noise: Noise) -> Noise:
     """Return the noise that the residual implies."""
     J, F = at.columns
     left = problem.left(at.values, at.nuisance)
@@ -113,5 +113,5 @@ def _noise(problem: Problem, at: Standing, noise: Noise) -> Noise:
     precision = np.concatenate([problem.bounds.held**-2.0, np.zeros(F.shape[1])])
     return estimated(
         noise, problem.known, left + (J @ off).reshape(left.shape), np.hstack([J, F]),
-        precision, np.asarray(at.weights > WILD),
+        precision, np.asarray(at.weights > OUTLIER),
     )  # fmt: skip

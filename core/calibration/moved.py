@@ -34,14 +34,14 @@ def moved_words(moved: Suspect | None, suspects: Sequence[Suspect]) -> str:
 def _size(estimates: Sequence[Estimate]) -> str:
     """Return how far lengths, angles and masses moved."""
     words = []
-    for unit, (factor, told) in FACTORS.items():
+    for unit, (factor, unit_name) in FACTORS.items():
         own = [e for e in estimates if e.unit == unit]
         if not own:
             continue
         size = float(np.linalg.norm([e.value for e in own]))
         sure = float(np.sqrt(np.mean([e.std**2 for e in own])))
         if size > 2 * sure or len(estimates) == 1:
-            words.append(f"{factor * size:.3g} {told} (1 sigma {factor * sure:.2g})")
+            words.append(f"{factor * size:.3g} {unit_name} (1 sigma {factor * sure:.2g})")
     return " and ".join(words) or "little"
 
 

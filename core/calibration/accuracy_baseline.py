@@ -1,4 +1,4 @@
-"""What a calibration promises, as a document that is kept beside the cell for later checks."""
+"""The accuracy of a calibration, as a document that is kept beside the cell for later checks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SCHEMA = "gapbridge.calibration/1"
 
 
 @dataclass(frozen=True)
-class Promise:
+class AccuracyBaseline:
     """How far off a calibrated model may be, and how noisy its readings were."""
 
     kind: str  # of the readings
@@ -40,7 +40,7 @@ class Promise:
 
 
 def document_of(calibration: Calibration, sigma: float = float("nan")) -> dict[str, Any]:
-    """Return the promise of a calibration as plain data, for JSON.
+    """Return the accuracy baseline of a calibration as plain data, for JSON.
 
     ``sigma`` (m) is the instrument's own, as the cell states it.
     """
@@ -68,15 +68,15 @@ def document_of(calibration: Calibration, sigma: float = float("nan")) -> dict[s
     }
 
 
-def promise_in(document: Mapping[str, Any], where: str = "calibration") -> Promise:
-    """Return the promise that a document holds; raises InputError naming what is wrong with it."""
+def baseline_in(document: Mapping[str, Any], where: str = "calibration") -> AccuracyBaseline:
+    """Return the baseline in a document; raises InputError naming what is wrong with it."""
     if document.get("schema") != SCHEMA:
         raise InputError(f"{where}: schema: found {document.get('schema')!r}, expected {SCHEMA!r}")
     try:
         parameters, noise = document["parameters"], document["noise"]
         names = tuple(str(p["name"]) for p in parameters)
         covariance = np.array(document["covariance"], dtype=float).reshape(len(names), len(names))
-        return Promise(
+        return AccuracyBaseline(
             str(document["kind"]), names, np.array([float(p["value"]) for p in parameters]),
             covariance, _number(noise["sigma"]), _number(noise["instrument"]),
             _number(noise["turn"]), _number(noise["joint"]),

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.calibration.lacking import Lack
+from gapbridge.core.calibration.converged_fit import ConvergedFit
+from gapbridge.core.calibration.missing_effects import MissingEffect
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.problem import Problem
 from gapbridge.core.calibration.remainder import Remainder
-from gapbridge.core.calibration.rest import Rest
 from gapbridge.core.calibration.result import Errors, Estimate
 from gapbridge.core.calibration.staging import DOUBT
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
@@ -20,9 +20,11 @@ SIGMAS = 3.0  # from zero, of its own, that a further effect must be to be fitte
 MEMBER = 0.35  # share of a combination from which a parameter is named in it
 
 
-def combinations(parameters: Parameters, rest: Rest, shown: NDArray[np.bool_]) -> tuple[str, ...]:
+def combinations(
+    parameters: Parameters, rest: ConvergedFit, shown: NDArray[np.bool_]
+) -> tuple[str, ...]:
     """Return what these readings do not determine, or only together."""
-    told = []
+    notes = []
     names = parameters.names
     std = np.sqrt(np.diag(rest.covariance))
     correlation = rest.covariance / np.outer(std, std)
@@ -31,21 +33,21 @@ def combinations(parameters: Parameters, rest: Rest, shown: NDArray[np.bool_]) -
         best = partners[0] if partners else -1
         if best >= 0 and abs(correlation[i, best]) > CLOSE:
             what = "difference" if correlation[i, best] > 0 else "sum"
-            told.append(f"{names[i]}: these readings determine only its {what} with {names[best]}")
+            notes.append(f"{names[i]}: these readings determine only its {what} with {names[best]}")
         elif others := _company(correlation, int(i)):
             company = ", ".join(names[j] for j in others)
-            told.append(f"{names[i]}: these readings determine it only together with {company}")
+            notes.append(f"{names[i]}: these readings determine it only together with {company}")
         else:
-            told.append(f"{names[i]}: these readings hardly show it; it stays near its beginning")
+            notes.append(f"{names[i]}: these readings hardly show it; it stays near its beginning")
     for i in np.flatnonzero(shown):
         for j in np.flatnonzero(shown):
             if j > i and abs(correlation[i, j]) > CLOSE:
                 what = "difference" if correlation[i, j] > 0 else "sum"
-                told.append(
+                notes.append(
                     f"{names[i]} and {names[j]}: mostly their {what} is known "
                     f"(correlation {correlation[i, j]:+.3f})"
                 )
-    return tuple(told)
+    return tuple(notes)
 
 
 def _company(correlation: Array, i: int) -> list[int]:
@@ -61,12 +63,12 @@ def _company(correlation: Array, i: int) -> list[int]:
 
 
 def notes_of(
-    problem: Problem, rest: Rest, remainder: Remainder, odds: float | None,
+    problem: Problem, rest: ConvergedFit, remainder: Remainder, odds: float | None,
     estimates: tuple[Estimate, ...],
 ) -> tuple[str, ...]:  # fmt: skip
     """Return what deserves a second look."""
     notes = []
-    if not rest.settled:
+    if not rest.converged:
         notes.append(
             "the fit did not converge: take its figures for where it stood, and fit fewer "
             "effects or measure more poses"
@@ -74,12 +76,12 @@ def notes_of(
     bound = [e.name for e in estimates if e.on_bound]
     if bound:
         notes.append(f"on their bound: {', '.join(bound)}")
-    wild = np.flatnonzero(~rest.calm)
-    if len(wild):
-        notes.append(f"{len(wild)} outlier(s) down-weighted")
-    if len(remainder.wild):
-        rows = ", ".join(str(int(r) + 1) for r in remainder.wild)
-        notes.append(f"held-out reading(s) far beyond what the fit promises: row {rows}")
+    outliers = np.flatnonzero(~rest.inliers)
+    if len(outliers):
+        notes.append(f"{len(outliers)} outlier(s) down-weighted")
+    if len(remainder.outliers):
+        rows = ", ".join(str(int(r) + 1) for r in remainder.outliers)
+        notes.append(f"held-out reading(s) far beyond the predicted spread: row {rows}")
     if odds is not None and odds < DOUBT:
         notes.append(
             "what differs between loads and all readings together disagree on the flexibilities: "
@@ -94,7 +96,7 @@ def notes_of(
 
 
 def verdict_of(
-    errors: tuple[Errors, ...], rest: Rest, floor: float, complete: bool, remaining: str
+    errors: tuple[Errors, ...], rest: ConvergedFit, floor: float, complete: bool, remaining: str
 ) -> str:
     """Return the calibration in one sentence."""
     held = len(errors[2].rows) > 0
@@ -110,16 +112,16 @@ def verdict_of(
 
 
 def remaining_of(
-    remainder: Remainder, diagnosis: Diagnosis | None, complete: bool, lacks: tuple[Lack, ...],
-    settled: bool,
+    remainder: Remainder, diagnosis: Diagnosis | None, complete: bool,
+    missing: tuple[MissingEffect, ...], converged: bool,
 ) -> str:  # fmt: skip
     """Return what is left: one statement, which every section of a report repeats."""
     if complete:
         return "nothing is left that a further effect could explain"
-    if not settled:
+    if not converged:
         return "the fit did not converge"
-    if lacks:
-        names = ", ".join(f"{lack.name} ({100 * lack.share:.0f} %)" for lack in lacks)
+    if missing:
+        names = ", ".join(f"{lack.name} ({100 * lack.share:.0f} %)" for lack in missing)
         return (
             "to be added, with the share that each takes off what is left on poses left out of its "
             f"fit: {names}"

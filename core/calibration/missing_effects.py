@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from gapbridge.core.calibration.converged_fit import ConvergedFit
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.problem import HELD, Problem
-from gapbridge.core.calibration.rest import Rest
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.estimation.identification import pose_groups
 
@@ -33,23 +33,23 @@ Candidate = tuple[Array, Array]  # columns (M, k), usual sizes (k,)
 
 
 @dataclass(frozen=True)
-class Lack:
+class MissingEffect:
     """An effect that would explain a part of the residuals."""
 
     name: str  # as Parameters.of takes it: backlash_3, thermal_drift
     share: float  # of the residuals' squares on poses left out in folds that it takes off
 
 
-def lacking(problem: Problem, rest: Rest) -> tuple[Lack, ...]:
+def missing_effects(problem: Problem, rest: ConvergedFit) -> tuple[MissingEffect, ...]:
     """Return the further effects that the poses of the fit support, the strongest first."""
     tried = _columns(problem, rest)
     folds = _Folds.of(problem, rest)
     known = np.hstack([rest.system.J, rest.system.F])
-    found: list[Lack] = []
+    found: list[MissingEffect] = []
     for _ in range(TOLD):
         likely = _likely(tried, known, rest.system.left, found)
         gains = [(name, folds.gain(tried[name])) for name in likely]
-        held = [Lack(name, gain) for name, gain in gains if gain >= SMALL]
+        held = [MissingEffect(name, gain) for name, gain in gains if gain >= SMALL]
         if not held:
             break
         found.append(max(held, key=lambda lack: lack.share))
@@ -58,7 +58,9 @@ def lacking(problem: Problem, rest: Rest) -> tuple[Lack, ...]:
     return tuple(found)
 
 
-def _likely(tried: dict[str, Candidate], known: Array, left: Array, found: list[Lack]) -> list[str]:
+def _likely(
+    tried: dict[str, Candidate], known: Array, left: Array, found: list[MissingEffect]
+) -> list[str]:
     """Return the effects that are far likelier than nothing, their number paid for."""
     Q = _orthonormal(known)
     free = left - Q @ (Q.T @ left)
@@ -92,7 +94,7 @@ class _Folds:
     fold: NDArray[np.int64]  # (M,)
 
     @classmethod
-    def of(cls, problem: Problem, rest: Rest) -> _Folds:
+    def of(cls, problem: Problem, rest: ConvergedFit) -> _Folds:
         """Return the folds of a converged fit; repeats and loads of a pose stay together."""
         system, held = rest.system, problem.bounds.held
         size = np.maximum(np.linalg.norm(system.F, axis=0), 1e-300)
@@ -151,7 +153,7 @@ def _orthonormal(columns: Array) -> Array:
     return np.asarray(U[:, s > 1e-8 * max(float(s.max(initial=0.0)), 1e-300)])
 
 
-def _columns(problem: Problem, rest: Rest) -> dict[str, Candidate]:
+def _columns(problem: Problem, rest: ConvergedFit) -> dict[str, Candidate]:
     """Return the columns and usual sizes of every further effect, weighed as the system is."""
     parameters, observable, readings = problem.parameters, problem.observable, problem.readings
     found = parameters.model(rest.values)
