@@ -17,7 +17,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-import pexpect
+import pexpect  # type: ignore[import-untyped]
 
 from gapbridge.bridge.demo.links.link import free_address
 from gapbridge.bridge.demo.links.ur_rtde import UrRtdeLink

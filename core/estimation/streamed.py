@@ -93,6 +93,7 @@ class _Task:
                 break
             if long and (change[kept] < ENOUGH * _spread(linear, kept)).all():
                 break
+        assert kept is not None
         shown = base_parameters.what_is_shown(linear, kept, self.scale)
         return _Found(now, noise, base, parts, shown)
 
@@ -199,8 +200,8 @@ def _stream(log: Iterable[Log], metrology: Metrology, motions: bool) -> Stream:
     kept, folds = [], []
     for number, (data, rows) in enumerate(store):
         fold = np.empty(len(rows), dtype=np.int64)
-        for k, part in stretches(number, len(rows)):
-            fold[part] = k
+        for k, stretch in stretches(number, len(rows)):
+            fold[stretch] = k
         taken = rows % every == 0
         kept.append(data.part(taken))
         folds.append(fold[taken])
