@@ -5,7 +5,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: help demo test check coverage bench faults mutants clean
+.PHONY: help demo test check coverage bench faults simulate mutants clean
 
 help:
 	@echo "make demo      the whole job on a simulated cell; results in out/demo"
@@ -15,6 +15,7 @@ help:
 	@echo "make bench     speed beside peers, in one run; figures in out/speed.json, out/fleet.json"
 	@echo "make faults    every fault on the real wire, and random ones; fills docs/reliability.md"
 	@echo "make mutants   small mistakes put into the product one at a time, and which go unnoticed"
+	@echo "make simulate  whole runs with faults in simulated time; SEEDS=100000, FIRST=0"
 	@echo "make clean     remove .venv and everything that was made"
 
 demo: .venv/.main
@@ -56,6 +57,13 @@ faults: .venv/.test
 
 mutants: .venv/.test
 	$(BIN)/python -m benchmarks.mutants --out out/mutants.jsonl
+
+# SEEDS: how many runs. One of them again: .venv/bin/python -m benchmarks.simulation --seed N
+SEEDS ?= 2000
+FIRST ?= 0
+
+simulate: .venv/.test
+	$(BIN)/python -m benchmarks.simulation --first $(FIRST) --seeds $(SEEDS)
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \

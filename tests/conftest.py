@@ -1,27 +1,101 @@
-"""How the tests are shared out over two processes, and which get more chances than one."""
+"""How the tests are shared out over two processes, and what becomes of those in real time.
+
+Every test has one chance. A test in real time (marked ``realtime``: it judges threads, signals and
+sockets of real processes) says nothing where the machine itself was late: it is skipped where the
+machine cannot keep any time before it begins, and where it failed while a process beside it, which
+only sleeps, was woken later than a state may be old. How late is in the skip's reason.
+"""
 
 from __future__ import annotations
 
+import sys
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 HERE = Path(__file__).parent
-REAL_TIME = ("bridge", "drivers", "faults", "hil")
-CHANCES = 3  # more, of a test in real time
-TOGETHER = ("drivers/can", "drivers/canopen")  # their buses are served on the same addresses
+if str(HERE) not in sys.path:
+    sys.path.insert(0, str(HERE))
+
+from lateness import HOPELESS, LIMIT, Witness  # noqa: E402
+
+REALTIME = (
+    "bridge/cli/test_cli_check.py",
+    "bridge/daemon/test_configuration_that_runs.py",
+    "bridge/daemon/test_daemon_checks.py",
+    "bridge/daemon/test_daemon_faults.py",
+    "bridge/daemon/test_daemon_writing.py",
+    "bridge/daemon/test_owner_lock.py",
+    "bridge/daemon/test_reload.py",
+    "bridge/daemon/test_service_manager.py",
+    "bridge/daemon/test_side_attack.py",
+    "bridge/daemon/test_withdrawal.py",
+    "bridge/demo/",
+    "bridge/ipc/test_side_process.py",
+    "bridge/loop/test_replayed_loop.py",
+    "bridge/recording/test_recorder_process.py",
+    "bridge/recording/test_recording_daemon.py",
+    "bridge/setpoint_source/test_planner_attack.py",
+    "bridge/setpoint_source/test_setpoint_modbus.py",
+    "bridge/web/",
+    "drivers/can/",
+    "drivers/canopen/",
+    "drivers/contract/",
+    "drivers/ft_sensor/",
+    "drivers/modbus/test_modbus_driver.py",
+    "drivers/modbus/test_modbus_wire.py",
+    "drivers/simulated/",
+    "drivers/ur_rtde/",
+    "faults/test_matrix.py",
+    "faults/test_short.py",
+    "faults/test_start.py",
+    "hil/",
+)
+"""Files and folders whose tests run real processes, buses or servers against the clock."""
+
+WITNESS = Witness()
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep a file's tests in one process; real time may have stood still on a busy machine.
-
-    Such a machine stands still more than once in the minutes of a run. A test that needed another
-    chance is listed at the end.
-    """
+    """Keep a file's tests in one process, and mark those in real time."""
     for item in items:
         place = item.path.relative_to(HERE).as_posix()
-        group = next((name for name in TOGETHER if place.startswith(f"{name}/")), place)
-        item.add_marker(pytest.mark.xdist_group(group))
-        if place.split("/")[0] in REAL_TIME:
-            item.add_marker(pytest.mark.flaky(reruns=CHANCES))
+        item.add_marker(pytest.mark.xdist_group(place))
+        if place.startswith(REALTIME):
+            item.add_marker(pytest.mark.realtime)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Judge the machine before a test in real time."""
+    if item.get_closest_marker("realtime") is None:
+        return
+    WITNESS.start()
+    late = WITNESS.worst(time.time() - 1.0, time.time())
+    if late > HOPELESS and (late := WITNESS.probe()) > HOPELESS:
+        pytest.skip(f"this machine keeps no time: it woke a process {1e3 * late:.0f} ms late")
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Iterator[None]:
+    """Judge the machine where a test in real time has failed."""
+    outcome = yield
+    report = outcome.get_result()  # type: ignore[attr-defined]
+    if not report.failed or item.get_closest_marker("realtime") is None:
+        return
+    late = WITNESS.worst(call.start, call.stop)
+    if late > LIMIT:
+        words = str(call.excinfo.value).splitlines() if call.excinfo is not None else []
+        reason = (
+            f"this machine woke a process {1e3 * late:.0f} ms late meanwhile, at most "
+            f"{1e3 * LIMIT:.0f} ms are judged by; it ended with: {(words or [''])[0][:200]}"
+        )
+        report.outcome = "skipped"
+        report.longrepr = (str(item.path), item.location[1] or 0, f"Skipped: {reason}")
+
+
+def pytest_sessionfinish() -> None:
+    """End what watches the machine."""
+    WITNESS.stop()

@@ -13,8 +13,12 @@ OWN = ROOT / "core" / "effects"
 # identifiers that are also a column of the log, a limit's key or a field of another record: as
 # such they are no effect
 SHARED = {"payload", "payload_cog", "joint_offset", "latency"}
-# names of joints that a simulator's model is given: they stand in the user's file and in docs
-LABELS = {"bridge/patch/mjcf.py": {"backlash", "axial_compliance"}}
+# names of joints that a simulator's model is given (they stand in the user's file and in docs), and
+# what the demo has put into its plant, by the name that a diagnosis must find
+LABELS = {
+    "bridge/patch/mjcf.py": {"backlash", "axial_compliance"},
+    "bridge/demo/hidden.py": {"tool_frame", "axial_compliance", "radial_compliance"},
+}
 ASKED = {"effect", "family", "identifier"}  # attributes whose text is an identifier
 TAKING = {"Term", "effect_named", "joints"}  # calls whose first argument is one
 

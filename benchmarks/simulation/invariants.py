@@ -33,7 +33,7 @@ INVARIANTS: dict[str, str] = {
     "over the deaths of all processes",
     "table": "the state changes as the table of states says, and in no other way",
     "taken": "what a person asks for is taken by a loop, and what is answered is so",
-    "ends": "a stop ends in time, with a summary, and the arm without an offset of ours growing",
+    "ends": "a stop ends in time, and with a summary",
     "crash": "no process ends by an exception that is none of the product's",
     "recorded": "the cycles handed to the recorder say of each setpoint whether it left",
     "recovers": "once robot, network and machine are healed, a person can arm again",

@@ -73,8 +73,8 @@ def _bent_tool(rng: np.random.Generator) -> Hidden:
     return Hidden("tool_frame", "the tool was bent, too", truth, {"tool_shift": shift})
 
 
-DRAWS: dict[str, Callable[[np.random.Generator], Hidden]] = {"tool_frame": _bent_tool}
-"""Effects that may be hidden: those that the diagnosis names rightly whatever the seed."""
+DRAWS: dict[str, Callable[[np.random.Generator], Hidden]] = {"bent_tool": _bent_tool}
+"""What may be hidden: that whose effect the diagnosis names rightly whatever the seed."""
 
 
 def accused_in(document: Mapping[str, Any]) -> tuple[Accused, ...]:

@@ -44,9 +44,10 @@ def page(result: Result, diagnosis: str, origin: Mapping[str, Any] | None = None
 
 def document(result: Result, diagnosis: str, origin: Mapping[str, Any]) -> Document:
     """Return the report as blocks."""
+    truth = _truth(result)
     parts: list[tuple[str, str, list[Block]]] = [
         ("result", "The result", _result(result)),
-        ("truth", "The hidden truth, and what was found", _truth(result)),
+        *([("truth", "The hidden truth, and what was found", truth)] if truth else []),
         ("visits", "Every visit", [Pictures((_errors(result),))]),
         ("flexibilities", "What was found of the arm", _flexibilities(result)),
         ("diagnosis", "What the diagnosis says of what the fit leaves", _diagnosis(diagnosis)),

@@ -1,5 +1,7 @@
 """Output files: written beside their place, then renamed, so that none is ever half-written.
 
+What was written outlives a power cut: the file is synced before its name, and its folder after it.
+
 A new one is the owner's to write and the group's to read (0640), whatever the umask; one that takes
 the place of another keeps that one's permissions.
 """
@@ -47,8 +49,8 @@ def require_writable(path: Path, *inputs: Path) -> Path:
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[IO[str]]:
     """Give a text file that takes the place of ``path`` when the block ends without an error."""
-    with replacing_bytes(path) as raw:
-        file = io.TextIOWrapper(raw, "utf-8", newline="\n")
+    with replacing_bytes(path) as binary:
+        file = io.TextIOWrapper(binary, "utf-8", newline="\n")
         try:
             yield file
         finally:
@@ -67,11 +69,30 @@ def replacing_bytes(path: Path) -> Iterator[IO[bytes]]:
             file.flush()
             os.fsync(file.fileno())
         os.replace(part, place)
+        sync_folder(place.parent)  # else a power cut takes the new file with its name
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
     finally:
         with contextlib.suppress(OSError):
             part.unlink()
+
+
+def sync_folder(folder: Path) -> None:
+    """Have the names in a folder on disk: a file that was synced can still lose its name."""
+    with contextlib.suppress(OSError):  # not every file system knows it
+        fd = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(fd)
+        finally:
+            os.close(fd)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder with all above it, nobody else's (0750), and have them on disk."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
+    for path in missing:
+        sync_folder(path.parent)
 
 
 def private(path: str | Path, flags: int) -> int:
@@ -101,8 +122,8 @@ def write_table(path: Path, columns: Sequence[str], table: NDArray[np.float64]) 
         from pyarrow import parquet
 
         frame = pyarrow.table({name: table[:, k] for k, name in enumerate(columns)})
-        with replacing_bytes(path) as raw:
-            parquet.write_table(frame, raw)
+        with replacing_bytes(path) as binary:
+            parquet.write_table(frame, binary)
         return
     if table.size > LONG:
         import pyarrow

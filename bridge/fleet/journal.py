@@ -6,12 +6,11 @@ import fcntl
 import os
 import time
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from pydantic_core import from_json, to_json
 
-from gapbridge.bridge.document.output_file import private
+from gapbridge.bridge.document.output_file import private, sync_folder
 from gapbridge.bridge.fleet.task import Outcome
 from gapbridge.core.errors import InputError, RunError
 
@@ -26,6 +25,7 @@ class Journal:
         self._synced = 0.0
         try:
             self._file = open(path, "a+b", opener=private)  # noqa: SIM115
+            sync_folder(path.parent)
         except OSError as error:
             raise InputError(f"{path}: cannot be written: {error.strerror}") from None
         try:
@@ -41,12 +41,7 @@ class Journal:
         """Use it."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close it; what was added is on the disk."""
         os.fsync(self._file.fileno())
         self._file.close()

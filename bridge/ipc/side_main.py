@@ -14,12 +14,14 @@ import select
 import socket
 import sys
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc.shared_memory import FollowedPage, SharedMemory
 from gapbridge.core.clock import SYSTEM
+from gapbridge.core.errors import GapbridgeError
 
 FAREWELL = 5.0  # s that a side process may take to end after the daemon
 NICENESS = 5  # the loop comes first
@@ -129,6 +131,18 @@ def take_order() -> Order:
         up=EventWriter(given["up"]),
         extra=given.get("extra", {}),
     )
+
+
+def run_side(kind: str, run: Callable[[Order], None]) -> int:
+    """Run a serving process of the daemon's until the daemon is gone; returns the exit code."""
+    order = take_order()
+    try:
+        run(order)
+    except GapbridgeError as error:
+        order.emit({"kind": kind, "failure": str(error)})
+        sys.stderr.write(f"{error}\n")
+        return 1
+    return 0
 
 
 def read_event(line: bytes) -> dict[str, Any] | None:

@@ -13,28 +13,15 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from gapbridge.bridge.ipc.side_main import Order, take_order
+from gapbridge.bridge.ipc.side_main import Order, run_side
 from gapbridge.bridge.metrics.counts import Counts
 from gapbridge.bridge.metrics.families import Families
 from gapbridge.bridge.served.credentials import read_token
 from gapbridge.bridge.served.guard import Guard
 from gapbridge.bridge.served.server import serve
-from gapbridge.core.errors import GapbridgeError
 
 TURN = 0.25  # s between two looks at the shared page
 TEXT = "text/plain; version=0.0.4; charset=utf-8"
-
-
-def main() -> int:
-    """Run until the daemon is gone; returns the exit code."""
-    order = take_order()
-    try:
-        run(order)
-    except GapbridgeError as error:
-        order.emit({"kind": "metrics", "failure": str(error)})
-        sys.stderr.write(f"{error}\n")
-        return 1
-    return 0
 
 
 def run(order: Order) -> None:
@@ -61,4 +48,4 @@ def run(order: Order) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_side("metrics", run))

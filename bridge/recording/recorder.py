@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
-from gapbridge.bridge.document.output_file import FOLDER_MODE
+from gapbridge.bridge.document.output_file import make_folder
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.recording.event_text import LEVELS, level_of, text_of
@@ -167,7 +167,7 @@ class Recorder:
     def _open(self) -> bool:
         """Begin a new file; returns whether there is one."""
         try:
-            self._folder.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
+            make_folder(self._folder)
             prune(self._folder, self._session, self._settings.keep_total)
             if self._room() < self._settings.keep_free:
                 raise OSError(0, f"less than {self._settings.keep_free:g} MB free")

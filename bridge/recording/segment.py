@@ -19,7 +19,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
-from gapbridge.bridge.document.output_file import MODE
+from gapbridge.bridge.document.output_file import MODE, sync_folder
 from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.log.mcap_layout import layout_of
 from gapbridge.core.log.mcap_schema import (
@@ -45,7 +45,7 @@ class _File:
         self.fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, MODE)
         with contextlib.suppress(OSError):  # who finishes files after a kill leaves this one alone
             fcntl.flock(self.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        _sync_folder(path.parent)  # else a power cut may take the name
+        sync_folder(path.parent)  # else a power cut may take the name
         self.good = 0  # bytes of the file that were written by whole flushes
         self._waiting = bytearray()
 
@@ -69,15 +69,6 @@ class _File:
     def close(self) -> None:
         fd, self.fd = self.fd, -1
         if fd >= 0:
-            os.close(fd)
-
-
-def _sync_folder(folder: Path) -> None:
-    with contextlib.suppress(OSError):  # not every file system knows it
-        fd = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(fd)
-        finally:
             os.close(fd)
 
 

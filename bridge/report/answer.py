@@ -126,7 +126,7 @@ def _causes(channel: ChannelDiagnosis) -> str:
             "No known effect explains it: something is going on that is not in the catalogue, "
             "and no known effect is blamed for it."
         )
-    words = listed([cause_title(c) for c in channel.causes])
+    causes = listed([cause_title(c) for c in channel.causes])
     fall = 1 - after(channel) / max(channel.gap_rms, 1e-300)
     sure = likelihood(min(c.probability for c in channel.causes))
     many = len(channel.causes) > 1
@@ -137,7 +137,7 @@ def _causes(channel: ChannelDiagnosis) -> str:
         else (f"the gap does not fall (it is {left})")
     )
     return (
-        f"Cause{'s' if many else ''}: {words}; with {'them' if many else 'it'} in the model "
+        f"Cause{'s' if many else ''}: {causes}; with {'them' if many else 'it'} in the model "
         f"{change} on measurements that the fit did not see ({sure} sure).{elsewhere(channel)}"
     )
 

@@ -8,27 +8,14 @@ from __future__ import annotations
 
 import sys
 
-from gapbridge.bridge.ipc.side_main import Order, take_order
+from gapbridge.bridge.ipc.side_main import Order, run_side
 from gapbridge.bridge.served.credentials import read_token
 from gapbridge.bridge.served.server import serve
 from gapbridge.bridge.web.app import make_app
 from gapbridge.bridge.web.stream import Stream
 from gapbridge.bridge.web.watched import Watched, encoded
-from gapbridge.core.errors import GapbridgeError
 
 TURN = 0.1  # s between two looks at the shared page
-
-
-def main() -> int:
-    """Run until the daemon is gone; returns the exit code."""
-    order = take_order()
-    try:
-        run(order)
-    except GapbridgeError as error:
-        order.emit({"kind": "web", "failure": str(error)})
-        sys.stderr.write(f"{error}\n")
-        return 1
-    return 0
 
 
 def run(order: Order) -> None:
@@ -54,4 +41,4 @@ def run(order: Order) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_side("web", run))

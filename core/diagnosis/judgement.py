@@ -37,8 +37,13 @@ from gapbridge.core.diagnosis.remainder import (
     with_the_links,
     withstanding,
 )
-from gapbridge.core.diagnosis.residual_structure import dependence, structure_p_value
+from gapbridge.core.diagnosis.residual_structure import (
+    basis_of,
+    dependence,
+    structure_p_value,
+)
 from gapbridge.core.diagnosis.selection.bent import not_bent
+from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.local_search import rivals
 from gapbridge.core.diagnosis.selection.problem import Found, Space
 from gapbridge.core.diagnosis.selection.refit import Remainder, worth
@@ -46,6 +51,7 @@ from gapbridge.core.diagnosis.selection.selection import Selection, standing
 from gapbridge.core.errors import InputError
 
 Array = NDArray[np.float64]
+SAME = 1e-4  # of the squares of a cause, left by another that does all that it does
 BESIDE = "it does not keep its value beside the unknown that is left"
 
 
@@ -171,12 +177,16 @@ def _no_value(selection: Selection) -> dict[int, str]:
 def still_sure(selection: Selection, judgement: Judgement, arm: Arm) -> tuple[Selection, Judgement]:
     """Return what is accused refitted as all there is, and its judgement.
 
-    Beside the unknown, and over the regions of the log, a value may be less sure than it was.
+    Beside the unknown, and over the regions of the log, a value may be less sure than it was, and a
+    stiffness curve straight.
     """
     while True:
         found = standing(selection, arm, judgement.accused, judgement.remainder)
         single = [p for p in judgement.accused if found.term_index[p] not in found.block]
-        share = [worth(found.terms[p], found.covariance[p]) for p in single]
+        straight = {p for p in not_bent(found.terms, found.covariance) if judgement.remainder}
+        share = [
+            0.0 if p in straight else worth(found.terms[p], found.covariance[p]) for p in single
+        ]
         if min(share, default=1.0) >= 1:
             return found, judgement
         weakest = single[int(np.argmin(share))]
@@ -289,11 +299,13 @@ def pure_error(left: Array, groups: NDArray[np.int64]) -> tuple[float, int]:
 
 
 def _ties(space: Space, found: Found, accused: Sequence[int]) -> dict[int, tuple[str, ...]]:
+    """Return the effects that would do as well as each accused one, at its place."""
     told: dict[int, tuple[str, ...]] = {}
     for c in accused:
         own = space.candidates[c].family
+        near = [other for _, other in rivals(space, found, c, TIE)]
         names: list[str] = []
-        for _, other in rivals(space, found, c, TIE):
+        for other in [*near, *holding(space, found, c)]:
             family = space.candidates[other].family
             if not space.candidates[other].named or family in (own, *names):
                 continue
@@ -301,3 +313,29 @@ def _ties(space: Space, found: Found, accused: Sequence[int]) -> dict[int, tuple
                 names.append(family)
         told[c] = tuple(names)
     return told
+
+
+def holding(space: Space, found: Found, c: int) -> list[int]:
+    """Return the named effects that do all that a candidate does, and more: nothing decides.
+
+    The zero of the last joint is a shift of the tool; it is the simpler guess, and no surer.
+    """
+    if not _geometric(space.candidates[c]):
+        return []
+    rest = basis_of(space.columns([o for o in found.chosen if o != c]))
+    x = space.columns([c])
+    x = x - rest @ (rest.T @ x)
+    whole = float(np.sum(x**2))
+    told = []
+    for other, k in enumerate(space.candidates):
+        if other == c or other in found.chosen or not _geometric(k):
+            continue
+        U = space.columns([other])
+        U = basis_of(U - rest @ (rest.T @ U))
+        if whole > 0 and float(np.sum((x - U @ (U.T @ x)) ** 2)) < SAME * whole:
+            told.append(other)
+    return told
+
+
+def _geometric(candidate: Candidate) -> bool:
+    return candidate.named and (candidate.effect.beside_links or candidate.effect.together)

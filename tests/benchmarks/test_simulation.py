@@ -217,8 +217,8 @@ def _fails_at_doubt(patch: Patch) -> None:
 def _records_too_little(patch: Patch) -> None:
     record = Loop._record
 
-    def other(self: Any, given: Any, setpoint: Any, attempted: bool = False, *_: Any) -> None:
-        record(self, given, setpoint, attempted, left=False)
+    def other(self: Any, given: Any, setpoint: Any, *more: Any, at: float | None = None) -> None:
+        record(self, given, setpoint, bool(more), left=False, at=at)
 
     patch.setattr(Loop, "_record", other)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from gapbridge.bridge.calibration.report.facts import SessionFacts
 from gapbridge.bridge.calibration.report.material import Material
@@ -22,12 +23,8 @@ from gapbridge.bridge.document.html import html
 from gapbridge.bridge.document.output_file import replacing_bytes, write_text
 from gapbridge.bridge.document.section import parts
 from gapbridge.core.calibration.payload_session import PayloadCalibration
-from gapbridge.core.calibration.tool_session import ToolCalibration
 
-AnyMaterial = (
-    Material | VerificationMaterial | ShortMaterial[PayloadCalibration]
-    | ShortMaterial[ToolCalibration]
-)  # fmt: skip
+AnyMaterial = Material | VerificationMaterial | ShortMaterial[Any]
 
 
 def write_report(material: AnyMaterial, out: Path) -> tuple[Path, Path]:
@@ -42,24 +39,16 @@ def write_report(material: AnyMaterial, out: Path) -> tuple[Path, Path]:
         name, what, made = "calibration", "Calibration", parts(CALIBRATION, material)
     elif isinstance(material, VerificationMaterial):
         name, what, made = "verification", "Verification", parts(VERIFICATION, material)
+    elif isinstance(material.found, PayloadCalibration):
+        name, what, made = "payload", "Load and force sensor", parts(PAYLOAD, material)
     else:
-        name, what, made = _short(material)
+        name, what, made = "tool", "Tool", parts(TOOL, material)
     document = _document(what, material.session, made)
     page, paper = out / f"{name}.html", out / f"{name}.pdf"
     write_text(page, html(document))
     with replacing_bytes(paper) as file:
         file.write(pdf(document))
     return page, paper
-
-
-def _short(
-    material: ShortMaterial[PayloadCalibration] | ShortMaterial[ToolCalibration],
-) -> tuple[str, str, tuple[Part, ...]]:
-    found, facts, nominal = material.found, material.session, material.nominal
-    if isinstance(found, PayloadCalibration):
-        made = parts(PAYLOAD, ShortMaterial(found, facts, nominal))
-        return "payload", "Load and force sensor", made
-    return "tool", "Tool", parts(TOOL, ShortMaterial(found, facts, nominal))
 
 
 def _document(what: str, session: SessionFacts, made: tuple[Part, ...]) -> Document:

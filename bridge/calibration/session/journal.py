@@ -11,12 +11,11 @@ import math
 import os
 import time
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 
-from gapbridge.bridge.document.output_file import FOLDER_MODE, MODE
+from gapbridge.bridge.document.output_file import MODE, make_folder, sync_folder
 from gapbridge.core.errors import InputError, RunError
 
 FILE = "journal.jsonl"
@@ -41,9 +40,9 @@ class Journal:
         cannot be written.
         """
         try:
-            self.path.parent.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
+            make_folder(self.path.parent)
             self._fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, MODE)
-            _sync_folder(self.path.parent)
+            sync_folder(self.path.parent)
         except OSError as error:
             raise RunError(f"{self.path}: cannot be written: {error.strerror}") from None
         try:
@@ -87,12 +86,7 @@ class Journal:
         self.open()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -131,12 +125,3 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return repr(value)
     return str(value) if isinstance(value, Path) else value
-
-
-def _sync_folder(folder: Path) -> None:
-    """Have the folder's entry of a new file on disk as well."""
-    fd = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)

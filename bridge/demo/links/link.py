@@ -36,7 +36,7 @@ class DemoLink(ABC):
     ports: ClassVar[tuple[int, ...]]  # of the simulated controller
     scene: ClassVar[Scene]
     settling: ClassVar[float] = SETTLING  # s from standing still until readings count
-    hides: ClassVar[tuple[str, ...]] = ("tool_frame",)  # one of these, drawn from the seed
+    hides: ClassVar[tuple[str, ...]] = ("bent_tool",)  # one of these, drawn from the seed
     tells_joints: ClassVar[bool] = True  # joints as read are good enough to fit on
 
     def __init__(self, out: Path, seed: int) -> None:

@@ -9,14 +9,17 @@ import numpy as np
 import pytest
 import small_arm as small
 
+from benchmarks.blind.session import Plan
+from gapbridge.core.diagnosis.channels.position import observe as observe_position
 from gapbridge.core.diagnosis.channels.wrench import observe
 from gapbridge.core.diagnosis.criteria import MINUTE
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import Judgement, judge, judge_geometry, still_sure
 from gapbridge.core.diagnosis.remainder import closes_everywhere, with_the_links
+from gapbridge.core.diagnosis.selection import selection
 from gapbridge.core.diagnosis.selection.candidate import named_candidates, with_what_it_needs
-from gapbridge.core.diagnosis.selection.refit import Remainder, _widened
+from gapbridge.core.diagnosis.selection.refit import Remainder, _widened, worth
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.metrology import Metrology
 
@@ -145,10 +148,10 @@ def links():
     return found.channels[0].selection
 
 
-def fallen(selection, family="link_geometry"):
+def fallen(found, family="link_geometry"):
     """Return a judgement that took everything back, one link among it."""
     arm = small.model_of().arm
-    whole = selection.with_all_links(arm) if not selection.block else selection
+    whole = found if found.block else found.with_all_links(arm)
     own = [p for p, c in enumerate(whole.term_index)
            if whole.space.candidates[c].family == family]  # fmt: skip
     return whole, Judgement((), True, 0.0, (), {}, tuple((p, "") for p in own))
@@ -166,8 +169,7 @@ def test_all_links_are_accused_where_they_close_the_gap_everywhere(links):
 
 @pytest.mark.parametrize("effect", ["cross_coupling", "backlash"])
 def test_links_that_close_no_gap_are_not_accused(effect):
-    selection = small.diagnosed(effect).channels[0].selection
-    whole, judgement = fallen(selection)
+    whole, judgement = fallen(small.diagnosed(effect).channels[0].selection)
     assert not closes_everywhere(replace(whole, found=replace(whole.found, chosen=())))
     found, again = judge_geometry(replace(whole, prior={}), judgement, small.model_of().arm)
     assert again is judgement
@@ -190,29 +192,29 @@ def test_a_joint_zero_goes_with_the_links_where_it_helps_elsewhere(links):
 
 
 def test_a_value_far_below_its_usual_size_is_no_accusation():
-    selection = small.diagnosed("backlash").channels[0].selection
-    (term,), (c,) = selection.terms, selection.term_index
-    usual = selection.space.candidates[c].parameters[0].scale
+    found = small.diagnosed("backlash").channels[0].selection
+    (term,), (c,) = found.terms, found.term_index
+    usual = found.space.candidates[c].parameters[0].scale
     for size, stays in ((0.5 * MINUTE * usual, False), (2 * MINUTE * usual, True)):
         small_one = replace(
-            selection, terms=(term.with_values(np.array([size])),),
+            found, terms=(term.with_values(np.array([size])),),
             covariance=(np.array([[(size / 50) ** 2]]),),
         )  # fmt: skip
-        judged = judge(small_one, HeldOut(selection))
+        judged = judge(small_one, HeldOut(found))
         assert (len(judged.accused) == 1) is stays
         assert stays or judged.withdrawn == ((0, "its value is too small to matter"),)
 
 
 def test_what_is_no_longer_sure_beside_the_unknown_is_taken_back():
-    selection = small.diagnosed("backlash").channels[0].selection
-    judgement = judge(selection, HeldOut(selection))
+    found = small.diagnosed("backlash").channels[0].selection
+    judgement = judge(found, HeldOut(found))
     arm = small.model_of().arm
-    assert still_sure(selection, judgement, arm)[1] is judgement
-    rows = len(selection.space.y)
+    assert still_sure(found, judgement, arm)[1] is judgement
+    rows = len(found.space.y)
     # an unnamed function that does the very same as the accused
-    twin = selection.space.columns(selection.term_index)
+    twin = found.space.columns(found.term_index)
     unknown = Remainder(twin, np.full(twin.shape[1], np.inf), np.arange(rows) // 3 % 20)
-    _, judged = still_sure(selection, replace(judgement, remainder=unknown), arm)
+    _, judged = still_sure(found, replace(judgement, remainder=unknown), arm)
     assert judged.accused == ()
     assert judged.structured
     assert [p for p, _ in judged.withdrawn] == [0]
@@ -223,3 +225,20 @@ def test_every_member_that_waits_for_another_names_one_of_its_channel():
         if effect.shown_by is not None:
             other = CATALOGUE[effect.shown_by.effect]
             assert set(effect.channels) & set(other.channels)
+
+
+def test_what_the_exact_refit_takes_back_gives_its_place_to_another(monkeypatch):
+    """Without reversals play is an offset: where the one has no value, the other is found."""
+    one_sided = small.session_of(3, Plan(poses=60, both_sides=False))
+    real = small.turned(2, lambda s, q: np.full(len(q), -4.5e-4))
+    log = small.log_of(one_sided, small.readings(real, one_sided, 3))
+    seen = observe_position(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
+    (first,) = selection.select(seen, small.model_of()).terms
+
+    def worthless(term, spread):
+        return 0.0 if term.effect == first.effect else worth(term, spread)
+
+    monkeypatch.setattr(selection, "worth", worthless)
+    (instead,) = selection.select(seen, small.model_of()).terms
+    assert {first.effect, instead.effect} == {"joint_offset", "backlash"}
+    assert instead.site.joint == 2

@@ -1,11 +1,11 @@
 """Every ready CAN cell that names a simulated bus is served, read, armed and let go."""
 
-import itertools
 from pathlib import Path
 
 import numpy as np
 import pytest
 from can_arm import next_state
+from ports import free_port
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.simulation import served_controller
@@ -14,14 +14,13 @@ from gapbridge.drivers import make_driver
 from gapbridge.drivers.simulated.server.protocol_server import ServerThread
 
 CONFIG = Path(__file__).parents[3] / "config"
-PORTS = itertools.count(29581)  # another one where a busy machine asks for a second try
 CELLS = [CONFIG / f"{name}_can_simulated.yaml" for name in ("piper", "odrive")]
 
 
 @pytest.mark.parametrize("path", CELLS, ids=lambda path: path.stem)
 def test_a_ready_cell_is_served_read_armed_and_let_go(path):
     cell = load_cell(path)
-    given = {"port": next(PORTS), "state_timeout": 0.5, "foreign_quiet": 0.1}
+    given = {"port": free_port(), "state_timeout": 0.5, "foreign_quiet": 0.1}
     link = cell.link.model_copy(update=given)
     found = served_controller(cell, link)
     with (

@@ -9,11 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ports import free_port, own_host
 
 from gapbridge.bridge.cell import load_cell
 
 CONFIG = Path(__file__).parents[3] / "config"
-HOST, BENCH = "127.0.0.78", 30178
+HOST = own_host()
+BENCH = free_port(HOST)
 SOFT = """
 compliance: &soft
   axial: [3.0e-5, 6.0e-5, 8.0e-5, 1.0e-4, 1.2e-4, 1.2e-4]

@@ -11,6 +11,7 @@ import pytest
 from can_arm import next_state
 from piper_sdk import C_PiperInterface_V2
 from piper_sdk.kinematics.piper_fk import C_PiperForwardKinematics
+from ports import free_port, own_host
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.drivers.can.driver import CanDriver
@@ -22,6 +23,7 @@ from gapbridge.drivers.simulated.server.protocol_server import ServerThread
 from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 CONFIG = Path(__file__).parents[3] / "config"
+HOST = own_host()
 CELL = CONFIG / "piper_can_simulated.yaml"
 START = (0.1, 1.2, -1.0, 0.2, 0.5, -0.3)
 
@@ -39,9 +41,9 @@ def served():
     cell = load_cell(CELL)
     controller = make_controller(*simulated_arm(cell.arm, seed=3, start_q=START), period=0.004)
     link = CanSettings(
-        profile="piper", interface="socketcand", host="127.0.0.2", port=29571, state_timeout=0.5
+        profile="piper", interface="socketcand", host=HOST, port=free_port(HOST), state_timeout=0.5
     )
-    with ServerThread(controller, make_servers(link, "127.0.0.2", controller), "127.0.0.2"):
+    with ServerThread(controller, make_servers(link, HOST, controller), HOST):
         yield controller, link, cell.model
 
 
@@ -95,7 +97,7 @@ def test_the_vendors_client_reads_and_commands_our_arm_and_we_notice_it(served, 
 
 def test_simulate_serves_the_cell_to_another_process(tmp_path):
     cell = tmp_path / "cell.yaml"
-    text = CELL.read_text().replace("127.0.0.2", "127.0.0.9").replace("piper.urdf", "p.urdf")
+    text = CELL.read_text().replace("127.0.0.2", HOST).replace("piper.urdf", "p.urdf")
     text = text.replace("state_timeout: 0.1", "state_timeout: 1.0")
     cell.write_text(text)
     (tmp_path / "p.urdf").write_text((CONFIG / "piper.urdf").read_text())
@@ -105,7 +107,7 @@ def test_simulate_serves_the_cell_to_another_process(tmp_path):
             assert server.stdout is not None
             lines = [server.stdout.readline(), server.stdout.readline()]
             assert "CAN (piper)" in lines[0]
-            assert lines[1] == "ready 127.0.0.9\n"
+            assert lines[1] == f"ready {HOST}\n"
             found = load_cell(cell)
             with CanDriver(found.link, found.model) as driver:
                 q = [next_state(driver).actual_q for _ in range(50)][-1]

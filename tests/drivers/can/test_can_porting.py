@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from can_arm import MODEL, next_state, setpoint_of
+from ports import free_port, own_host
 
 from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
@@ -16,6 +17,7 @@ from gapbridge.drivers.simulated.server.protocol_server import ServerThread
 from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 PAGE = Path(__file__).parents[3] / "docs" / "porting.md"
+HOST = own_host()
 HALF = np.radians(0.005)
 
 
@@ -31,12 +33,12 @@ def folder(tmp_path):
 
 def test_the_page_s_arm_is_read_armed_and_moved(folder):
     settings = CanSettings(
-        profile="my_can_arm.yaml", interface="socketcand", host="127.0.0.2", port=29577,
+        profile="my_can_arm.yaml", interface="socketcand", host=HOST, port=free_port(HOST),
         state_timeout=0.5, foreign_quiet=0.1,
     ).located(folder)  # fmt: skip
     controller = make_controller(*simulated_arm(MODEL.arm, seed=2), period=0.004)
-    servers = make_servers(settings, "127.0.0.2", controller)
-    with ServerThread(controller, servers, "127.0.0.2"), CanDriver(settings, MODEL) as driver:
+    servers = make_servers(settings, HOST, controller)
+    with ServerThread(controller, servers, HOST), CanDriver(settings, MODEL) as driver:
         assert driver.rate == 100.0
         state = next_state(driver)
         assert state.actual_q == pytest.approx(controller.q, abs=HALF * 1.01)

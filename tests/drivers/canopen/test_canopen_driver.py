@@ -10,6 +10,7 @@ import can
 import numpy as np
 import pytest
 from drive_arm import DriveArm, follow, read_on, served, setpoint, settled, wait_for
+from ports import free_port
 
 from gapbridge.core.errors import (
     InputError,
@@ -302,7 +303,7 @@ def test_drives_stop_by_themselves_when_we_fall_silent(
 
 
 def test_a_bus_that_dies_is_a_lost_link() -> None:
-    with served("cia402", interface="socketcand", port=29811) as arm, arm.driver() as driver:
+    with served("cia402", interface="socketcand", port=free_port()) as arm, arm.driver() as driver:
         settled(driver)
         arm.thread.stop()
         with pytest.raises(LinkError):
@@ -370,7 +371,7 @@ def test_a_node_that_is_not_there_is_named() -> None:
 
 
 def test_a_bus_that_is_not_served_is_reported_soon() -> None:
-    arm = DriveArm("cia402", interface="socketcand", port=29812)
+    arm = DriveArm("cia402", interface="socketcand", port=free_port())
     with pytest.raises(LinkError, match="cannot be reached"):
         arm.driver().connect()
 

@@ -18,6 +18,7 @@ import pytest
 from contract_checks import OFFSET, check_reads, next_state, read_on, setpoint_of, stream
 from contract_modbus import ModbusCase
 from evil_proxy import EvilProxy, Ruin
+from ports import free_port
 
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
 from gapbridge.drivers.modbus.driver import ModbusDriver
@@ -191,9 +192,10 @@ def test_the_contract_holds_over_mutual_tls(keys: Path) -> None:
     context.load_cert_chain(keys / "server.pem", keys / "server.key")
     context.load_verify_locations(keys / "ca.pem")
     context.verify_mode = ssl.CERT_REQUIRED
-    server = ModbusServer(case.file, case.host, 15802, tls=context)
+    port = free_port(case.host)
+    server = ModbusServer(case.file, case.host, port, tls=context)
     settings = ModbusSettings(
-        profile="ur", host=case.host, port=15802, transport="tls", rate=50.0,
+        profile="ur", host=case.host, port=port, transport="tls", rate=50.0,
         authority=keys / "ca.pem", certificate=keys / "client.pem", key=keys / "client.key",
     )  # fmt: skip
     with ServerThread(case.controller, [server], case.host):
@@ -215,8 +217,9 @@ def test_over_tls_only_the_named_or_the_pinned_controller_is_let_in(keys: Path) 
     own = certify(keys, "other", "192.0.2.1")  # of the same authority, made out to another
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(keys / "other.pem", keys / "other.key")
-    server = ModbusServer(case.file, case.host, 15802, tls=context)
-    base = {"profile": "ur", "host": case.host, "port": 15802, "transport": "tls", "rate": 50.0}
+    port = free_port(case.host)
+    server = ModbusServer(case.file, case.host, port, tls=context)
+    base = {"profile": "ur", "host": case.host, "port": port, "transport": "tls", "rate": 50.0}
     with ServerThread(case.controller, [server], case.host):
         named = ModbusSettings(**base, authority=keys / "ca.pem")
         with pytest.raises(LinkError, match="certificate is refused: IP address mismatch"):

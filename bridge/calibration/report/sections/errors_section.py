@@ -19,9 +19,9 @@ def before_and_after(material: Material) -> list[Block]:
     pictures = [_distribution(material)]
     if len(material.axes) > 1:
         pictures.append(_axes(material))
-    words = material.error_words
+    meaning = material.error_meaning
     return [
-        Paragraph(f"{words[:1].upper()}{words[1:]}.", "note"),
+        Paragraph(f"{meaning[:1].upper()}{meaning[1:]}.", "note"),
         _table(material),
         Pictures(tuple(pictures), _caption(material)),
     ]
@@ -29,10 +29,10 @@ def before_and_after(material: Material) -> list[Block]:
 
 def _caption(material: Material) -> str:
     text = (
-        f"On {material.judged_words}. Distribution: the share of the readings whose error is at "
+        f"On {material.judged_on}. Distribution: the share of the readings whose error is at "
         "most so large, errors in powers of ten."
     )
-    if material.wild:
+    if material.outlier_rows:
         text += " The table counts outliers too."
     if len(material.axes) > 1:
         c = material.calibration

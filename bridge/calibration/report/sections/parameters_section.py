@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gapbridge.bridge.calibration.report.figures import decimals_of, estimate_words, fixed
+from gapbridge.bridge.calibration.report.figures import decimals_of, estimate_texts, fixed
 from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.document.blocks import Block, Bullets, Cell, Heading, Paragraph, Table
 from gapbridge.bridge.report.labels import unit_of
@@ -45,7 +45,7 @@ def estimates_table(shown: list[Estimate], *, planned: bool) -> Table:
 
 
 def _row(e: Estimate) -> list[Cell]:
-    value, interval, std, unit = estimate_words(e)
+    value, interval, std, unit = estimate_texts(e)
     return [parameter_title(e.name) + (" *" if e.on_bound else ""), value, interval, std, unit]
 
 

@@ -1,4 +1,4 @@
-"""The residual: the diagnosis of the remainder, in words."""
+"""The residual: what the diagnosis says of it."""
 
 from __future__ import annotations
 

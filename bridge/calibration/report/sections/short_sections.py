@@ -34,7 +34,7 @@ from gapbridge.core.calibration.tool_session import ToolCalibration
 from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
-F = TypeVar("F", PayloadCalibration, ToolCalibration)
+F = TypeVar("F", bound=PayloadCalibration | ToolCalibration)
 
 
 @dataclass(frozen=True)

@@ -37,17 +37,17 @@ def summary(material: Material) -> list[Block]:
         Tile("expanded uncertainty (k = 2)", f"± {mm(material.budget.expanded)}",
              "of one coordinate of the tool"),
     ]  # fmt: skip
-    text = f"Errors are those of {material.judged_words}: {material.error_words}."
+    text = f"Errors are those of {material.judged_on}: {material.error_meaning}."
     if not material.shows_places:
         text += (
             " Such readings show a part of where the tool is: how well its place is known "
             "stands in the uncertainty, not in these errors."
         )
-    wild = [r for r in material.judged[1].rows if r in material.wild]
-    if wild and material.held_out:
-        rows = listed([str(int(r) + 1) for r in wild])
+    outliers = [r for r in material.judged[1].rows if r in material.outlier_rows]
+    if outliers and material.held_out:
+        rows = listed([str(int(r) + 1) for r in outliers])
         text += (
-            f" Among them {'is reading' if len(wild) == 1 else 'are readings'} {rows}, far "
+            f" Among them {'is reading' if len(outliers) == 1 else 'are readings'} {rows}, far "
             "beyond all others: to be measured again. The uncertainty does not count it."
         )
     asked = [] if material.session.accuracy is None else [_asked(material)]

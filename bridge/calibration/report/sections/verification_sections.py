@@ -113,11 +113,11 @@ def moved(material: VerificationMaterial) -> list[Block]:
             "No single change (tool, load, one joint's zero, instrument, one bad reading) "
             "explains the errors. Calibrate anew."
         )]  # fmt: skip
-    blocks: list[Block] = [Paragraph(f"What explains it best: {suspect_words(v.moved)}.")]
+    blocks: list[Block] = [Paragraph(f"What explains it best: {suspect_title(v.moved)}.")]
     if v.moved.estimates:
         blocks.append(estimates_table(list(v.moved.estimates), planned=False))
     if v.suspects:
-        rows = [[suspect_words(s), likelihood(s.chance)] for s in v.suspects]
+        rows = [[suspect_title(s), likelihood(s.chance)] for s in v.suspects]
         blocks += [
             Heading("What explains it nearly as well"),
             Table(("change", "chance of what is left"), rows, (3, 1), (1,)),
@@ -125,8 +125,8 @@ def moved(material: VerificationMaterial) -> list[Block]:
     return blocks
 
 
-def suspect_words(suspect: Suspect) -> str:
-    """Return what may have moved, in words."""
+def suspect_title(suspect: Suspect) -> str:
+    """Return what may have moved, for people."""
     kind, _, number = suspect.name.rpartition("_")
     if kind == "reading":
         return f"reading {number} alone is wrong"

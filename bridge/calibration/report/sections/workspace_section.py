@@ -20,7 +20,7 @@ VIEWS = {"from above": (("x, m", 0), ("y, m", 1)), "from the side": (("x, m", 0)
 
 def over_the_workspace(material: Material) -> list[Block]:
     """Return the errors as arrows, from two sides, and a table of zones."""
-    before, after = material.calm
+    before, after = material.inliers
     tip = material.tip[before.rows]
     zones = _zones(tip, before, after)
     if not material.shows_places:
@@ -42,7 +42,7 @@ def over_the_workspace(material: Material) -> list[Block]:
 
 
 def _all(material: Material) -> str:
-    return "All readings but the outliers." if material.wild else "All readings."
+    return "All readings but the outliers." if material.outlier_rows else "All readings."
 
 
 def _factor(errors: Errors, size: float) -> float:

@@ -11,7 +11,7 @@ from gapbridge.bridge.calibration.report import (
     VerificationMaterial,
     write_report,
 )
-from gapbridge.bridge.calibration.report.figures import estimate_words, mm
+from gapbridge.bridge.calibration.report.figures import estimate_texts, mm
 
 
 def read(paths):
@@ -59,7 +59,7 @@ def test_a_short_session_shows_each_number_with_its_interval(kind, unit, tmp_pat
     html, phrase = read(paths)
 
     for estimate in found.estimates:
-        value, interval, _, _ = estimate_words(estimate)
+        value, interval, _, _ = estimate_texts(estimate)
         assert f"<div>{value}</div>" in html
         assert f"<div>{interval}</div>" in html
         assert interval in phrase

@@ -1,0 +1,82 @@
+"""A test in real time counts where the machine keeps time; else it is skipped, saying how late."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from lateness import LIMIT, NOTED, Witness
+
+HERE = Path(__file__).parent
+FAILING = """
+import signal, time
+import pytest
+from conftest import WITNESS
+
+def stop():
+    WITNESS._process.send_signal(signal.SIGSTOP)
+    time.sleep(0.15)
+    WITNESS._process.send_signal(signal.SIGCONT)
+    time.sleep(0.15)
+
+@pytest.mark.realtime
+def test_that_fails_while_the_machine_is_late():
+    time.sleep(0.3)
+    stop()
+    assert False, "late"
+
+@pytest.mark.realtime
+def test_that_passes_while_the_machine_is_late():
+    stop()
+
+def test_that_fails_without_a_clock():
+    stop()
+    assert False, "wrong"
+"""
+
+
+def test_a_failure_counts_unless_the_machine_was_late_and_the_test_in_real_time(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "conftest.py").write_text((HERE / "conftest.py").read_text(encoding="utf-8"))
+    (tmp_path / "lateness.py").write_text((HERE / "lateness.py").read_text(encoding="utf-8"))
+    (tmp_path / "test_it.py").write_text(FAILING)
+    options = ["-p", "no:cacheprovider", "-o", "markers=realtime: x\nxdist_group: x", "-rsfp"]
+    ran = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", *options, "--rootdir", str(tmp_path), str(tmp_path)],
+        capture_output=True, text=True, check=False, cwd=tmp_path,
+    )  # fmt: skip
+    found = ran.stdout
+    assert re.search(r"SKIPPED.*woke a process 1[0-9]{2} ms late meanwhile.*late", found), found
+    assert "PASSED test_it.py::test_that_passes_while_the_machine_is_late" in found
+    assert "FAILED test_it.py::test_that_fails_without_a_clock" in found
+
+
+def test_nothing_gives_a_test_another_chance() -> None:
+    project = (HERE.parent / "pyproject.toml").read_text(encoding="utf-8")
+    assert "rerun" not in project
+    for path in HERE.rglob("*.py"):
+        if path.name != Path(__file__).name:
+            assert not re.search(r"\bflaky\b|\breruns\b", path.read_text(encoding="utf-8")), path
+
+
+def test_the_witness_measures_how_late_it_was_woken() -> None:
+    witness = Witness()
+    witness.start()
+    try:
+        time.sleep(0.5)
+        assert witness._process is not None
+        begun = time.time()
+        witness._process.send_signal(signal.SIGSTOP)
+        time.sleep(0.2)
+        witness._process.send_signal(signal.SIGCONT)
+        time.sleep(0.2)
+        assert 0.15 < witness.worst(begun, time.time()) < 2.0
+        assert witness.worst(time.time() + 10.0, time.time() + 11.0) == 0.0
+    finally:
+        witness.stop()
+    assert NOTED < LIMIT
