@@ -17,7 +17,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-import pexpect
+import pexpect  # type: ignore[import-untyped]
 
 from gapbridge.bridge.demo.links.link import free_address
 from gapbridge.bridge.demo.links.ur_rtde import UrRtdeLink
@@ -26,7 +26,7 @@ from gapbridge.drivers.simulated.ur.settings import BENCH_PORT, SCRIPT_PORT
 
 ROOT = Path(__file__).resolve().parents[2]
 SEED = 3
-PATIENCE = 60.0  # s
+PATIENCE = 420.0  # s: many stops pass without a question
 LOADS = {  # kg, m from the flange
     "reflector alone": (1.5, (0.0, 0.0, 0.05)),
     "with the 8 kg plate": (9.5, (0.0, 0.0, 0.09)),

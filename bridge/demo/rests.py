@@ -52,6 +52,8 @@ def rests(
     the arm carried, where the controller does not report it. Raises RunError where a visit is
     missing or the tracker saw too little of it.
     """
+    if "timestamp" not in recording:  # a machine that stalls: the run is repeated
+        raise RunError("the recording holds no state of the arm, expected one of each cycle")
     if load is not None and "payload" not in recording:
         recording = {**recording, **_told(load, len(recording["timestamp"]))}
     spans = _spans(recording, settling)

@@ -46,7 +46,7 @@ class Data:
     sessions: int = 1  # how many there are, in the whole data
     remounted: bool = False  # each session has a tool point of its own
 
-    def part(self, rows: NDArray[Any]) -> Data:
+    def part(self, rows: NDArray[Any] | slice) -> Data:
         """Return some of the rows."""
         rotation = None if self.rotation is None else self.rotation[rows]
         session = None if self.session is None else self.session[rows]

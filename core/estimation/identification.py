@@ -136,8 +136,11 @@ def identify_compliance(
     )
 
 
-def data_of(log: Log, metrology: Metrology) -> tuple[Data, NDArray[np.int64]]:
-    """Return the rows of a log that have measured poses, and which ones they are."""
+def data_of(log: Log, metrology: Metrology, motions: bool = True) -> tuple[Data, NDArray[np.int64]]:
+    """Return the rows of a log that have measured poses, and which ones they are.
+
+    ``motions`` False: without the joints' last motions.
+    """
     q = log.require("actual_q", "target_q")
     measured = log.get("measured_position")
     if measured is None:
@@ -149,7 +152,7 @@ def data_of(log: Log, metrology: Metrology) -> tuple[Data, NDArray[np.int64]]:
         good &= np.isfinite(rotation).all(axis=1)
     used = np.flatnonzero(good)
     matrix = None if rotation is None else rotation_matrix(rotation[used])
-    loads = log.loads()[used]
+    loads = log.loads(motions)[used]
     data = Data(q[used], loads, measured[used], matrix, metrology.registered)
     count = max(len(log.session_names), 1)
     if count > 1 or metrology.remounted:

@@ -8,7 +8,7 @@ of rows, poses are not separated. They are judged on the sample's rows, some twe
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
@@ -57,7 +57,7 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 SAMPLE = 20_000  # rows kept at most, for the first guess and the look whether anything bends
 MANY_OUTLIERS = 100_000  # rows that are named at most
-ENOUGH = 1e-4  # relative step at which a fit of more rows than the sample has converged
+ENOUGH = 0.2  # sigmas of a last step, which leaves some percent of itself, with many rows
 INLIER = 1e-6  # weight below which a row counts as an outlier
 
 
@@ -81,16 +81,19 @@ class _Task:
         A step that is small leaves an error of some percent of itself, by the weights: the steps
         need not become smaller than what so many rows determine anyway.
         """
-        now, enough = begin, CONVERGED if stream.count <= SAMPLE else ENOUGH
+        now, long = begin, stream.count > SAMPLE
         kept: Mask | None = None
         for _ in range(ROUNDS):
             noise = scale_of(now, stream.sample)
             parts = factors(now, noise, stream)
             found, kept, linear = self.step(now, joined(parts), stream.nuisances, kept)
-            change = np.abs(found.flexibility - now.flexibility).max()
+            change = np.abs(found.flexibility - now.flexibility)
             base, now = now, found
-            if change < enough * max(np.abs(now.flexibility).max(), 1e-12):
+            if change.max() < CONVERGED * max(np.abs(now.flexibility).max(), 1e-12):
                 break
+            if long and (change[kept] < ENOUGH * _spread(linear, kept)).all():
+                break
+        assert kept is not None
         shown = base_parameters.what_is_shown(linear, kept, self.scale)
         return _Found(now, noise, base, parts, shown)
 
@@ -119,6 +122,12 @@ class _Task:
             kept,
             linear,
         )
+
+
+def _spread(linear: Linear, kept: Mask) -> Array:
+    """Return 1 sigma of the kept flexibilities, rad/Nm."""
+    A = linear.matrix[:, kept]
+    return np.sqrt(np.diag(np.linalg.pinv(A.T @ A, hermitian=True)))
 
 
 @dataclass(frozen=True)
@@ -150,7 +159,7 @@ def identify_streamed(
     metrology = metrology or Metrology()
     emit = progress or (lambda text: None)
     emit("reading")
-    stream = _stream(log, metrology, any(CATALOGUE[t.effect].by_approach for t in model.terms))
+    stream = _stream(log, metrology, by_approach(model))
     usual = 1e-2 / typical_moment(model.arm)
     prior_std = usual if prior_std is None else prior_std
     require_excitation(model, stream.sample, metrology, min(prior_std, usual))
@@ -172,13 +181,16 @@ def _nuisances_alone(model: Model, rows: Data) -> Fit:
     return Fit(found.model, found.frame, NONE)
 
 
-def _stream(log: Iterable[Log], metrology: Metrology, by_approach: bool) -> Stream:
+def by_approach(model: Model) -> bool:
+    """Return whether the model's effects ask for the joints' last motions."""
+    return any(CATALOGUE[term.effect].by_approach for term in model.terms)
+
+
+def _stream(log: Iterable[Log], metrology: Metrology, motions: bool) -> Stream:
     """Return the rows with measured poses; passes once over the log."""
     store, first, empty = RowStore(), 0, None
     for part in log:
-        data, used = data_of(part, metrology)
-        if not by_approach:
-            data = replace(data, loads=replace(data.loads, approach=None))
+        data, used = data_of(part, metrology, motions)
         if len(used):
             store.append(data, used + first)
         else:
@@ -188,8 +200,8 @@ def _stream(log: Iterable[Log], metrology: Metrology, by_approach: bool) -> Stre
     kept, folds = [], []
     for number, (data, rows) in enumerate(store):
         fold = np.empty(len(rows), dtype=np.int64)
-        for k, part in stretches(number, len(rows)):
-            fold[part] = k
+        for k, stretch in stretches(number, len(rows)):
+            fold[stretch] = k
         taken = rows % every == 0
         kept.append(data.part(taken))
         folds.append(fold[taken])

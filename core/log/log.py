@@ -82,8 +82,8 @@ class Log:
                 f"{flat[row, column]}, expected a finite number"
             )
 
-    def loads(self) -> Loads:
-        """Return what acts on the arm, row by row."""
+    def loads(self, motions: bool = True) -> Loads:
+        """Return what acts on the arm, row by row; ``motions`` False: without ``approach``."""
         given = {
             "payload_mass": "payload",
             "payload_cog": "payload_cog",
@@ -98,7 +98,8 @@ class Log:
                 f"{self.path}: row {self.line(row)}, column payload: found {mass[row]:g}, "
                 "expected 0 or more kg"
             )
-        return Loads(**found, approach=self.approach(), time=self.times())
+        approach = self.approach() if motions else None
+        return Loads(**found, approach=approach, time=self.times())
 
     def times(self) -> Array:
         """Return when each row was taken (N,): s of ``timestamp``, else the row's number from 1."""

@@ -40,6 +40,7 @@ class LogPieces:
     path: Path
     n: int  # joints
     rows: int = ROWS  # of a piece at most (a recording: of a chunk)
+    motions: bool = True  # False: without the last motions, which are carried from piece to piece
 
     def __iter__(self) -> Iterator[Log]:
         """Yield the pieces in order. Raises LogError, as ``read_log`` does."""
@@ -52,7 +53,7 @@ class LogPieces:
                 read_log(self.path, self.n)  # says what is wrong with it
             unknown = tuple(name for name in names if not is_known(name))
             piece = Log(str(self.path), columns, self.n, first, unknown=unknown)
-            yield motion.carried(piece)
+            yield motion.carried(piece) if self.motions else piece
             first += len(table)
 
     def count(self) -> int:

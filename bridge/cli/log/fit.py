@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +26,8 @@ from gapbridge.bridge.document.provenance import fitted, provenance
 from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.estimation.identification import Identification, identify_compliance
-from gapbridge.core.estimation.streamed import identify_streamed
+from gapbridge.core.estimation.streamed import by_approach, identify_streamed
+from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.ranges import merged, range_of
 
@@ -78,10 +79,16 @@ def _identified(
         and is_large(paths[0])
         and not (has_sessions(paths[0]) or metrology.remounted)
     ):
-        log = LargeLog(paths[0], cell)
+        ranges: list[dict[str, tuple[float, float]]] = []
+
+        def read_once() -> Iterator[Log]:
+            for piece in LargeLog(paths[0], cell, by_approach(cell.model)):
+                ranges.append(range_of(piece))
+                yield piece
+
         with status("fitting") as tell_step:
-            found = identify_streamed(cell.model, log, metrology, progress=tell_step)
-        return found, merged(range_of(piece) for piece in log)
+            found = identify_streamed(cell.model, read_once(), metrology, progress=tell_step)
+        return found, merged(ranges)
     rows = open_logs(paths, cell)
     with progress("fitting"):
         return identify_compliance(cell.model, rows, metrology), range_of(rows)

@@ -25,12 +25,13 @@ class LargeLog:
 
     path: Path
     cell: Cell
+    motions: bool = True  # see LogPieces
 
     def __iter__(self) -> Iterator[Log]:
         """Yield the pieces. Raises LogError, as ``open_log`` does."""
         files = files_of(self.path) if not self.path.is_file() else [self.path]
         for file in files:
-            for piece in LogPieces(file, self.cell.arm.n):
+            for piece in LogPieces(file, self.cell.arm.n, motions=self.motions):
                 check_log(piece, self.cell)
                 yield piece
 

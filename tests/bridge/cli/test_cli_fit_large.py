@@ -32,7 +32,9 @@ def test_a_large_log_gives_what_it_gives_in_one_piece(tmp_path, monkeypatch):
     whole = gapbridge("fit", log, "--cell", cell, "--out", tmp_path / "whole.yaml")
     assert whole.code == 0, whole.err
     monkeypatch.setattr(large_log, "LARGE", 500)
-    monkeypatch.setattr(large_log, "LogPieces", lambda path, n: LogPieces(path, n, 200))
+    monkeypatch.setattr(
+        large_log, "LogPieces", lambda path, n, motions=True: LogPieces(path, n, 200)
+    )
     parts = gapbridge("fit", log, "--cell", cell, "--out", tmp_path / "parts.yaml")
     assert parts.code == 0, parts.err
     one, other = (load_cell(tmp_path / f"{name}.yaml").model for name in ("whole", "parts"))

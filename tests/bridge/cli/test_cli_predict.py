@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cli.main import main
+from gapbridge.bridge.document.output_file import LONG, write_table
 from gapbridge.core.loads import Loads
 
 Array = NDArray[np.float64]
@@ -144,3 +145,15 @@ def test_a_diagnosis_that_is_applied_keeps_the_covariance_of_its_causes(folder: 
     cell = load_cell(applied)
     assert "axial_compliance_2" in cell.spread.names
     assert np.isfinite(cell.spread.position_std(cell.model, np.zeros((1, 6)))).all()
+
+
+def test_long_tables_read_back_exactly(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    table = rng.normal(size=(LONG // 4, 5)) * 10.0 ** rng.integers(-300, 300, (LONG // 4, 5))
+    table[:2] = [[np.nan, 0.0, -0.0, 1.0, 1e22], [np.inf, -np.inf, 5e-324, 0.1, 3.0]]
+    write_table(tmp_path / "long.csv", list("abcde"), table)
+    text = (tmp_path / "long.csv").read_text(encoding="utf-8")
+    assert text.startswith("a,b,c,d,e\n")
+    read = np.loadtxt(tmp_path / "long.csv", delimiter=",", skiprows=1)
+    np.testing.assert_array_equal(read, table)
+    assert (np.signbit(read) == np.signbit(table)).all()

@@ -80,7 +80,7 @@ def errors(link: DemoLink, plant: Plant, cell: Cell) -> np.ndarray:
 @pytest.mark.parametrize(
     ("name", "seed"),
     [("ur_rtde", 5), ("can", 3), ("modbus", 3)]
-    + [pytest.param(n, s, marks=pytest.mark.slow) for n in sorted(LINKS) for s in range(6, 12)],
+    + [pytest.param(n, s, marks=pytest.mark.slow) for n in sorted(LINKS) for s in range(4, 10)],
 )
 def test_what_is_hidden_is_named_on_every_link(tmp_path: Path, name: str, seed: int) -> None:
     link = LINKS[name](tmp_path, seed)

@@ -298,3 +298,8 @@ def test_three_rounds_of_visits_and_the_truth_are_shown(
     assert "+1 ± 0.003 mm" in html
     assert whole.summary()["tcp_error_mm"]["fitted"]["rms"] > 0
     assert whole.summary()["hidden"]["tool_frame_x"] == 1e-3
+
+
+def test_a_recording_without_states_is_a_run_to_be_repeated():
+    with pytest.raises(RunError, match="holds no state of the arm"):
+        rests({}, np.zeros((0, 7)), HOME[None])

@@ -1,0 +1,103 @@
+"""What commands cost, as a user has them: CPU time and memory of a whole process.
+
+    python -m benchmarks.speed.commands [--rows 1000000] [--repeats 3]
+
+A simulated UR10e at random poses under three payloads, measured to 30 um, one reading of 500 wild.
+Prints a table: the least of the repeats' CPU times, the largest memory. Numerics on one thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow
+from pyarrow import parquet
+
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
+
+CELL = """robot: {model: ur10e}
+tool: {tcp: {xyz: [0, 0, 0.1], rpy: [0, 0, 0]}}
+metrology: {registered: false, sigma: 3.0e-5}
+"""
+
+
+def write_log(path: Path, rows: int) -> None:
+    """Write a log of ``rows`` measured poses."""
+    rng = np.random.default_rng(1)
+    tool = np.eye(4)
+    tool[2, 3] = 0.1
+    model = Model(builtin_arm("ur10e"), tool).with_compliance(
+        np.array([8, 9, 10, 20, 25, 30]) * 1e-6, np.array([2, 3, 2, 5, 5, 9]) * 1e-6
+    )
+    q, mass = rng.uniform(-2, 2, (rows, 6)), rng.choice([0.0, 3.0, 6.0], rows)
+    cog = np.tile([0.0, 0.0, 0.1], (rows, 1))
+    position = model.predict(q, Loads(mass, cog)).position + rng.normal(0, 3e-5, (rows, 3))
+    wild = rng.random(rows) < 0.002
+    position[wild] += rng.normal(0, 5e-3, (wild.sum(), 3))
+    columns = {f"actual_q_{i}": q[:, i] for i in range(6)} | {"payload": mass}
+    columns |= {f"payload_cog_{i}": cog[:, i] for i in range(3)}
+    columns |= {f"measured_position_{i}": position[:, i] for i in range(3)}
+    parquet.write_table(pyarrow.table(columns), path)
+
+
+def cost(arguments: list[str], repeats: int) -> tuple[float, float]:
+    """Return CPU time (s) and memory (MB) of a command. Raises SystemExit where it fails."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+    found = []
+    for _ in range(repeats + 1):  # the first compiles what has never been
+        process = subprocess.Popen(
+            [sys.executable, "-m", "gapbridge", *arguments], env=environment,
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        _, status, used = os.wait4(process.pid, 0)
+        if status:
+            raise SystemExit(f"gapbridge {' '.join(arguments)}: ended with {status}")
+        found.append((used.ru_utime + used.ru_stime, used.ru_maxrss / 1024))
+    return min(cpu for cpu, _ in found[1:]), max(memory for _, memory in found)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rows", type=int, default=1_000_000)
+    parser.add_argument("--repeats", type=int, default=3)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="commands-") as name:
+        folder = Path(name)
+        cell, fitted = folder / "cell.yaml", folder / "fitted.yaml"
+        cell.write_text(CELL, encoding="utf-8")
+        logs = {rows: folder / f"{rows}.parquet" for rows in (options.rows, options.rows // 10, 70)}
+        for rows, path in logs.items():
+            write_log(path, rows)
+        many, tenth, poses = logs.values()
+        commands = {
+            f"`fit`, {options.rows:,} rows, Parquet":
+                ["fit", many, "--cell", cell, "--out", fitted],
+            f"`predict`, {options.rows:,} rows, Parquet in and out":
+                ["predict", many, "--cell", fitted, "--out", folder / "p.parquet"],
+            f"`compensate`, {options.rows // 10:,} rows, Parquet to CSV":
+                ["compensate", tenth, "--cell", fitted, "--out", folder / "c.csv"],
+            "`diagnose`, 70 poses": ["diagnose", poses, "--cell", cell],
+            "`--help`": ["--help"],
+            "`explain`": ["explain"],
+        }  # fmt: skip
+        print("| command | CPU, s | memory, MB |\n| --- | --- | --- |")
+        for label, arguments in commands.items():
+            cpu, memory = cost([str(a) for a in arguments], options.repeats)
+            print(f"| {label} | {cpu:.2f} | {memory:.0f} |", flush=True)
+    load = os.getloadavg()[0]
+    print(f"load average {load:.1f}, {time.strftime('%Y-%m-%d')}")
+
+
+if __name__ == "__main__":
+    main()
