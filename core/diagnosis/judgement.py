@@ -38,6 +38,7 @@ from gapbridge.core.diagnosis.selection.refit import worth
 from gapbridge.core.diagnosis.selection.selection import Selection
 
 Array = NDArray[np.float64]
+VAGUE = "its value may as well be none"
 BESIDE = "it does not keep its value beside the unknown that is left"
 
 
@@ -54,6 +55,7 @@ class Judgement:
     ties: dict[int, tuple[str, ...]]  # position -> effects that would do as well
     withdrawn: tuple[tuple[int, str], ...]  # position, reason
     beside: tuple[int, ...] = ()  # unnamed functions that account for what is left
+    vague: tuple[int, ...] = ()  # positions that some rows leave vague: all rows decide
     stand_ins: tuple[
         int, ...
     ] = ()  # positions not accused that shrink the gap in regions not fitted
@@ -127,7 +129,7 @@ def _no_value(selection: Selection) -> dict[int, str]:
         ):
             found[position] = "its value stands on its bound"
         if worth(term, spread) < 1:
-            found[position] = "its value may as well be none"
+            found[position] = VAGUE
     return found
 
 

@@ -33,6 +33,7 @@ class LinkCog(JointEffect):
     order = 22
     carried = True
     felt_by_all = True
+    together = True
     channels = ("torque",)
     motion = "poses that turn the link against gravity, or its accelerations"
 

@@ -29,7 +29,8 @@ def members(space: Space) -> tuple[int, ...]:
 
 def prior(candidate: Candidate, share: float = 1.0) -> Array:
     """Return 1 sigma (d,) of each number of a link; ``share`` is that of an engineer's size."""
-    return np.array([share * (LENGTH if p.unit == "m" else ANGLE) for p in candidate.parameters])
+    usual = {"m": LENGTH, "rad": ANGLE}
+    return np.array([share * usual.get(p.unit, p.scale) for p in candidate.parameters])
 
 
 @dataclass(frozen=True)
