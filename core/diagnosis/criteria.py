@@ -23,6 +23,7 @@ HEAVIEST = 3.0  # times the largest declared payload (or the rated one): a load 
 # Geometry as a whole
 LENGTH, ANGLE = 5e-4, 1e-3  # m, rad: 1 sigma of machining and assembly
 SHARES = (0.2, 1.0)  # of them: a factory calibration leaves a fifth, a kit arm all of it
+FEW_LINKS = 3  # links whose first moments are off singly, from which all are tried as a whole
 GEOMETRIC = 2  # geometric causes from which all links are tried as a whole
 # A residual with structure
 SURE = 0.002  # probability below which it is sure, times one more than the causes beside it

@@ -114,19 +114,17 @@ def still_accused(
     )
 
 
-def _sure(
-    selection: Selection, judgement: Judgement, model: Model
-) -> tuple[Selection, Judgement]:
+def _sure(selection: Selection, judgement: Judgement, model: Model) -> tuple[Selection, Judgement]:
     """Return what stays of effects that were vague on some rows: values that are many sigmas."""
     accused, withdrawn, vague = list(judgement.accused), list(judgement.withdrawn), judgement.vague
     least = (SIGMAS / OWN_SIGMAS) ** 2
     while True:
-        sure = {p: worth(selection.terms[p], selection.covariance[p]) for p in vague if p in accused}
+        sure = {
+            p: worth(selection.terms[p], selection.covariance[p]) for p in vague if p in accused
+        }
         weakest = min(sure, key=lambda p: sure[p], default=None)
         if weakest is None or sure[weakest] >= least:
-            return selection, replace(
-                judgement, accused=tuple(accused), withdrawn=tuple(withdrawn)
-            )
+            return selection, replace(judgement, accused=tuple(accused), withdrawn=tuple(withdrawn))
         accused.remove(weakest)
         withdrawn.append((weakest, VAGUE))
         selection = _alone(selection, accused, model)
