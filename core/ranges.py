@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.log.columns import label
 from gapbridge.core.log.log import Log
 from gapbridge.core.sessions import sessions_in
 
@@ -50,7 +51,7 @@ def outside(log: Log, fitted: Range) -> list[str]:
         if len(beyond):
             worst = beyond[np.argmax(np.abs(values[beyond] - (low + high) / 2))]
             reported.append(
-                f"{name}: {len(beyond)} of {len(values)} rows lie outside what was fitted, "
+                f"{label(name)}: {len(beyond)} of {len(values)} rows lie outside what was fitted, "
                 f"{low:.4g} to {high:.4g} {UNITS[_stem(name)]} (row {log.line(worst)}: "
                 f"{values[worst]:.4g})"
             )
@@ -74,7 +75,7 @@ def outside_findings(log: Log) -> list[str]:
     ranges, found = [range_of(part) for part in parts], []
     for s, (name, part) in enumerate(zip(log.session_names, parts, strict=True)):
         others = merged(one for i, one in enumerate(ranges) if i != s)
-        columns = [c for c, share in _beyond(part, others).items() if share >= MANY]
+        columns = [label(c) for c, share in _beyond(part, others).items() if share >= MANY]
         if columns:
             found.append(
                 f"session {name} goes beyond the other sessions in {', '.join(columns)}: its "

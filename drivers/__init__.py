@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, cast
 
+from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import LinkError
 
 if TYPE_CHECKING:
@@ -22,7 +23,12 @@ DRIVERS: dict[str, str] = {
 """Driver name in a cell file -> ``module:Class``, imported when it is used."""
 
 
-def make_driver(settings: DriverSettings, model: Model, bounds: GateBounds | None = None) -> Driver:
+def make_driver(
+    settings: DriverSettings,
+    model: Model,
+    bounds: GateBounds | None = None,
+    clock: Clock = SYSTEM,
+) -> Driver:
     """Return the driver that the settings name, not yet connected.
 
     ``model`` gives it the arm and the tool, ``bounds`` what its gate lets pass (left out: the
@@ -36,7 +42,7 @@ def make_driver(settings: DriverSettings, model: Model, bounds: GateBounds | Non
         found = getattr(importlib.import_module(module), kind)
     except ImportError as error:
         raise LinkError(f"link.driver {name}: its library cannot be imported: {error}") from None
-    driver = cast("Driver", found(settings, model))
+    driver = cast("Driver", found(settings, model, clock))
     if bounds is not None:
         driver.gate.hold_to(bounds)
     return driver

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import WriteError
 from gapbridge.core.model import Model
 from gapbridge.core.setpoint import Setpoint
@@ -64,11 +65,15 @@ class Driver(ABC):
     and only the side that reads. ``write_setpoint`` is the only call after which an arm moves.
     """
 
-    def __init__(self, rate: float, model: Model, moves_arm: bool = True) -> None:
+    def __init__(
+        self, rate: float, model: Model, moves_arm: bool = True, clock: Clock = SYSTEM
+    ) -> None:
+        self.clock = clock  # what its states are stamped by, and all who judge their age
+        self._now = clock.monotonic
         self.rate = rate  # Hz: cycles per second that read_state is paced at
         self.n = model.arm.n  # joints
         self.moves_arm = moves_arm  # setpoints are the arm's motion; False: they ride on its own
-        self.gate = Gate(rate, model, moves_arm)
+        self.gate = Gate(rate, model, moves_arm, clock.monotonic)
         self._cell_model = model  # what the controller is compared with
 
     def __init_subclass__(cls, **keys: Any) -> None:

@@ -7,7 +7,6 @@ forward kinematics of its own, and the step against what was last sent, over thi
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -15,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from gapbridge.core.clock import SYSTEM
 from gapbridge.core.errors import GateError
 from gapbridge.core.kernels.reference import JIT
 from gapbridge.core.model import Model
@@ -158,7 +158,10 @@ class Gate:
     ``clock`` gives the time over which steps count, s. Some microseconds a setpoint.
     """
 
-    def __init__(self, rate: float, model: Model, moves_arm: bool) -> None:
+    def __init__(
+        self, rate: float, model: Model, moves_arm: bool,
+        clock: Callable[[], float] = SYSTEM.monotonic,
+    ) -> None:  # fmt: skip
         arm = model.arm
         n = arm.n
         self._shapes = ((n,), (n,), (6,))
@@ -177,7 +180,7 @@ class Gate:
         self._started: tuple[Vector, Vector] | None = None  # rad, where the arm was when armed
         self._open = False
         self._budget = self._at = self._travel = 0.0  # s
-        self._clock: Callable[[], float] = time.monotonic
+        self._clock = clock
         self.bounds = GateBounds()
         self.hold_to(self.bounds)
         self._judged(0.0)  # compiled here: the first setpoint must not wait for a compiler

@@ -6,7 +6,6 @@ offsets bit for bit; with another, what that one would have made of it. Nothing 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import LinkError, LogError
 from gapbridge.core.setpoint import Setpoint
 from gapbridge.core.state import RobotState
@@ -83,7 +83,7 @@ class ReplayDriver(Driver):
     where the recording holds none, or was made of another arm.
     """
 
-    def __init__(self, settings: ReplaySettings, model: Model) -> None:
+    def __init__(self, settings: ReplaySettings, model: Model, clock: Clock = SYSTEM) -> None:
         self.settings = settings
         first = next(self._rows(), None)
         if first is None:
@@ -96,7 +96,7 @@ class ReplayDriver(Driver):
             raise LogError(
                 f"{settings.file}: found {n} joints, expected {model.arm.n} as the cell's arm has"
             )
-        super().__init__(float(first["rate"]), model)
+        super().__init__(float(first["rate"]), model, clock=clock)
         self.gate.count_by(lambda: self._last)  # a recording may go by faster than it was made
         self.cycle: Cycle | None = None
         self._left: Iterator[Mapping[str, Vector]] = iter(())
@@ -122,7 +122,7 @@ class ReplayDriver(Driver):
             int(row["attempted"]), int(row["flags"]), row["own_q"], row["nominal_q"],
             float(row["ramp_time"]),
         )  # fmt: skip
-        return _state(row)
+        return _state(row, self._now())
 
     def nominal_q(self, state: RobotState) -> Vector:
         """Return what the robot itself wanted then, (n,) rad."""
@@ -144,14 +144,14 @@ class ReplayDriver(Driver):
                 yield {name: values[k] for name, values in batch.columns.items()}
 
     def _wait(self, timestamp: float) -> None:
-        now, speed = time.monotonic(), self.settings.speed
+        now, speed = self._now(), self.settings.speed
         if not 0.0 < timestamp - self._last < LONGEST_PAUSE:
             self._begun = now - timestamp / speed
         self._last = timestamp
-        time.sleep(max(self._begun + timestamp / speed - now, 0.0))
+        self.clock.sleep(max(self._begun + timestamp / speed - now, 0.0))
 
 
-def _state(row: Mapping[str, Vector]) -> RobotState:
+def _state(row: Mapping[str, Vector], received: float) -> RobotState:
     """Return the state of a recorded cycle; what it lacked is NaN there."""
 
     def known(name: str) -> Vector | None:
@@ -161,7 +161,7 @@ def _state(row: Mapping[str, Vector]) -> RobotState:
     payload = known("payload")
     return RobotState(
         timestamp=float(row["timestamp"]),
-        received=time.monotonic(),
+        received=received,
         actual_q=row["actual_q"],
         actual_qd=row["actual_qd"],
         target_q=row["target_q"],

@@ -28,11 +28,11 @@ from benchmarks.calibration.laid_out import (
     lay_out,
     readings_of,
 )
+from gapbridge.core.calibration.converged_fit import converged_fit
 from gapbridge.core.calibration.fit import estimates_of
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.remainder import predicted
-from gapbridge.core.calibration.rest import come_to_rest
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 
@@ -95,7 +95,7 @@ def run(setting: Setting, seed: int) -> Outcome:
     how = make_observable(readings.kind, registered=layout.registered)
     begun = time.perf_counter()
     fitted = readings[~readings.held_out]
-    problem, rest = come_to_rest(setting.parameters, how, fitted, metrology, lambda text: None)
+    problem, rest = converged_fit(setting.parameters, how, fitted, metrology, lambda text: None)
     seconds = time.perf_counter() - begun
     estimates = estimates_of(setting.parameters, rest, None)
     held = [

@@ -112,7 +112,7 @@ def run(arm: str, effect: str, seed: int, asked: bool = False) -> Outcome:
 
     found = fit()
     for _ in range(REFITS if asked else 0):
-        new = [name for name in found.lacking if name not in chosen]
+        new = [name for name in found.missing_effects if name not in chosen]
         if not new:
             break
         chosen = (*chosen, *new)
@@ -190,7 +190,7 @@ def main(seeds: int, seed: int, effects: str, asked: bool, out: Path | None) -> 
     for o in over:
         console.print(f"over {LIMIT}: {o.arm} {o.effect} {o.ratio:.2f}")
     for o in [o for o in done if asked and not o.named]:
-        console.print(f"asked for {', '.join(o.lacking) or 'nothing'}: {o.arm} {o.effect}")
+        console.print(f"asked for {', '.join(o.missing_effects) or 'nothing'}: {o.arm} {o.effect}")
 
 
 def _cells(own: list[Outcome]) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 
+from benchmarks.faults.punctual import Witness
 from benchmarks.faults.rig import Rig
 from benchmarks.faults.row import Result, Row
 from gapbridge.bridge.loop.supervisor import Cause, State
@@ -13,13 +14,19 @@ AFTERWARDS = 0.25  # s for which the end state must stay
 RESTING, AT_REST = (State.OBSERVING, State.COMPENSATING, State.FAULT), 3.0  # s: stays for good
 END_LIMIT = 90.0  # s: a new process takes its time on a busy machine
 PATIENCE = 10.0  # s on top of what is allowed, to distinguish what is late from what never comes
+LATE = 0.03  # s behind its time: the proxies of this process made faults of their own
 BUSY = (Cause.OVERRUN.value, Cause.RESYNC.value)
 
 
 def make_fault(rig: Rig, row: Row) -> Result:
     """Make a row's fault while the daemon compensates; returns what became of it."""
-    assert row.inject is not None
     rig.compensate()
+    with Witness() as witness:
+        return _make(rig, row, witness)
+
+
+def _make(rig: Rig, row: Row, witness: Witness) -> Result:
+    assert row.inject is not None
     found = rig.found
     found.largest_step, before = 0.0, found.violated
     counts = rig.run.page.counts()
@@ -37,12 +44,17 @@ def make_fault(rig: Rig, row: Row) -> Result:
     return Result(
         row.key, rig.link.name, rig.link.cycle, detected, end, found.largest_step,
         bounds.offset_rate * bounds.cycle, tuple(wrong), found.violated > before,
-        not found.violated > before and _disturbed(rig, row, moment),
+        not found.violated > before and _disturbed(rig, row, moment, witness),
     )  # fmt: skip
 
 
-def _disturbed(rig: Rig, row: Row, moment: float) -> bool:
-    """Return whether the machine was too busy meanwhile: the loop missed deadlines by itself."""
+def _disturbed(rig: Rig, row: Row, moment: float, witness: Witness) -> bool:
+    """Return whether the machine was too busy meanwhile.
+
+    This process slept for longer than a state may be old, or the loop missed deadlines by itself.
+    """
+    if witness.latest > LATE:
+        return True
     if "overrun" in row.sign:
         return False
     return any(event.get("cause") in BUSY for event in rig.run.since(moment))

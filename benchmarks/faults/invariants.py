@@ -109,6 +109,12 @@ class Checker:
         self._ended_at = -math.inf  # s
         self._written, self._written_at = ZEROS, -math.inf  # the last offset on the wire; s
         self._unused = 0.0  # states that no write has followed yet
+        self._planned: tuple[int, float] | None = None  # the joint that the plan moves; rad before
+
+    def leave_to_plan(self, joint: int) -> None:
+        """Take what ``joint`` (from 0) does from now on for the plan's; offsets are the others'."""
+        q = self._stream.joints[0] or (self._fresh.q if self._fresh is not None else ())
+        self._planned = (joint, q[joint])
 
     @property
     def last_offset(self) -> Numbers:
@@ -245,30 +251,36 @@ class Checker:
         """Return the TCP offset (6,) of a write, base axes, m and rad."""
         if write.kind == "offset":
             return write.values
-        b, stream = self.bounds, self._stream
+        stream = self._stream
         if stream.nominal is None:
             stream.nominal = self._nominal_of(write.values)
-            stream.offset = gap(stream.nominal, tcp_in_base(b.arm, write.values, b.tool))
+            stream.offset = gap(stream.nominal, self._tcp_in_base(write.values))
             if self._fresh is not None:
                 away = max(abs(x - y) for x, y in zip(write.values, self._fresh.q, strict=True))
                 if away > START_AWAY:
                     self.found.add(f"a stream began {away:.4f} rad from where the arm was")
         if stream.joints[0] != write.values or stream.joints[1] is ZEROS:
-            now = tcp_in_base(b.arm, write.values, b.tool)
-            stream.joints = (write.values, gap(stream.nominal, now))
+            stream.joints = (write.values, gap(stream.nominal, self._tcp_in_base(write.values)))
         return stream.joints[1]
+
+    def _tcp_in_base(self, q: Numbers) -> Frame:
+        """Return where joints (n,) rad bring the TCP, without what the plan itself moves."""
+        if self._planned is not None:
+            joint, before = self._planned
+            q = (*q[:joint], before, *q[joint + 1 :])
+        return tcp_in_base(self.bounds.arm, q, self.bounds.tool)
 
     def _nominal_of(self, q: Numbers) -> Frame:
         """Return where the TCP was wanted as a stream of joints begins.
 
         Where the last one has left the arm, its offset is still in it: what was wanted is older.
         """
-        last, b = self._ended, self.bounds
+        last = self._ended
         if last.nominal is not None and len(last.joints[0]) == len(q):
             away = max(abs(x - y) for x, y in zip(q, last.joints[0], strict=True))
             if away < STAYED:
                 return last.nominal
-        return tcp_in_base(b.arm, q, b.tool)
+        return self._tcp_in_base(q)
 
     def _check_size(self, write: Write, offset: Numbers) -> None:
         b = self.bounds

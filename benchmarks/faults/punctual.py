@@ -7,6 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
+import time
+from types import TracebackType
+from typing import Self
 
 FIRST = 2  # SCHED_FIFO: before all that has no real-time priority
 PRIORITY = 20  # SCHED_FIFO; below the loop's and the simulated controller's
@@ -26,3 +30,32 @@ def go_first(pid: int | None = None) -> None:
     """
     with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(pid or 0, os.SCHED_FIFO, os.sched_param(FIRST))
+
+
+class Witness:
+    """Measures how late this process wakes: what disturbs it is the machine's, and no fault."""
+
+    TICK = 0.002  # s
+
+    def __init__(self) -> None:
+        self.latest = 0.0  # s behind a tick, the worst
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True, name="witness")
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:  # fmt: skip
+        self._over.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        be_punctual()
+        before = time.monotonic()
+        while not self._over.wait(self.TICK):
+            now = time.monotonic()
+            self.latest, before = max(self.latest, now - before - self.TICK), now

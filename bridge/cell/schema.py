@@ -124,6 +124,12 @@ class Simulation(Section):
     droop: list[NotNegative] | None = Field(
         default=None, description="rad/Nm per joint by which servos give way; default: none"
     )
+    zero: list[Number] | None = Field(
+        default=None, description="rad per joint beyond what its encoder says; default: none"
+    )
+    tool_shift: Vector3 | None = Field(
+        default=None, description="m, flange axes: where the TCP is beyond tool.tcp; default: 0"
+    )
     tracker_noise: NotNegative | None = Field(default=None, description="m, 1 sigma")
     rtde_port: int | None = Field(default=None, gt=0, lt=65536, strict=True)
     dashboard_port: int | None = Field(default=None, gt=0, lt=65536, strict=True)

@@ -149,24 +149,19 @@ def _plant(cell: Cell) -> dict[str, Any]:
     }
     if simulation.tracker_noise is not None:
         fields["tracker_noise"] = simulation.tracker_noise
-    if simulation.droop is not None:
-        if len(simulation.droop) != cell.arm.n:
+    if simulation.tool_shift is not None:
+        fields["tool_shift"] = tuple(simulation.tool_shift)
+    per_joint = {"droop": simulation.droop, "zero": simulation.zero}
+    if (compliance := simulation.compliance) is not None:
+        per_joint |= {"compliance.axial": compliance.axial, "compliance.radial": compliance.radial}
+    for key, values in per_joint.items():
+        if values is None:
+            continue
+        if len(values) != cell.arm.n:
             raise CellError(
-                f"{cell.path}: simulation.droop: found {len(simulation.droop)} values, "
-                f"expected {cell.arm.n}"
+                f"{cell.path}: simulation.{key}: found {len(values)} values, expected {cell.arm.n}"
             )
-        fields["droop"] = tuple(simulation.droop)
-    if simulation.compliance is not None:
-        for key in ("axial", "radial"):
-            values = getattr(simulation.compliance, key)
-            if values is None:
-                continue
-            if len(values) != cell.arm.n:
-                raise CellError(
-                    f"{cell.path}: simulation.compliance.{key}: found {len(values)} values, "
-                    f"expected {cell.arm.n}"
-                )
-            fields[key] = tuple(values)
+        fields[key.rpartition(".")[2]] = tuple(values)
     return fields
 
 

@@ -12,8 +12,10 @@ from typing import NoReturn
 
 import click
 
+from gapbridge.bridge.cli.progress import Compiling
 from gapbridge.bridge.cli.table import COMMANDS
 from gapbridge.core.errors import GapbridgeError
+from gapbridge.core.kernels import compiling
 
 SUCCESS, FAILURE, UNUSABLE = 0, 1, 2
 
@@ -89,6 +91,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
 
 
 def _run(arguments: list[str]) -> int:
+    compiling.listeners[:] = [Compiling()]
     try:
         result = gapbridge.main(args=arguments, prog_name="gapbridge", standalone_mode=False)
         sys.stdout.flush()

@@ -6,6 +6,11 @@ import contextlib
 import sys
 from collections.abc import Callable, Iterator
 
+from gapbridge.core.clock import SYSTEM
+from gapbridge.core.kernels.compiling import ABOUT
+
+AGAIN = 10.0  # s between two words on compiling
+
 
 @contextlib.contextmanager
 def progress(label: str, total: int | None = None) -> Iterator[Callable[[int], None]]:
@@ -28,6 +33,28 @@ def status(label: str) -> Iterator[Callable[[str], None]]:
         yield lambda text: None
         return
     from rich.console import Console
+    from rich.text import Text  # as it stands: ":wrench:" is no picture here
 
     with Console(stderr=True).status(label) as shown:
-        yield lambda text: shown.update(f"{label}: {text}")
+        yield lambda text: shown.update(Text(f"{label}: {text}"))
+
+
+class Compiling:
+    """Says on stderr that functions are compiled, at once and then now and again."""
+
+    def __init__(self, clock: Callable[[], float] = SYSTEM.monotonic) -> None:
+        self._clock = clock
+        self._begun: float | None = None  # s
+        self._next = 0.0  # s: when it says so again
+
+    def __call__(self, functions: int) -> None:
+        """Take note that so many functions have begun."""
+        now = self._clock()
+        if self._begun is None:
+            self._begun = now
+            sys.stderr.write(f"{ABOUT}: it takes a minute or two\n")
+        elif now >= self._next:
+            sys.stderr.write(f"  {functions} functions, {now - self._begun:.0f} s\n")
+        else:
+            return
+        self._next = now + AGAIN

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -10,6 +9,7 @@ from gapbridge.bridge.ipc.control_socket import Peer, refusal
 from gapbridge.bridge.ipc.events import Event
 from gapbridge.bridge.ipc.shared_memory import Phase
 from gapbridge.bridge.loop.supervisor import Cause, State
+from gapbridge.core.clock import SYSTEM, Clock
 
 LONGEST_ARMING = 25.0  # s: uploads a program to the robot
 LONGEST_RAMP = 20.0  # s
@@ -64,8 +64,8 @@ class Controlled(Protocol):
 class Control:
     """Answers requests; ``answer`` may take as long as the arm does."""
 
-    def __init__(self, daemon: Controlled) -> None:
-        self._daemon = daemon
+    def __init__(self, daemon: Controlled, clock: Clock = SYSTEM) -> None:
+        self._daemon, self._clock = daemon, clock
 
     def answer(self, command: str, peer: Peer) -> dict[str, Any]:
         """Return the answer to a command of COMMANDS."""
@@ -98,8 +98,8 @@ class Control:
         return self._await_armed(mark)
 
     def _await_armed(self, mark: int) -> dict[str, Any]:
-        daemon, begun, waiting = self._daemon, time.monotonic(), None
-        while time.monotonic() - begun < LONGEST_ARMING:
+        daemon, begun, waiting = self._daemon, self._clock.monotonic(), None
+        while self._clock.monotonic() - begun < LONGEST_ARMING:
             for event in daemon.events_since(mark):
                 if event["kind"] == "refused" or event.get("cause") == Cause.START_REFUSED:
                     return refusal(f"refused: {event['detail']}")
@@ -110,10 +110,10 @@ class Control:
             if daemon.state == State.DISCONNECTED:
                 return refusal("the loop has ended before it was armed")
             idle = daemon.state == State.ARMED and daemon.phase == Phase.RUNNING
-            waiting = (waiting or time.monotonic()) if idle else None
-            if waiting is not None and time.monotonic() - waiting > SOURCE_SILENT:
+            waiting = (waiting or self._clock.monotonic()) if idle else None
+            if waiting is not None and self._clock.monotonic() - waiting > SOURCE_SILENT:
                 return _done("armed; waits for the first setpoint of its source")
-            time.sleep(LOOK)
+            self._clock.sleep(LOOK)
         return refusal(f"no answer of the loop within {LONGEST_ARMING:g} s")
 
     def _disarm(self, by: str) -> dict[str, Any]:
@@ -139,13 +139,12 @@ class Control:
             return _done(f"acknowledged ({fault}); observing as soon as the robot is fine")
         return refusal(f"still {daemon.state.name.lower()} after {LONGEST_RAMP:g} s")
 
-    @staticmethod
-    def _comes(what: Callable[[], bool], limit: float) -> bool:
-        until = time.monotonic() + limit
+    def _comes(self, what: Callable[[], bool], limit: float) -> bool:
+        until = self._clock.monotonic() + limit
         while not what():
-            if time.monotonic() > until:
+            if self._clock.monotonic() > until:
                 return False
-            time.sleep(LOOK)
+            self._clock.sleep(LOOK)
         return True
 
 

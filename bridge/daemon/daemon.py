@@ -11,7 +11,6 @@ import os
 import queue
 import subprocess
 import threading
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -39,6 +38,7 @@ from gapbridge.bridge.loop.loop import LONGEST_STOP, Exit
 from gapbridge.bridge.loop.setpoint_stream import longest_withdrawal
 from gapbridge.bridge.loop.supervisor import Cause, State
 from gapbridge.bridge.recording.folder import LOOP_LOG, new_session, require_folder
+from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import InputError, LinkError
 from gapbridge.drivers.controller_address import address_of
 
@@ -56,37 +56,41 @@ Say = Callable[[str], None]
 class Daemon:
     """One run. ``stop``, ``reload``, ``arm`` and ``disarm`` may be called from other threads."""
 
+    loop_process: type[LoopProcess] = LoopProcess  # a simulation has one of its own
+
     def __init__(
         self,
         given: DaemonSettings | Configuration,
         may_write: bool,
         say: Say = lambda _: None,
         log: Callable[[Event], None] | None = None,
+        clock: Clock = SYSTEM,
     ) -> None:
+        self._clock = clock
         if not isinstance(given, Configuration):
             given = configuration_for(given)
         self.configuration = given  # read once; loops get these very bytes
         settings = given.settings
         self.may_write, self._say = may_write, say
         n = self.configuration.n
-        self.page = RunPage(n)  # of the loop's process, one after the other
+        self.page = RunPage(n, clock)  # of the loop's process, one after the other
         self._commands = CommandPage()  # one for the whole run; nobody else can write to it
         self._requests: queue.SimpleQueue[tuple[int, Command, str]] = queue.SimpleQueue()
         self._taken = 0
         self._request_lock = threading.RLock()
         self._reader = self.page.reader()
         self._output: IO[bytes] | int = subprocess.DEVNULL  # of all processes of the run
-        self.sides = Sides()
+        self.sides = Sides(clock)
         self.tally = Tally(n, settings.link.rate)
         listeners = [self._on_event, self.sides.tell]
-        self.event_log = EventLog(*listeners, *([log] if log else []))
+        self.event_log = EventLog(*listeners, *([log] if log else []), clock=clock)
         self._posted: queue.SimpleQueue[Event] = queue.SimpleQueue()  # by other threads
-        self.manager = ServiceManager()
+        self.manager = ServiceManager(clock)
         self.session = ""
-        self._status = DaemonStatus(self.page.slices)
+        self._status = DaemonStatus(self.page.slices, clock)
         self._status_at = 0.0
         self._reload = Reload(self.manager, self.event_log)
-        self.control = Control(self)
+        self.control = Control(self, clock)
         self.loop: LoopProcess | None = None
         self._failure: Event = {}
         self._faults: list[str] = []
@@ -153,14 +157,14 @@ class Daemon:
         counted = self.page.counts()
         return {
             "schema": SCHEMA,
-            "time": time.time(),
+            "time": self._clock.time(),
             "pid": os.getpid(),
             "started": status.started,
             "session": self.session,
             "cell": str(self.settings.cell),
             "configuration_hash": self.configuration.hash,
             "configured": status.configured,
-            "state": self.state.name.lower(),
+            "state": status.named(self.state),
             **status.history(),
             "may_write": self.may_write,
             "armed_by": status.armed_by,
@@ -301,9 +305,9 @@ class Daemon:
 
     def _pause(self) -> None:
         """Wait before the next process of the loop, and go on looking after the rest."""
-        until = time.monotonic() + self._wait
+        until = self._clock.monotonic() + self._wait
         self._wait = min(2.0 * self._wait, self.settings.backoff[1])
-        while time.monotonic() < until and not self._stopping.wait(TICK):
+        while self._clock.monotonic() < until and not self._clock.wait(self._stopping, TICK):
             self._tick()
 
     def _tick(self) -> None:
@@ -316,8 +320,8 @@ class Daemon:
             self.event_log.add(event)
         while not self._posted.empty():
             self.event_log.add(self._posted.get())
-        if time.monotonic() >= self._status_at:
-            self._status_at = time.monotonic() + STATUS_EVERY
+        if self._clock.monotonic() >= self._status_at:
+            self._status_at = self._clock.monotonic() + STATUS_EVERY
             self.sides.tell({"kind": "status", **self.status()})
         loop = self.loop
         if loop is None or not loop.hangs:
@@ -331,13 +335,13 @@ class Daemon:
         stop_by = first_cycle = None
         try:
             while loop.exit_code is None:
-                time.sleep(TICK)
+                self._clock.sleep(TICK)
                 self._tick()
                 if self.page.seen and first_cycle is None:
-                    first_cycle, self._seen = time.monotonic(), True
+                    first_cycle, self._seen = self._clock.monotonic(), True
                     self.manager.ready()
                 over = first_cycle is not None and (
-                    duration is not None and time.monotonic() - first_cycle >= duration
+                    duration is not None and self._clock.monotonic() - first_cycle >= duration
                 )
                 if over or (self.page.ended and duration is None):
                     self._stopping.set()
@@ -345,17 +349,17 @@ class Daemon:
                     self._commands.ask(Command.RAMP_OUT)  # by nobody's wish
                 if (self._stopping.is_set() or self._reload.wants_end) and stop_by is None:
                     needed = LONGEST_STOP + longest_withdrawal(self.settings.limits)
-                    stop_by = time.monotonic() + needed + STOP_MARGIN
+                    stop_by = self._clock.monotonic() + needed + STOP_MARGIN
                     if self._stopping.is_set():
                         self.manager.stopping()
                     loop.ask_to_stop()
-                if loop.hangs or (stop_by is not None and time.monotonic() > stop_by):
+                if loop.hangs or (stop_by is not None and self._clock.monotonic() > stop_by):
                     words = f"the loop stood still for {self.page.silence:.2f} s and was ended"
                     loop.kill()  # reported when it is over: nothing is written after that
                     self._fault("hang", words)
             self._take()
             self._after(loop)
-            if first_cycle is not None and time.monotonic() - first_cycle > HEALTHY:
+            if first_cycle is not None and self._clock.monotonic() - first_cycle > HEALTHY:
                 self._wait = self.settings.backoff[0]
         finally:
             self.loop = None
@@ -379,7 +383,9 @@ class Daemon:
             self._request(Command.ARM, armed_by)
             self._pass_on()
         self._loops += 1
-        return LoopProcess(self.configuration, self.page, self._commands, order, self._output)
+        return self.loop_process(
+            self.configuration, self.page, self._commands, order, self._output, self._clock
+        )
 
     def _take(self) -> None:
         """Take cycles and events over from the loop."""

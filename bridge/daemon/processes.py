@@ -10,7 +10,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from typing import IO, Any
 
 from gapbridge.bridge.cell.run_settings import Configuration
@@ -19,6 +18,7 @@ from gapbridge.bridge.ipc.sealed_memory import sealed_bytes
 from gapbridge.bridge.ipc.shared_memory import Phase, RunPage
 from gapbridge.bridge.ipc.side_process import environment
 from gapbridge.bridge.loop.loop import Exit
+from gapbridge.core.clock import SYSTEM, Clock
 
 STARTING_LIMIT = 180.0  # s: imports and, the first time, compilation
 ENDING_LIMIT = 2.0  # s
@@ -35,8 +35,9 @@ class LoopProcess:
 
     def __init__(
         self, configuration: Configuration, page: RunPage, commands: CommandPage,
-        order: dict[str, Any], log: IO[Any] | int,
+        order: dict[str, Any], log: IO[Any] | int, clock: Clock = SYSTEM,
     ) -> None:  # fmt: skip
+        self._now = clock.monotonic
         page.renew()
         self.page, self._commands = page, commands
         self._settings = settings = configuration.settings
@@ -46,7 +47,7 @@ class LoopProcess:
         orders, stdin = socket.socketpair()
         self._events = ours
         ours.setblocking(False)
-        self.started = time.monotonic()
+        self.started = self._now()
         order = {
             **order, "settings": settings.model_dump(mode="json"), "n": page.n,
             "page": page.fd, "commands": commands.fd, "events": theirs.fileno(),
@@ -89,7 +90,7 @@ class LoopProcess:
             Phase.ARMING: settings.link.connect_timeout,
             Phase.ENDING: ENDING_LIMIT,
         }[page.phase]
-        silence = page.silence or time.monotonic() - self.started
+        silence = page.silence or self._now() - self.started
         return silence > limit
 
     def events(self) -> list[dict[str, Any]]:

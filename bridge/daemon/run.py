@@ -6,6 +6,7 @@ import gc
 import signal
 import threading
 from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -32,11 +33,17 @@ def run_cell(
     cannot be run, LinkError where the robot cannot be reached. ``log`` gets every event.
     """
     configuration = read_configuration(cell.path if isinstance(cell, Cell) else cell)
-    summary = run_daemon(configuration, observe, arm, duration, click.echo, log)
+    summary = run_daemon(configuration, observe, arm, duration, _say, log)
     for line in summary.lines():
         click.echo(line)
     gc.freeze()  # else Python's last collection, of all compiled code, delays the end by 0.5 s
     return summary.exit_code
+
+
+def _say(text: str) -> None:
+    """Print what happened, with the time of day."""
+    now = datetime.now()
+    click.echo(f"{now:%H:%M:%S}.{now.microsecond // 1000:03d} {text}")
 
 
 def run_daemon(

@@ -8,13 +8,15 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
-import time
+
+from gapbridge.core.clock import SYSTEM, Clock
 
 
 class ServiceManager:
     """Speaks to the service manager where there is one; silent where there is none."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock = SYSTEM) -> None:
+        self._now = clock.monotonic
         self._address = os.environ.get("NOTIFY_SOCKET", "")
         if self._address.startswith("@"):
             self._address = "\0" + self._address[1:]
@@ -35,7 +37,7 @@ class ServiceManager:
 
     def reloading(self) -> None:
         """Report that a changed cell file is being taken; ``ready`` follows."""
-        self._send(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
+        self._send(f"RELOADING=1\nMONOTONIC_USEC={int(1e6 * self._now())}")
 
     def stopping(self) -> None:
         """Report that the run ends."""
@@ -47,7 +49,7 @@ class ServiceManager:
 
     def kick(self) -> None:
         """Give a sign of life, where one is due; only to be called when there was progress."""
-        now = time.monotonic()
+        now = self._now()
         if self._every and now - self._kicked >= self._every:
             self._kicked = now
             self._send("WATCHDOG=1")

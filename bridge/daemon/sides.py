@@ -8,6 +8,7 @@ from typing import IO, Any
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
+from gapbridge.core.clock import SYSTEM, Clock
 
 SIDES: dict[str, tuple[str, Callable[[DaemonSettings], bool]]] = {
     "recorder": ("gapbridge.bridge.recording.main", lambda s: s.recording.folder is not None),
@@ -23,7 +24,8 @@ LITTLE = 0.3
 class Sides:
     """All side processes of a run."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock = SYSTEM) -> None:
+        self._clock = clock
         self._running: dict[str, SideProcess] = {}
 
     def start(
@@ -36,7 +38,7 @@ class Sides:
         """Start those that the settings want."""
         for name, (module, wanted) in SIDES.items():
             if wanted(settings):
-                self._running[name] = SideProcess(module, order, page, log)
+                self._running[name] = SideProcess(module, order, page, log, self._clock)
 
     def show(self, page: SharedMemory) -> None:
         """Have all change over to a page that the daemon shows."""

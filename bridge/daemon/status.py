@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections import deque
 from typing import Any
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from gapbridge.bridge.ipc.events import Event
 from gapbridge.bridge.loop.checks import NOTHING, UNSOLVED
 from gapbridge.bridge.loop.supervisor import HEALED_BY_RECONNECTING, Cause, State
+from gapbridge.core.clock import SYSTEM, Clock
 
 RATE_SPAN = 2.0  # s that the rate is taken over
 
@@ -37,9 +37,11 @@ def correction(flags: int, residual: float) -> dict[str, Any]:
 class DaemonStatus:
     """Keeps of cycles and events what the status document says; ``slices`` of a cycle's row."""
 
-    def __init__(self, slices: dict[str, slice]) -> None:
-        self.started = self._since = time.time()
+    def __init__(self, slices: dict[str, slice], clock: Clock = SYSTEM) -> None:
+        self._now = clock.monotonic
+        self.started = self._since = clock.time()
         self._why = ""
+        self._down = False  # the loop has ended and no other is connected
         self.armed_by = ""
         self._asked_by = ""  # of the last request to arm
         self.latched = ""  # the fault that waits for being acknowledged
@@ -51,10 +53,11 @@ class DaemonStatus:
         self._residual_at = slices["residual"].start
         self._correction = (0, 0.0)  # flags and residual, m, of the last cycle
         self.configured: Event = {}  # the last attempt to reload
+        self._compiling = ""  # what the loop's process is at before its first cycle
 
     def take(self, rows: NDArray[np.float64]) -> None:
         """Take note of cycles."""
-        now = time.monotonic()
+        now = self._now()
         if len(rows):
             self._heard = float(rows[-1, self._received])
             self._correction = int(rows[-1, self._flags]), float(rows[-1, self._residual_at])
@@ -68,10 +71,19 @@ class DaemonStatus:
             self.configured = event
         if event["kind"] == "request" and event["command"] == "arm":
             self._asked_by = event["by"]
+        if event["kind"] == "compiling":
+            self._compiling = event["detail"]
+        if event["kind"] == "granted":  # compiled, and about to connect
+            self._compiling = ""
+        if event["kind"] in ("fault", "failure"):  # the loop's process ends
+            if not self._down:
+                self._since, self._down = event["time"], True
+            self._why = event["detail"]
         if event["kind"] != "transition":
             return
+        self._compiling = ""
         to, cause, detail = event["to"], event["cause"], event["detail"]
-        self._since = event["time"]
+        self._since, self._down = event["time"], to == State.DISCONNECTED.name
         self._why = f"{cause}: {detail}" if detail else cause
         if to == State.FAULT.name:
             if cause != Cause.LATCHED:  # else it is the one that is known already
@@ -85,8 +97,17 @@ class DaemonStatus:
         if to not in (State.ARMED.name, State.COMPENSATING.name, State.HOLDING.name):
             self.armed_by = ""
 
+    def named(self, state: State) -> str:
+        """Return the state as the document names it: compiling is one of its own."""
+        return (
+            self._compiling
+            if state == State.DISCONNECTED and self._compiling
+            else (state.name.lower())
+        )
+
     def lost_loop(self) -> None:
         """Take note that link and loop are gone: faults of the link end with them."""
+        self._compiling = ""
         if self._heals:
             self.latched, self._heals = "", False
         self.armed_by = ""
@@ -102,7 +123,7 @@ class DaemonStatus:
 
     def link(self) -> dict[str, float | None]:
         """Return how old the last state is, s, and how many come in a second."""
-        now, batches = time.monotonic(), tuple(self._batches)
+        now, batches = self._now(), tuple(self._batches)
         rate = sum(n for _, n in batches[1:]) / max(now - batches[0][0], 1e-9) if batches else 0.0
         return {
             "age": None if self._heard is None else now - self._heard,

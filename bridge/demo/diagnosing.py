@@ -11,17 +11,17 @@ from typing import Self
 
 from gapbridge.core.errors import RunError
 
-LONGEST = 120.0  # s
+LONGEST = 900.0  # s, on a machine that stalls
 POLITE = 10  # niceness: the loop comes first
 
 
 class Diagnosing:
     """``gapbridge diagnose`` as a process of its own while the ``with`` block lasts."""
 
-    def __init__(self, log: Path, cell: Path, out: Path) -> None:
+    def __init__(self, log: Path, cell: Path, out: Path, new_cell: Path) -> None:
         self._command = [
             sys.executable, "-m", "gapbridge", "diagnose", str(log), "--cell", str(cell),
-            "--out", str(out),
+            "--out", str(out), "--apply", str(new_cell),
         ]  # fmt: skip
         self._process: subprocess.Popen[str] | None = None
 

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from gapbridge.bridge.cell import Cell, load_cell, save_cell
 from gapbridge.bridge.demo.diagnosing import Diagnosing
+from gapbridge.bridge.demo.hidden import accused_in
 from gapbridge.bridge.demo.links import DemoLink, demo_link
 from gapbridge.bridge.demo.links.link import free_address as _free_address
 from gapbridge.bridge.demo.links.ur_rtde import UrRtdeLink
@@ -24,6 +25,8 @@ from gapbridge.bridge.demo.result import Result
 from gapbridge.bridge.demo.session import Session
 from gapbridge.bridge.demo.terminal import show
 from gapbridge.bridge.document.output_file import write_text
+from gapbridge.bridge.document.provenance import provenance
+from gapbridge.bridge.document.svg import svg_file
 from gapbridge.bridge.loop.warm_up import warm_up
 from gapbridge.core.errors import RunError
 from gapbridge.core.estimation.identification import identify_compliance
@@ -55,7 +58,7 @@ def run_demo(seed: int, out: Path, link: str = "ur_rtde", console: Console | Non
     out.mkdir(parents=True, exist_ok=True)
     shown = kind(out, seed)
     warm_up()
-    console.print(f"simulated {shown.cell.arm.name} at {shown.host}, its flexibilities hidden")
+    console.print(f"simulated {shown.cell.arm.name} at {shown.host}, what bends it hidden")
     with shown.served():
         result = _job(shown, seed, out, console, begun)
     _write(result[0], result[1], out)
@@ -76,24 +79,45 @@ def _job(
     save_cell(cell, out / "calibrated.yaml", found.model)
     calibrated = load_cell(out / "calibrated.yaml")
     console.print(
-        f"fitted on {found.samples} poses: gap {found.gap_rms * 1e3:.3f} mm per coordinate before, "
-        f"{found.remaining_rms * 1e3:.3f} mm after"
+        f"fitted on {found.samples} poses: gap in space {3**0.5 * found.gap_rms * 1e3:.3f} mm rms "
+        f"before, {3**0.5 * found.remaining_rms * 1e3:.3f} mm after"
     )
     seen = _Visits()
-    with Diagnosing(log, cell.path, out / "diagnosis") as diagnosing:
+    explained: list[Rests] = []
+    better, folder = out / "explained.yaml", out / "diagnosis"
+    with Diagnosing(log, calibrated.path, folder, better) as diagnosing:
         for load, poses in zip(scene.test_loads, planned.test, strict=True):
             visits = np.tile(poses, (scene.visits, 1))
             _check(cell, calibrated, session, load, visits, seen, console)
-        console.print("diagnosing the calibration log")
+        console.print("diagnosing what the fit leaves of the calibration log")
         diagnosis = diagnosing.answer()
+    found_json = (folder / "diagnosis.json").read_text(encoding="utf-8")
+    accused = accused_in(json.loads(found_json))
+    names = dict.fromkeys(cause.effect for cause in accused)
+    console.print(f"named by the diagnosis, and applied: {', '.join(names) or 'nothing'}")
+    corrected = _fit_again(log, load_cell(better), out)
+    for load, poses in zip(scene.test_loads, planned.test, strict=True):
+        visits = np.tile(poses, (scene.visits, 1))
+        console.print(f"checking {len(visits)} visits with {load.name}, with that")
+        explained.append(session.visit(corrected, load, visits))
     result = Result(
         link=link.name, seed=seed, identification=found,
         model=calibrated.model, without=joined(seen.without), compensated=joined(seen.compensated),
         loads=tuple(seen.loads), setpoints_written=session.written, loop=session.figures(),
         duration=time.monotonic() - begun, resolution=link.resolution(),
-        test_loads=scene.test_loads,
+        test_loads=scene.test_loads, explained=joined(explained),
+        hidden=link.hidden, accused=accused,
     )  # fmt: skip
     return result, diagnosis
+
+
+def _fit_again(log: Path, explained: Cell, out: Path) -> Cell:
+    """Fit the flexibilities again beside what the diagnosis applied: alone they had bent to it."""
+    found = identify_compliance(
+        explained.model, read_log(log, explained.arm.n), explained.metrology
+    )
+    save_cell(explained, out / "corrected.yaml", found.model)
+    return load_cell(out / "corrected.yaml")
 
 
 def _calibrate(
@@ -127,13 +151,17 @@ def free_address() -> str:
 
 def _write(result: Result, diagnosis: str, out: Path) -> None:
     write_text(out / "summary.json", json.dumps(result.summary(), indent=1) + "\n")
-    write_text(out / "picture.svg", picture(result))
-    write_text(out / "report.html", page(result, diagnosis))
+    write_text(out / "picture.svg", svg_file(picture(result)))
+    files = {"log": [out / "calibration.csv"], "cell": [out / "calibrated.yaml"]}
+    write_text(out / "report.html", page(result, diagnosis, provenance(files)))
 
 
 def _require_success(result: Result) -> None:
     """Raise RunError where compensation did not help: nobody should take that for a success."""
     before, after = result.error_without, result.error_with
+    denials = [] if result.hidden is None else result.hidden.denials(result.accused)
+    if denials:
+        raise RunError(f"the diagnosis does not hold against the truth: {'; '.join(denials)}")
     if np.sqrt(np.mean(after**2)) > 0.2 * np.sqrt(np.mean(before**2)):
         raise RunError(
             f"compensation left {np.sqrt(np.mean(after**2)) * 1e3:.3f} mm of "

@@ -2,154 +2,167 @@
 
 from __future__ import annotations
 
-from html import escape
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from gapbridge.bridge.demo.picture import GREEN, RED, picture
+from gapbridge.bridge.demo.picture import arm_drawing, bars_drawing, coloured
 from gapbridge.bridge.demo.result import Result
+from gapbridge.bridge.demo.terminal import truth_rows
+from gapbridge.bridge.document.axes import Chart, logarithmic, named, scale
+from gapbridge.bridge.document.blocks import (
+    Block,
+    Bullets,
+    Cell,
+    Columns,
+    Document,
+    Heading,
+    Named,
+    Pairs,
+    Paragraph,
+    Part,
+    Pictures,
+    Table,
+)
+from gapbridge.bridge.document.drawing import AFTER, BEFORE, EDGE, INK, Drawing
+from gapbridge.bridge.document.html import html
+from gapbridge.bridge.document.provenance import origin_blocks, origin_line
 
-STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; color: #1f2933; max-width: 980px; margin: 2rem auto;
-  padding: 0 1rem; }
-h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2rem; }
-table { border-collapse: collapse; } td, th { padding: .2rem .8rem; text-align: right; }
-th { border-bottom: 1px solid #9aa5b1; } .figures td:first-child { text-align: left; }
-svg { max-width: 100%; height: auto; }
-pre { background: #f5f7fa; padding: 1rem; white-space: pre-wrap; }
-"""
-
-
-def page(result: Result, diagnosis: str) -> str:
-    """Return the page; ``diagnosis`` is the diagnosis in plain sentences."""
-    from plotly.offline import get_plotlyjs
-
-    charts = [_errors(result), _flexibilities(result)]
-    return "\n".join([
-        "<!doctype html>",
-        '<html lang="en"><head><meta charset="utf-8"><title>Gapbridge demo</title>',
-        f"<style>{STYLE}</style>",
-        f"<script>{get_plotlyjs()}</script></head><body>",
-        f"<h1>The whole job on a simulated {escape(result.model.arm.name)}</h1>",
-        _lead(result),
-        picture(result),
-        "<h2>Every visit</h2>", charts[0],
-        "<h2>What was found of the arm</h2>", charts[1], _flexibility_table(result),
-        "<h2>What the diagnosis says of the calibration log</h2>",
-        f"<pre>{escape(diagnosis)}</pre>",
-        '<p>In pictures: <a href="diagnosis/report.html">the diagnosis</a>.</p>',
-        "<h2>How it was done</h2>", _figures(result),
-        "</body></html>",
-    ]) + "\n"  # fmt: skip
+NEXT_STEPS = (
+    "Write a cell for your own robot: gapbridge init HOST --out CELL, or copy "
+    "config/ur10e_simulated.yaml.",
+    "Check it: gapbridge check CELL --live, then watch it: gapbridge run CELL --observe.",
+    "Calibrate it with an instrument: gapbridge calibrate CELL.",
+)
 
 
-def _lead(result: Result) -> str:
+def page(result: Result, diagnosis: str, origin: Mapping[str, Any] | None = None) -> str:
+    """Return the page; ``diagnosis`` is in plain sentences, ``origin`` the run's provenance."""
+    return html(document(result, diagnosis, origin or {}))
+
+
+def document(result: Result, diagnosis: str, origin: Mapping[str, Any]) -> Document:
+    """Return the report as blocks."""
+    parts: list[tuple[str, str, list[Block]]] = [
+        ("result", "The result", _result(result)),
+        ("truth", "The hidden truth, and what was found", _truth(result)),
+        ("visits", "Every visit", [Pictures((_errors(result),))]),
+        ("flexibilities", "What was found of the arm", _flexibilities(result)),
+        ("diagnosis", "What the diagnosis says of what the fit leaves", _diagnosis(diagnosis)),
+        ("figures", "How it was done", [_figures(result), *origin_blocks(origin)]),
+    ]
+    software = origin_line(origin)
+    return Document(
+        f"The whole job on a simulated {result.model.arm.name}",
+        f"Link {result.link}, seed {result.seed} · {software}",
+        tuple(Part(key, title, "", tuple(blocks)) for key, title, blocks in parts if blocks),
+        f"Demo of {software}, seed {result.seed}",
+    )
+
+
+def _result(result: Result) -> list[Block]:
     errors = result.summary()["tcp_error_mm"]
     ratio = errors["without"]["rms"] / errors["with"]["rms"]
-    return (
-        f"<p>Without compensation the tool misses its place by {errors['without']['rms']:.3f} mm "
+    lead = (
+        f"Without compensation the tool misses its place by {errors['without']['rms']:.3f} mm "
         f"rms (at most {errors['without']['max']:.3f}); with it, by {errors['with']['rms']:.3f} mm "
         f"({errors['with']['max']:.3f}): {ratio:.0f} times less. The arm comes back to a place "
         f"within {result.repeatability * 1e3:.3f} mm. The arm's flexibilities are drawn from seed "
-        f"{result.seed}; nothing that corrects the arm knows them.</p>"
+        f"{result.seed}; nothing that corrects the arm knows them."
     )
-
-
-def _chart(traces: list[Any], title_y: str, title_x: str, **layout: Any) -> str:
-    import plotly.graph_objects as go
-
-    figure = go.Figure(traces)
-    figure.update_layout(
-        template="plotly_white", height=380, margin={"l": 60, "r": 20, "t": 30, "b": 50},
-        xaxis_title=title_x, yaxis_title=title_y, **layout,
-    )  # fmt: skip
-    text: str = figure.to_html(full_html=False, include_plotlyjs=False)
-    return text
-
-
-def _errors(result: Result) -> str:
-    import plotly.graph_objects as go
-
-    visit = np.arange(1, len(result.loads) + 1)
-    told = [
-        f"{load}<br>q = {np.round(q, 3).tolist()}"
-        for load, q in zip(result.loads, result.without.nominal_q, strict=True)
-    ]
-    traces: list[Any] = [
-        go.Scatter(x=visit, y=error * 1e3, mode="markers", name=name, text=told,
-                   marker={"color": colour, "size": 10})
-        for name, error, colour in (
-            ("without", result.error_without, RED),
-            ("with compensation", result.error_with, GREEN),
-        )
+    return [
+        Paragraph(lead, "lead"), Heading("What to do now"), Bullets(NEXT_STEPS),
+        Pictures((arm_drawing(result), bars_drawing(result))),
     ]  # fmt: skip
-    traces.append(
-        go.Scatter(x=visit[[0, -1]], y=[result.repeatability * 1e3] * 2, mode="lines",
-                   name="repeatability", line={"color": "#9aa5b1", "dash": "dash"})
-    )  # fmt: skip
-    return _chart(traces, "distance from the wanted place, mm", "visit", yaxis_type="log")
 
 
-def _flexibilities(result: Result) -> str:
-    import plotly.graph_objects as go
-
-    found = result.identification
-    joints = [f"joint {i + 1}" for i in range(len(found.axial))]
-    traces = [
-        go.Bar(
-            x=joints,
-            y=np.where(shown, value * 1e6, 0),
-            name=name,
-            error_y={"array": 2e6 * np.where(shown, std, 0)},
-        )
-        for name, value, std, shown in (
-            ("axial", found.axial, found.std_axial, found.identifiable[: len(joints)]),
-            ("radial", found.radial, found.std_radial, found.identifiable[len(joints) :]),
-        )
+def _truth(result: Result) -> list[Block]:
+    """Return what was hidden beside what was found; nothing where nothing was hidden."""
+    if result.hidden is None:
+        return []
+    fitted = result.summary()["tcp_error_mm"]["fitted"]["rms"]
+    rows: list[list[Cell]] = [
+        [Named("", code=name), truly, found or "not found"]
+        for name, truly, found in truth_rows(result)
     ]
-    return _chart(traces, "flexibility, 1e-6 rad/Nm (bars: 2 sigma)", "", barmode="group")
+    return [
+        Paragraph(f"The fitted flexibilities alone left {fitted:.3f} mm: {result.hidden.about}."),
+        Table(("parameter", "truly", "found"), rows),
+    ]  # fmt: skip
 
 
-def _flexibility_table(result: Result) -> str:
+def _errors(result: Result) -> Drawing:
+    rounds = coloured(result)
+    visit = [float(i) for i in range(1, len(result.loads) + 1)]
+    every = [v * 1e3 for _, error, _ in rounds for v in error]
+    chart = Chart("Distance from the wanted place", scale("visit", visit, zero=False),
+                  logarithmic("mm", [*every, result.repeatability * 1e3]), width=520)  # fmt: skip
+    for _, error, colour in rounds:
+        hints = [
+            f"{load}: {e * 1e3:.3f} mm, q = {np.round(q, 3).tolist()}"
+            for load, e, q in zip(result.loads, error, result.without.nominal_q, strict=True)
+        ]
+        chart.points(visit, [*error * 1e3], colour, radius=3.4, hints=hints)
+    chart.level(result.repeatability * 1e3, "repeatability", EDGE)
+    chart.legend([(name, colour) for name, _, colour in rounds])
+    return chart.drawing
+
+
+def _flexibilities(result: Result) -> list[Block]:
     found = result.identification
     n = len(found.axial)
-
-    def cell(value: float, std: float, shown: bool) -> str:
-        told = f"{value * 1e6:.3f} ± {std * 1e6:.3f}" if shown else "not identifiable"
-        return f"<td>{told}</td>"
-
-    rows = "".join(
-        f"<tr><td>{i + 1}</td>"
-        + cell(found.axial[i], found.std_axial[i], bool(found.identifiable[i]))
-        + cell(found.radial[i], found.std_radial[i], bool(found.identifiable[n + i]))
-        + "</tr>"
-        for i in range(n)
+    kinds = (
+        ("axial", found.axial, found.std_axial, found.identifiable[:n], BEFORE, -0.2),
+        ("radial", found.radial, found.std_radial, found.identifiable[n:], AFTER, 0.2),
     )
-    notes = "".join(f"<li>{escape(n)}</li>" for n in (*found.notes, *found.combinations))
-    return (
-        "<table><tr><th>joint</th><th>axial, 1e-6 rad/Nm</th><th>radial, 1e-6 rad/Nm</th></tr>"
-        f"{rows}</table><ul>{notes}</ul>"
-    )
+    tops = [v * 1e6 for _, value, std, shown, _, _ in kinds for v in (value + 2 * std)[shown]]
+    labels = [f"joint {i + 1}" for i in range(n)]
+    chart = Chart("Flexibility, lines: 2 sigma", named("", labels), scale("µrad/Nm", tops),
+                  width=520)  # fmt: skip
+    cells: list[list[str]] = [[str(i + 1)] for i in range(n)]
+    for _, value, std, shown, colour, shift in kinds:
+        for i in range(n):
+            if not shown[i]:
+                cells[i].append("not identifiable")
+                continue
+            v, s = float(value[i]) * 1e6, float(std[i]) * 1e6
+            cells[i].append(f"{v:.3f} ± {s:.3f}")
+            chart.column(i + shift, v, colour, 0.36)
+            chart.line([i + shift] * 2, [max(v - 2 * s, 0.0), v + 2 * s], INK)
+    chart.legend([(name, colour) for name, _, _, _, colour, _ in kinds])
+    notes = (*found.notes, *found.combinations)
+    heads = ("joint", "axial, µrad/Nm", "radial, µrad/Nm")
+    return [
+        Pictures((chart.drawing,)), Table(heads, cells, (0.5, 1, 1)),
+        *([Bullets(notes)] if notes else []),
+    ]  # fmt: skip
+
+
+def _diagnosis(text: str) -> list[Block]:
+    lines = [line.strip() for line in text.splitlines()]
+    return [
+        *(Paragraph(line) for line in lines if line),
+        Paragraph("In pictures: diagnosis/report.html.", "note"),
+    ]
 
 
 def _count(length: float) -> str:
     return f"{length * 1e3:.3g} mm" if length else "64-bit floats"
 
 
-def _figures(result: Result) -> str:
+def _figures(result: Result) -> Columns:
     figures, loop = result.summary(), result.loop
-    lines = (
+    pairs = (
         ("link", result.link),
         ("measured poses in the fit", f"{figures['samples']}"),
         ("setpoints written", f"{figures['setpoints_written']}"),
         ("rate of the loop", f"{loop.rate:.1f} Hz"),
         ("cycles missed", f"{loop.missed} of {loop.cycles}"),
-        ("age of the state behind a setpoint, p99", f"{loop.p99:.0f} us"),
+        ("age of the state behind a setpoint, p99", f"{loop.p99:.0f} µs"),
         ("one count of what is written, at the TCP", _count(result.resolution.written)),
         ("one count of the joints as read, at the TCP", _count(result.resolution.read)),
         ("what that means", result.resolution.note or "nothing is lost on the wire"),
         ("whole demo", f"{result.duration:.0f} s"),
     )
-    rows = "".join(f"<tr><td>{escape(k)}</td><td>{escape(v)}</td></tr>" for k, v in lines)
-    return f'<table class="figures">{rows}</table>'
+    return Columns((Pairs(pairs),))

@@ -1,112 +1,105 @@
-"""The picture of a demo run as SVG: the arm as it hangs, and the error pose by pose."""
+"""The picture of a demo run: the arm as it hangs, and the error pose by pose."""
 
 from __future__ import annotations
-
-from html import escape
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.bridge.demo.poses import Load
 from gapbridge.bridge.demo.result import Result, visits_of_poses
-from gapbridge.core.kernels import reference as kernel
-from gapbridge.core.loads import Loads
-from gapbridge.core.model import Model
+from gapbridge.bridge.document.drawing import (
+    BAD_DOT,
+    BEFORE,
+    EDGE,
+    INK,
+    LIMIT,
+    SOFT,
+    Circle,
+    Drawing,
+    Rectangle,
+    Stroke,
+    Text,
+)
+from gapbridge.bridge.document.skeleton import skeleton
 
 Array = NDArray[np.float64]
-WIDTH, HEIGHT = 960, 420
+WIDTH, HEIGHT = 430.0, 380.0
 MAGNIFIED = 60  # times the bending is drawn larger
-INK, FAINT, RED, GREEN = "#1f2933", "#9aa5b1", "#d64545", "#2f9e5b"
+COLOURS = {2: (BAD_DOT, LIMIT), 3: (BAD_DOT, BEFORE, LIMIT)}  # by the number of rounds of visits
 
 
-def skeleton(model: Model, q: Array, load: Load) -> Array:
-    """Return base, joint origins, flange and TCP (n+3, 3) in base, bent as the model says."""
-    shape = kernel.new_shape(model.arm.n)
-    rows = model.rows(q[None], load.rows(1) if model.terms else Loads())
-    kernel.equilibrium(model.chain(), rows, 0, shape)
-    return np.vstack([np.zeros(3), shape.origin, shape.tcp_position])
+def coloured(result: Result) -> list[tuple[str, Array, str]]:
+    """Return name, errors (M,), m, and colour of each round of visits."""
+    colours = COLOURS[len(result.series)]
+    return [(name, e, c) for (name, e), c in zip(result.series, colours, strict=True)]
 
 
-def picture(result: Result) -> str:
-    """Return the whole picture."""
-    parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" '
-        f'width="{WIDTH}" height="{HEIGHT}" font-family="system-ui, sans-serif" '
-        f'role="img" aria-label="TCP error without and with compensation">',
-        f'<rect width="{WIDTH}" height="{HEIGHT}" fill="#ffffff"/>',
-        _arm(result),
-        _bars(result),
-        "</svg>",
-    ]
-    return "\n".join(parts) + "\n"
-
-
-def _text(x: float, y: float, text: str, size: int = 13, colour: str = INK, more: str = "") -> str:
-    place = f'x="{x:.1f}" y="{y:.1f}" font-size="{size}" fill="{colour}"'
-    return f"<text {place} {more}>{escape(text)}</text>"
-
-
-def _bold(x: float, y: float, text: str, colour: str = INK, size: int = 13) -> str:
-    return _text(x, y, text, size, colour, 'font-weight="600"')
-
-
-def _arm(result: Result) -> str:
-    """Draw the arm at the test visit with the largest error, seen from its side."""
+def arm_drawing(result: Result) -> Drawing:
+    """Return the arm at the test visit with the largest error, seen from its side."""
     visit = int(np.argmax(result.error_without))
     q = result.without.nominal_q[visit]
     load = next(known for known in result.test_loads if known.name == result.loads[visit])
-    rigid = skeleton(result.model.without_terms(), q, load)
-    bent = rigid + MAGNIFIED * (skeleton(result.model, q, load) - rigid)
+    rigid = skeleton(result.model.without_terms(), q)
+    loads = load.rows(1) if result.model.terms else None
+    bent = rigid + MAGNIFIED * (skeleton(result.model, q, loads) - rigid)
     ahead = rigid[-1, :2] / np.linalg.norm(rigid[-1, :2])
     side = np.array([[ahead[0], 0.0], [ahead[1], 0.0], [0.0, 1.0]])  # towards the tool, up
-    drawn = [points @ side for points in (rigid, bent)]
-    both = np.vstack(drawn)
-    low, high = both.min(axis=0), both.max(axis=0)
-    scale = min(380 / max(high[0] - low[0], 0.1), 270 / max(high[1] - low[1], 0.1))
+    flat = [points @ side for points in (rigid, bent)]
+    low, high = np.vstack(flat).min(axis=0), np.vstack(flat).max(axis=0)
+    scale = min(380 / max(high[0] - low[0], 0.1), 280 / max(high[1] - low[1], 0.1))
     middle = (low + high) / 2
 
     def at(point: Array) -> tuple[float, float]:
-        return 225 + (point[0] - middle[0]) * scale, 225 - (point[1] - middle[1]) * scale
+        x, y = (point - middle) * scale
+        return WIDTH / 2 + float(x), 185 - float(y)
 
-    parts = [_bold(30, 34, "One test pose, seen from the side", size=16)]
-    for points, colour, width in ((drawn[0], FAINT, 9), (drawn[1], RED, 4)):
+    drawing = Drawing(WIDTH, HEIGHT, "The arm at one test pose, as it was wanted and as it hangs")
+    drawing.add(Text(0, 16, "One test pose, seen from the side", 14, bold=True))
+    for points, colour, width in ((flat[0], EDGE, 9.0), (flat[1], BAD_DOT, 4.0)):
         places = [at(point) for point in points]
-        line = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
-        stroke = f'stroke="{colour}" stroke-width="{width}"'
-        parts.append(f'<polyline points="{line}" fill="none" stroke-linejoin="round" {stroke}/>')
-        stroke = f'r="{width / 2 + 1:.1f}" fill="#ffffff" stroke="{colour}" stroke-width="2"'
-        parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" {stroke}/>' for x, y in places]
+        drawing.line(places, Stroke(colour, width))
+        for place in places:
+            drawing.add(Circle(*place, width / 2 + 1, colour))
     x, y = at(rigid[0] @ side)
-    parts.append(f'<rect x="{x - 32:.1f}" y="{y:.1f}" width="64" height="8" fill="{INK}"/>')
-    parts.append(_bold(30, 388, "where it was wanted", "#6b7785"))
-    parts.append(_bold(30, 406, f"how it hangs, bending drawn {MAGNIFIED} times larger", RED))
-    return "\n".join(parts)
+    drawing.add(Rectangle(x - 32, y, 64, 8, INK))
+    drawing.add(Text(0, 352, "where it was wanted", 12.5, SOFT, bold=True))
+    text = f"how it hangs, bending drawn {MAGNIFIED} times larger"
+    drawing.add(Text(0, 371, text, 12.5, BAD_DOT, bold=True))
+    return drawing
 
 
-def _bars(result: Result) -> str:
-    """Draw error without and with compensation for each test pose."""
-    left, top, width = 560, 58, 300
-    poses = visits_of_poses(result)
-    before, after = result.error_without * 1e3, result.error_with * 1e3
-    longest = float(before.max())
-    step = min(300 / len(poses), 34)
-    parts = [_bold(490, 34, "Distance of the TCP from where it was wanted, mm", size=16)]
+def bars_drawing(result: Result) -> Drawing:
+    """Return the error of each test pose, without and with compensation."""
+    left, width = 60.0, 320.0
+    poses, rounds = visits_of_poses(result), coloured(result)
+    longest = float(rounds[0][1].max())
+    step = min(284 / len(poses), 34)
+    drawing = Drawing(WIDTH, HEIGHT, "TCP error without and with compensation")
+    title = "Distance of the TCP from where it was wanted, mm"
+    drawing.add(Text(0, 16, title, 14, bold=True))
     for number, rows in enumerate(poses):
-        y = top + number * step
-        parts.append(_text(490, y + step * 0.55, f"pose {number + 1}", 12, FAINT))
-        for k, (values, colour) in enumerate(((before, RED), (after, GREEN))):
-            value = float(values[rows].mean())
-            height = step * 0.36
-            length = max(width * value / longest, 1.0)
-            y_bar = y + k * (height + 1)
-            parts.append(f'<rect x="{left}" y="{y_bar:.1f}" width="{length:.1f}" '
-                         f'height="{height:.1f}" fill="{colour}"/>')  # fmt: skip
-            parts.append(_text(left + length + 5, y_bar + height - 1, f"{value:.2f}", 10, colour))
-    figures = result.summary()
-    errors = figures["tcp_error_mm"]
-    without, with_it = errors["without"]["rms"], errors["with"]["rms"]
-    repeats = figures["repeatability_mm"]
-    parts.append(_bold(490, 370, f"without compensation {without:.2f} mm rms", RED))
-    parts.append(_bold(490, 388, f"with compensation {with_it:.3f} mm rms", GREEN))
-    parts.append(_bold(490, 406, f"the arm repeats to {repeats:.3f} mm", "#6b7785"))
-    return "\n".join(parts)
+        y = 34 + number * step
+        drawing.add(Text(0, y + step * 0.5, f"pose {number + 1}", 11, SOFT))
+        height = step * 0.74 / len(rounds)
+        for k, (_, error, colour) in enumerate(rounds):
+            value = float(error[rows].mean())
+            length, top = max(width * value / longest, 1.0), y + k * height
+            drawing.add(Rectangle(left, top, length, height - 0.8, colour))
+            figure = f"{value * 1e3:.2f}"
+            drawing.add(Text(left + length + 5, top + height - 1.5, figure, 9, colour))
+    lines = [
+        (f"{name}: {np.sqrt(np.mean(error**2)) * 1e3:.3f} mm rms", colour)
+        for name, error, colour in rounds
+    ]
+    lines.append((f"the arm repeats to {result.repeatability * 1e3:.3f} mm", SOFT))
+    for k, (text, colour) in enumerate(reversed(lines)):
+        drawing.add(Text(0, 374 - 16 * k, text, 12.5, colour, bold=True))
+    return drawing
+
+
+def picture(result: Result) -> Drawing:
+    """Return both side by side, as one drawing."""
+    arm, bars = arm_drawing(result), bars_drawing(result)
+    both = Drawing(2 * WIDTH + 40, HEIGHT, bars.title, [*arm.shapes])
+    for shape in bars.shapes:
+        both.add(shape.moved(WIDTH + 40, 0.0))
+    return both

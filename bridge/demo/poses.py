@@ -65,7 +65,7 @@ class Scene:
     calibration_loads: tuple[Load, ...]
     test_loads: tuple[Load, ...]
     calibrate: int = 11  # poses per calibration load
-    test: int = 4  # poses per test load
+    test: int = 3  # poses per test load
     visits: int = 3  # of each test pose: what differs between them is the arm's repeatability
 
 

@@ -106,7 +106,8 @@ def _rest(
     return (
         np.array(begin),
         pose,
-        recording["actual_q"][during].mean(axis=0),
+        # the middle one: the servo's tail, some nanoradians, is no place to rest at
+        np.median(recording["actual_q"][during], axis=0),
         recording["payload"][during].mean(),
         recording["payload_cog"][during].mean(axis=0),
         recording["actual_TCP_force"][during].mean(axis=0),

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.bridge.demo.hidden import Accused, Hidden
 from gapbridge.bridge.demo.poses import TEST_LOADS, Load
 from gapbridge.bridge.demo.rests import Rests
 from gapbridge.core.estimation.identification import Identification
@@ -51,6 +52,9 @@ class Result:
     duration: float  # s
     resolution: Resolution = Resolution(0.0, 0.0)
     test_loads: tuple[Load, ...] = TEST_LOADS
+    explained: Rests | None = None  # the same visits, corrected by what the diagnosis named too
+    hidden: Hidden | None = None  # the truth beside the flexibilities
+    accused: tuple[Accused, ...] = ()  # by the diagnosis, with the fitted flexibilities
 
     @property
     def error_without(self) -> Array:
@@ -58,9 +62,24 @@ class Result:
         return tcp_error(self.model, self.without)
 
     @property
-    def error_with(self) -> Array:
-        """Return the same with compensation."""
+    def error_fitted(self) -> Array:
+        """Return the same, corrected by the fitted flexibilities alone."""
         return tcp_error(self.model, self.compensated)
+
+    @property
+    def error_with(self) -> Array:
+        """Return the same, corrected by all that was found."""
+        return tcp_error(self.model, self.explained or self.compensated)
+
+    @property
+    def series(self) -> tuple[tuple[str, Array], ...]:
+        """Return the errors (M,) of each round of visits, by what corrected them."""
+        if self.explained is None:
+            return (("without", self.error_without), ("with compensation", self.error_with))
+        return (
+            ("without", self.error_without), ("fit alone", self.error_fitted),
+            ("fit and diagnosis", self.error_with),
+        )  # fmt: skip
 
     @property
     def repeatability(self) -> float:
@@ -75,7 +94,14 @@ class Result:
             "samples": self.identification.samples,
             "tcp_error_mm": {
                 "without": millimetres(self.error_without),
+                "fitted": millimetres(self.error_fitted),
                 "with": millimetres(self.error_with),
+            },
+            "hidden": None if self.hidden is None else dict(self.hidden.truth),
+            "accused": {
+                name: {"value": value, "std": std, "unit": unit}
+                for cause in self.accused
+                for name, value, std, unit in cause.parameters
             },
             "repeatability_mm": self.repeatability * 1e3,
             "resolution_mm": self.resolution.written * 1e3,

@@ -22,18 +22,22 @@ def bar(share: float, width: int = WIDTH) -> str:
 def show(result: Result, console: Console | None = None) -> None:
     """Print what the demo has shown."""
     console = console or Console()
-    before, after = result.error_without * 1e3, result.error_with * 1e3
+    series = [(name, error * 1e3) for name, error in result.series]
+    before = series[0][1]
     table = Table(title="distance of the TCP from where it was wanted, mm", title_justify="left")
-    for name in ("pose", "load", "without", "with", ""):
+    names = [name for name, _ in series]
+    for name in ("pose", "load", *names, ""):
         table.add_column(name, justify="left" if name in ("load", "") else "right")
     longest = float(before.max())
     for row in visits_of_poses(result):
-        bars = Text(bar(before[row].mean() / longest), style="red")
-        bars.append("\n" + bar(after[row].mean() / longest), style="green")
+        means = [float(values[row].mean()) for _, values in series]
+        styles = ("red", "yellow", "green") if len(means) == 3 else ("red", "green")
+        bars = Text()
+        for k, (mean, style) in enumerate(zip(means, styles, strict=True)):
+            bars.append(("\n" if k else "") + bar(mean / longest), style=style)
         table.add_row(
-            str(len(table.rows) + 1), result.loads[row[0]], f"{before[row].mean():.3f}",
-            f"{after[row].mean():.3f}", bars,
-        )  # fmt: skip
+            str(len(table.rows) + 1), result.loads[row[0]], *(f"{m:.3f}" for m in means), bars
+        )
     console.print(table)
     figures = result.summary()
     errors, loop = figures["tcp_error_mm"], figures["loop"]
@@ -43,6 +47,8 @@ def show(result: Result, console: Console | None = None) -> None:
         f"with compensation: {ratio:.0f} times smaller; the arm repeats to "
         f"{figures['repeatability_mm']:.3f} mm"
     )
+    for line in truth_lines(result):
+        console.print(line, highlight=False)
     if result.resolution.written:
         console.print(
             f"one count written is {figures['resolution_mm']:.3g} mm at the TCP, one count of the "
@@ -53,3 +59,32 @@ def show(result: Result, console: Console | None = None) -> None:
         f"written at {loop['rate_hz']:.1f} Hz, {loop['missed']} of {loop['cycles']} cycles missed, "
         f"state behind a setpoint {loop['p99_us']:.0f} us old (p99)"
     )
+
+
+def truth_lines(result: Result) -> list[str]:
+    """Return what was hidden beside what was found, a line each; none where nothing was hidden."""
+    if result.hidden is None:
+        return []
+    fitted = result.summary()["tcp_error_mm"]["fitted"]["rms"]
+    lines = [f"the fitted flexibilities alone left {fitted:.3f} mm: {result.hidden.about}"]
+    return lines + [
+        f"  {name}: truly {true}, {f'found {found}' if found else 'not found'}"
+        for name, true, found in truth_rows(result)
+    ]
+
+
+def truth_rows(result: Result) -> list[tuple[str, str, str]]:
+    """Return parameter, truth and what was found of it (empty: nothing) of all that was hidden."""
+    found = {
+        name: (value, std, unit) for c in result.accused for name, value, std, unit in c.parameters
+    }
+    rows = []
+    for name, true in ({} if result.hidden is None else result.hidden.truth).items():
+        if name not in found:
+            rows.append((name, f"{true:+.3g}", ""))
+            continue
+        value, std, unit = found[name]
+        times, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
+        deviation = f"{value * times:+.3g} ± {std * times:.1g} {unit}"
+        rows.append((name, f"{true * times:+.3g} {unit}", deviation))
+    return rows

@@ -6,12 +6,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from gapbridge.bridge.document.drawing import (
     EDGE,
     GRID,
     INK,
     SOFT,
     Circle,
+    Dots,
     Drawing,
     Line,
     Point,
@@ -49,14 +53,17 @@ class Scale:
         return (value - self.low) / (self.high - self.low)
 
 
-def scale(title: str, values: Sequence[float], *, tight: bool = False, ticks: int = 4) -> Scale:
-    """Return a scale that holds 0 and all values, with round ticks.
+def scale(
+    title: str, values: Sequence[float], *, tight: bool = False, ticks: int = 4, zero: bool = True
+) -> Scale:
+    """Return a scale that holds all values, and 0 where ``zero``, with round ticks.
 
     It begins and ends at a tick, or, ``tight``, a little beyond the values.
     """
     finite = [float(v) for v in values if math.isfinite(v)] or [0.0]
     low, high = min(finite), max(finite)
-    low, high = min(low, 0.0), max(high, 0.0)
+    if zero:
+        low, high = min(low, 0.0), max(high, 0.0)
     if high - low < 1e-12:
         high = low + 1.0
     step = _round_step((high - low) / ticks)
@@ -128,9 +135,10 @@ class Chart:
         opacity: float = 0.75, hints: Sequence[str] = (),
     ) -> None:  # fmt: skip
         """Draw a dot for each value."""
-        for i, (a, b) in enumerate(zip(x, y, strict=True)):
-            place = self.at(float(a), float(b))
-            hint = hints[i] if hints else ""
+        places = tuple(self.at(float(a), float(b)) for a, b in zip(x, y, strict=True))
+        if not hints:
+            self.drawing.add(Dots(places, radius, colour, opacity))
+        for place, hint in zip(places, hints, strict=False):
             self.drawing.add(Circle(*place, radius, colour, opacity=opacity, hint=hint))
 
     def line(
@@ -157,6 +165,18 @@ class Chart:
         a, b = self.at(x, y)
         self.drawing.add(Rectangle(a - side / 2, b - side / 2, side, side, colour))
 
+    def bar(self, y: float, x: float, colour: str, width: float, hint: str = "") -> None:
+        """Draw a bar from 0 to the right, centred at ``y``; ``width`` in units of y."""
+        left, top = self.at(0.0, y + width / 2)
+        right, bottom = self.at(x, y - width / 2)
+        self.drawing.add(Rectangle(left, top, max(right - left, 0.5), bottom - top, colour, hint))
+
+    def upright(self, x: float, text: str, colour: str) -> None:
+        """Draw a dashed line upwards, with what it means at its top."""
+        self.line([x, x], [self.y.low, self.y.high], colour, width=1.2, dashed=True)
+        place = self.at(x, self.y.high)
+        self.drawing.add(Text(place[0] + 3, place[1] + 8, text, 10, colour))
+
     def level(self, y: float, text: str, colour: str) -> None:
         """Draw a dashed line across, with what it means at its right end."""
         self.line([self.x.low, self.x.high], [y, y], colour, width=1.2, dashed=True)
@@ -171,6 +191,14 @@ class Chart:
             self.drawing.add(Text(x, 13, text, 10.5, SOFT))
             self.drawing.add(Circle(x - 7, 9.5, 3.6, colour))
             x -= 22
+
+    def legend_below(self, entries: Sequence[tuple[str, str]]) -> None:
+        """Say what the colours mean in lines below the axes, for long texts."""
+        for text, colour in entries:
+            y = self.drawing.height + 8
+            self.drawing.add(Circle(self.left + 4, y - 3.5, 3.6, colour))
+            self.drawing.add(Text(self.left + 13, y, text, 10, SOFT))
+            self.drawing.height += 15
 
     def _make_equal(self) -> None:
         """Give both axes the same number of units to the pixel."""
@@ -203,3 +231,24 @@ class Chart:
 def _widened(given: Scale, span: float) -> Scale:
     middle = (given.low + given.high) / 2
     return Scale(given.title, middle - span / 2, middle + span / 2, given.ticks, given.labels)
+
+
+def distribution(
+    title: str, quantity: str, series: Sequence[tuple[str, NDArray[np.float64], str]]
+) -> Chart:
+    """Return the share of values that are at most so large, per series of (name, values, colour).
+
+    ``quantity`` names the values, which stand in powers of ten.
+    """
+    every = [float(v) for _, values, _ in series for v in values]
+    chart = Chart(title, logarithmic(quantity, visible(every)), scale("share, %", [0, 100]))
+    for _, values, colour in series:
+        ordered = np.sort(values)
+        if len(ordered) > 400:  # a finer step is no wider than a line
+            ordered = ordered[np.linspace(0, len(ordered) - 1, 400).astype(int)]
+        x = [v for v in ordered for _ in (0, 1)]
+        share = [100.0 * k / len(ordered) for k in range(len(ordered) + 1)]
+        y = [v for v in share for _ in (0, 1)]
+        chart.line([chart.x.low, *x, chart.x.high], y, colour, width=2.0)
+    chart.legend([(name, colour) for name, _, colour in series])
+    return chart

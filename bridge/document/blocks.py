@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from gapbridge.bridge.document.drawing import Drawing
+from gapbridge.bridge.document.drawing import AFTER, Drawing
+from gapbridge.bridge.document.scene import Scene
 
 GOOD, DOUBTFUL, BAD, QUIET = "good", "doubtful", "bad", "quiet"
 
@@ -29,11 +31,27 @@ class Badge:
 class Bar:
     """A small bar for a share of 0 to 1, with its figure beside it."""
 
-    share: float
+    share: float | None
     text: str
+    colour: str = AFTER
+
+    @property
+    def filled(self) -> float:
+        """Return the share that can be drawn, 0 to 1."""
+        given = self.share
+        return 0.0 if given is None or not math.isfinite(given) else min(max(given, 0.0), 1.0)
 
 
-Cell = str | Strong | Badge | Bar
+@dataclass(frozen=True)
+class Named:
+    """A name in bold, what belongs to it, and its identifier below."""
+
+    text: str
+    more: str = ""
+    code: str = ""
+
+
+Cell = str | Strong | Badge | Bar | Named
 
 
 @dataclass(frozen=True)
@@ -42,6 +60,7 @@ class Verdict:
 
     badge: Badge
     text: str
+    more: tuple[Badge, ...] = ()  # beside the first
 
 
 @dataclass(frozen=True)
@@ -116,7 +135,47 @@ class Pictures:
     caption: str = ""
 
 
-Block = Verdict | Tiles | Heading | Paragraph | Bullets | Columns | Table | Pictures
+@dataclass(frozen=True)
+class Beside:
+    """Small tables side by side where there is room."""
+
+    tables: tuple[Table, ...]
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """One drawing of several, which the page's menus choose from; paper shows the first.
+
+    ``menus`` are titles with their entries; the drawings stand in the order of the menus' entries,
+    those of the last menu next to each other.
+    """
+
+    menus: tuple[tuple[str, tuple[str, ...]], ...]
+    drawings: tuple[Drawing, ...]
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class View:
+    """Lines in space, which the page lets one turn; paper shows them from one side."""
+
+    scene: Scene
+    caption: str = ""
+
+
+Block = (
+    Verdict
+    | Tiles
+    | Heading
+    | Paragraph
+    | Bullets
+    | Columns
+    | Table
+    | Beside
+    | Pictures
+    | Gallery
+    | View
+)
 
 
 @dataclass(frozen=True)

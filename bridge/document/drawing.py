@@ -1,12 +1,30 @@
-"""Drawings: a few shapes in a plane, which the HTML writes as SVG and the PDF as its own lines."""
+"""Drawings: a few shapes in a plane, described once; HTML writes them as SVG, PDF as its lines.
+
+Colours are names of PALETTE, so that a page can show them dark.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Self
 
-INK, SOFT, GRID, EDGE = "#1c2730", "#5b6770", "#e3e8ec", "#9aa5b1"
-BEFORE, AFTER, LIMIT, BAD_DOT = "#d9822b", "#1f77b4", "#2f9e62", "#c43d3d"
+INK, SOFT, GRID, EDGE = "ink", "soft", "grid", "edge"
+BEFORE, AFTER, LIMIT, BAD_DOT = "before", "after", "limit", "bad-dot"
+PALE, VIOLET = "pale", "violet"
+ON_BAR = "on-bar"  # text on a filled bar
+PALETTE = {
+    INK: "#1c2730", SOFT: "#5b6770", GRID: "#e3e8ec", EDGE: "#9aa5b1", BEFORE: "#d9822b",
+    AFTER: "#1f77b4", ON_BAR: "#ffffff", LIMIT: "#2f9e62",
+    BAD_DOT: "#c43d3d", PALE: "#a9cbe6", VIOLET: "#8e5bb5",
+}  # fmt: skip
+"""Colours of a drawing by name, on paper and on a light screen."""
+DARK = {
+    INK: "#e6edf3", SOFT: "#9aa9b6", GRID: "#2a3641", EDGE: "#6f7f8d", BEFORE: "#f0a35e",
+    AFTER: "#6ea8ff", ON_BAR: "#0e151b", LIMIT: "#4fd093",
+    BAD_DOT: "#ff7b72", PALE: "#36557a", VIOLET: "#b98be0",
+}  # fmt: skip
+"""The same on a dark screen."""
 
 Point = tuple[float, float]
 
@@ -27,13 +45,27 @@ class Line:
     points: tuple[Point, ...]
     stroke: Stroke
 
+    def moved(self, x: float, y: float) -> Line:
+        """Return the line elsewhere."""
+        return replace(self, points=tuple((a + x, b + y) for a, b in self.points))
+
 
 @dataclass(frozen=True)
-class Rectangle:
-    """A filled rectangle; (x, y) is its upper left corner."""
+class _At:
+    """A shape at one place."""
 
     x: float
     y: float
+
+    def moved(self, x: float, y: float) -> Self:
+        """Return the shape elsewhere."""
+        return replace(self, x=self.x + x, y=self.y + y)
+
+
+@dataclass(frozen=True)
+class Rectangle(_At):
+    """A filled rectangle; (x, y) is its upper left corner."""
+
     width: float
     height: float
     fill: str
@@ -41,11 +73,9 @@ class Rectangle:
 
 
 @dataclass(frozen=True)
-class Circle:
+class Circle(_At):
     """A circle, filled or not."""
 
-    x: float
-    y: float
     radius: float
     fill: str = ""
     stroke: Stroke | None = None
@@ -54,11 +84,23 @@ class Circle:
 
 
 @dataclass(frozen=True)
-class Text:
+class Dots:
+    """Many filled circles of one size."""
+
+    points: tuple[Point, ...]
+    radius: float
+    fill: str
+    opacity: float = 1.0
+
+    def moved(self, x: float, y: float) -> Dots:
+        """Return the dots elsewhere."""
+        return replace(self, points=tuple((a + x, b + y) for a, b in self.points))
+
+
+@dataclass(frozen=True)
+class Text(_At):
     """A line of text; ``anchor`` is start, middle or end; ``turned`` reads upwards."""
 
-    x: float
-    y: float
     text: str
     size: float = 11.0
     colour: str = INK
@@ -67,7 +109,7 @@ class Text:
     turned: bool = False
 
 
-Shape = Line | Rectangle | Circle | Text
+Shape = Line | Rectangle | Circle | Dots | Text
 
 
 @dataclass

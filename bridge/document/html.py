@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-import math
+import json
+from collections.abc import Callable
 from html import escape
 from importlib.resources import files
 
 from gapbridge.bridge.document.blocks import (
     Badge,
     Bar,
+    Beside,
     Block,
     Bullets,
     Cell,
     Columns,
     Document,
+    Gallery,
     Heading,
+    Named,
     Pairs,
     Paragraph,
     Part,
@@ -23,8 +27,9 @@ from gapbridge.bridge.document.blocks import (
     Table,
     Tiles,
     Verdict,
+    View,
 )
-from gapbridge.bridge.document.svg import svg
+from gapbridge.bridge.document.svg import colours, svg
 
 
 def html(document: Document) -> str:
@@ -32,20 +37,24 @@ def html(document: Document) -> str:
     links = "".join(f'<a href="#{p.key}">{escape(p.title)}</a>' for p in document.parts)
     body = "".join(_part(part) for part in document.parts)
     title = escape(document.title)
+    moving = any(isinstance(b, Gallery | View) for p in document.parts for b in p.blocks)
+    script = f'<script type="module">{_own("view.js")}{_own("page.js")}</script>' if moving else ""
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        '<meta name="color-scheme" content="light dark">'
         f"<title>{title}</title>"
         # an empty icon keeps browsers from asking for one
         '<link rel="icon" href="data:,">'
-        f"<style>{_own('gapbridge.bridge.report')}{_own('gapbridge.bridge.document')}</style></head><body>"
+        f"<style>{colours()}{_own('style.css')}</style></head><body>"
         f"<header><h1>{title}</h1><p>{escape(document.subtitle)}</p><nav>{links}</nav></header>"
-        f"<main>{body}</main><footer><p>{escape(document.footer)}</p></footer></body></html>\n"
+        f"<main>{body}</main><footer><p>{escape(document.footer)}</p></footer>"
+        f"{script}</body></html>\n"
     )
 
 
-def _own(package: str) -> str:
-    return files(package).joinpath("style.css").read_text(encoding="utf-8")
+def _own(name: str) -> str:
+    return files("gapbridge.bridge.document").joinpath(name).read_text(encoding="utf-8")
 
 
 def _part(part: Part) -> str:
@@ -59,24 +68,33 @@ def _part(part: Part) -> str:
 
 
 def _block(block: Block) -> str:
-    if isinstance(block, Paragraph):
-        css = f' class="{block.kind}"' if block.kind else ""
-        return f"<p{css}>{escape(block.text)}</p>"
-    if isinstance(block, Heading):
-        return f"<h3>{escape(block.text)}</h3>"
-    if isinstance(block, Bullets):
-        return "<ul>" + "".join(f"<li>{escape(i)}</li>" for i in block.items) + "</ul>"
-    if isinstance(block, Verdict):
-        return (
-            f'<p class="verdict">{_cell(block.badge)}</p><p class="lead">{escape(block.text)}</p>'
-        )
-    if isinstance(block, Tiles):
-        return _tiles(block)
-    if isinstance(block, Columns):
-        return f'<div class="columns">{"".join(_pairs(p) for p in block.columns)}</div>'
-    if isinstance(block, Table):
-        return _table(block)
-    return _pictures(block)
+    return _WRITERS[type(block)](block)
+
+
+def _paragraph(block: Paragraph) -> str:
+    css = f' class="{block.kind}"' if block.kind else ""
+    return f"<p{css}>{escape(block.text)}</p>"
+
+
+def _heading(block: Heading) -> str:
+    return f"<h3>{escape(block.text)}</h3>"
+
+
+def _bullets(block: Bullets) -> str:
+    return "<ul>" + "".join(f"<li>{escape(i)}</li>" for i in block.items) + "</ul>"
+
+
+def _verdict(block: Verdict) -> str:
+    badges = " ".join(_cell(badge) for badge in (block.badge, *block.more))
+    return f'<p class="verdict">{badges}</p><p class="lead">{escape(block.text)}</p>'
+
+
+def _columns(block: Columns) -> str:
+    return f'<div class="columns">{"".join(_pairs(p) for p in block.columns)}</div>'
+
+
+def _beside(block: Beside) -> str:
+    return f'<div class="grid">{"".join(f"<div>{_table(t)}</div>" for t in block.tables)}</div>'
 
 
 def _pairs(block: Pairs) -> str:
@@ -97,8 +115,39 @@ def _tiles(block: Tiles) -> str:
 
 def _pictures(block: Pictures) -> str:
     drawings = "".join(svg(drawing) for drawing in block.drawings)
-    caption = f"<figcaption>{escape(block.caption)}</figcaption>" if block.caption else ""
-    return f'<figure><div class="drawings">{drawings}</div>{caption}</figure>'
+    return _figure(f'<div class="drawings">{drawings}</div>', block.caption)
+
+
+def _gallery(block: Gallery) -> str:
+    menus = "".join(
+        f"<label>{escape(title)} <select>"
+        + "".join(f"<option>{escape(entry)}</option>" for entry in entries)
+        + "</select></label>"
+        for title, entries in block.menus
+        if len(entries) > 1
+    )
+    menu = f'<div class="menus">{menus}</div>' if menus else ""
+    shown = "".join(
+        f'<div class="drawings"{" hidden" if i else ""}>{svg(drawing)}</div>'
+        for i, drawing in enumerate(block.drawings)
+    )
+    return _figure(f"{menu}{shown}", block.caption, "gallery")
+
+
+def _view(block: View) -> str:
+    data = json.dumps(block.scene.document(), separators=(",", ":")).replace("<", "\\u003c")
+    return _figure(
+        f'<canvas class="view" tabindex="0" role="img" aria-label="{escape(block.scene.title)}">'
+        f'</canvas><script type="application/json">{data}</script>'
+        f"<noscript>{svg(block.scene.drawing())}</noscript>",
+        block.caption,
+    )
+
+
+def _figure(body: str, caption: str, kind: str = "") -> str:
+    words = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
+    css = f' class="{kind}"' if kind else ""
+    return f"<figure{css}>{body}{words}</figure>"
 
 
 def _table(block: Table) -> str:
@@ -130,9 +179,19 @@ def _cell(cell: Cell) -> str:
     if isinstance(cell, Badge):
         return f'<span class="badge {cell.kind}">{escape(cell.text)}</span>'
     if isinstance(cell, Bar):
-        share = min(max(cell.share, 0.0), 1.0) if math.isfinite(cell.share) else 0.0
         return (
-            f'<span class="share"><span class="bar"><i style="width:{share * 100:.0f}%">'
-            f"</i></span>{escape(cell.text)}</span>"
+            f'<span class="share"><span class="bar"><i style="width:{cell.filled * 100:.0f}%;'
+            f'background:var(--{cell.colour})"></i></span>{escape(cell.text)}</span>'
         )
+    if isinstance(cell, Named):
+        text = f"<b>{escape(cell.text)}</b>{escape(cell.more)}" if cell.text else ""
+        line = "<br>" if text and cell.code else ""
+        return text + (f"{line}<code>{escape(cell.code)}</code>" if cell.code else "")
     return escape(cell)
+
+
+_WRITERS: dict[type, Callable[..., str]] = {
+    Verdict: _verdict, Tiles: _tiles, Heading: _heading, Paragraph: _paragraph, Bullets: _bullets,
+    Columns: _columns, Table: _table, Beside: _beside, Pictures: _pictures, Gallery: _gallery,
+    View: _view,
+}  # fmt: skip

@@ -22,10 +22,12 @@ from reportlab.platypus import (
 from reportlab.platypus import Paragraph as Text
 
 from gapbridge.bridge.document.blocks import (
+    Beside,
     Block,
     Bullets,
     Columns,
     Document,
+    Gallery,
     Heading,
     Paragraph,
     Part,
@@ -33,10 +35,11 @@ from gapbridge.bridge.document.blocks import (
     Table,
     Tiles,
     Verdict,
+    View,
 )
 from gapbridge.bridge.document.pdf_drawing import DrawnRow
 from gapbridge.bridge.document.pdf_style import STYLES, badge_markup
-from gapbridge.bridge.document.pdf_table import columns_table, table, tiles_table
+from gapbridge.bridge.document.pdf_table import beside_table, columns_table, table, tiles_table
 from gapbridge.bridge.document.pdf_text import PLAIN, load_fonts, markup
 
 SIDE, TOP, BOTTOM = 18 * mm, 16 * mm, 18 * mm
@@ -132,12 +135,19 @@ def _block(block: Block) -> list[list[Flowable]]:
     if isinstance(block, Bullets):
         return [[Text(markup(i), STYLES["bullet"], bulletText="•")] for i in block.items]
     if isinstance(block, Verdict):
-        word = Text(badge_markup(block.badge), STYLES["verdict"])
+        badges = " ".join(badge_markup(badge) for badge in (block.badge, *block.more))
+        word = Text(badges, STYLES["verdict"])
         return [[word, Text(markup(block.text), STYLES["lead"])]]
     if isinstance(block, Tiles):
         return [[tiles_table(block, WIDTH), Spacer(1, 8)]]
     if isinstance(block, Columns):
         return [[columns_table(block, WIDTH), Spacer(1, 6)]]
+    if isinstance(block, Beside):
+        return [[beside_table(block, WIDTH), Spacer(1, 8)]]
+    if isinstance(block, Gallery):
+        return _pictures(Pictures(block.drawings[:1], block.caption))
+    if isinstance(block, View):
+        return _pictures(Pictures((block.scene.drawing(),), block.caption))
     if isinstance(block, Table):
         long = len(block.rows) > WHOLE
         grid, space = table(block, WIDTH), Spacer(1, 8)

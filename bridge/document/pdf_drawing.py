@@ -6,7 +6,17 @@ from reportlab.lib.colors import HexColor
 from reportlab.pdfgen.canvas import Canvas
 from reportlab.platypus import Flowable
 
-from gapbridge.bridge.document.drawing import Circle, Drawing, Line, Rectangle, Shape, Stroke, Text
+from gapbridge.bridge.document.drawing import (
+    PALETTE,
+    Circle,
+    Dots,
+    Drawing,
+    Line,
+    Rectangle,
+    Shape,
+    Stroke,
+    Text,
+)
 from gapbridge.bridge.document.pdf_text import BOLD, PLAIN
 
 
@@ -49,13 +59,20 @@ def _shape(canvas: Canvas, shape: Shape) -> None:
             path.lineTo(x, -y)
         canvas.drawPath(path)
     elif isinstance(shape, Rectangle):
-        canvas.setFillColor(HexColor(shape.fill))
+        canvas.setFillColor(HexColor(PALETTE[shape.fill]))
         canvas.rect(shape.x, -shape.y - shape.height, shape.width, shape.height, 0, 1)
+    elif isinstance(shape, Dots):
+        _stroke(canvas, Stroke(shape.fill, 2 * shape.radius))
+        canvas.setLineCap(1)
+        canvas.setStrokeAlpha(shape.opacity)
+        canvas.lines([(x, -y, x, -y) for x, y in shape.points])
+        canvas.setStrokeAlpha(1.0)
+        canvas.setLineCap(0)
     elif isinstance(shape, Circle):
         if shape.stroke:
             _stroke(canvas, shape.stroke)
         if shape.fill:
-            canvas.setFillColor(HexColor(shape.fill))
+            canvas.setFillColor(HexColor(PALETTE[shape.fill]))
             canvas.setFillAlpha(shape.opacity)
         canvas.circle(
             shape.x, -shape.y, shape.radius, int(bool(shape.stroke)), int(bool(shape.fill))
@@ -67,7 +84,7 @@ def _shape(canvas: Canvas, shape: Shape) -> None:
 
 def _text(canvas: Canvas, shape: Text) -> None:
     canvas.saveState()
-    canvas.setFillColor(HexColor(shape.colour))
+    canvas.setFillColor(HexColor(PALETTE[shape.colour]))
     canvas.setFont(BOLD if shape.bold else PLAIN, shape.size)
     canvas.translate(shape.x, -shape.y)
     if shape.turned:
@@ -79,7 +96,7 @@ def _text(canvas: Canvas, shape: Text) -> None:
 
 
 def _stroke(canvas: Canvas, stroke: Stroke) -> None:
-    canvas.setStrokeColor(HexColor(stroke.colour))
+    canvas.setStrokeColor(HexColor(PALETTE[stroke.colour]))
     canvas.setLineWidth(stroke.width)
     canvas.setLineJoin(1)
     canvas.setDash([4, 3] if stroke.dashed else [])

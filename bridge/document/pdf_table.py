@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from reportlab.lib.colors import HexColor
 from reportlab.platypus import Flowable, Paragraph, TableStyle
 from reportlab.platypus import Table as Grid
 
-from gapbridge.bridge.document.blocks import Badge, Bar, Cell, Columns, Pairs, Strong, Table, Tiles
+from gapbridge.bridge.document.blocks import (
+    Badge,
+    Bar,
+    Beside,
+    Cell,
+    Columns,
+    Named,
+    Pairs,
+    Strong,
+    Table,
+    Tiles,
+)
+from gapbridge.bridge.document.drawing import PALETTE
 from gapbridge.bridge.document.pdf_style import STYLES, badge_markup
 from gapbridge.bridge.document.pdf_text import markup
 
@@ -68,6 +79,17 @@ def tiles_table(block: Tiles, width: float) -> Flowable:
     return Grid(cells, [width / columns] * columns, style=TableStyle(style))
 
 
+def beside_table(block: Beside, width: float) -> Flowable:
+    """Return small tables side by side."""
+    each = width / len(block.tables)
+    style: list[Command] = [
+        ("VALIGN", (0, 0), (-1, -1), "TOP"),
+        ("LEFTPADDING", (0, 0), (-1, -1), 0),
+    ]
+    cells = [table(t, each - 14) for t in block.tables]
+    return Grid([cells], [each] * len(cells), style=TableStyle(style))
+
+
 def columns_table(block: Columns, width: float) -> Flowable:
     """Return pairs side by side."""
     each = width / len(block.columns)
@@ -100,6 +122,10 @@ def _cell(cell: Cell, number: bool, strong: bool) -> Flowable:
         return _Bar(cell)
     if isinstance(cell, Badge):
         return Paragraph(badge_markup(cell), STYLES["cell"])
+    if isinstance(cell, Named):
+        name = f"<b>{markup(cell.text)}</b>{markup(cell.more)}" if cell.text else ""
+        code = f'<font color="#5b6770">{markup(cell.code)}</font>' if cell.code else ""
+        return Paragraph(f"{name}{'<br/>' if name and code else ''}{code}", STYLES["cell"])
     text = markup(cell.text if isinstance(cell, Strong) else cell)
     if strong or isinstance(cell, Strong):
         text = f"<b>{text}</b>"
@@ -111,7 +137,7 @@ class _Bar(Flowable):
 
     def __init__(self, bar: Bar) -> None:
         super().__init__()
-        self.share = min(max(bar.share, 0.0), 1.0) if math.isfinite(bar.share) else 0.0
+        self.share, self.colour = bar.filled, HexColor(PALETTE[bar.colour])
         self.text = Paragraph(markup(bar.text), STYLES["cell"])
 
     def wrap(self, available_width: float, available_height: float) -> tuple[float, float]:
@@ -124,6 +150,6 @@ class _Bar(Flowable):
         middle = self.text.height - 7.5
         self.canv.setFillColor(HexColor("#eef1f4"))
         self.canv.rect(0, middle, BAR, 5, 0, 1)
-        self.canv.setFillColor(HexColor("#1f77b4"))
+        self.canv.setFillColor(self.colour)
         self.canv.rect(0, middle, BAR * self.share, 5, 0, 1)
         self.text.drawOn(self.canv, BAR + 5, 0)

@@ -11,6 +11,7 @@ from typing import Any
 
 import click
 
+from gapbridge.bridge.document.blocks import Block, Columns, Heading, Pairs, Table
 from gapbridge.core.calibration.spread import Spread
 
 BLOCK = 1 << 20  # bytes read at a time
@@ -36,15 +37,39 @@ def provenance(files: Mapping[str, Sequence[Path]]) -> dict[str, Any]:
     }
 
 
+def origin_line(origin: Mapping[str, Any]) -> str:
+    """Return version and time in one line, for the head and foot of a report."""
+    return f"Gapbridge {origin.get('version', '')} · {origin.get('time', '')}".strip(" ·")
+
+
+def origin_blocks(origin: Mapping[str, Any]) -> list[Block]:
+    """Return version, time, arguments and files with their SHA-256 as blocks; none for none."""
+    if not origin:
+        return []
+    arguments = ", ".join(f"{k} {_argument(v)}" for k, v in origin["arguments"].items())
+    pairs = [("software", f"Gapbridge {origin['version']}"), ("time (UTC)", origin["time"]),
+             ("command", f"gapbridge {origin['command']}" if origin["command"] else ""),
+             ("arguments", arguments)]  # fmt: skip
+    rows = [[f["role"], f["name"], f["sha256"] or "not readable"] for f in origin["files"]]
+    blocks: list[Block] = [
+        Heading("Origin"), Columns((Pairs(tuple((k, v) for k, v in pairs if v)),)),
+    ]  # fmt: skip
+    return [*blocks, Table(("file", "name", "SHA-256"), rows, (0.7, 2, 4))] if rows else blocks
+
+
+def _argument(value: Any) -> str:
+    return " ".join(str(v) for v in value) if isinstance(value, list) else str(value)
+
+
 def fitted(
     origin: dict[str, Any], ranges: Mapping[str, tuple[float, float]], spread: Spread
 ) -> dict[str, Any]:
     """Return the provenance of a cell: with what its model was fitted on, and its covariance."""
     listed = {name: [low, high] for name, (low, high) in ranges.items()}
-    told = {**origin, "fitted": listed}
+    result = {**origin, "fitted": listed}
     if spread.names:
-        told |= {"parameters": list(spread.names), "covariance": spread.covariance.tolist()}
-    return told
+        result |= {"parameters": list(spread.names), "covariance": spread.covariance.tolist()}
+    return result
 
 
 def installed_version() -> str:

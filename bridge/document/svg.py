@@ -4,10 +4,36 @@ from __future__ import annotations
 
 from html import escape
 
-from gapbridge.bridge.document.drawing import Circle, Drawing, Line, Rectangle, Shape, Stroke, Text
+from gapbridge.bridge.document.drawing import (
+    DARK,
+    PALETTE,
+    Circle,
+    Dots,
+    Drawing,
+    Line,
+    Rectangle,
+    Shape,
+    Stroke,
+    Text,
+)
 
 
-def svg(drawing: Drawing) -> str:
+def colours() -> str:
+    """Return the CSS that gives the palette's names their colours, light and dark."""
+    light, dark = (
+        "".join(f"--{name}:{colour};" for name, colour in palette.items())
+        for palette in (PALETTE, DARK)
+    )
+    return f":root{{{light}}}@media screen and (prefers-color-scheme:dark){{:root{{{dark}}}}}"
+
+
+def svg_file(drawing: Drawing) -> str:
+    """Return the drawing as a file of its own."""
+    style = f"<style>{colours()}text{{font-family:system-ui,sans-serif}}</style>"
+    return svg(drawing, style) + "\n"
+
+
+def svg(drawing: Drawing, style: str = "") -> str:
     """Return the drawing as one SVG element, as wide as its place but not wider than drawn."""
     width, height = _number(drawing.width), _number(drawing.height)
     # as wide as its place allows, up to half as wide again as it was drawn
@@ -16,7 +42,7 @@ def svg(drawing: Drawing) -> str:
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
         f'width="{width}" height="{height}" style="max-width:min(100%,{most}px)" role="img" '
-        f'aria-label="{escape(drawing.title)}">{shapes}</svg>'
+        f'aria-label="{escape(drawing.title)}">{style}{shapes}</svg>'
     )
 
 
@@ -27,14 +53,23 @@ def _shape(shape: Shape) -> str:
     if isinstance(shape, Rectangle):
         return (
             f'<rect x="{_number(shape.x)}" y="{_number(shape.y)}" width="{_number(shape.width)}" '
-            f'height="{_number(shape.height)}" fill="{shape.fill}">{_hint(shape.hint)}</rect>'
+            f'height="{_number(shape.height)}" fill="var(--{shape.fill})">'
+            f"{_hint(shape.hint)}</rect>"
+        )
+    if isinstance(shape, Dots):
+        places = "".join(f"M{_number(x)} {_number(y)}h0" for x, y in shape.points)
+        return (
+            f'<path class="dots" d="{places}" fill="none" stroke="var(--{shape.fill})" '
+            f'stroke-width="{_number(2 * shape.radius)}" stroke-linecap="round" '
+            f'stroke-opacity="{_number(shape.opacity)}"/>'
         )
     if isinstance(shape, Circle):
         stroke = _stroke(shape.stroke) if shape.stroke else ""
+        fill = f"var(--{shape.fill})" if shape.fill else "none"
         solid = "" if shape.opacity == 1.0 else f' fill-opacity="{_number(shape.opacity)}"'
         return (
             f'<circle cx="{_number(shape.x)}" cy="{_number(shape.y)}" r="{_number(shape.radius)}" '
-            f'fill="{shape.fill or "none"}"{solid} {stroke}>{_hint(shape.hint)}</circle>'
+            f'fill="{fill}"{solid} {stroke}>{_hint(shape.hint)}</circle>'
         )
     return _text(shape)
 
@@ -44,7 +79,7 @@ def _text(shape: Text) -> str:
     turned = f' transform="rotate(-90 {x} {y})"' if shape.turned else ""
     bold = ' font-weight="600"' if shape.bold else ""
     return (
-        f'<text x="{x}" y="{y}" font-size="{_number(shape.size)}" fill="{shape.colour}" '
+        f'<text x="{x}" y="{y}" font-size="{_number(shape.size)}" fill="var(--{shape.colour})" '
         f'text-anchor="{shape.anchor}"{bold}{turned}>{escape(shape.text)}</text>'
     )
 
@@ -52,7 +87,7 @@ def _text(shape: Text) -> str:
 def _stroke(stroke: Stroke) -> str:
     dashes = ' stroke-dasharray="4 3"' if stroke.dashed else ""
     return (
-        f'stroke="{stroke.colour}" stroke-width="{_number(stroke.width)}" '
+        f'stroke="var(--{stroke.colour})" stroke-width="{_number(stroke.width)}" '
         f'stroke-linejoin="round"{dashes}'
     )
 

@@ -10,7 +10,15 @@ from typing import Any
 import numpy as np
 
 from gapbridge.bridge.fleet.arms import by_arm, usable
-from gapbridge.bridge.fleet.drift import Drift, Series, drifts, places
+from gapbridge.bridge.fleet.drift import (
+    ChannelFigure,
+    Drift,
+    Figure,
+    Quantity,
+    Series,
+    drifts,
+    places,
+)
 from gapbridge.bridge.fleet.outlying import Outlier, far_from_median
 from gapbridge.bridge.fleet.task import Outcome
 
@@ -123,7 +131,7 @@ def _series(arms: Mapping[str, Sequence[Outcome]]) -> Iterator[Series]:
         kind = sessions[0].result["type"]
         for (channel, name, unit), found in values.items():
             index = [i for i, _, _ in found]
-            quantity = f"{channel} {name}" if name == GAP else name
+            quantity: Quantity = ChannelFigure(channel, Figure.GAP) if name == GAP else name
             yield Series(
                 arm, quantity, unit, f"{kind} {channel} {name}", at[index], per,
                 np.array([v for _, v, _ in found]), np.array([s for _, _, s in found]),
@@ -146,18 +154,18 @@ def _onsets(arms: Mapping[str, Sequence[Outcome]]) -> Iterator[Onset]:
 
 def _outliers(done: Sequence[Outcome]) -> list[Outlier]:
     found: list[Outlier] = []
-    figures = (("gap_rms", "gap"), ("remaining_rms", "gap that stays unexplained"))
+    figures = ((GAP, Figure.GAP), ("remaining_rms", Figure.UNEXPLAINED))
     kinds = {(o.result["type"], c["channel"]) for o in done for c in o.result["channels"]}
     for kind, name in sorted(kinds):
         same = [
             (o, c) for o in done if o.result["type"] == kind
             for c in o.result["channels"] if c["channel"] == name
         ]  # fmt: skip
-        for figure, words in figures:
-            for i, usual, deviations in far_from_median([c[figure] for _, c in same], ratios=True):
+        for key, figure in figures:
+            for i, usual, deviations in far_from_median([c[key] for _, c in same], ratios=True):
                 outcome, channel = same[i]
                 found.append(Outlier(
-                    outcome.arm, outcome.session, f"{name}: {words}", channel[figure], usual,
+                    outcome.arm, outcome.session, ChannelFigure(name, figure), channel[key], usual,
                     channel["unit"], deviations,
                 ))  # fmt: skip
     found += _parameter_outliers(done)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +17,31 @@ WRONG = 0.05  # share of the drifts reported that may be none (Benjamini, Hochbe
 DAY = 86400.0
 
 
+class Figure(Enum):
+    """A figure of a session that is no parameter; the value is how reports call it."""
+
+    GAP = "gap"
+    UNEXPLAINED = "gap that stays unexplained"
+    MISFIT = "misfit of the session"
+
+
+@dataclass(frozen=True)
+class ChannelFigure:
+    """A figure of one channel."""
+
+    channel: str
+    figure: Figure
+
+
+Quantity = str | ChannelFigure  # a parameter's public name, or a figure
+
+
 @dataclass(frozen=True)
 class Series:
     """A value of one arm over its sessions."""
 
     arm: str
-    quantity: str  # the parameter's name
+    quantity: Quantity
     unit: str
     group: str  # series of a group scatter alike
     at: Array  # (m,) days, or numbers of sessions
@@ -36,7 +56,7 @@ class Drift:
     """A slope that is reported."""
 
     arm: str
-    quantity: str
+    quantity: Quantity
     unit: str
     per: str
     slope: float

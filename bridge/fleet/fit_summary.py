@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from gapbridge.bridge.fleet.arms import by_arm
-from gapbridge.bridge.fleet.drift import Drift, believed
+from gapbridge.bridge.fleet.drift import ChannelFigure, Drift, Figure, believed
 from gapbridge.bridge.fleet.outlying import Outlier
 from gapbridge.bridge.fleet.task import Outcome
 from gapbridge.core.estimation.hierarchical import ArmFit, Scatter, SessionFit, TypeFit, fit_type
@@ -147,8 +147,8 @@ def _outliers(kind: FittedType) -> Iterator[Outlier]:
         for session in arm.sessions:
             if session.fit.surprise > SURPRISING:
                 yield Outlier(
-                    arm.name, session.outcome.session, "misfit of the session", session.gap_after,
-                    kind.scatter.noise, "m", math.sqrt(session.fit.surprise),
+                    arm.name, session.outcome.session, ChannelFigure("position", Figure.MISFIT),
+                    session.gap_after, kind.scatter.noise, "m", math.sqrt(session.fit.surprise),
                 )  # fmt: skip
 
 

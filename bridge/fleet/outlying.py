@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gapbridge.bridge.fleet.drift import Quantity
+
 FAR = 4.0  # robust deviations
 FEWEST = 8  # values from which on a median's deviation is worth anything
 
@@ -18,7 +20,7 @@ class Outlier:
 
     arm: str
     session: str  # empty: the arm as a whole
-    what: str
+    quantity: Quantity
     value: float
     usual: float
     unit: str

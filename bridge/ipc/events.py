@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any
+
+from gapbridge.core.clock import SYSTEM, Clock
 
 KEPT = 500
 Event = dict[str, Any]
@@ -14,7 +15,8 @@ Event = dict[str, Any]
 class EventLog:
     """Numbers events and passes them on; ``listeners`` get each one, in order."""
 
-    def __init__(self, *listeners: Callable[[Event], None]) -> None:
+    def __init__(self, *listeners: Callable[[Event], None], clock: Clock = SYSTEM) -> None:
+        self._clock = clock
         self._listeners = listeners
         self.sequence = 0
         self.counts: Counter[str] = Counter()  # by kind, transitions also by their cause
@@ -24,7 +26,8 @@ class EventLog:
         """Take an event; returns it with its number and times."""
         self.sequence += 1
         whole = {
-            "kind": "note", "time": time.time(), "monotonic": time.monotonic(), **event,
+            "kind": "note", "time": self._clock.time(), "monotonic": self._clock.monotonic(),
+            **event,
             "sequence": self.sequence,
         }  # fmt: skip
         self.counts[whole["kind"]] += 1

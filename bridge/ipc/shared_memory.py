@@ -15,7 +15,6 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
-import time
 from enum import IntEnum
 
 import numpy as np
@@ -29,6 +28,7 @@ from gapbridge.bridge.ipc.sealed_memory import (
     map_as_writer,
     seal,
 )
+from gapbridge.core.clock import SYSTEM, Clock
 
 Array = NDArray[np.float64]
 WORDS = 128
@@ -76,7 +76,10 @@ class SharedMemory:
     joins it for writing is the last who can.
     """
 
-    def __init__(self, n: int, fd: int | None = None, writable: bool = True) -> None:
+    def __init__(
+        self, n: int, fd: int | None = None, writable: bool = True, clock: Clock = SYSTEM
+    ) -> None:
+        self._now = clock.monotonic
         self.n = n
         self.slices = slices_of(n)
         self.width = max(part.stop for part in self.slices.values())
@@ -96,7 +99,7 @@ class SharedMemory:
 
     def beat(self) -> None:
         """Report that the loop is alive."""
-        self._times[_BEAT_TIME] = time.monotonic()
+        self._times[_BEAT_TIME] = self._now()
         self._words[_BEATS] += 1
 
     def enter(self, phase: Phase) -> None:
@@ -174,7 +177,7 @@ class SharedMemory:
     def silence(self) -> float:
         """Return s since the last heartbeat; 0 before the first."""
         beat = float(self._times[_BEAT_TIME])
-        return time.monotonic() - beat if beat else 0.0
+        return self._now() - beat if beat else 0.0
 
     @property
     def written(self) -> int:
@@ -209,8 +212,8 @@ class SharedMemory:
 class RunPage(SharedMemory):
     """The daemon's view, for reading only: one page after the other, cycles and counts going on."""
 
-    def __init__(self, n: int) -> None:
-        super().__init__(n, writable=False)
+    def __init__(self, n: int, clock: Clock = SYSTEM) -> None:
+        super().__init__(n, writable=False, clock=clock)
         seal(self.fd)  # of no loop: it only says that nothing has happened yet
         self._shown = os.dup(self.fd)  # the newest one that nobody but its loop can write to
 

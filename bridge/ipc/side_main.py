@@ -14,12 +14,12 @@ import select
 import socket
 import sys
 import threading
-import time
 from dataclasses import dataclass
 from typing import Any
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc.shared_memory import FollowedPage, SharedMemory
+from gapbridge.core.clock import SYSTEM
 
 FAREWELL = 5.0  # s that a side process may take to end after the daemon
 NICENESS = 5  # the loop comes first
@@ -110,7 +110,7 @@ class Order:
 
     def emit(self, event: dict[str, Any]) -> None:
         """Notify the daemon of an event (a dict with "kind"), who hands it to all; never blocks."""
-        self.up.emit({"time": time.time(), "monotonic": time.monotonic(), **event})
+        self.up.emit({"time": SYSTEM.time(), "monotonic": SYSTEM.monotonic(), **event})
 
 
 def take_order() -> Order:
@@ -145,5 +145,5 @@ def _end_after_daemon(fd: int) -> None:
     watch = select.poll()
     watch.register(fd, 0)  # hang-ups only, which are always reported
     watch.poll()
-    time.sleep(FAREWELL)
+    SYSTEM.sleep(FAREWELL)
     os._exit(1)

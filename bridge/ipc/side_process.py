@@ -13,11 +13,11 @@ import socket
 import subprocess
 import sys
 import termios
-import time
 from typing import IO, Any
 
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_main import EventLines, EventWriter
+from gapbridge.core.clock import SYSTEM, Clock
 
 BACKOFF = (0.2, 10.0)  # s before a restart: first, most
 HEALTHY = 10.0  # s after which a restart counts as the first again
@@ -34,8 +34,10 @@ class SideProcess:
     """
 
     def __init__(
-        self, module: str, order: dict[str, Any], page: SharedMemory, log: IO[Any] | int = -3
-    ) -> None:
+        self, module: str, order: dict[str, Any], page: SharedMemory, log: IO[Any] | int = -3,
+        clock: Clock = SYSTEM,
+    ) -> None:  # fmt: skip
+        self._now = clock.monotonic
         self.module, self.order = module, order
         self.restarts = 0
         self.stalls = 0
@@ -78,7 +80,7 @@ class SideProcess:
 
     def check(self) -> str | None:
         """Look after it; returns in words what went wrong, None where nothing did."""
-        now = time.monotonic()
+        now = self._now()
         if self._process is None:
             if now >= self._retry_at:
                 self.restarts += 1
@@ -133,7 +135,7 @@ class SideProcess:
                 os.close(fd)
         self._down_fd: int | None = ours
         self._down, self._up = EventWriter(ours), EventLines(up_ours)
-        self._started = self._read_at = time.monotonic()
+        self._started = self._read_at = self._now()
         self._has_read = False
         order = {
             **self.order, "page": page, "events": theirs, "up": up_theirs, "pages": passed[3],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +12,7 @@ from gapbridge.bridge.ipc.counts import Count
 from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.supervisor import Cause, Supervisor
 from gapbridge.core.arm import Arm
+from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.driver import Driver
@@ -47,7 +47,8 @@ class ControllerClock:
     which no clock shows: the two are tied anew only while nothing is written.
     """
 
-    def __init__(self, rate: float, hold: float = 1.0) -> None:
+    def __init__(self, rate: float, hold: float = 1.0, clock: Clock = SYSTEM) -> None:
+        self._now = clock.monotonic
         self._rate, self._hold = rate, hold
         self._lead: float | None = None  # s: monotonic minus controller time, quickest sample
         self._last: float | None = None  # s, controller clock
@@ -81,7 +82,7 @@ class ControllerClock:
 
     def age(self, state: RobotState) -> float:
         """Return how old a state is now, s."""
-        return time.monotonic() - self._due(state)
+        return self._now() - self._due(state)
 
     def expiry(self, state: RobotState) -> float:
         """Return when a state becomes too old for a setpoint to be made of it, s monotonic."""
@@ -157,6 +158,7 @@ class LinkMonitor:
         patience: float = 0.0,
     ) -> None:
         self._driver, self._supervisor, self._reports = driver, supervisor, reports
+        self._now = driver.clock.monotonic
         self.lost: str | None = None
         self._hold = hold_time(driver.rate)
         self._patience = max(patience, self._hold)  # s that one reading takes at most
@@ -165,7 +167,7 @@ class LinkMonitor:
         self._left = 0.0  # s, monotonic: when the last reading ended
         self._stale = self._silent = False  # has been reported since the last believable state
         self._told: dict[Count, float] = {}  # s, monotonic
-        self._heard = time.monotonic()  # s, of the last believable state
+        self._heard = self._now()  # s, of the last believable state
         self._has_armed = False
 
     def next(self, has_armed: bool = False) -> RobotState | None:
@@ -174,20 +176,20 @@ class LinkMonitor:
         ``has_armed``: the writing half of the robot's library exists in this process.
         """
         self._has_armed = has_armed
-        begun, self._left = time.monotonic(), self._left or time.monotonic()
+        begun, self._left = self._now(), self._left or self._now()
         away = begun - self._left > self._hold
         try:
             return self._read(begun, away)
         finally:
-            self._left = time.monotonic()
+            self._left = self._now()
 
     def _read(self, begun: float, away: bool) -> RobotState | None:
         """Return the next state; ``away``: this process itself stood still before ``begun``."""
         try:
             state = self._driver.read_state()
         except StaleStateError as error:
-            if away or time.monotonic() - begun > self._patience + SUSPENDED:
-                self._heard = time.monotonic()  # it was this process that slept: ask once more
+            if away or self._now() - begun > self._patience + SUSPENDED:
+                self._heard = self._now()  # it was this process that slept: ask once more
                 self._reports.count(Count.LATE)
             else:
                 self._stand_still(str(error))
@@ -208,7 +210,7 @@ class LinkMonitor:
         One that was too old (``expiry``, s monotonic) when it could be used is late, and several
         in a row are a link on which nothing fresh comes any more.
         """
-        now = time.monotonic()
+        now = self._now()
         self._old = self._old + 1 if now > expiry else 0
         self._invalid = 0
         if self._old >= OLD_IN_A_ROW:
@@ -224,11 +226,11 @@ class LinkMonitor:
     def forget(self) -> None:
         """Take note that nobody asked for states meanwhile."""
         self._check.forget()
-        self._heard = self._left = time.monotonic()
+        self._heard = self._left = self._now()
 
     def _stand_still(self, detail: str) -> None:
         """Judge a clock that stands still: late at first, then stale, then silent."""
-        if time.monotonic() - self._heard <= self._hold:
+        if self._now() - self._heard <= self._hold:
             self._reports.count(Count.LATE)
             return
         if not self._stale:
@@ -242,7 +244,7 @@ class LinkMonitor:
         """Drop a state that cannot be believed; several in a row end the compensation."""
         self._reports.count(reason)
         self._invalid += 1
-        now = time.monotonic()
+        now = self._now()
         if now - self._told.get(reason, -TELL_EVERY) >= TELL_EVERY:
             self._told[reason] = now
             self._reports.emit({"kind": "dropped", "what": reason.label, "detail": detail})
@@ -252,7 +254,7 @@ class LinkMonitor:
         self._fall_silent(detail)
 
     def _fall_silent(self, detail: str) -> None:
-        silent = time.monotonic() - self._heard
+        silent = self._now() - self._heard
         if silent > SILENCE:
             if not self._silent:
                 self._silent = True

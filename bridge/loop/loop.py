@@ -6,7 +6,6 @@ a fault. What the loop is doing is one of the states in supervisor.py.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from enum import IntEnum
 from typing import Any, NamedTuple
@@ -82,14 +81,15 @@ class Loop:
         self._number = number  # which process of the loop this is, from 0
         self._settings, self._driver, self._source = settings, driver, source
         self._page, self._tell = page, tell
-        self._stream = SetpointStream(model, settings.limits, driver.rate)
+        clock, self._now = driver.clock, driver.clock.monotonic
+        self._stream = SetpointStream(model, settings.limits, driver.rate, clock)
         self._loads = LiveLoads(
             model.arm.n, settings.setpoints.use_force, settings.setpoints.force_filter,
             LoadBounds.of(model),
         )  # fmt: skip
         self._acting = Loads()  # of the last cycle
         self._model_check = ModelCheck(model, settings.setpoints.use_force)
-        self._clock = ControllerClock(driver.rate, hold_time(driver.rate))
+        self._clock = ControllerClock(driver.rate, hold_time(driver.rate), clock)
         reports = Reports(page, tell)
         self._supervisor = Supervisor(reports.transition)
         patience = settings.link.state_timeout
@@ -207,10 +207,10 @@ class Loop:
         """Ramp out, then end; a deadline makes sure of the end."""
         if self._stop_by is None:
             needed = LONGEST_STOP + longest_withdrawal(self._settings.limits)
-            self._stop_by = time.monotonic() + needed
+            self._stop_by = self._now() + needed
             self._stream.hasten(HASTY_RAMP)
             self._supervisor.take(Cause.STOP)
-        if not self._supervisor.state.writes or time.monotonic() > self._stop_by:
+        if not self._supervisor.state.writes or self._now() > self._stop_by:
             self._release()
             self._supervisor.take(Cause.RAMPED_OUT, "not at rest in time")
             self._exit = Exit.DONE
@@ -262,7 +262,7 @@ class Loop:
         loads = self._acting = self._loads.update(state)
         self._checks.judge_loads(self._loads.doubt)
         self._checks.judge_settings(state, self._driver)
-        seen = time.monotonic()
+        seen = self._now()
         if is_fresh and supervisor.state == State.ARMED:
             used_up = writing.start(state, own)
             self._look_after_writing()
@@ -282,7 +282,7 @@ class Loop:
         self._record(given, setpoint, writes, written is not None)
         clamped = 0 if written is None else self._stream.clamped
         commanded = own if written is None else written.q
-        self._checks.end(state, commanded, clamped, time.monotonic() - state.received)
+        self._checks.end(state, commanded, clamped, self._now() - state.received)
         if written is not None and holding and writing.at_rest(written, state):
             self._release()  # takes a moment: after the cycle has been timed
             supervisor.take(Cause.RAMPED_OUT)
@@ -316,14 +316,14 @@ class Loop:
         if stream.unsolved:
             flags |= UNSOLVED
         clamped = stream.clamped if setpoint is not None else 0
-        late = 0.0 if at is None else time.monotonic() - at  # arming: no part of the cycle
+        late = 0.0 if at is None else self._now() - at  # arming: no part of the cycle
         row, slices = page.next_row(), page.slices
         write_cycle(row, slices, state, nominal, corrected, offset)
         row[2] = self._supervisor.state
         row[3] = left
         row[4] = missed
         row[5] = self._clock.age(state) - late
-        row[6] = time.monotonic() - state.received - late
+        row[6] = self._now() - state.received - late
         row[7] = clamped
         row[8] = stream.residual
         row[slices["own_q"]] = own

@@ -17,7 +17,6 @@ import os
 import pickle
 import signal
 import sys
-import time
 import traceback
 from collections.abc import Callable
 from typing import Any
@@ -35,8 +34,10 @@ from gapbridge.bridge.loop.replay import ReplayedLoop
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream, gate_bounds
 from gapbridge.bridge.setpoint_source import make_source
 from gapbridge.bridge.setpoint_source.source import Source
+from gapbridge.core.clock import SYSTEM
 from gapbridge.core.errors import GapbridgeError, InputError
 from gapbridge.core.files import read_only_from
+from gapbridge.core.kernels import compiling
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.drivers import make_driver
@@ -53,6 +54,7 @@ def main() -> None:
     order = json.loads(sys.stdin.readline())
     os.set_blocking(order["events"], False)
     tell = _teller(order["events"])
+    compiling.listeners.append(_tell_compiling(tell))
     code: int = Exit.CRASH
     try:
         code = _run(order, tell)
@@ -115,11 +117,22 @@ def _teller(events: int) -> Callable[[dict[str, Any]], None]:
     def tell(event: dict[str, Any]) -> None:
         if len(event.get("detail", "")) > LONGEST_WORDS:
             event = {**event, "detail": event["detail"][:LONGEST_WORDS]}
-        now = {"time": time.time(), "monotonic": time.monotonic()}
+        now = {"time": SYSTEM.time(), "monotonic": SYSTEM.monotonic()}
         with contextlib.suppress(OSError):  # a message each: taken whole, or not at all
             os.write(events, json.dumps({**now, **event}).encode())
 
     return tell
+
+
+def _tell_compiling(tell: Callable[[dict[str, Any]], None]) -> Callable[[int], None]:
+    """Return a listener that notifies the daemon of the first function and every tenth."""
+
+    def began(functions: int) -> None:
+        if functions % 10 == 1:
+            far = "" if functions == 1 else f" ({functions} functions)"
+            tell({"kind": "compiling", "detail": f"starting: {compiling.ABOUT}{far}"})
+
+    return began
 
 
 def _read_model(settings: DaemonSettings) -> Model:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 
 import numpy as np
 from numba import njit
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from gapbridge.bridge.cell.sections import LimitSettings
 from gapbridge.bridge.loop.offset_in_force import InForce
 from gapbridge.core.arm import Arm
+from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.compensation import Compensator, Correction
 from gapbridge.core.errors import StaleStateError
 from gapbridge.core.kernels.reference import JIT
@@ -121,7 +121,10 @@ class NominalStream:
 class SetpointStream:
     """One stream of setpoints between ``start`` and coming to rest."""
 
-    def __init__(self, model: Model, settings: LimitSettings, rate: float) -> None:
+    def __init__(
+        self, model: Model, settings: LimitSettings, rate: float, clock: Clock = SYSTEM
+    ) -> None:
+        self._now = clock.monotonic
         limits = limits_of(settings, model.arm, rate)
         self.limiter = Limiter(limits, model.arm.n)
         self._compensator = Compensator(model)
@@ -217,7 +220,7 @@ class SetpointStream:
             corrected, offset = nominal + self._solved[:n], self._solved[n:]
         step, before = usable / self._ramp_time, self._share(offset)
         ramp = min(max(goal, before - step), before + step)
-        if time.monotonic() > expiry:
+        if self._now() > expiry:
             raise StaleStateError("the state was too old before its setpoint could leave")
         limited = self.limiter.limit(nominal, corrected, offset, ramp, state.actual_q, gap)
         if source_q is not None:

@@ -20,7 +20,7 @@ from gapbridge.drivers.ur_rtde.state import plausible
 
 
 def warm_up() -> None:
-    """Call each compiled function once; CAN and Modbus drivers compile theirs when made."""
+    """Call each compiled function once."""
     n = 6
     model = Model(builtin_arm("ur10e")).with_compliance([1e-6] * n, [1e-6] * n)
     q = np.array([[0.0, -1.5, 1.8, -1.87, -1.57, 0.0]])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,6 +47,7 @@ class Writing:
         in_force: OffsetInForce | None = None,
     ) -> None:
         self._settings, self._driver, self._source = settings, driver, source
+        self._now = driver.clock.monotonic
         self._stream, self._supervisor, self._reports = stream, supervisor, reports
         self._in_force = in_force or OffsetInForce(driver.n, None)
         self.ready = False  # the driver is armed
@@ -138,7 +137,7 @@ class Writing:
         """
         stream, self.unsent = self._stream, None
         self.ramps_out = self._supervisor.state == State.HOLDING
-        if time.monotonic() > expiry:
+        if self._now() > expiry:
             stream.forget()
             return None
         source_q = self._next(state, own)
@@ -164,7 +163,7 @@ class Writing:
                 self.unsent = _copied(setpoint)
                 words = "the model's correction is no number"
                 self._end(Count.BAD_OUTPUT, Cause.BAD_OUTPUT, words)
-            elif time.monotonic() > expiry:  # the system stopped this process since it was judged
+            elif self._now() > expiry:  # the system stopped this process since it was judged
                 self.unsent = _copied(setpoint)
                 self._reports.count(Count.LATE)
             else:
@@ -187,7 +186,7 @@ class Writing:
 
     def _judge_sending(self, expiry: float) -> None:
         """End the motion where the system stopped this process between judging and sending."""
-        late = time.monotonic() - expiry
+        late = self._now() - expiry
         if late > 0.0:
             words = f"a setpoint left {1e3 * late:.0f} ms after its state was too old"
             self._reports.count(Count.OVERRUN)
@@ -233,7 +232,7 @@ class Writing:
             return self._stream.is_bare
         if not self._stream.rests:
             return False
-        now = time.monotonic()
+        now = self._now()
         self._settling = self._settling or now
         near = bool((np.abs(state.target_q - setpoint.q) < SETTLED).all())
         if near or now - self._settling > LONGEST_SETTLING:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import signal
-import time
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 from gapbridge.bridge.ipc.side_main import Order, take_order
 from gapbridge.bridge.recording.recorder import Recorder
 from gapbridge.bridge.recording.redaction import redacted
+from gapbridge.core.clock import SYSTEM
 
 LOOK_EVERY = 0.1  # s
 QUIET = 0.6  # s without a heartbeat of the loop after which a lost daemon's run is over
@@ -42,7 +42,7 @@ def _follow(order: Order, recorder: Recorder) -> bool:
     ended = False
     while not order.events.closed:
         order.events.wait(LOOK_EVERY)
-        time.sleep(LOOK_EVERY / 2)  # events may come in crowds; cycles wait in the ring
+        SYSTEM.sleep(LOOK_EVERY / 2)  # events may come in crowds; cycles wait in the ring
         for event in order.events.poll():
             recorder.take(event)
             ended |= event.get("kind") == "ended"
@@ -54,13 +54,13 @@ def _follow(order: Order, recorder: Recorder) -> bool:
 
 def _outlive(order: Order, recorder: Recorder) -> None:
     """Record on until the loop, which has lost its daemon, has stopped too."""
-    until = time.monotonic() + LONGEST_FAREWELL
+    until = SYSTEM.monotonic() + LONGEST_FAREWELL
     recorder.take(
-        {"time": time.time(), "kind": "recorder", "detail": "the daemon is gone without an end"}
+        {"time": SYSTEM.time(), "kind": "recorder", "detail": "the daemon is gone without an end"}
     )
-    while order.page.silence < QUIET and time.monotonic() < until:
+    while order.page.silence < QUIET and SYSTEM.monotonic() < until:
         recorder.step()
-        time.sleep(LOOK_EVERY)
+        SYSTEM.sleep(LOOK_EVERY)
 
 
 def _configuration(order: Order, event: dict[str, Any] | None = None) -> dict[str, Any]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -24,6 +23,7 @@ from gapbridge.bridge.recording.event_text import LEVELS, level_of, text_of
 from gapbridge.bridge.recording.finishing import finish, unfinished
 from gapbridge.bridge.recording.folder import next_path, number_after, prune, segments
 from gapbridge.bridge.recording.segment import Segment
+from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.mcap_schema import CONFIGURATION, EVENTS, LOG, STATUS
 
@@ -50,7 +50,9 @@ class Recorder:
         page: SharedMemory,
         configuration: Mapping[str, Any],
         emit: Emit,
+        clock: Clock = SYSTEM,
     ) -> None:
+        self._clock = clock
         assert settings.folder is not None
         self._settings, self._folder, self._session = settings, settings.folder, session
         self._page, self._emit = page, emit
@@ -58,7 +60,7 @@ class Recorder:
         self._states = [state.name for state in State]
         self._segment: Segment | None = None
         self._events: deque[Event] = deque(maxlen=MOST_EVENTS)  # not yet flushed
-        self._flushed = time.monotonic()
+        self._flushed = self._clock.monotonic()
         self._retry_at = 0.0
         self._why_paused = ""
         self.pauses = 0
@@ -86,7 +88,7 @@ class Recorder:
 
     def step(self, flush: bool = False) -> int:
         """Take what the page has; flush, rotate, pause, resume. Returns the cycles taken."""
-        now = time.monotonic()
+        now = self._clock.monotonic()
         if self._segment is None and now < self._retry_at and not flush:
             return 0
         if self._segment is None and not self._open():
@@ -150,7 +152,7 @@ class Recorder:
 
     def _write_event(self, segment: Segment, event: Event) -> None:
         at = event.get("time")
-        at = at if isinstance(at, int | float) else time.time()
+        at = at if isinstance(at, int | float) else self._clock.time()
         if event.get("kind") == "status":
             segment.emit(STATUS, event, at)
             return
@@ -170,7 +172,7 @@ class Recorder:
             if self._room() < self._settings.keep_free:
                 raise OSError(0, f"less than {self._settings.keep_free:g} MB free")
             path = next_path(self._folder, self._session)
-            self._segment = Segment(path, self._page.slices, self._states)
+            self._segment = Segment(path, self._page.slices, self._states, self._clock)
             self._describe()
             self._segment.flush()
         except OSError as error:
@@ -178,7 +180,7 @@ class Recorder:
             return False
         self._why_paused = ""
         self._reader = self._page.reader(self._next)
-        self._flushed = time.monotonic()
+        self._flushed = self._clock.monotonic()
         self._say(f"recording into {path}", file=str(path))
         return True
 
@@ -186,7 +188,7 @@ class Recorder:
         assert self._segment is not None
         number = int(re.sub(r".*-", "", self._segment.path.stem))
         document = {
-            "time": time.time(), "session": self._session, "segment": number,
+            "time": self._clock.time(), "session": self._session, "segment": number,
             "clock": self._segment.clock / 1e9, "every": self._settings.every,
             "first_cycle": self._next, **self.configuration,
         }  # fmt: skip
@@ -204,7 +206,7 @@ class Recorder:
             self._segment.abandon()
             self._cut_off.append(self._segment.path)
         self._segment = None
-        self._retry_at = time.monotonic() + RETRY_EVERY
+        self._retry_at = self._clock.monotonic() + RETRY_EVERY
         if why != self._why_paused:
             self.pauses += 1
             self._say(f"recording paused: {why}", paused=why, next_cycle=self._next)
@@ -217,7 +219,7 @@ class Recorder:
 
     def _say(self, message: str, **more: Any) -> None:
         event = {
-            "time": time.time(), "monotonic": time.monotonic(), "kind": "recorder",
+            "time": self._clock.time(), "monotonic": self._clock.monotonic(), "kind": "recorder",
             "detail": message, **more,
         }  # fmt: skip
         self._emit(event)

@@ -11,7 +11,6 @@ import fcntl
 import json
 import math
 import os
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from gapbridge.bridge.document.output_file import MODE
+from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.log.mcap_layout import layout_of
 from gapbridge.core.log.mcap_schema import (
     CYCLE_CHANNELS,
@@ -84,15 +84,17 @@ def _sync_folder(folder: Path) -> None:
 class Segment:
     """One file of a run, from its first byte to its summary."""
 
-    def __init__(self, path: Path, slices: Mapping[str, slice], states: Sequence[str]) -> None:
+    def __init__(
+        self, path: Path, slices: Mapping[str, slice], states: Sequence[str], clock: Clock = SYSTEM
+    ) -> None:
         """Open a new file. Raises OSError, FileExistsError where the name is taken."""
-        self.path = path
-        self.opened = time.monotonic()
+        self.path, self._clock = path, clock
+        self.opened = clock.monotonic()
         self.rows = 0  # handed over, flushed or not
         self._slices = slices
         self._next_sync = 0.0
         # ns between this machine's monotonic clock and the calendar, the same for the whole file
-        self.clock = time.time_ns() - time.monotonic_ns()
+        self.clock = round(1e9 * (clock.time() - clock.monotonic()))
         self._file = _File(path)
         try:
             self._writer = Writer(
@@ -134,7 +136,7 @@ class Segment:
             return
         numbers = rows[:, self._slices["number"].start].astype(np.int64) & 0xFFFFFFFF
         received = rows[:, self._slices["received"].start]
-        known = np.where(np.isfinite(received), received, time.monotonic())
+        known = np.where(np.isfinite(received), received, self._clock.monotonic())
         times = ((known * 1e9).astype(np.int64) + self.clock).tolist()
         add = self._writer.add_message
         encoded = [
@@ -147,17 +149,17 @@ class Segment:
 
     def emit(self, topic: str, document: Mapping[str, Any], at: float | None = None) -> None:
         """Take a JSON message over; ``at``: s since 1970, else now."""
-        stamp = int((time.time() if at is None else at) * 1e9)
+        stamp = int((self._clock.time() if at is None else at) * 1e9)
         data = _json(document)
         self._writer.add_message(self._channels[topic], stamp, data, stamp)
 
     def flush(self) -> None:
         """Hand over what was taken; now and then wait for the disk. Raises OSError."""
         self._writer.flush()  # type: ignore[no-untyped-call]
-        now = time.monotonic()
+        now = self._clock.monotonic()
         if now >= self._next_sync:
             os.fdatasync(self._file.fd)
-            spent = time.monotonic() - now
+            spent = self._clock.monotonic() - now
             self._next_sync = now + max(SYNC_EVERY, spent / SYNC_SHARE)
 
     def close(self) -> None:

@@ -2,41 +2,82 @@
 
 from __future__ import annotations
 
-from gapbridge.bridge.report.answer_picture import picture
-from gapbridge.bridge.report.fragment import badge, figure_block, html_of, paragraph
-from gapbridge.bridge.report.material import Material, after, chosen_channel, unexplained
-from gapbridge.bridge.report.words import (
+from gapbridge.bridge.document.blocks import (
+    BAD,
+    DOUBTFUL,
+    GOOD,
+    Badge,
+    Block,
+    Bullets,
+    Heading,
+    Paragraph,
+    Pictures,
+    Verdict,
+)
+from gapbridge.bridge.report.answer_picture import CAPTION, picture
+from gapbridge.bridge.report.labels import (
     CHANNELS,
     VERDICTS,
-    effect_words,
-    joints_words,
+    effect_title,
+    joint_list,
     likelihood,
     listed,
     percent,
-    quantity_words,
-    told,
+    quantity_title,
+    with_unit,
 )  # fmt: skip
-from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
+from gapbridge.bridge.report.material import Material, after, chosen_channel, unexplained
+from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
 from gapbridge.core.diagnosis.result import Cause
 
-KINDS = {"no_gap": "good", "explained": "good", "partly_explained": "doubtful",
-         "unexplained": "bad"}  # fmt: skip
+KINDS = {"no_gap": GOOD, "explained": GOOD, "partly_explained": DOUBTFUL, "unexplained": BAD}
 
 
-def section(material: Material) -> str:
-    """Return the section: verdict, three sentences, the picture, a line for further channels."""
+def answer(material: Material) -> list[Block]:
+    """Return the blocks; further channels have a line each."""
     diagnosis = material.diagnosis
     main = chosen_channel(diagnosis)
-    word = badge(VERDICTS[diagnosis.verdict], KINDS[diagnosis.verdict])
-    parts = [f'<p class="verdict">{html_of(word)}</p>']
-    parts.append(paragraph(" ".join(sentences(main)), "lead"))
-    parts += [
-        paragraph(f"{CHANNELS[c.channel]}: {one_line(c)}")
+    verdict = Badge(VERDICTS[diagnosis.verdict], KINDS[diagnosis.verdict])
+    others = [
+        Paragraph(f"{CHANNELS[c.channel]}: {one_line(c)}")
         for c in diagnosis.channels
         if c is not main
     ]
-    parts.append(figure_block(picture(diagnosis.channels)))
-    return "".join(parts)
+    return [
+        Verdict(verdict, " ".join(sentences(main))), *others,
+        Heading("What to do now"), Bullets(tuple(next_steps(diagnosis))),
+        Pictures(tuple(picture(c) for c in diagnosis.channels), CAPTION),
+    ]  # fmt: skip
+
+
+def next_steps(diagnosis: Diagnosis) -> list[str]:
+    """Return what the user does next, most urgent first."""
+    causes = [cause for c in diagnosis.channels for cause in c.causes]
+    steps = []
+    if diagnosis.findings:
+        steps.append(
+            "Read the findings under Data quality first: where one of them is a mistake in log or "
+            "cell, correct it and diagnose again."
+        )
+    if causes:
+        steps.append(
+            "Write the causes into a new cell with --apply NEW_CELL, then diagnose a log with "
+            "other poses against that cell: its gap should be that of “after”."
+        )
+    elif diagnosis.verdict == "no_gap":
+        steps.append("Nothing: use the cell as it is. Diagnose again after a change to the arm.")
+    if any(c.structured or c.verdict == "unexplained" for c in diagnosis.channels):
+        steps.append(
+            "Do not compensate what no effect explains. Look at what the remaining gap depends on "
+            "(“Where the gap lies”) and at the arm there: wear, a loose part, cables, the "
+            "instrument's mounting."
+        )
+    if diagnosis.next_measurements:
+        open_ = any(cause.indistinguishable_from for cause in causes)
+        what = "To decide between the causes that these data cannot separate, measure" if open_ \
+            else "To answer the open questions, measure"  # fmt: skip
+        steps.append(f"{what} the poses under “What to measure next” and add them to the log.")
+    return steps
 
 
 def sentences(channel: ChannelDiagnosis) -> list[str]:
@@ -45,18 +86,18 @@ def sentences(channel: ChannelDiagnosis) -> list[str]:
 
 
 def one_line(channel: ChannelDiagnosis) -> str:
-    """Return what is to be said of a channel that is not the main one."""
+    """Return one sentence on a channel that is not the main one."""
     if channel.verdict == "no_gap":
-        return f"no gap; {told(channel.gap_rms, channel.unit)} is what noise makes."
+        return f"no gap; {with_unit(channel.gap_rms, channel.unit)} is what noise makes."
     return f"{_causes(channel)} {_left(channel)}"
 
 
-def cause_words(cause: Cause) -> str:
+def cause_title(cause: Cause) -> str:
     """Return a cause in plain words with its joints."""
-    where = f" ({joints_words(cause.joints)})" if cause.joints else ""
-    ties = [effect_words(name) for name in cause.indistinguishable_from]
+    where = f" ({joint_list(cause.joints)})" if cause.joints else ""
+    ties = [effect_title(name) for name in cause.indistinguishable_from]
     tie = f" – or, these data cannot distinguish between, {listed(ties, 'or')}" if ties else ""
-    return f"{effect_words(cause.effect)}{where}{tie}"
+    return f"{effect_title(cause.effect)}{where}{tie}"
 
 
 def _size(channel: ChannelDiagnosis) -> str:
@@ -66,14 +107,14 @@ def _size(channel: ChannelDiagnosis) -> str:
     }[channel.channel]  # fmt: skip
     per = "joint" if channel.channel in ("tracking", "torque") else "axis"
     floor = channel.noise_floor_rms
-    noise = "" if floor is None else f"; measurement noise makes {told(floor, unit)} of it"
+    noise = "" if floor is None else f"; measurement noise makes {with_unit(floor, unit)} of it"
     if floor is not None and floor >= channel.gap_rms:
-        noise = f", no more than the measurement noise of {told(floor, unit)}"
+        noise = f", no more than the measurement noise of {with_unit(floor, unit)}"
     elif channel.verdict == "no_gap":
-        noise = "" if floor is None else f", and noise alone makes {told(floor, unit)}"
+        noise = "" if floor is None else f", and noise alone makes {with_unit(floor, unit)}"
     return (
-        f"{what} {told(channel.gap_rms, unit)} per {per} (rms over {channel.samples} samples, "
-        f"{told(channel.gap_max, unit)} at worst){noise}."
+        f"{what} {with_unit(channel.gap_rms, unit)} per {per} (rms over {channel.samples} samples, "
+        f"{with_unit(channel.gap_max, unit)} at worst){noise}."
     )
 
 
@@ -85,11 +126,11 @@ def _causes(channel: ChannelDiagnosis) -> str:
             "No known effect explains it: something is going on that is not in the catalogue, "
             "and no known effect is blamed for it."
         )
-    words = listed([cause_words(c) for c in channel.causes])
+    words = listed([cause_title(c) for c in channel.causes])
     fall = 1 - after(channel) / max(channel.gap_rms, 1e-300)
     sure = likelihood(min(c.probability for c in channel.causes))
     many = len(channel.causes) > 1
-    left = told(after(channel), channel.unit)
+    left = with_unit(after(channel), channel.unit)
     change = (
         f"the gap falls by {percent(fall)} to {left}"
         if fall > 0
@@ -106,9 +147,9 @@ def elsewhere(channel: ChannelDiagnosis) -> str:
     found, unit = channel.elsewhere, channel.unit
     parts = []
     if found.new_region is not None:
-        parts.append(f"{told(found.new_region, unit)} in a new region of joint space")
+        parts.append(f"{with_unit(found.new_region, unit)} in a new region of joint space")
     if found.new_session is not None:
-        parts.append(f"{told(found.new_session, unit)} in a new session")
+        parts.append(f"{with_unit(found.new_session, unit)} in a new session")
     session = "" if found.new_session is not None else (
         " One session does not show what a new one brings."
     )  # fmt: skip
@@ -117,9 +158,10 @@ def elsewhere(channel: ChannelDiagnosis) -> str:
 
 def _left(channel: ChannelDiagnosis) -> str:
     if channel.structured:
-        names = [quantity_words(name) for name, share in channel.depends_on[:3] if share > 0.01]
+        names = [quantity_title(name) for name, share in channel.depends_on[:3] if share > 0.01]
         on = f" It depends on {listed(names)}." if names else ""
-        return f"{told(unexplained(channel), channel.unit)} stays unexplained, more than noise.{on}"
+        size = with_unit(unexplained(channel), channel.unit)
+        return f"{size} stays unexplained, more than noise.{on}"
     if channel.verdict == "no_gap":
         return "Nothing needs to be changed on account of this log."
     return "What remains looks like measurement noise, with no structure left in it."

@@ -9,8 +9,8 @@ import inspect
 import sys
 from pathlib import Path
 
-from gapbridge.bridge.report.words import CHANNELS as CHANNEL_WORDS
-from gapbridge.bridge.report.words import effect_words
+from gapbridge.bridge.report.labels import CHANNELS as CHANNEL_WORDS
+from gapbridge.bridge.report.labels import effect_title
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.effects import CATALOGUE, CHANNELS, Effect, ties_of
 
@@ -39,7 +39,7 @@ def _table(channel: str) -> str:
     rows = ["| effect | in plain words | where |", "| --- | --- | --- |"]
     for name, effect in CATALOGUE.items():
         if channel in effect.channels:
-            rows.append(f"| [`{name}`](#{name}) | {effect_words(name)} | {_place(effect)} |")
+            rows.append(f"| [`{name}`](#{name}) | {effect_title(name)} | {_place(effect)} |")
     return "\n".join(rows)
 
 
@@ -57,11 +57,11 @@ def _effect(effect: Effect) -> str:
         lines.append(f"- looks the same as `{other}` on: {data}")
     if effect.needs:
         lines.append(f"- columns beyond the channel's own: {', '.join(effect.needs)}")
-    told = [
+    names = [
         f"`{parameter.name or 'value'}` ({parameter.unit or 'no unit'})"
         for parameter in effect.parameters(arm, effect.sites(arm)[0])
     ]
-    return "\n".join([*lines, f"- parameters: {', '.join(told)}", ""])
+    return "\n".join([*lines, f"- parameters: {', '.join(names)}", ""])
 
 
 def main(arguments: list[str]) -> int:

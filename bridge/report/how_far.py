@@ -4,87 +4,78 @@ from __future__ import annotations
 
 import numpy as np
 
-from gapbridge.bridge.report.fragment import (
-    AFTER,
-    BEFORE,
-    EXPLAINED,
-    FLOOR,
-    LEFT,
-    Cell,
-    Figure,
-    bar,
-    figure_block,
-    paragraph,
-    table,
+from gapbridge.bridge.document.axes import Chart, distribution, scale
+from gapbridge.bridge.document.blocks import Bar, Block, Cell, Paragraph, Pictures, Table
+from gapbridge.bridge.document.drawing import BAD_DOT, EDGE, LIMIT, Drawing
+from gapbridge.bridge.report.labels import CHANNELS, effect_title, percent, unit_of, with_unit
+from gapbridge.bridge.report.material import (
+    Array,
+    Index,
+    Material,
+    before_and_after,
+    channel_heading,
+    held_out_pair,
+    shares,
+    thinned,
 )
-from gapbridge.bridge.report.material import Array, Material, held_out_pair, shares, thinned
-from gapbridge.bridge.report.words import CHANNELS, effect_words, percent, told, unit_of
 from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
 
-BINS = 40
 
-
-def section(material: Material) -> str:
+def how_far(material: Material) -> list[Block]:
     """Return the shares, and before and after for every channel."""
-    parts = [_shares(material.diagnosis.channels)]
-    for channel in material.diagnosis.channels:
-        if len(material.diagnosis.channels) > 1:
-            parts.append(f"<h3>{CHANNELS[channel.channel]}</h3>")
-        parts.append(_channel(channel))
-        parts.append(_sessions(channel, material.diagnosis.sessions))
-    return "".join(parts)
+    diagnosis = material.diagnosis
+    blocks: list[Block] = [_shares(diagnosis.channels)]
+    for channel in diagnosis.channels:
+        blocks += channel_heading(diagnosis, channel)
+        blocks += _channel(channel) + _sessions(channel, diagnosis.sessions)
+    return blocks
 
 
-def _shares(channels: tuple[ChannelDiagnosis, ...]) -> str:
+def _shares(channels: tuple[ChannelDiagnosis, ...]) -> Table:
     rows: list[list[Cell]] = []
     for c in channels:
         part = shares(c)
         rows.append([
-            CHANNELS[c.channel], told(c.gap_rms, c.unit),
-            told(c.remaining_rms_held_out, c.unit) if c.causes else "–",
-            told(c.elsewhere.new_region, c.unit), told(c.elsewhere.new_session, c.unit),
-            told(c.noise_floor_rms, c.unit),
-            bar(part.explained, percent(part.explained), EXPLAINED),
-            bar(part.noise, percent(part.noise), FLOOR),
-            bar(part.unexplained, percent(part.unexplained), LEFT),
+            CHANNELS[c.channel], with_unit(c.gap_rms, c.unit),
+            with_unit(c.remaining_rms_held_out, c.unit) if c.causes else "–",
+            with_unit(c.elsewhere.new_region, c.unit), with_unit(c.elsewhere.new_session, c.unit),
+            with_unit(c.noise_floor_rms, c.unit),
+            Bar(part.explained, percent(part.explained), LIMIT),
+            Bar(part.noise, percent(part.noise), EDGE),
+            Bar(part.unexplained, percent(part.unexplained), BAD_DOT),
         ])  # fmt: skip
-    heads = ("channel", "before", "after, held out", "in a new region",
-             "in a new session", "noise", "explained", "noise share",
-             "unexplained")  # fmt: skip
-    return table(heads, rows)
+    heads = ("channel", "before", "after, held out", "in a new region", "in a new session",
+             "noise", "explained", "noise share", "unexplained")  # fmt: skip
+    return Table(heads, rows)
 
 
-def _channel(channel: ChannelDiagnosis) -> str:
+def _channel(channel: ChannelDiagnosis) -> list[Block]:
     pair = held_out_pair(channel)
-    parts = []
-    if channel.causes:
-        parts.append(_causes(channel))
+    blocks: list[Block] = [_causes(channel)] if any(c.shrink for c in channel.causes) else []
     if pair is None:
-        parts.append(paragraph("There are too few different poses to hold any out."))
-        return "".join(parts)
+        return [*blocks, Paragraph("There are too few different poses to hold any out.")]
     before, after = pair
     if not channel.causes:
-        parts.append(paragraph("No cause was put into the model, so before and after are the same.",
-                               "note"))  # fmt: skip
-    parts += [figure_block(_histogram(channel, before, after)),
-              figure_block(_by_sample(channel, before, after))]  # fmt: skip
-    better = float(np.mean(after < before)) if channel.causes else None
-    if better is not None:
-        parts.append(paragraph(f"{percent(better)} of the held-out samples came closer."))
-    return "".join(parts)
+        text = "No cause was put into the model, so before and after are the same."
+        blocks.append(Paragraph(text, "note"))
+    blocks.append(_pictures(channel, before, after))
+    if channel.causes:
+        better = float(np.mean(after < before))
+        blocks.append(Paragraph(f"{percent(better)} of the held-out samples came closer."))
+    return blocks
 
 
-def _sessions(channel: ChannelDiagnosis, sessions: tuple[str, ...]) -> str:
+def _sessions(channel: ChannelDiagnosis, sessions: tuple[str, ...]) -> list[Block]:
     """Return how each session does under a fit of the others, and what changed between them."""
     found = channel.elsewhere.by_session
     if not found:
-        return ""
-    rows: list[list[Cell]] = [[sessions[s], told(rms, channel.unit)] for s, rms in found]
-    parts = [table(("session", "left under a fit of the others"), rows)]
+        return []
+    rows: list[list[Cell]] = [[sessions[s], with_unit(rms, channel.unit)] for s, rms in found]
+    blocks: list[Block] = [Table(("session", "residual under a fit of the others"), rows)]
     for across in channel.carried:
-        words = effect_words(across.effect)
+        title = effect_title(across.effect)
         if across.carries:
-            parts.append(paragraph(f"{words}: the same in all sessions that show it."))
+            blocks.append(Paragraph(f"{title}: the same in all sessions that show it."))
             continue
         heads = ("changed between sessions", *(sessions[s] for s, _ in across.values))
         values = [parameters for _, parameters in across.values]
@@ -92,11 +83,11 @@ def _sessions(channel: ChannelDiagnosis, sessions: tuple[str, ...]) -> str:
             [same[0].name, *(f"{p.value:.4g} ± {p.std or 0.0:.2g} {p.unit}" for p in same)]
             for same in zip(*values, strict=True)
         ]
-        parts.append(table(heads, lines))
-    return "".join(parts)
+        blocks.append(Table(heads, lines))
+    return blocks
 
 
-def _causes(channel: ChannelDiagnosis) -> str:
+def _causes(channel: ChannelDiagnosis) -> Table:
     rows: list[list[Cell]] = []
     for cause in channel.causes:
         s = cause.shrink
@@ -104,57 +95,45 @@ def _causes(channel: ChannelDiagnosis) -> str:
             continue
         low, high = s.interval
         rows.append([
-            effect_words(cause.effect), told(s.gap_without, channel.unit),
-            told(s.gap_with, channel.unit),
-            bar(s.shrink, f"{percent(s.shrink)} ({percent(low)} to {percent(high)})", EXPLAINED),
+            effect_title(cause.effect), with_unit(s.gap_without, channel.unit),
+            with_unit(s.gap_with, channel.unit),
+            Bar(s.shrink, f"{percent(s.shrink)} ({percent(low)} to {percent(high)})", LIMIT),
         ])  # fmt: skip
     heads = ("cause, all others kept in", "gap without it", "gap with it", "shrinks by (95 %)")
-    return table(heads, rows) if rows else ""
+    return Table(heads, rows, (2.4, 1, 1, 2))
 
 
-def _histogram(channel: ChannelDiagnosis, before: Array, after: Array) -> Figure:
+def _pictures(channel: ChannelDiagnosis, before: Array, after: Array) -> Pictures:
     name, factor = unit_of(channel.unit)
-    most = float(max(before.max(), after.max())) * factor
-    edges = np.linspace(0, max(most, 1e-12), BINS + 1)
-    middle = 0.5 * (edges[1:] + edges[:-1])
-    given = [("before", before, BEFORE)] + ([("after", after, AFTER)] if channel.causes else [])
-    traces = [
-        {"type": "bar", "x": middle, "y": np.histogram(values * factor, edges)[0], "name": label,
-         "marker": {"color": colour}, "opacity": 0.7, "width": float(edges[1])}
-        for label, values, colour in given
-    ]  # fmt: skip
-    layout = {
-        "barmode": "overlay", "xaxis": {"title": {"text": f"gap per coordinate ({name})"}},
-        "yaxis": {"title": {"text": "samples"}}, **_floor_line(channel, vertical=True),
-    }  # fmt: skip
-    return Figure(traces, layout, "How many samples have which gap, held out. Dotted: the noise.",
-                  height=300)  # fmt: skip
-
-
-def _by_sample(channel: ChannelDiagnosis, before: Array, after: Array) -> Figure:
-    name, factor = unit_of(channel.unit)
-    rows = channel.selection.observation.rows[channel.selection.kept] + 1
+    series = [
+        (label, values * factor, colour)
+        for label, values, colour in before_and_after(channel, before, after)
+    ]
+    floor = channel.noise_floor_rms
+    level = None if floor is None else floor * factor
+    share = distribution("Distribution of the gap", f"gap per coordinate, {name}", series)
+    if level is not None and share.x.low <= level <= share.x.high:
+        share.upright(level, "noise", EDGE)
     keep = thinned(before)
-    given = [("before", before, BEFORE)] + ([("after", after, AFTER)] if channel.causes else [])
-    traces = [
-        {"type": "scatter", "mode": "markers", "x": rows[keep], "y": values[keep] * factor,
-         "name": label, "marker": {"color": colour, "size": 5, "opacity": 0.75}}
-        for label, values, colour in given
-    ]  # fmt: skip
-    layout = {
-        "xaxis": {"title": {"text": "row of the log"}},
-        "yaxis": {"title": {"text": f"gap per coordinate ({name})"}, "rangemode": "tozero"},
-        **_floor_line(channel, vertical=False),
-    }
     thin = f" {len(keep)} of {len(before)} samples are drawn." if len(keep) < len(before) else ""
-    return Figure(traces, layout, f"Every sample, held out. Dotted: the noise.{thin}", height=320)
+    rows = channel.selection.observation.rows[channel.selection.kept][keep] + 1
+    by_sample = _by_sample(rows, [(n, v[keep], c) for n, v, c in series], name, level)
+    return Pictures(
+        (share.drawing, by_sample),
+        "Held out. Left: the share of the samples whose gap is at most so large, gaps in powers "
+        f"of ten. Right: every sample. Dashed: the noise.{thin}",
+    )
 
 
-def _floor_line(channel: ChannelDiagnosis, *, vertical: bool) -> dict[str, object]:
-    if channel.noise_floor_rms is None:
-        return {}
-    at = channel.noise_floor_rms * unit_of(channel.unit)[1]
-    line = {"type": "line", "line": {"dash": "dot", "width": 1.5, "color": "#444"}}
-    if vertical:
-        return {"shapes": [line | {"x0": at, "x1": at, "y0": 0, "y1": 1, "yref": "paper"}]}
-    return {"shapes": [line | {"y0": at, "y1": at, "x0": 0, "x1": 1, "xref": "paper"}]}
+def _by_sample(
+    rows: Index, series: list[tuple[str, Array, str]], unit: str, level: float | None
+) -> Drawing:
+    highest = [level or 0.0, *(float(values.max()) for _, values, _ in series)]
+    chart = Chart("Every sample", scale("row of the log", [*rows], tight=True),
+                  scale(f"gap per coordinate, {unit}", highest))  # fmt: skip
+    for _, values, colour in series:
+        chart.points([*rows], [*values], colour, radius=1.8, opacity=0.7)
+    if level is not None:
+        chart.level(level, "noise", EDGE)
+    chart.legend([(label, colour) for label, _, colour in series])
+    return chart.drawing

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.bridge.document.blocks import Block, Heading
+from gapbridge.bridge.document.drawing import AFTER, BEFORE
+from gapbridge.bridge.report.labels import CHANNELS
 from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.log.log import Log
@@ -25,6 +30,7 @@ class Material:
     cell_name: str
     log: Log
     model: Model  # as it was before the diagnosis
+    origin: Mapping[str, Any] = field(default_factory=dict)  # provenance: version, time, files
 
 
 @dataclass(frozen=True)
@@ -106,3 +112,16 @@ def chosen_channel(diagnosis: Diagnosis) -> ChannelDiagnosis:
 
     gaps = [c for c in diagnosis.channels if c.verdict != "no_gap"]
     return max(gaps or list(diagnosis.channels), key=excess)
+
+
+def before_and_after(
+    channel: ChannelDiagnosis, before: Array, after: Array
+) -> list[tuple[str, Array, str]]:
+    """Return name, values and colour of what is drawn: after only where there are causes."""
+    given = [("before", before, BEFORE)]
+    return [*given, ("after", after, AFTER)] if channel.causes else given
+
+
+def channel_heading(diagnosis: Diagnosis, channel: ChannelDiagnosis) -> list[Block]:
+    """Return a heading for a channel where there are several."""
+    return [Heading(CHANNELS[channel.channel])] if len(diagnosis.channels) > 1 else []

@@ -1,12 +1,20 @@
-"""Parameters with their intervals, ties in plain words, and what to measure next."""
+"""Parameters with their intervals, ties, and what to measure next."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from gapbridge.bridge.report.fragment import Cell, Raw, bullets, heading, html_of, paragraph, table
+from gapbridge.bridge.document.blocks import (
+    Block,
+    Bullets,
+    Cell,
+    Heading,
+    Named,
+    Paragraph,
+    Table,
+)
+from gapbridge.bridge.report.labels import effect_title, joint_list, listed, number, unit_of
 from gapbridge.bridge.report.material import Material
-from gapbridge.bridge.report.words import effect_words, joints_words, listed, number, unit_of
 from gapbridge.core.diagnosis.result import Cause
 from gapbridge.core.diagnosis.separation import Measurement
 from gapbridge.core.effects import Reported
@@ -15,31 +23,31 @@ SIDE = 1.96  # standard deviations of a 95 % interval
 SHOWN = 12
 
 
-def section(material: Material) -> str:
+def parameters(material: Material) -> list[Block]:
     """Return the parameters, the ties and the next measurements."""
     causes = [c for channel in material.diagnosis.channels for c in channel.causes]
-    return "".join(
-        [_parameters(causes), _ties(causes), _next(material.diagnosis.next_measurements)]
-    )
+    return [
+        *_parameters(causes), *_ties(causes), Heading("What to measure next"),
+        *_next(material.diagnosis.next_measurements),
+    ]  # fmt: skip
 
 
-def _parameters(causes: list[Cause]) -> str:
+def _parameters(causes: list[Cause]) -> list[Block]:
     if not causes:
-        return paragraph("No effect was accused, so there are no parameters to add to the model.")
+        return [Paragraph("No effect was accused, so there are no parameters to add to the model.")]
     rows: list[list[Cell]] = []
     for cause in causes:
-        where = f", {joints_words(cause.joints)}" if cause.joints else ""
-        first: Cell = Raw(f"<b>{html_of(effect_words(cause.effect))}</b>{where}")
+        where = f", {joint_list(cause.joints)}" if cause.joints else ""
+        first: Cell = Named(effect_title(cause.effect), where)
         for p in cause.parameters:
-            rows.append([first, Raw(f"<code>{html_of(p.name)}</code>"), *_value(p)])
+            rows.append([first, Named("", code=p.name), *_value(p)])
             first = ""
     note = (
         "Each is what the real arm has more than the model; the interval holds it in 19 of 20 "
         "cases."
     )
-    return table(("cause", "parameter", "value", "95 % interval", "unit"), rows) + paragraph(
-        note, "note"
-    )
+    heads = ("cause", "parameter", "value", "95 % interval", "unit")
+    return [Table(heads, rows, (2.2, 2.2, 1, 1.6, 0.8)), Paragraph(note, "note")]
 
 
 def _value(p: Reported) -> tuple[str, str, str]:
@@ -64,54 +72,58 @@ def _decimals(side: float) -> int:
     return int(min(max(1 - np.floor(np.log10(side)), 0), 9))
 
 
-def _ties(causes: list[Cause]) -> str:
-    told = [
-        f"{effect_words(c.effect).capitalize()} ({c.effect}) explains these data no better than "
-        f"{listed([f'{effect_words(n)} ({n})' for n in c.indistinguishable_from], 'or')}. "
+def _ties(causes: list[Cause]) -> list[Block]:
+    ties = tuple(
+        f"{effect_title(c.effect).capitalize()} ({c.effect}) explains these data no better than "
+        f"{listed([f'{effect_title(n)} ({n})' for n in c.indistinguishable_from], 'or')}. "
         "The simpler or likelier one is named; a measurement below would decide."
         for c in causes if c.indistinguishable_from
-    ]  # fmt: skip
-    return heading("What these data cannot separate") + bullets(told) if told else ""
+    )  # fmt: skip
+    return [Heading("What these data cannot separate"), Bullets(ties)] if ties else []
 
 
-def _next(measurements: tuple[Measurement, ...]) -> str:
-    head = heading("What to measure next")
+def _next(measurements: tuple[Measurement, ...]) -> list[Block]:
     if not measurements:
-        return head + paragraph(
-            "No question is open that another pose under another load would settle."
-        )
-    approach, moving = (
-        any(m.approach for m in measurements),
-        any(m.velocity for m in measurements),
-    )
-    rows = []
-    for i, m in enumerate(measurements[:SHOWN], start=1):
-        row: list[Cell] = [str(i), _degrees(m.q, 1), number(m.payload),
-                           _purpose(m), f"{number(m.expected_gain, 2)} × noise"]  # fmt: skip
-        if moving:
-            row.insert(2, _motion(m))
-        if approach:
-            signs = " ".join({1: "+", -1: "−"}.get(a, "0") for a in m.approach or ())
-            row.insert(2, signs or "any")
-        rows.append(row)
-    heads = ["", "joint angles (deg)", "load (kg)", "decides", "expected difference"]
-    if moving:
-        heads.insert(2, "in motion (deg/s; deg/s²)")
-    if approach:
-        heads.insert(2, "reach each joint from")
+        text = "No question is open that another pose under another load would settle."
+        return [Paragraph(text)]
+    moving = any(m.velocity for m in measurements)
     text = (
         "Move to these poses with these loads and add the rows to the log"
         f"{'; record a motion through those with a speed' if moving else ''}. Check each for free "
         "space first: the poses keep the joint limits, but nothing here knows your cell."
     )
+    blocks: list[Block] = [Paragraph(text), measurements_table(measurements, SHOWN)]
     more = len(measurements) - SHOWN
-    end = paragraph(f"{more} more stand in the JSON.", "note") if more > 0 else ""
-    return head + paragraph(text) + table(heads, rows) + end
+    return [*blocks, Paragraph(f"{more} more stand in the JSON.", "note")] if more > 0 else blocks
+
+
+def measurements_table(measurements: tuple[Measurement, ...], most: int) -> Table:
+    """Return what to measure next as a table; speeds and approaches only where there are any."""
+    shown = measurements[:most]
+    columns: list[tuple[str, float, list[Cell]]] = [
+        ("", 0.3, [str(i) for i in range(1, len(shown) + 1)]),
+        ("joint angles (deg)", 2.6, [_degrees(m.q, 1) for m in shown]),
+    ]
+    if any(m.approach for m in shown):
+        columns.append(("reach each joint from", 1.2, [_approach(m) for m in shown]))
+    if any(m.velocity for m in shown):
+        columns.append(("in motion (deg/s; deg/s²)", 2.2, [_motion(m) for m in shown]))
+    columns += [
+        ("load (kg)", 0.7, [number(m.payload) for m in shown]),
+        ("decides", 2.4, [_purpose(m) for m in shown]),
+        ("expected difference", 1.2, [f"{number(m.expected_gain, 2)} × noise" for m in shown]),
+    ]
+    heads, widths, cells = zip(*columns, strict=True)
+    return Table(heads, list(zip(*cells, strict=True)), widths)
+
+
+def _approach(m: Measurement) -> str:
+    return " ".join({1: "+", -1: "−"}.get(a, "0") for a in m.approach or ()) or "any"
 
 
 def _degrees(values: tuple[float, ...], digits: int) -> str:
-    told = (f"{v + 0.0:.{digits}f}" for v in np.rad2deg(values).round(digits))
-    return ", ".join(told).replace("-", "−")
+    angles = (f"{v + 0.0:.{digits}f}" for v in np.rad2deg(values).round(digits))
+    return ", ".join(angles).replace("-", "−")
 
 
 def _motion(m: Measurement) -> str:
@@ -121,7 +133,7 @@ def _motion(m: Measurement) -> str:
 
 
 def _purpose(m: Measurement) -> str:
-    names = [effect_words(n) for n in m.separates]
+    names = [effect_title(n) for n in m.separates]
     if len(names) > 1:
         return f"whether it is “{names[0]}” or “{names[1]}”"
     return f"would show “{names[0]}”"

@@ -2,84 +2,67 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from gapbridge.bridge.report.arm_view import arm_figure
-from gapbridge.bridge.report.fragment import (
-    AFTER,
-    BEFORE,
-    Cell,
-    Choice,
-    Figure,
-    bar,
-    figure_block,
-    heading,
-    paragraph,
-    table,
-)  # fmt: skip
+from gapbridge.bridge.document.axes import Chart, scale
+from gapbridge.bridge.document.blocks import Bar, Beside, Block, Cell, Gallery, Table
+from gapbridge.bridge.document.drawing import Drawing
+from gapbridge.bridge.report.arm_view import arm_view
+from gapbridge.bridge.report.labels import percent, quantity_title, quantity_unit, unit_of
 from gapbridge.bridge.report.material import (
     Array,
     Index,
     Material,
+    before_and_after,
+    channel_heading,
     own_coordinates,
     per_sample,
     thinned,
 )
-from gapbridge.bridge.report.words import CHANNELS, percent, quantity_unit, quantity_words, unit_of
 from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
 
 MOST_QUANTITIES = 14
 STATED = 0.02  # share below which a dependence is not worth a line
+POINTS = 600  # of a drawing among many
 
 
-def section(material: Material) -> str:
-    """Return shares by joint and axis, the gap against quantities, and the arm in 3D."""
-    parts = []
+def where(material: Material) -> list[Block]:
+    """Return shares by joint and axis, the gap against quantities, and the arm in space."""
+    blocks: list[Block] = []
     for channel in material.diagnosis.channels:
-        if len(material.diagnosis.channels) > 1:
-            parts.append(heading(CHANNELS[channel.channel]))
-        parts.append(_channel(channel))
+        blocks += channel_heading(material.diagnosis, channel)
+        blocks += [Beside((_joints(channel), _axes(channel), _depends(channel)))]
+        blocks.append(_against(channel))
         if channel.channel == "position":
-            parts.append(figure_block(arm_figure(channel, material)))
-    return "".join(parts)
+            blocks.append(arm_view(channel, material))
+    return blocks
 
 
-def _channel(channel: ChannelDiagnosis) -> str:
-    tables = [_joints(channel), _axes(channel), _depends(channel)]
-    grid = f'<div class="grid">{"".join(f"<div>{t}</div>" for t in tables if t)}</div>'
-    return grid + figure_block(_against(channel))
-
-
-def _joints(channel: ChannelDiagnosis) -> str:
+def _joints(channel: ChannelDiagnosis) -> Table:
     rows: list[list[Cell]] = [
-        [f"joint {j}", bar(s, percent(s))] for j, s in channel.where.joints if s >= 0.005
+        [f"joint {j}", Bar(s, percent(s))] for j, s in channel.where.joints if s >= 0.005
     ]
-    if not rows:
-        return paragraph("No single joint stands out.", "note")
     title = "share of the gap" if channel.causes else "gap this joint alone could make"
-    return table(("joint", title), rows)
+    return Table(("joint", title), rows or [["none", "no single joint stands out"]])
 
 
-def _axes(channel: ChannelDiagnosis) -> str:
+def _axes(channel: ChannelDiagnosis) -> Table:
     names = channel.selection.observation.axes
     rows: list[list[Cell]] = [
-        [names[i], bar(s, percent(s))] for i, s in enumerate(channel.where.axes)
+        [names[i], Bar(s, percent(s))] for i, s in enumerate(channel.where.axes)
     ]
     frame = {"position": "axis of base", "wrench": "axis of the flange"}.get(
         channel.channel, "axis"
     )
-    return table((frame, "share of the gap"), rows)
+    return Table((frame, "share of the gap"), rows)
 
 
-def _depends(channel: ChannelDiagnosis) -> str:
+def _depends(channel: ChannelDiagnosis) -> Table:
     rows: list[list[Cell]] = [
-        [quantity_words(n), bar(s, percent(s))] for n, s in channel.where.depends_on if s > STATED
+        [quantity_title(n), Bar(s, percent(s))] for n, s in channel.where.depends_on if s > STATED
     ]
-    if not rows:
-        return paragraph("The gap follows no single quantity of the log.", "note")
-    return table(("the gap follows", "predicts of it"), rows)
+    heads = ("the gap depends on", "which predicts")
+    return Table(heads, rows or [["none", "no single quantity of the log"]])
 
 
 def _quantities(channel: ChannelDiagnosis) -> list[str]:
@@ -93,57 +76,75 @@ def _quantities(channel: ChannelDiagnosis) -> list[str]:
     return [n for n in names if n in have][:MOST_QUANTITIES]
 
 
-def _against(channel: ChannelDiagnosis) -> Figure:
+def _against(channel: ChannelDiagnosis) -> Gallery:
+    """Return the gap of every sample against what it may depend on, one drawing a choice."""
     kept = channel.selection.kept
     gap, after = channel.gap[kept], channel.remaining[kept]
     count = own_coordinates(channel)
-    keep = thinned(per_sample(gap, count))
-    given = [("before", gap, BEFORE)] + ([("after", after, AFTER)] if channel.causes else [])
-    traces: list[dict[str, Any]] = [
-        {"type": "scattergl" if len(keep) > 3000 else "scatter", "mode": "markers", "name": label,
-         "marker": {"color": colour, "size": 5, "opacity": 0.7}}
-        for label, _, colour in given
-    ]  # fmt: skip
-    x = _x_choices(channel, keep, len(given))
-    y = _y_choices(channel, [values[keep] for _, values, _ in given], count)
-    for i, trace in enumerate(traces):
-        trace |= {"x": x[0].values[i], "y": y[0].values[i]}
-    layout = {
-        "xaxis": {"title": {"text": x[0].title}},
-        "yaxis": {"title": {"text": y[0].title}},
-    }
-    return Figure(
-        traces, layout, "The gap of every sample against what it may follow; choose above. What "
-        "the causes explain is gone from the blue points.", choices={"y": y, "x": x},
+    keep = thinned(per_sample(gap, count), POINTS)
+    given = before_and_after(channel, gap[keep], after[keep])
+    across, upwards = _abscissas(channel, keep), _ordinates(channel, given, count)
+    drawings = [
+        _scatter((x_title, x), (y_title, series))
+        for _, y_title, series in upwards
+        for _, x_title, x in across
+    ]
+    menus = (
+        ("Show", tuple(label for label, _, _ in upwards)),
+        ("Against", tuple(label for label, _, _ in across)),
+    )
+    return Gallery(
+        menus, tuple(drawings), "The gap of the samples against what it may depend on; choose "
+        "above. What the causes explain is gone from “after”."
+        + (f" {len(keep)} of {len(gap)} samples are drawn." if len(keep) < len(gap) else ""),
     )  # fmt: skip
 
 
-def _x_choices(channel: ChannelDiagnosis, keep: Index, traces: int) -> list[Choice]:
+Series = list[tuple[str, Array, str]]  # name, values, colour
+
+
+def _scatter(across: tuple[str, Array], upwards: tuple[str, Series]) -> Drawing:
+    x_title, x = across
+    y_title, series = upwards
+    every = np.concatenate([values for _, values, _ in series])
+    chart = Chart("", scale(x_title, [*x], tight=True, zero=False),
+                  scale(y_title, [*every], tight=True), width=430, height=270)  # fmt: skip
+    for _, values, colour in series:
+        chart.points([*x], [*values], colour, radius=2.0, opacity=0.7)
+    chart.legend([(name, colour) for name, _, colour in series])
+    return chart.drawing
+
+
+def _abscissas(channel: ChannelDiagnosis, keep: Index) -> list[tuple[str, str, Array]]:
+    """Return label, axis title and values of what the gap can be drawn against."""
     observation, kept = channel.selection.observation, channel.selection.kept
     spread = np.random.default_rng(0).uniform(-0.08, 0.08, len(keep))
     choices = []
     for name in _quantities(channel):
         unit, factor = quantity_unit(name)
         values: Array = observation.quantities[name][kept][keep] * factor
-        if name.startswith("approach"):
+        if name.startswith("approach_"):
             values = values + spread  # so that points at -1 and +1 do not hide each other
-        words = quantity_words(name)
-        title = f"{words} ({unit})" if unit else words
-        choices.append(Choice(words, title, [values] * traces))
+        title = quantity_title(name)
+        choices.append((title, f"{title} ({unit})" if unit else title, values))
     if not choices:
         rows: Array = np.asarray(observation.rows[kept][keep] + 1, dtype=np.float64)
-        choices.append(Choice("row of the log", "row of the log", [rows] * traces))
+        choices.append(("row of the log", "row of the log", rows))
     return choices
 
 
-def _y_choices(channel: ChannelDiagnosis, gaps: list[Array], count: int) -> list[Choice]:
-    name, factor = unit_of(channel.unit)
+def _ordinates(
+    channel: ChannelDiagnosis, given: Series, count: int
+) -> list[tuple[str, str, Series]]:
+    """Return label, axis title and series: the largest coordinate, the size, the others."""
+    unit, factor = unit_of(channel.unit)
     names = channel.selection.observation.axes
-    size = Choice("size of the gap", f"gap ({name})", [per_sample(g, count) * factor for g in gaps])
+    size = ("size of the gap", f"gap ({unit})",
+            [(n, per_sample(g, count) * factor, c) for n, g, c in given])  # fmt: skip
     order = np.argsort(-np.asarray(channel.where.axes)[:count])
     single = [
-        Choice(f"along {names[i]}" if count == 3 else names[i], f"gap, {names[i]} ({name})",
-               [g[:, i] * factor for g in gaps])
+        (f"along {names[i]}" if count == 3 else names[i], f"gap, {names[i]} ({unit})",
+         [(n, g[:, i] * factor, c) for n, g, c in given])
         for i in order
     ]  # fmt: skip
     return [*single[:1], size, *single[1:]]

@@ -2,57 +2,50 @@
 
 from __future__ import annotations
 
-from gapbridge.bridge.report.fragment import (
-    AFTER,
-    FLOOR,
+from gapbridge.bridge.document.blocks import (
+    DOUBTFUL,
+    GOOD,
+    QUIET,
+    Badge,
+    Bar,
+    Block,
     Cell,
-    Raw,
-    badge,
-    bar,
-    html_of,
-    paragraph,
-    table,
+    Named,
+    Paragraph,
+    Table,
 )
-from gapbridge.bridge.report.material import Material
-from gapbridge.bridge.report.words import (
-    CHANNELS,
-    effect_words,
-    joints_words,
-    likelihood,
-    listed,
-    percent,
-)
+from gapbridge.bridge.document.drawing import EDGE
+from gapbridge.bridge.report.labels import effect_title, joint_list, likelihood, listed, percent
+from gapbridge.bridge.report.material import Material, channel_heading
 from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
-from gapbridge.core.diagnosis.result import Cause, Considered
+from gapbridge.core.diagnosis.result import Cause, Considered, Outcome
 
 HEADS = ("effect", "verdict", "shrinks alone", "probability", "why")
+NOTE = (
+    "“Alone” says how far the gap would fall, on measurements the fit did not see, if this effect "
+    "were the only one in the model. An effect can score well alone and still lose: when another "
+    "explains the same better, or with fewer numbers."
+)
 
 
-def section(material: Material) -> str:
+def which(material: Material) -> list[Block]:
     """Return one table per channel."""
-    parts = [paragraph(
-        "“Alone” says how far the gap would fall, on measurements the fit did not see, if this "
-        "effect were the only one in the model. An effect can score well alone and still lose: "
-        "when another explains the same better, or with fewer numbers.", "note",
-    )]  # fmt: skip
+    blocks: list[Block] = [Paragraph(NOTE, "note")]
     for channel in material.diagnosis.channels:
-        if len(material.diagnosis.channels) > 1:
-            parts.append(f"<h3>{CHANNELS[channel.channel]}</h3>")
-        parts.append(_table(channel))
-    return "".join(parts)
+        blocks += [*channel_heading(material.diagnosis, channel), _table(channel)]
+    return blocks
 
 
-def _table(channel: ChannelDiagnosis) -> str:
+def _table(channel: ChannelDiagnosis) -> Table:
     rows = [_accused(c) for c in channel.causes]
     losers = sorted(channel.considered, key=lambda k: (not k.excited, -(k.shrink_alone or 0.0)))
     tied = {name for c in channel.causes for name in c.indistinguishable_from}
-    rows += [_lost(k, channel, k.effect in tied) for k in losers]
-    return table(HEADS, rows)
+    rows += [_considered(k, k.effect in tied, bool(channel.causes)) for k in losers]
+    return Table(HEADS, rows, (2.2, 1.1, 1.1, 0.9, 3))
 
 
-def _name(effect: str, joints: tuple[int, ...] = ()) -> Raw:
-    where = f", {joints_words(joints)}" if joints else ""
-    return Raw(f"<b>{html_of(effect_words(effect))}</b>{where}<br><code>{html_of(effect)}</code>")
+def _name(effect: str, joints: tuple[int, ...] = ()) -> Named:
+    return Named(effect_title(effect), f", {joint_list(joints)}" if joints else "", effect)
 
 
 def _accused(cause: Cause) -> list[Cell]:
@@ -64,33 +57,30 @@ def _accused(cause: Cause) -> list[Cell]:
             f"({percent(low)} to {percent(high)})"
         )
     if cause.indistinguishable_from:
-        ties = listed([effect_words(n) for n in cause.indistinguishable_from], "or")
+        ties = listed([effect_title(n) for n in cause.indistinguishable_from], "or")
         why += f"; these data cannot separate it from: {ties}"
-    word = badge("cause, tied", "doubtful") if cause.indistinguishable_from else badge(
-        "cause", "good")  # fmt: skip
-    alone = bar(cause.shrink_alone, percent(cause.shrink_alone), AFTER)
-    return [_name(cause.effect, cause.joints), word, alone, likelihood(cause.probability), why]
+    tied = bool(cause.indistinguishable_from)
+    verdict = Badge("cause, tied", DOUBTFUL) if tied else Badge("cause", GOOD)
+    alone = Bar(cause.shrink_alone, percent(cause.shrink_alone))
+    return [_name(cause.effect, cause.joints), verdict, alone, likelihood(cause.probability), why]
 
 
-def _lost(considered: Considered, channel: ChannelDiagnosis, tied: bool) -> list[Cell]:
-    if not considered.excited:
-        need = considered.reason.removeprefix("not excited; needs ")
-        return [_name(considered.effect), badge("cannot be seen", "quiet"), "–", "–",
-                f"this log does not show it; it needs {need}"]  # fmt: skip
-    word = badge("tied", "doubtful") if tied else badge("no", "quiet")
-    why = considered.reason
-    withdrawn = not why.startswith("does not pay")
-    if not withdrawn:
-        why = (
-            "explains too little more, beside the causes found, for the numbers it adds"
-            if channel.causes else "explains too little for the numbers it adds"
-        )  # fmt: skip
-    elif not tied:
-        word = badge("withdrawn", "doubtful")
-        why = f"looked like a cause, but is not accused: {why}"
+def _considered(considered: Considered, tied: bool, beside: bool) -> list[Cell]:
+    """Return the row of an effect that is not accused; ``beside``: others are."""
+    if considered.outcome is Outcome.NOT_EXCITED:
+        why = f"this log does not show it; it needs {considered.needs}"
+        return [_name(considered.effect), Badge("not excited", QUIET), "–", "–", why]
     if tied:
+        verdict = Badge("tied", DOUBTFUL)
         why = "would explain these data as well as the cause named above"
+    elif considered.outcome is Outcome.WITHDRAWN:
+        verdict = Badge("withdrawn", DOUBTFUL)
+        why = f"looked like a cause, but is not accused: {considered.reason}"
+    else:
+        verdict = Badge("no", QUIET)
+        others = ", beside the causes found," if beside else ""
+        why = f"explains too little{' more' if beside else ''}{others} for the numbers it adds"
     alone: Cell = "–"
     if considered.shrink_alone is not None:
-        alone = bar(considered.shrink_alone, percent(considered.shrink_alone), FLOOR)
-    return [_name(considered.effect), word, alone, likelihood(considered.probability), why]
+        alone = Bar(considered.shrink_alone, percent(considered.shrink_alone), EDGE)
+    return [_name(considered.effect), verdict, alone, likelihood(considered.probability), why]

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.bridge.setpoint_source.source import SourceDryError
+from gapbridge.core.clock import SYSTEM, Clock
 
 Vector = NDArray[np.float64]
 LONGEST_GLIDE = 0.1  # s
@@ -19,17 +18,18 @@ class Glide:
     What has not been renewed for ``timeout`` s is dry.
     """
 
-    def __init__(self, timeout: float, what: str) -> None:
+    def __init__(self, timeout: float, what: str, clock: Clock = SYSTEM) -> None:
+        self._now = clock.monotonic
         self._timeout, self._what = timeout, what
         self._newest: Vector | None = None
         self._last_received = 0.0  # s, monotonic
         self._from: Vector | None = None
         self._length = 0.0  # s
-        self._now: Vector | None = None
+        self._present: Vector | None = None
 
     def take(self, q: Vector) -> None:
         """Take a new setpoint (n,), rad."""
-        now = time.monotonic()
+        now = self._now()
         self._length = (
             min(now - self._last_received, LONGEST_GLIDE) if self._newest is not None else 0.0
         )
@@ -37,27 +37,27 @@ class Glide:
 
     def first(self) -> Vector | None:
         """Return the newest setpoint where one has come lately."""
-        if self._newest is None or time.monotonic() - self._last_received > self._timeout:
+        if self._newest is None or self._now() - self._last_received > self._timeout:
             return None
         return self._newest
 
     def begin(self, own_q: Vector) -> None:
         """Start from where the arm stands."""
-        self._now = own_q.copy()
+        self._present = own_q.copy()
         self.turn()
 
     def turn(self) -> None:
         """Glide to the newest setpoint from where the stream is."""
-        self._from = self._now if self._now is not None else self._newest
+        self._from = self._present if self._present is not None else self._newest
 
     def sample(self) -> Vector:
         """Return the setpoint of this moment. Raises SourceDryError where none came in time."""
-        silent = time.monotonic() - self._last_received
+        silent = self._now() - self._last_received
         if self._newest is None or silent > self._timeout:
             raise SourceDryError(f"setpoints: found no {self._what} for {silent:.3f} s")
         share = min(silent / self._length, 1.0) if self._length > 0.0 else 1.0
         if share >= 1.0 or self._from is None:
-            self._now = self._newest
+            self._present = self._newest
         else:
-            self._now = self._from + share * (self._newest - self._from)
-        return self._now
+            self._present = self._from + share * (self._newest - self._from)
+        return self._present

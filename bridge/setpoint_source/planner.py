@@ -18,7 +18,6 @@ import math
 import os
 import socket
 import stat
-import time
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +27,7 @@ from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.ipc.control_socket import peer_of
 from gapbridge.bridge.setpoint_source.glide import Glide
 from gapbridge.bridge.setpoint_source.source import Source
+from gapbridge.core.clock import SYSTEM
 from gapbridge.core.errors import RunError
 
 Vector = NDArray[np.float64]
@@ -42,11 +42,12 @@ class Connection:
     """One planner's connection: its unread bytes and how many lines it may still send."""
 
     def __init__(self, link: socket.socket, rate: float) -> None:
+        self._now = SYSTEM.monotonic
         link.setblocking(False)
         self._link, self._rate = link, rate
         self._buffer = b""
         self._credit = SPAN * rate
-        self._at = self.opened = time.monotonic()
+        self._at = self.opened = self._now()
         self.heard = 0.0  # s, monotonic: of the last good line
         self.admitted = False  # a token has been given, or none is asked for
         self.closed = False
@@ -57,7 +58,7 @@ class Connection:
 
     def note_line(self) -> None:
         """Take note of a good line now."""
-        self.heard = time.monotonic()
+        self.heard = self._now()
 
     def lines(self) -> list[bytes]:
         """Return the lines that have arrived, some of them; closes where there is no end."""
@@ -68,7 +69,7 @@ class Connection:
         if len(rest.split(b"\n", 1)[0]) > LONGEST_LINE:
             self.refuse("a line without end")
             return []
-        now = time.monotonic()
+        now = self._now()
         self._credit = min(self._credit + (now - self._at) * self._rate, SPAN * self._rate)
         self._credit -= len(lines)
         self._at = now
@@ -210,7 +211,7 @@ class PlannerSource(Source):
         planner = self._planner
         if planner is None or planner.closed:
             return False
-        return time.monotonic() - planner.heard <= self.settings.timeout
+        return SYSTEM.monotonic() - planner.heard <= self.settings.timeout
 
     def _accept(self) -> None:
         if self._listener is None:

@@ -9,10 +9,10 @@ from __future__ import annotations
 import hmac
 import ipaddress
 import socket
-import time
 
 from gapbridge.bridge.served.credentials import read_token
 from gapbridge.bridge.setpoint_source.planner import Connection, PlannerSource
+from gapbridge.core.clock import SYSTEM
 from gapbridge.core.errors import InputError
 
 FIRST_LINE = 2.0  # s in which the token has to come
@@ -67,7 +67,7 @@ class TcpSource(PlannerSource):
         return True
 
     def _receive(self) -> bool:
-        late = time.monotonic() - FIRST_LINE
+        late = SYSTEM.monotonic() - FIRST_LINE
         for connection in self._waiting:
             if not connection.admitted and not connection.closed and connection.opened < late:
                 self._end(connection, f"no token within {FIRST_LINE:g} s")

@@ -22,7 +22,8 @@ from gapbridge.bridge.web.watched import Watched, encoded
 
 FILES = {
     "index.html": "text/html", "style.css": "text/css", "page.js": "text/javascript",
-    "drawing.js": "text/javascript", "words.js": "text/javascript", "icon.svg": "image/svg+xml",
+    "drawing.js": "text/javascript", "view.js": "text/javascript",
+    "words.js": "text/javascript", "icon.svg": "image/svg+xml",
 }  # fmt: skip
 MOST_POINTS = 2000
 LARGEST_FORM = 4096  # bytes
@@ -129,6 +130,8 @@ def _file(name: str) -> Callable[[Request], Awaitable[Response]]:
 
 
 def _read(name: str) -> bytes:
+    if name == "view.js":  # as reports have it
+        return files("gapbridge.bridge.document").joinpath(name).read_bytes()
     return files("gapbridge.bridge.web").joinpath("page", name).read_bytes()
 
 

@@ -1,15 +1,19 @@
-"""The wrench that the model expects at the flange sensor, beside what the sensor says."""
+"""What the model says at this moment: the wrench at the flange sensor, and the arm as it bends."""
 
 from __future__ import annotations
 
 import importlib
 import threading
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.document.drawing import EDGE
+from gapbridge.bridge.document.scene import Path, Scene, base
+from gapbridge.bridge.document.skeleton import reach, round_factor, skeleton
 from gapbridge.core.dynamics import predict_wrench
 from gapbridge.core.errors import GapbridgeError
 from gapbridge.core.loads import Loads
@@ -17,47 +21,86 @@ from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion
 
 Array = NDArray[np.float64]
+DRAWN = 0.15  # of the reach: how far the stretched arm's bend is drawn
 
 
-class WrenchPrediction:
+class Prediction:
     """Predicts for rows of the shared page, in this process and never in the loop's.
 
-    Accelerations are left out: what is predicted is the weight of the payload and the pull of the
-    surroundings on the tool. The model is read in a thread of its own, which takes a moment; until
-    then, and where it cannot be read, predictions are NaN.
+    The model is read in a thread of its own, which takes a moment; until then, and where it cannot
+    be read, there is no prediction.
     """
 
     def __init__(self, settings: DaemonSettings, slices: Mapping[str, slice]) -> None:
         self._settings, self._slices = settings, slices
         self._model: Model | None = None
+        self._factor = 1.0  # by which the bend is drawn larger
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self) -> None:
         module, function = self._settings.model_source.split(":")
         try:
             model = getattr(importlib.import_module(module), function)(self._settings.cell).model
-            n = model.arm.n
-            self._predict(model, np.zeros((1, n)), Loads())  # compiled before it is needed
+            # compiled before it is needed
+            q = np.zeros(model.arm.n)
+            self._predict(model, q[None], Loads())
+            bend = np.linalg.norm(skeleton(model, q)[-1] - skeleton(model.without_terms(), q)[-1])
         except (GapbridgeError, ValueError, AttributeError, ImportError):
             return
+        self._factor = round_factor(DRAWN * reach(model) / max(float(bend), 1e-5))
         self._model = model
 
-    def of(self, rows: Array) -> Array:
-        """Return the wrenches (k, 6), N and Nm, flange axes, for rows (k, width)."""
+    def arm(self, row: Array) -> dict[str, Any] | None:
+        """Return the arm at a row (width,): joints, TCP, load and a scene of it; None: unknown."""
+        s, model = self._slices, self._model
+        q = row[s["actual_q"]]
+        if model is None or not np.isfinite(q).all():
+            return None
+        loads = self._loads(row[None])
+        rigid = skeleton(model.without_terms(), q)
+        try:
+            tcp = model.predict(q[None], loads)
+            bent = skeleton(model, q, loads)
+        except GapbridgeError:  # no equilibrium under this load
+            return None
+        declared = loads.payload_mass is not None
+        pull = row[s["actual_TCP_force"]]
+        return {
+            "q": q.tolist(),
+            "temperature": row[s["joint_temperatures"]].tolist(),
+            "tcp": tcp.position[0].tolist(),
+            "rotation": tcp.rotation_vector[0].tolist(),
+            "bend": float(np.linalg.norm(bent[-1] - rigid[-1])),
+            "factor": self._factor,
+            "mass": float(row[s["payload"].start] if declared else model.payload_mass),
+            "cog": (row[s["payload_cog"]] if declared else np.asarray(model.payload_cog)).tolist(),
+            "declared": declared,
+            "force": float(np.linalg.norm(pull[:3])),
+            "scene": self._scene(model, rigid, rigid + self._factor * (bent - rigid),
+                                 tcp.rotation[0]).document(),
+        }  # fmt: skip
+
+    @staticmethod
+    def _scene(model: Model, rigid: Array, bent: Array, tool_in_base: Array) -> Scene:
+        length = 0.1 * reach(model)
+        axes = [
+            Path(np.array([bent[-1], bent[-1] + length * tool_in_base[:, i]]), name, 3.0)
+            for i, name in enumerate("xyz")
+        ]
+        arm = (Path(rigid, EDGE, 6.0, dots=True), Path(bent, "bar", 3.5, dots=True), *axes)
+        return Scene("The arm", (*base(reach(model)), *arm))
+
+    def wrenches(self, rows: Array) -> Array:
+        """Return the wrenches (k, 6), N and Nm, flange axes, for rows (k, width).
+
+        Accelerations are left out: what is predicted is the weight of the payload and the pull of
+        the surroundings on the tool; NaN where there is no prediction.
+        """
         nothing = np.full((len(rows), 6), np.nan)
         s, model = self._slices, self._model
         if model is None or not len(rows) or np.isnan(rows[:, s["ft_raw_wrench"]]).all():
             return nothing
-        mass, cog = rows[:, s["payload"].start], rows[:, s["payload_cog"]]
-        temperature = rows[:, s["joint_temperatures"]]
-        declared = bool(np.isfinite(mass).all() and np.isfinite(cog).all())
-        force = rows[:, s["actual_TCP_force"]]
-        loads = Loads(
-            payload_mass=mass if declared else None,
-            payload_cog=cog if declared else None,
-            wrench=force if np.isfinite(force).all() else None,
-            temperature=temperature if np.isfinite(temperature).all() else None,
-        )
+        loads = self._loads(rows)
         q = rows[:, s["actual_q"]]
         if not np.isfinite(q).all():
             return nothing
@@ -65,6 +108,18 @@ class WrenchPrediction:
             return self._predict(model, q, loads)
         except GapbridgeError:  # no equilibrium under this load
             return nothing
+
+    def _loads(self, rows: Array) -> Loads:
+        s = self._slices
+        mass, cog = rows[:, s["payload"].start], rows[:, s["payload_cog"]]
+        temperature, force = rows[:, s["joint_temperatures"]], rows[:, s["actual_TCP_force"]]
+        declared = bool(np.isfinite(mass).all() and np.isfinite(cog).all())
+        return Loads(
+            payload_mass=mass if declared else None,
+            payload_cog=cog if declared else None,
+            wrench=force if np.isfinite(force).all() else None,
+            temperature=temperature if np.isfinite(temperature).all() else None,
+        )
 
     @staticmethod
     def _predict(model: Model, q: Array, loads: Loads) -> Array:

@@ -16,14 +16,16 @@ from gapbridge.bridge.cell.reread import RereadSettings
 from gapbridge.bridge.ipc.shared_memory import ROWS, SharedMemory
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.web.history import COLUMNS, STEP, History
-from gapbridge.bridge.web.prediction import WrenchPrediction
+from gapbridge.bridge.web.prediction import Prediction
 from gapbridge.bridge.web.timing import Timing
 from gapbridge.core.limits import CLAMPS
 
 Array = NDArray[np.float64]
 Message = tuple[str, dict[str, Any]]  # kind, data
+ENDS = ("fault", "failure")  # kinds of events with which a process of the loop ends
 EVENTS = 200  # kept to show
 TIMING_EVERY = 1.0  # s
+ARM_EVERY = 0.2  # s
 RATE_SPAN = 2.0  # s that the rate is taken over
 DIGITS = 6  # significant ones of what is drawn
 
@@ -45,10 +47,12 @@ class Watched:
         self._slices, self._n = page.slices, n
         # whoever comes late still shows what the ring holds
         self._reader = page.reader(max(page.written - ROWS + ROWS // 4, 0))
-        self._prediction = WrenchPrediction(settings, page.slices)
+        self._prediction = Prediction(settings, page.slices)
         self._history = History(settings.web.history)
         self._timing = Timing()
-        self._timing_at = 0.0
+        self._timing_at = self._arm_at = 0.0
+        self._row: Array | None = None  # the last cycle
+        self._down = False  # the loop has ended and no other is connected
         self._times = np.empty(0)  # s, monotonic, of the last cycles
         self.events: deque[dict[str, Any]] = deque(maxlen=EVENTS)
         self.status: dict[str, Any] = {}
@@ -69,13 +73,17 @@ class Watched:
         messages = [message for event in events for message in self._on_event(event)]
         changed = [self._reread.on_event(event) for event in events]
         if any(changed):
-            self._prediction = WrenchPrediction(self._settings, self._slices)
+            self._prediction = Prediction(self._settings, self._slices)
             messages.append(("hello", self.snapshot()))  # limits and rate may be others
         points = self._take(self._reader.drain())
         messages.append(("tick", {**self.now(), "points": plain(points)}))
         if time.monotonic() >= self._timing_at:
             self._timing_at = time.monotonic() + TIMING_EVERY
             messages.append(("timing", self._timing.figures()))
+        if time.monotonic() >= self._arm_at and self._row is not None:
+            self._arm_at = time.monotonic() + ARM_EVERY
+            arm = self._prediction.arm(self._row)
+            messages += [] if arm is None else [("arm", arm)]
         return messages
 
     def _on_event(self, event: dict[str, Any]) -> list[Message]:
@@ -84,6 +92,12 @@ class Watched:
             return [("status", event)]
         if "to" in event:
             self._why = event
+            self._down = event["to"] == State.DISCONNECTED.name
+        elif event.get("kind") in ENDS:
+            # since when it is down is the first end's time; why, the newest one's
+            since = self._why["time"] if self._down else event["time"]
+            self._why = {"cause": "", "detail": event["detail"], "time": since}
+            self._down = True
         self.events.append(event)
         return [("event", event)]
 
@@ -101,7 +115,7 @@ class Watched:
             bits = rows[:, s["clamped"].start].astype(np.int64)
             for bit, name in enumerate(CLAMPS):
                 self._clamped[name] += int((bits >> bit & 1).sum())
-            self._last = float(received[-1])
+            self._last, self._row = float(received[-1]), rows[-1].copy()
             times = np.concatenate([self._times, received])
             self._times = times[times > times[-1] - RATE_SPAN]
             self._timing.add(received, rows[:, s["duration"].start], age)
@@ -113,7 +127,7 @@ class Watched:
             # a few for each point are plenty: points are means
             step = max(int(rate * STEP / 2), 1)
             picked = np.arange(len(rows) - 1, -1, -step)[::-1]
-            cycles[picked, 14:20] = self._prediction.of(rows[picked])
+            cycles[picked, 14:20] = self._prediction.wrenches(rows[picked])
         return self._history.add(cycles, now + wall)
 
     # -- out --------------------------------------------------------------------------------------
@@ -126,7 +140,7 @@ class Watched:
         rate = (len(times) - 1) / (times[-1] - times[0]) if alive else 0.0
         return {
             "time": time.time(),
-            "state": State(self._page.state).name.lower(),
+            "state": (State.DISCONNECTED if self._down else State(self._page.state)).name.lower(),
             "phase": self._page.phase.name.lower(),
             "why": {k: v for k, v in self._why.items() if k in ("cause", "detail", "time")},
             "silence": silence,  # s since the last state of the robot

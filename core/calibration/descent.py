@@ -3,7 +3,7 @@
 A payload times a flexibility bends the arm: such products make Gauss and Newton's full steps
 overshoot. Each step is tried against the exact prediction; one that does not keep what it promises
 is shortened, most along what the readings hardly separate (columns scaled to length one,
-Marquardt, J. SIAM 11 (1963) 431). Derivatives are taken anew where they promise too much.
+Marquardt, J. SIAM 11 (1963) 431). Derivatives are computed anew where they predict too much.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ STEPS = 12  # steps tried with the same derivatives at most
 MOVED = 0.02  # of its deviation: a smaller step changes nothing that anybody reports
 LOOSE = 0.2  # of its deviation: what weights that still sway may leave at the end of patience
 STALE = 3.0  # deviations of movement beyond which derivatives are taken anew
-KEPT = 0.1  # share of its promise that a step must keep to be taken
+KEPT = 0.1  # share of the predicted decrease that an accepted step must reach
 POOR = 0.5  # share below which the next step is shorter, with new derivatives
 GOOD = 0.8  # share above which the next step may be longer
 LEAST, MOST = 1e-4, 1e8  # damping: below it is none; above it nothing is gained any more
@@ -35,7 +35,7 @@ NOTHING = 1e-6  # of the sum of squares, in which one is a standard deviation: r
 
 
 @dataclass(frozen=True)
-class Standing:
+class FitState:
     """Where a fit stands, with derivatives that hold there."""
 
     values: Array  # (p,)
@@ -48,17 +48,17 @@ class Standing:
     covariance: Array  # (p, p)
     spent: float  # numbers that the fit spent
     share: Array  # (N,) of them on each reading
-    settled: bool  # no step would change anything any more
+    converged: bool  # no step would change anything any more
 
     def stale(self) -> bool:
         """Return whether the derivatives were taken too far away."""
         return bool(_sizes(self.values - self.anchor, self.covariance) > STALE)
 
 
-def standing(
+def fit_state(
     problem: Problem, values: Array, nuisance: Nuisance, noise: Noise,
     columns: Columns | None = None, anchor: Array | None = None, share: Array | None = None,
-) -> Standing:  # fmt: skip
+) -> FitState:  # fmt: skip
     """Return the standing at values, derivatives taken there where none are given.
 
     Raises InputError where the arm finds no equilibrium.
@@ -74,32 +74,32 @@ def standing(
     system, weights = weighed_system(left, noise, columns, share)
     covariance, spent, each = posterior(system, problem.bounds)
     share = each.reshape(left.shape).sum(axis=1)
-    return Standing(
+    return FitState(
         values, nuisance, columns, values if anchor is None else anchor, system, weights,
         np.zeros(len(values), dtype=bool), covariance, spent, share, False,
     )  # fmt: skip
 
 
-def descended(problem: Problem, at: Standing, noise: Noise) -> Standing:
+def descended(problem: Problem, at: FitState, noise: Noise) -> FitState:
     """Return where steps from ``at`` converge under this noise, or where patience ends."""
     damping = 0.0
-    at = standing(
+    at = fit_state(
         problem, at.values, at.nuisance, noise, at.columns, at.anchor, at.share
     )  # fmt: skip
     for _ in range(LOOKS):
         if at.stale():
-            at = standing(problem, at.values, at.nuisance, noise, share=at.share)
+            at = fit_state(problem, at.values, at.nuisance, noise, share=at.share)
         at, damping, renew = _stepped(problem, at, noise, damping)
-        if not renew and ((at.settled and not at.stale()) or damping > MOST):
+        if not renew and ((at.converged and not at.stale()) or damping > MOST):
             break
         if renew:
-            at = standing(problem, at.values, at.nuisance, noise, share=at.share)
+            at = fit_state(problem, at.values, at.nuisance, noise, share=at.share)
     return at
 
 
 def _stepped(
-    problem: Problem, at: Standing, noise: Noise, damping: float
-) -> tuple[Standing, float, bool]:
+    problem: Problem, at: FitState, noise: Noise, damping: float
+) -> tuple[FitState, float, bool]:
     """Return the standing after steps with the same derivatives, and the damping.
 
     Last comes whether the derivatives promised too much.
@@ -118,28 +118,28 @@ def _stepped(
             if not fresh:
                 return at, damping, True
             if small and damping == 0.0:
-                return replace(at, stuck=stuck, settled=True), damping, False
+                return replace(at, stuck=stuck, converged=True), damping, False
             damping = max(GROWTH * damping, LEAST)
             if damping > MOST:
                 return at, damping, False
             continue
-        at = standing(problem, values, nuisance, noise, at.columns, at.anchor, at.share)
-        at = replace(at, stuck=stuck, settled=small and damping == 0.0)
-        if at.settled:
+        at = fit_state(problem, values, nuisance, noise, at.columns, at.anchor, at.share)
+        at = replace(at, stuck=stuck, converged=small and damping == 0.0)
+        if at.converged:
             return at, damping, False
         if kept < POOR:
             return at, max(damping * 2, LEAST), True
         if kept > GOOD:
             damping = damping / GROWTH if damping > LEAST else 0.0
-    calm = size < LOOSE and damping == 0.0
-    return replace(at, settled=calm), damping, not calm
+    converged = size < LOOSE and damping == 0.0
+    return replace(at, converged=converged), damping, not converged
 
 
 def _kept(
-    problem: Problem, at: Standing, noise: Noise, step: Array, shift: Array,
+    problem: Problem, at: FitState, noise: Noise, step: Array, shift: Array,
     trial: tuple[Array, Nuisance],
 ) -> float:  # fmt: skip
-    """Return the share of its promise that a step keeps; what promises nothing keeps it."""
+    """Return the actual over the predicted decrease of a step; 1 where none is predicted."""
     before = float(at.system.left @ at.system.left) + problem.prior(at.values)
     rest = at.system.left - at.system.J @ step - at.system.F @ shift
     promised = before - float(rest @ rest) - problem.prior(trial[0])

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from gapbridge.core.calibration.lacking import Lack, lacking
+from gapbridge.core.calibration.converged_fit import ConvergedFit, converged_fit
+from gapbridge.core.calibration.missing_effects import MissingEffect, missing_effects
 from gapbridge.core.calibration.noise import Noise
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.observables.nuisance import Nuisance
@@ -19,10 +20,9 @@ from gapbridge.core.calibration.plan import Expectation
 from gapbridge.core.calibration.problem import Problem
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.remainder import carried, diagnosed, repeatability_of
-from gapbridge.core.calibration.rest import Rest, come_to_rest
 from gapbridge.core.calibration.result import Calibration, Errors, Estimate
 from gapbridge.core.calibration.staging import at_odds
-from gapbridge.core.calibration.telling import combinations, notes_of, remaining_of, verdict_of
+from gapbridge.core.calibration.summary import combinations, notes_of, remaining_of, verdict_of
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.metrology import Metrology
@@ -43,9 +43,9 @@ class SessionFit:
     metrology: Metrology
     readings: Readings  # all, those held out too
     problem: Problem
-    rest: Rest
+    rest: ConvergedFit
     notes: tuple[str, ...]
-    lacks: tuple[Lack, ...]  # further effects that the fitted poses support
+    missing: tuple[MissingEffect, ...]  # further effects that the fitted poses support
 
     def estimates(self, expected: Expectation | None = None) -> tuple[Estimate, ...]:
         """Return the parameters, beside what a plan ``expected`` of them."""
@@ -98,11 +98,11 @@ def fit_session(
     readings, lonely = _with_places(readings)
     to_fit = np.flatnonzero(~readings.held_out)
     with threadpool_limits(1, "blas"):  # matrices of this size gain nothing from threads
-        problem, rest = come_to_rest(
+        problem, rest = converged_fit(
             parameters, how, readings[to_fit], metrology, progress or _silent
         )
-        lacks = lacking(problem, rest)
-    return SessionFit(parameters, how, metrology, readings, problem, rest, lonely, lacks)
+        missing = missing_effects(problem, rest)
+    return SessionFit(parameters, how, metrology, readings, problem, rest, lonely, missing)
 
 
 def judged(
@@ -119,24 +119,24 @@ def judged(
     ``model`` is the arm as the cell had it; ``declined`` are further effects that were fitted and
     not borne out.
     """
-    tell = progress or _silent
+    report = progress or _silent
     parameters, readings = fit.parameters, fit.readings
     problem, rest, how = fit.problem, fit.rest, fit.observable
     to_fit = np.flatnonzero(~readings.held_out)
-    lacks = tuple(lack for lack in fit.lacks if lack.name not in declined)
+    missing = tuple(e for e in fit.missing if e.name not in declined)
     with threadpool_limits(1, "blas"):
-        tell("judging")
+        report("judging")
         found = parameters.model(rest.values)
         remainder = carried(problem, rest, found, readings, fit.metrology)
-        told = diagnosed(found, readings, rest, fit.metrology, tell) if diagnose else None
+        diagnosis = diagnosed(found, readings, rest, fit.metrology, report) if diagnose else None
     estimates = fit.estimates(expected)
     shown = np.array([e.shown for e in estimates], dtype=bool)
     errors = _errors(model, found, how, readings, rest.nuisance)
     odds = _stages_at_odds(problem, rest)
-    complete = rest.settled and remainder.calm and not lacks
-    complete = complete and (told is None or told.verdict == "no_gap")
-    remaining = remaining_of(remainder, told, complete, lacks, rest.settled)
-    floor = _floor(told)
+    complete = rest.converged and remainder.is_consistent and not missing
+    complete = complete and (diagnosis is None or diagnosis.verdict == "no_gap")
+    remaining = remaining_of(remainder, diagnosis, complete, missing, rest.converged)
+    floor = _floor(diagnosis)
     notes = (*fit.notes, *notes_of(problem, rest, remainder, odds, estimates))
     return Calibration(
         model=found, nominal=model, readings=readings, estimates=estimates,
@@ -144,21 +144,21 @@ def judged(
         combinations=(*parameters.redundant, *combinations(parameters, rest, shown)),
         before=errors[0], after=errors[1],
         held_out_before=errors[2], held_out_after=errors[3],
-        outliers=to_fit[~rest.calm], noise=rest.noise.coordinate(),
+        outliers=to_fit[~rest.inliers], noise=rest.noise.coordinate(),
         repeatability=repeatability_of(problem, rest, found, readings),
         stations=rest.nuisance.stations,
         tcp_std=tcp_deviation(parameters, rest, readings[readings.held_out]),
-        diagnosis=told, complete=complete,
+        diagnosis=diagnosis, complete=complete,
         verdict=verdict_of(errors, rest, floor, complete, remaining), notes=notes,
         instrument_noise=rest.noise.instrument, turn_noise=_turn_noise(how, rest.noise),
         joint_noise=rest.noise.joint, freedom=rest.freedom,
-        whole_covariance=rest.covariance, lacking=tuple(lack.name for lack in lacks),
+        whole_covariance=rest.covariance, missing_effects=tuple(effect.name for effect in missing),
         remaining=remaining, noise_floor=floor,
     )  # fmt: skip
 
 
 def _silent(text: str) -> None:
-    """Tell nobody."""
+    """Report to nobody."""
 
 
 def _floor(diagnosis: Diagnosis | None) -> float:
@@ -187,17 +187,17 @@ def _with_places(readings: Readings) -> tuple[Readings, tuple[str, ...]]:
 
 
 def estimates_of(
-    parameters: Parameters, rest: Rest, expected: Expectation | None
+    parameters: Parameters, rest: ConvergedFit, expected: Expectation | None
 ) -> tuple[Estimate, ...]:
     """Return the parameters as they are reported, beside what was ``expected`` of them."""
     promised = {} if expected is None else dict(
         zip(expected.names, expected.std, strict=True)
     )  # fmt: skip
     std = np.sqrt(np.diag(rest.covariance))
-    told = []
+    estimates = []
     for i, name in enumerate(parameters.names):
         promise = promised.get(name)
-        told.append(
+        estimates.append(
             Estimate(
                 name, float(rest.values[i]), float(std[i]), parameters.units[i],
                 None if promise is None else float(promise),
@@ -205,7 +205,7 @@ def estimates_of(
                 on_bound=bool(rest.stuck[i]), freedom=rest.freedom,
             )
         )  # fmt: skip
-    return tuple(told)
+    return tuple(estimates)
 
 
 def _errors(
@@ -217,14 +217,14 @@ def _errors(
     """
     fitted, held = np.flatnonzero(~readings.held_out), np.flatnonzero(readings.held_out)
     placed = observable.start(model, readings[fitted])
-    told = []
+    errors = []
     for rows in (fitted, held):
         for one, place in ((model, placed), (found, nuisance)):
             gap = np.zeros((0, min(observable.equations, 3)))
             if len(rows):
                 gap = observable.residual(one, readings[rows], place)[:, :3]
-            told.append(Errors(gap, rows))
-    return told[0], told[1], told[2], told[3]
+            errors.append(Errors(gap, rows))
+    return errors[0], errors[1], errors[2], errors[3]
 
 
 def _turn_noise(observable: Observable, noise: Noise) -> float:
@@ -234,14 +234,14 @@ def _turn_noise(observable: Observable, noise: Noise) -> float:
     return float(noise.sizes[1] * observable.sigmas[3])
 
 
-def _stages_at_odds(problem: Problem, rest: Rest) -> float | None:
+def _stages_at_odds(problem: Problem, rest: ConvergedFit) -> float | None:
     return at_odds(
         rest.system, problem.stages, rest.covariance, problem.bounds,
         problem.observable.equations, np.sqrt(rest.weights),
     )  # fmt: skip
 
 
-def tcp_deviation(parameters: Parameters, rest: Rest, readings: Readings) -> Array:
+def tcp_deviation(parameters: Parameters, rest: ConvergedFit, readings: Readings) -> Array:
     """Return 1 sigma (3D, m) of the predicted TCP at readings (M,): the parameters' part alone."""
     if not len(readings):
         return np.zeros(0)

@@ -105,7 +105,7 @@ class Parameters:
             lower=self.lower[kept],
             upper=self.upper[kept],
             begin=self.begin[kept],
-            redundant=found.told,
+            redundant=found.reasons,
         )
 
     def model(self, values: Array) -> Model:

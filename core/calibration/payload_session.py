@@ -143,10 +143,10 @@ def _told(values: Array, covariance: Array) -> tuple[Array, Array]:
     """Return the covariance in terms of the centre of gravity itself, and that centre."""
     mass, moment = float(values[0]), values[1:4]
     if abs(mass) < LIGHT * np.sqrt(covariance[0, 0]):
-        told = covariance.copy()
-        told[1:4, :] = told[:, 1:4] = 0.0
-        told[1:4, 1:4] = np.diag([np.inf] * 3)
-        return told, np.zeros(3)
+        bounded = covariance.copy()
+        bounded[1:4, :] = bounded[:, 1:4] = 0.0
+        bounded[1:4, 1:4] = np.diag([np.inf] * 3)
+        return bounded, np.zeros(3)
     T = np.eye(10)
     T[1:4, 1:4] = np.eye(3) / mass
     T[1:4, 0] = -moment / mass**2

@@ -39,7 +39,7 @@ class Redundancy:
     """What stays, and why the rest does not."""
 
     kept: list[int]
-    told: tuple[str, ...]
+    reasons: tuple[str, ...]
 
 
 def redundancy(
@@ -52,7 +52,7 @@ def redundancy(
     J, F = J * parameters.scales * weight, F * weight
     base = list(np.linalg.svd(F, full_matrices=False)[0].T[: np.linalg.matrix_rank(F)])
     kept: list[int] = []
-    told = []
+    reasons = []
     limit = VISIBLE * np.sqrt(len(J))
     for i in _turns(parameters):
         Q = np.array(base).reshape(-1, len(J))
@@ -63,11 +63,11 @@ def redundancy(
             kept.append(i)
             base.append(left / size)
         elif whole <= limit:
-            told.append(f"{parameters.names[i]}: nothing that is hung or read here shows it")
+            reasons.append(f"{parameters.names[i]}: nothing that is hung or read here shows it")
         else:
             names = [parameters.names[k] for k in kept]
-            told.append(f"{parameters.names[i]}: {_stand_in(J[:, i], F, J[:, kept], names)}")
-    return Redundancy(sorted(kept), tuple(told))
+            reasons.append(f"{parameters.names[i]}: {_stand_in(J[:, i], F, J[:, kept], names)}")
+    return Redundancy(sorted(kept), tuple(reasons))
 
 
 def _turns(parameters: Parameters) -> list[int]:

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import f as fisher
 
+from gapbridge.core.calibration.converged_fit import ConvergedFit
 from gapbridge.core.calibration.noise import presumed
 from gapbridge.core.calibration.problem import Problem
 from gapbridge.core.calibration.readings import Readings
-from gapbridge.core.calibration.rest import Rest
 from gapbridge.core.diagnosis.diagnosis import Diagnosis, diagnose
 from gapbridge.core.errors import InputError
 from gapbridge.core.log.log import Log
@@ -27,21 +27,21 @@ FEWEST_TO_DIAGNOSE = 12
 
 @dataclass(frozen=True)
 class Remainder:
-    """How poses that the fit never saw stand against what it promises of them."""
+    """How poses that the fit never saw agree with its predicted covariance."""
 
     held_out: int  # readings
-    ratio: float  # mean square over what was promised; nan without held-out readings
+    ratio: float  # mean square over the predicted one; nan without held-out readings
     chance: float  # of so large a ratio were all well; 1 without
-    wild: NDArray[np.int64]  # rows of held-out readings far beyond the promise
+    outliers: NDArray[np.int64]  # rows of held-out readings far beyond the predicted spread
 
     @property
-    def calm(self) -> bool:
+    def is_consistent(self) -> bool:
         """Return whether nothing in them speaks against the fit."""
         return self.chance > SURPRISE
 
 
 def carried(
-    problem: Problem, rest: Rest, found: Model, readings: Readings, metrology: Metrology
+    problem: Problem, rest: ConvergedFit, found: Model, readings: Readings, metrology: Metrology
 ) -> Remainder:
     """Return how the held-out readings stand against the fit, noise and uncertainty counted."""
     rows = np.flatnonzero(readings.held_out)
@@ -53,14 +53,14 @@ def carried(
     shape, _ = presumed(found, part, observable, rest.nuisance, metrology)
     V = replace(shape, sizes=rest.noise.sizes).variance + predicted(problem, rest, part)
     square = np.einsum("ni,ni->n", left, np.linalg.solve(V, left[..., None])[..., 0])
-    wild = square > 30 + 5 * k
-    kept = square[~wild] if (~wild).sum() >= 3 else square
+    outliers = square > 30 + 5 * k
+    kept = square[~outliers] if (~outliers).sum() >= 3 else square
     ratio = float(kept.sum() / (k * len(kept)))
     chance = float(fisher.sf(ratio, k * len(kept), rest.freedom))
-    return Remainder(len(rows), ratio, chance, rows[wild])
+    return Remainder(len(rows), ratio, chance, rows[outliers])
 
 
-def predicted(problem: Problem, rest: Rest, readings: Readings) -> Array:
+def predicted(problem: Problem, rest: ConvergedFit, readings: Readings) -> Array:
     """Return the covariance (N, k, k) of what the fit predicts of readings, noise left aside."""
     layout = problem.observable.layout(problem.readings)  # these may be of some places only
     given = problem.parameters, rest.values, readings, rest.nuisance, layout
@@ -69,7 +69,7 @@ def predicted(problem: Problem, rest: Rest, readings: Readings) -> Array:
     return np.asarray(X @ joint_covariance(problem, rest) @ np.swapaxes(X, 1, 2))
 
 
-def joint_covariance(problem: Problem, rest: Rest) -> Array:
+def joint_covariance(problem: Problem, rest: ConvergedFit) -> Array:
     """Return the covariance of parameters and nuisances together (p + m, p + m)."""
     system, held = rest.system, problem.bounds.held
     A = np.hstack([system.J, system.F])
@@ -80,20 +80,22 @@ def joint_covariance(problem: Problem, rest: Rest) -> Array:
     return np.asarray(core / np.outer(size, size))
 
 
-def repeatability_of(problem: Problem, rest: Rest, found: Model, readings: Readings) -> float:
+def repeatability_of(
+    problem: Problem, rest: ConvergedFit, found: Model, readings: Readings
+) -> float:
     """Return the arm's 1 sigma of one coordinate from repeated poses (m); nan without repeats.
 
     The instrument's own noise is taken off.
     """
     left = problem.observable.residual(found, readings, rest.nuisance)[:, :3]
-    wild = np.zeros(len(readings), dtype=bool)
-    wild[np.flatnonzero(~readings.held_out)[~rest.calm]] = True
+    outliers = np.zeros(len(readings), dtype=bool)
+    outliers[np.flatnonzero(~readings.held_out)[~rest.inliers]] = True
     keys = np.column_stack([readings.pose, readings.load, readings.station, readings.target])
     _, group = np.unique(keys, axis=0, return_inverse=True)
     group = group.reshape(-1)
     square, freedom = 0.0, 0
-    for one in np.unique(group[~wild]):
-        own = left[(group == one) & ~wild]
+    for one in np.unique(group[~outliers]):
+        own = left[(group == one) & ~outliers]
         if len(own) > 1:
             square += float(np.sum((own - own.mean(axis=0)) ** 2))
             freedom += own.shape[1] * (len(own) - 1)
@@ -103,7 +105,7 @@ def repeatability_of(problem: Problem, rest: Rest, found: Model, readings: Readi
 
 
 def diagnosed(
-    found: Model, readings: Readings, rest: Rest, metrology: Metrology,
+    found: Model, readings: Readings, rest: ConvergedFit, metrology: Metrology,
     progress: Callable[[str], None],
 ) -> Diagnosis | None:  # fmt: skip
     """Return the diagnosis of what the calibrated model leaves over, or None where it has no log.

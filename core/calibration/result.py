@@ -91,7 +91,7 @@ class Calibration:
     turn_noise: float = float("nan")  # rad, 1 sigma of a measured rotation; nan: none were
     joint_noise: float = float("nan")  # rad, 1 sigma of one joint's repeatability
     freedom: float = float("inf")  # degrees of freedom that the fit left
-    lacking: tuple[str, ...] = ()  # effects to ask for next: the fit's own poses support them
+    missing_effects: tuple[str, ...] = ()  # supported by the fit's own poses, not asked for
     remaining: str = ""  # in words: what is left, the same in every section of a report
     noise_floor: float = float("nan")  # m, 1 sigma of one coordinate, without the fit; nan: unknown
     whole_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # of all estimates

@@ -54,8 +54,8 @@ def stages_of(parameters: Parameters, readings: Readings) -> Stages:
 
 def _heaviness(readings: Readings) -> Index:
     """Return a number per different load (N,): the plan's, or what the readings say hung there."""
-    told = (readings.load, readings.loads.payload_mass, readings.loads.wrench)
-    parts = [np.round(one.reshape(len(readings), -1), 3) for one in told if one is not None]
+    given = (readings.load, readings.loads.payload_mass, readings.loads.wrench)
+    parts = [np.round(one.reshape(len(readings), -1), 3) for one in given if one is not None]
     return np.unique(np.hstack(parts), axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
 
 

@@ -35,7 +35,7 @@ class ToolCalibration:
     point: Array  # (3,) m, base: the fixed point, or the fixed ball's centre
     estimates: tuple[Estimate, ...]  # tool_tcp_x, _y, _z
     covariance: Array  # (3, 3)
-    noise: float  # m, 1 sigma of one coordinate of one touch: hand, arm, and what the model lacks
+    noise: float  # m, 1 sigma of one coordinate of one touch: hand, arm, and what the model missing
     residual: Array  # (N,) m, how far each touch is from the fixed point or ball
     nominal_residual: Array  # (N,) m, the same with the tool that the cell had, point fitted
     outliers: NDArray[np.int64]  # touches down-weighted as outlier

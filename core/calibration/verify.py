@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from scipy.stats import f as fisher
 
+from gapbridge.core.calibration.accuracy_baseline import AccuracyBaseline, baseline_in
+from gapbridge.core.calibration.moved import moved_words, verdict_words
 from gapbridge.core.calibration.noise import presumed
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.parameters import Parameters
-from gapbridge.core.calibration.promise import Promise, promise_in
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.result import Errors, Estimate
-from gapbridge.core.calibration.telling_moved import moved_words, verdict_words
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.estimation.registration import Registration
@@ -32,7 +32,7 @@ from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
-BROKEN = 1e-3  # chance below which a promise counts as broken
+BROKEN = 1e-3  # chance below which a model has moved since its calibration
 BESIDE = 6.0  # of chi-square: suspects that explain as much are reported beside the best one
 
 
@@ -64,7 +64,7 @@ class Verification:
 
 @dataclass(frozen=True)
 class _Task:
-    """Readings against a promise, whitened by all that was promised."""
+    """Readings against a baseline, whitened by the covariance stated there."""
 
     left: Array  # (M,)
     root: Array  # (M, M): root @ equations are independent, of variance one
@@ -89,20 +89,22 @@ class _Task:
 def verify(
     model: Model,
     readings: Readings,
-    calibration: Mapping[str, Any] | Promise,
+    calibration: Mapping[str, Any] | AccuracyBaseline,
     metrology: Metrology | None = None,
     *,
     observable: Observable | None = None,
 ) -> Verification:
     """Return whether the calibration that made ``model`` still holds, and if not, what moved.
 
-    ``calibration`` is its promise (``promise.document_of``). Raises ExcitationError where there are
-    too few readings to say anything, InputError where the promise does not fit the model.
+    ``calibration`` is its baseline (``accuracy_baseline.document_of``). Raises ExcitationError
+    where there are too few readings to say anything, InputError where it does not fit the model.
     """
     metrology = metrology or Metrology()
-    promise = calibration if isinstance(calibration, Promise) else promise_in(calibration)
+    baseline = (
+        calibration if isinstance(calibration, AccuracyBaseline) else baseline_in(calibration)
+    )
     how = observable or make_observable(readings.kind, registered=metrology.registered)
-    parameters = promise.parameters(model)
+    parameters = baseline.parameters(model)
     nuisance = how.start(model, readings)
     left = how.residual(model, readings, nuisance)
     if left.size <= how.layout(readings).size + 1:
@@ -110,10 +112,10 @@ def verify(
             f"verification: {len(readings)} reading(s) only determine where the instrument stands, "
             "expected more poses"
         )
-    task, spread = _task(model, how, readings, nuisance, promise, parameters, metrology)
+    task, spread = _task(model, how, readings, nuisance, baseline, parameters, metrology)
     rest, freedom, _, _ = task.chi_square(np.zeros((left.size, 0)))
     ratio = float(np.sqrt(rest / freedom))
-    chance = float(fisher.sf(rest / freedom, freedom, promise.freedom))
+    chance = float(fisher.sf(rest / freedom, freedom, baseline.freedom))
     holds = chance > BROKEN
     suspects = () if holds else _suspects(model, how, readings, nuisance, task)
     moved = suspects[0] if suspects and suspects[0].chance > BROKEN else None
@@ -122,26 +124,26 @@ def verify(
         holds, verdict_words(holds, errors, ratio, chance, moved_words(moved, suspects)),
         errors, spread, ratio, chance, moved,
         tuple(s for s in suspects[1:] if moved and s.left < moved.left + BESIDE),
-        nuisance.stations, _notes(promise, metrology, freedom),
+        nuisance.stations, _notes(baseline, metrology, freedom),
     )  # fmt: skip
 
 
 def _task(
-    model: Model, how: Observable, readings: Readings, nuisance: Nuisance, promise: Promise,
-    parameters: Parameters, metrology: Metrology,
+    model: Model, how: Observable, readings: Readings, nuisance: Nuisance,
+    baseline: AccuracyBaseline, parameters: Parameters, metrology: Metrology,
 ) -> tuple[_Task, Array]:  # fmt: skip
     """Return the whitened problem, and what was promised of each error (N,)."""
     at = np.zeros(len(parameters))
     J, F = how.columns(parameters, at, readings, nuisance)
     noise, _ = presumed(model, readings, how, nuisance, metrology)
-    sizes = [_instrument(promise, metrology)]
+    sizes = [_instrument(baseline, metrology)]
     if len(noise.sizes) > 2:
-        told = promise.turn / how.sigmas[3]
-        sizes.append(told if np.isfinite(told) else noise.sizes[1])
-    sizes.append(promise.joint if np.isfinite(promise.joint) else noise.joint)
+        turn = baseline.turn / how.sigmas[3]
+        sizes.append(turn if np.isfinite(turn) else noise.sizes[1])
+    sizes.append(baseline.joint if np.isfinite(baseline.joint) else noise.joint)
     own = np.asarray(sum(s**2 * one for s, one in zip(sizes, noise.shapes, strict=True)))
     N, k, _ = own.shape
-    V = J @ promise.covariance @ J.T
+    V = J @ baseline.covariance @ J.T
     for i in range(N):
         V[i * k : i * k + k, i * k : i * k + k] += own[i]
     spread = np.sqrt(np.diag(V).reshape(N, k)[:, :3].sum(axis=1))
@@ -149,11 +151,11 @@ def _task(
     return _Task(how.residual(model, readings, nuisance).ravel(), root, F), spread
 
 
-def _instrument(promise: Promise, metrology: Metrology) -> float:
+def _instrument(baseline: AccuracyBaseline, metrology: Metrology) -> float:
     """Return 1 sigma of today's instrument: what the session found where it is the same one."""
-    same = abs(promise.sigma - metrology.sigma) < 1e-3 * metrology.sigma
-    known = np.isfinite(promise.instrument) and (same or not np.isfinite(promise.sigma))
-    return promise.instrument if known else metrology.sigma
+    same = abs(baseline.sigma - metrology.sigma) < 1e-3 * metrology.sigma
+    known = np.isfinite(baseline.instrument) and (same or not np.isfinite(baseline.sigma))
+    return baseline.instrument if known else metrology.sigma
 
 
 def _suspects(
@@ -206,14 +208,14 @@ def _suspect(
     seen = (std > 0) | (np.abs(values) > 0)
     estimates = tuple(
         Estimate(n, float(v), float(s), u)
-        for n, v, s, u, told in zip(names, values, std, units, seen, strict=False)
-        if told
+        for n, v, s, u, shown in zip(names, values, std, units, seen, strict=False)
+        if shown
     )
     chance = float(chi2.sf(left, freedom)) if freedom > 0 else 0.0
     return Suspect(name, estimates, chance, left), freedom
 
 
-def _notes(promise: Promise, metrology: Metrology, freedom: int) -> tuple[str, ...]:
+def _notes(baseline: AccuracyBaseline, metrology: Metrology, freedom: int) -> tuple[str, ...]:
     notes = []
     if not metrology.registered:
         notes.append(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from enum import Enum, auto
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,15 +38,25 @@ class Cause:
     notes: tuple[str, ...] = ()
 
 
+class Outcome(Enum):
+    """Why an effect is not accused."""
+
+    NOT_EXCITED = auto()  # the log cannot show it
+    NOT_NEEDED = auto()  # explains too little beside the accused ones
+    WITHDRAWN = auto()  # selected first, and refused by a check
+
+
 @dataclass(frozen=True)
 class Considered:
-    """One effect of the catalogue that is not accused."""
+    """One effect of the catalogue that is not accused; ``needs``: what would excite it."""
 
     effect: str
     shrink_alone: float | None
     probability: float
     excited: bool
     reason: str
+    outcome: Outcome
+    needs: str = ""
 
 
 def causes_of(
@@ -155,13 +166,15 @@ def considered_of(
         excited = any(_shown(selection, c) for c in own)
         if not own or not excited:
             needs = effect.motion or ", ".join(effect.needs)
-            told.append(Considered(identifier, None, 0.0, False, f"not excited; needs {needs}"))
+            told.append(Considered(identifier, None, 0.0, False, f"not excited; needs {needs}",
+                                   Outcome.NOT_EXCITED, needs))  # fmt: skip
             continue
         alone = held.shrink(own, ()).shrink if held.possible and len(own) < 40 else None
         better = min(_score_with(selection, base, c) for c in own)
         odds = float(np.exp(-0.5 * min(max(better - base.score, -700.0), 700.0)))
         reason = reasons.get(identifier, "does not pay for its parameters beside what is found")
-        told.append(Considered(identifier, alone, odds / (1 + odds), True, reason))
+        outcome = Outcome.WITHDRAWN if identifier in reasons else Outcome.NOT_NEEDED
+        told.append(Considered(identifier, alone, odds / (1 + odds), True, reason, outcome))
     return tuple(told)
 
 

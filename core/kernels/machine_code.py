@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from numba import config
-from numba.core import caching
+from numba.core import caching, event
+
+from gapbridge.core.kernels import compiling
 
 CORE = Path(__file__).resolve().parents[1]
 FOLDERS = (CORE, CORE / "kernels")  # where compiled functions are that others have inside them
@@ -78,12 +80,27 @@ class UserWide(_OfAllSources, caching.UserWideCacheLocator):
     """In the user's own cache, where the sources' folder cannot be written to."""
 
 
+class _Compiling(event.Listener):
+    """Hears of each function that numba compiles rather than loads."""
+
+    def on_start(self, event: Any) -> None:
+        """Inform whoever waits for it."""
+        compiling.begin()
+
+    def on_end(self, event: Any) -> None:
+        """Do nothing: the next begins at once."""
+
+
 def keep_by_all_sources() -> None:
-    """Have numba ask for all compiled sources from now on; before the first compiled function."""
+    """Have numba ask for all compiled sources from now on; before the first compiled function.
+
+    From then on ``compiling.listeners`` hear of what is compiled.
+    """
     settings: Any = config  # its values are made when it is imported
     ours = [f"{__name__}.{one.__name__}" for one in (UserProvided, InTree, UserWide)]
     if ours[0] in settings.CACHE_LOCATOR_CLASSES:
         return
+    event.register("numba:compile", _Compiling())  # type: ignore[no-untyped-call]
     names = [f"{name}CacheLocator" for name in USUAL]
     others = settings.CACHE_LOCATOR_CLASSES or ",".join(
         f"{caching.__name__}.{name}" for name in names if hasattr(caching, name)

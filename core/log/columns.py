@@ -25,13 +25,14 @@ COLUMNS: dict[str, int | None] = {
     "approach": None,
     "measured_position": 3,
     "measured_rotation": 3,
+    "actual_TCP_pose": 6,  # of a simulator: what the controller takes its TCP for, no measurement
 }
 INDEXED = re.compile(r"(.+)_(\d+)$")
 ALIKE = 0.85  # likeness of two names from which one may be the other misspelt
 # RTDE fields that look like a log's columns and are none of them: never a slip of the pen
 OTHERS = {
     "target_qd", "target_qdd", "target_moment", "target_current", "target_TCP_pose",
-    "target_TCP_speed", "actual_current", "actual_current_window", "actual_TCP_pose",
+    "target_TCP_speed", "actual_current", "actual_current_window",
     "actual_TCP_speed", "payload_mass", "payload_inertia", "joint_mode", "joint_control_output",
 }  # fmt: skip
 
@@ -52,6 +53,14 @@ def written(name: str, n: int) -> str:
     """Return a column group as messages write it: ``actual_q_0..5``, ``payload``."""
     ends = indices(name, n)
     return f"{name}_0..{len(ends) - 1}" if ends[0] else name
+
+
+def label(column: str) -> str:
+    """Return a column as people read it: joints from 1 and its name, ``joint 2 (actual_q_1)``."""
+    match = INDEXED.match(column)
+    if match and COLUMNS.get(match[1], 0) is None:
+        return f"joint {int(match[2]) + 1} ({column})"
+    return column
 
 
 def misspelt(unknown: Sequence[str], names: Sequence[str], n: int) -> str:

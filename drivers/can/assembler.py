@@ -13,20 +13,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.drivers.can.codec import Reading
 from gapbridge.drivers.can.profile import CanProfile, Incoming, Key
 
 Vector = NDArray[np.float64]
+QUANTITIES = ("position", "velocity", "torque", "temperature")
 
 
 class Sample(NamedTuple):
     """One complete sample, SI units; (n,) each, NaN where a joint has not reported yet.
 
-    All quantities are rows of ``table`` (q, n), the position first, then ``others`` in order. A
-    tuple, because one is made in every cycle.
+    A tuple, because one is made in every cycle.
     """
 
-    table: Vector
     position: Vector  # rad
     others: dict[str, Vector]  # velocity rad/s, torque Nm, temperature °C
     stamp: float  # s, clock of the bus, of its last frame
@@ -40,14 +38,17 @@ class Assembler:
     def __init__(self, profile: CanProfile) -> None:
         self._profile = profile
         self._members = frozenset(profile.sample)
-        # messages that carry nothing but joints are taken apart together, once a sample is whole
-        self._plan = Reading(profile)
-        self._slots = self._plan.slots
-        self._held: dict[Key, dict[str, float] | bytes] = {}
+        self._names = [name for name in QUANTITIES if name in profile.quantities]
+        self._rows = {name: k for k, name in enumerate(self._names)}
+        joints = profile.joints
+        self._scale = np.array([joints.scale[name] for name in self._names])
+        self._zero = np.zeros_like(self._scale)
+        self._zero[0] = joints.zero
+        self._wire = np.full_like(self._scale, np.nan)  # (q, n): last values, the wire's units
+        self._held: dict[Key, dict[str, float]] = {}
         self._first = 0.0  # s, bus clock
         self._began = 0.0  # s, monotonic
         self._count: float | None = None
-        self._values = self._plan.wire
         self.dropped: Counter[str] = Counter()  # reason -> frames or sets
         self.status: dict[tuple[Key, str], tuple[float, str, bool]] = {}
         self.enabled: dict[tuple[Key, str], bool] = {}
@@ -82,14 +83,6 @@ class Assembler:
         if self._seen.get(key) == data:  # the same bytes say the same: most of an arm's status
             self.received_at[key] = received
             return None
-        slot = self._slots.get(key)
-        if slot is not None and len(data) == incoming.length:
-            self.received_at[key] = received
-            if key in self._members:
-                return self._collect(incoming, data, stamp, received)
-            self._seen[key] = data
-            self._plan.put(slot, data)
-            return None
         try:
             values = incoming.decode(data)
         except ValueError:
@@ -120,10 +113,10 @@ class Assembler:
 
     def _read(self, incoming: Incoming, values: dict[str, float]) -> None:
         for reading in incoming.readings:
-            self._values[reading.quantity][reading.joint] = values[reading.signal]
+            self._wire[self._rows[reading.quantity], reading.joint] = values[reading.signal]
 
     def _collect(
-        self, incoming: Incoming, values: dict[str, float] | bytes, stamp: float, received: float
+        self, incoming: Incoming, values: dict[str, float], stamp: float, received: float
     ) -> Sample | None:
         profile, key = self._profile, incoming.key
         if self._held and self._breaks(incoming, values, stamp):
@@ -139,31 +132,28 @@ class Assembler:
         if len(self._held) < len(self._members):
             return None
         held, self._held = self._held, {}
-        if incoming.counter is not None and not isinstance(values, bytes):
+        if incoming.counter is not None:
             if values[incoming.counter] == self._count:
                 self.dropped["repeated"] += 1
                 return None
             self._count = values[incoming.counter]
         for member, found in held.items():
-            if isinstance(found, bytes):
-                self._plan.put(self._slots[member], found)
-            else:
-                self._read(profile.incoming[member], found)
+            self._read(profile.incoming[member], found)
         return self._sample(stamp, received)
 
-    def _breaks(self, incoming: Incoming, values: dict[str, float] | bytes, stamp: float) -> bool:
+    def _breaks(self, incoming: Incoming, values: dict[str, float], stamp: float) -> bool:
         """Return whether a frame cannot belong to the sample that has been begun."""
         if incoming.key in self._held or not 0.0 <= stamp - self._first <= self._profile.window:
             return True
         if self._profile.ordered and self._profile.sample[len(self._held)] != incoming.key:
             return True
         counter = incoming.counter
-        if counter is None or isinstance(values, bytes):
+        if counter is None:
             return False
         count = values[counter]
-        return any(isinstance(v, bytes) or v[counter] != count for v in self._held.values())
+        return any(v[counter] != count for v in self._held.values())
 
     def _sample(self, stamp: float, received: float) -> Sample:
-        table = self._plan.table()
-        others = dict(zip(self._plan.names[1:], table[1:], strict=True))
-        return Sample(table, table[0], others, stamp, received, self._began)
+        table = self._wire * self._scale + self._zero
+        others = dict(zip(self._names[1:], table[1:], strict=True))
+        return Sample(table[0], others, stamp, received, self._began)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import time
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import (
     ForeignCommandError,
     InvalidStateError,
@@ -39,17 +39,17 @@ class CanDriver(Driver):
     armed writes no more.
     """
 
-    def __init__(self, settings: CanSettings, model: Model) -> None:
+    def __init__(self, settings: CanSettings, model: Model, clock: Clock = SYSTEM) -> None:
         profile = read_profile(settings.profile_path, settings.installation)
-        super().__init__(min(settings.rate, profile.rate), model)
+        super().__init__(min(settings.rate, profile.rate), model, clock=clock)
         if model.arm.n != profile.n:
             raise LinkError(
                 f"link.profile: found {profile.n} joints in {profile.name}, the cell's arm has "
                 f"{model.arm.n}"
             )
         self.settings, self.profile = settings, profile
-        self.reader = FrameReader(settings, profile)
-        self.writer = FrameWriter(settings, profile)
+        self.reader = FrameReader(settings, profile, clock)
+        self.writer = FrameWriter(settings, profile, clock)
         self._builder = StateBuilder(profile, model.arm)
         self._armed_at: float | None = None  # s, monotonic
         self._given = -1.0  # s, received of the sample last returned
@@ -67,15 +67,15 @@ class CanDriver(Driver):
         """Open the bus and wait until the arm has reported everything once. Sends no command."""
         self.reader.open()
         self.writer.use(self.reader.bus)
-        self._listening = time.monotonic()
-        end = time.monotonic() + min(FIRST_SAMPLE, self.settings.connect_timeout)
+        self._listening = self._now()
+        end = self._now() + min(FIRST_SAMPLE, self.settings.connect_timeout)
         found = False
         while not found or self.reader.silent_status():
-            if time.monotonic() > end:
+            if self._now() > end:
                 raise self._nothing_heard(found)
             self._ask()
             found = self.reader.listen(max(1.0 / self.rate, SLICE)) is not None or found
-        self._changed = time.monotonic()
+        self._changed = self._now()
         self._begin_anew()
 
     def _begin_anew(self) -> None:
@@ -115,12 +115,12 @@ class CanDriver(Driver):
 
     def _awaited(self) -> Sample:
         """Return the next sample of an arm that sends by itself; slower where we want fewer."""
-        end = time.monotonic() + self.settings.state_timeout
+        end = self._now() + self.settings.state_timeout
         earliest = self._given + 1.0 / self.rate - 0.5 / self.profile.rate
         sample, self._kept = self.reader.newest() or self._kept, None
         self._check_torn(sample)
         while sample is None or sample.received < earliest:
-            left = end - time.monotonic()
+            left = end - self._now()
             if left <= 0.0:
                 raise self._stale()
             sample = self.reader.poll(min(left, SLICE)) or sample
@@ -139,27 +139,27 @@ class CanDriver(Driver):
 
     def _asked(self) -> Sample:
         """Return the sample that an arm gives when it is asked, once per cycle."""
-        now = time.monotonic()
+        now = self._now()
         self._slot = max(self._slot + 1.0 / self.rate, now - 1.0 / self.rate)
         if self._slot > now:
             self.reader.listen(self._slot - now)
         self.reader.newest()
         self.reader.assembler.reset()
-        asked = time.monotonic()
+        asked = self._now()
         self._ask()
         end = asked + self.settings.state_timeout
         whole = asked + max(ANSWER, 2.0 / self.rate)
-        while (left := end - time.monotonic()) > 0.0:
+        while (left := end - self._now()) > 0.0:
             sample = self.reader.poll(min(left, SLICE))
             if sample is not None and sample.began >= asked:
                 return sample
             missing = self.reader.assembler.missing
-            if missing and time.monotonic() > whole:
+            if missing and self._now() > whole:
                 raise InvalidStateError(f"{self.profile.name}: no answer of {', '.join(missing)}")
         raise self._stale()
 
     def _stale(self) -> StaleStateError:
-        silent = f"for {time.monotonic() - self._given:.3f} s" if self._given > 0.0 else "yet"
+        silent = f"for {self._now() - self._given:.3f} s" if self._given > 0.0 else "yet"
         errors = self.reader.error_frames
         detail = f" ({errors} error frames so far)" if errors else ""
         return StaleStateError(
@@ -197,9 +197,9 @@ class CanDriver(Driver):
         if not self.profile.writes:
             raise WriteError(f"{self.profile.name}: this profile is read only")
         quiet = self.settings.foreign_quiet
-        self._listen(max(self._listening + quiet - time.monotonic(), 0.0))
+        self._listen(max(self._listening + quiet - self._now(), 0.0))
         foreign = self.reader.foreign
-        if foreign is not None and time.monotonic() - foreign.seen < quiet:
+        if foreign is not None and self._now() - foreign.seen < quiet:
             raise self._commanded_by_another()
         self._kept = None
         trouble, message = self.reader.trouble(writing=False)
@@ -217,7 +217,7 @@ class CanDriver(Driver):
             raise
         if self.writer.target is None:
             self.writer.write(self._present())
-        self._armed_at = self._changed = time.monotonic()
+        self._armed_at = self._changed = self._now()
         self._begin_anew()
 
     def _present(self) -> Vector:
@@ -227,8 +227,8 @@ class CanDriver(Driver):
 
     def _listen(self, seconds: float) -> None:
         """Read for a while, asking those that must be asked; keeps the present joints."""
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0.0 or seconds == 0.0:
+        end = self._now() + seconds
+        while (left := end - self._now()) > 0.0 or seconds == 0.0:
             self._ask()
             sample = self.reader.listen(min(max(left, 0.001), 1.0 / self.rate))
             if sample is not None and np.isfinite(sample.position).all():
@@ -247,7 +247,7 @@ class CanDriver(Driver):
         assert foreign is not None
         return ForeignCommandError(
             f"{self.settings.where()}: another commander sent {foreign.key[0]:#x} "
-            f"{time.monotonic() - foreign.seen:.2f} s ago: found two masters, expected one"
+            f"{self._now() - foreign.seen:.2f} s ago: found two masters, expected one"
         )
 
     def _send(self, setpoint: Setpoint) -> None:

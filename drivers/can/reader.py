@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import LinkError
 from gapbridge.drivers.can.assembler import Assembler, Sample
 from gapbridge.drivers.can.profile import CanProfile, Key
@@ -31,7 +31,8 @@ class Foreign:
 class FrameReader:
     """Reads one bus for one profile. Opens and closes it; knows nothing of writing."""
 
-    def __init__(self, settings: CanSettings, profile: CanProfile) -> None:
+    def __init__(self, settings: CanSettings, profile: CanProfile, clock: Clock = SYSTEM) -> None:
+        self._now = clock.monotonic
         self._settings, self._profile = settings, profile
         self.bus: Any = None
         self.assembler = Assembler(profile)
@@ -57,7 +58,7 @@ class FrameReader:
         ]
         in_kernel = self._settings.interface == "socketcan"
         self.bus = open_bus(self._settings, filters if in_kernel else None)
-        self._empty = time.monotonic()
+        self._empty = self._now()
 
     def close(self) -> None:
         """Close the bus; may be repeated."""
@@ -73,14 +74,14 @@ class FrameReader:
         frame = self._receive(timeout)
         if frame is None:
             return None
-        return self._fresh(self._take(frame, time.monotonic()), self._empty)
+        return self._fresh(self._take(frame, self._now()), self._empty)
 
     def newest(self) -> Sample | None:
         """Take everything that has piled up; returns the newest complete sample of it."""
-        newest, until = None, time.monotonic() + BACKLOG_TIME
+        newest, until = None, self._now() + BACKLOG_TIME
         empty = self._empty  # before all that is read now
         while (frame := self._receive(0.0)) is not None:
-            now = time.monotonic()
+            now = self._now()
             newest = self._take(frame, now) or newest
             if now > until:
                 break
@@ -96,8 +97,8 @@ class FrameReader:
 
     def listen(self, seconds: float) -> Sample | None:
         """Take frames for a while; returns the newest complete sample of them."""
-        newest, until = None, time.monotonic() + seconds
-        while (left := until - time.monotonic()) > 0.0:
+        newest, until = None, self._now() + seconds
+        while (left := until - self._now()) > 0.0:
             newest = self.poll(min(left, 0.02)) or newest
         return newest
 
@@ -105,7 +106,7 @@ class FrameReader:
         if self.bus is None:
             raise LinkError(f"{self._settings.where()}: found no bus, expected connect() first")
         try:
-            asked = time.monotonic()
+            asked = self._now()
             if (frame := self.bus.recv(0.0)) is not None:
                 return frame
             self._empty = asked
@@ -144,7 +145,7 @@ class FrameReader:
         joints, foreign = self._profile.joints, self.foreign
         if foreign is None or joints.setpoint_scale is None:
             return None
-        if time.monotonic() - foreign.seen > within or not np.isfinite(self._foreign_wire).all():
+        if self._now() - foreign.seen > within or not np.isfinite(self._foreign_wire).all():
             return None
         return self._foreign_wire * joints.setpoint_scale + joints.zero
 
@@ -174,7 +175,7 @@ class FrameReader:
 
     def silent_status(self) -> str:
         """Return the name of a status message that has not come for too long; empty: none."""
-        now, all_received = time.monotonic(), self.assembler.received_at
+        now, all_received = self._now(), self.assembler.received_at
         oldest = min(all_received.values(), default=0.0)
         complete = len(all_received) == len(self._profile.incoming)
         if complete and now - oldest <= self._profile.status_timeout:

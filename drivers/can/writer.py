@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import PartialWriteError, WriteError
-from gapbridge.drivers.can.codec import Writing
 from gapbridge.drivers.can.profile import Action, CanProfile, Key, Outgoing
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.can_bus.bus import first_line
@@ -22,10 +21,10 @@ Frames = list[tuple[Key, bytes]]
 class FrameWriter:
     """Sends setpoints and sequences over a bus that is open."""
 
-    def __init__(self, settings: CanSettings, profile: CanProfile) -> None:
+    def __init__(self, settings: CanSettings, profile: CanProfile, clock: Clock = SYSTEM) -> None:
+        self._now = clock.monotonic
         self._settings, self._profile = settings, profile
         self._bus: Any = None
-        self._plan = Writing(profile)
         self._last: Frames | None = None  # the setpoint that got out whole
         self.target: Vector | None = None  # rad, the same as joints
         self.mended = 0  # setpoints that had to be taken back
@@ -76,9 +75,6 @@ class FrameWriter:
 
     def _encode(self, q: Vector) -> Frames:
         """Return all frames before any is sent. Raises WriteError."""
-        plan = self._plan
-        if plan.able and q.shape == (self._profile.n,) and (frames := plan.frames(q)) is not None:
-            return frames
         if q.shape != (self._profile.n,) or not np.isfinite(q).all():
             raise WriteError(f"{self._profile.name}: found {q}, expected finite joints")
         wire: list[float] = self._profile.joints.to_wire(q).tolist()
@@ -105,13 +101,13 @@ class FrameWriter:
         whether an ``until`` is there.
         """
         for action in actions:
-            end = time.monotonic() + action.within
+            end = self._now() + action.within
             while True:
                 self._do(action, hold)
                 listen(action.wait if action.until is None else action.every)
                 if action.until is None or reached(action.until):
                     break
-                if time.monotonic() > end:
+                if self._now() > end:
                     names = ", ".join(f.name for f in action.frames) or "hold"
                     raise WriteError(
                         f"{self._profile.name}: {names}: not {action.until} after "

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import time
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import (
     InputError,
     InvalidStateError,
@@ -50,9 +50,9 @@ class CanopenDriver(Driver):
     before ``arm``.
     """
 
-    def __init__(self, settings: CanopenSettings, model: Model) -> None:
+    def __init__(self, settings: CanopenSettings, model: Model, clock: Clock = SYSTEM) -> None:
         self.profile = read_profile(settings.profile_path, model.arm.n)
-        super().__init__(settings.rate, model)
+        super().__init__(settings.rate, model, clock=clock)
         fastest = 1.0 / self.profile.file.sync_period
         if settings.rate > fastest * (1.0 + 1e-9):
             raise InputError(
@@ -81,7 +81,7 @@ class CanopenDriver(Driver):
         master = self.master
         master.open()
         try:
-            time.sleep(self.settings.listen)
+            self.clock.sleep(self.settings.listen)
             if self.foreign is not None:
                 raise LinkError(self._two_masters(self.foreign))
             for node in self.profile.nodes:
@@ -98,7 +98,7 @@ class CanopenDriver(Driver):
         except LinkError:
             master.close()
             raise
-        self._connected_at = time.monotonic()
+        self._connected_at = self._now()
         self._armed_at = None
         self._builder.forget()
 
@@ -106,9 +106,9 @@ class CanopenDriver(Driver):
         """Wait until all drives are OPERATIONAL and answer a SYNC. Raises LinkError."""
         life = self.master.life
         assert life is not None
-        end = time.monotonic() + min(STARTING, self.settings.connect_timeout)
+        end = self._now() + min(STARTING, self.settings.connect_timeout)
         while (found := self.rhythm.exchange()) is None or not life.all_operational:
-            if time.monotonic() > end:
+            if self._now() > end:
                 why = self.master.collector.why() + " after a SYNC"
                 if found is not None:
                     silent = [n for n in self.profile.nodes if life.nmt.get(n) != OPERATIONAL]
@@ -135,7 +135,7 @@ class CanopenDriver(Driver):
                 self._fresh_at = found.received
                 return self._believe(found)
             why = self.master.collector.why() if found is None else f"{stray} came without a SYNC"
-            now = time.monotonic()
+            now = self._now()
             if now - self._fresh_at > self.settings.state_timeout:
                 raise StaleStateError(
                     f"{self.master.where}: no whole sample for {now - self._fresh_at:.3f} s: {why}"
@@ -191,7 +191,7 @@ class CanopenDriver(Driver):
     def _two_masters(self, foreign: Foreign) -> str:
         return (
             f"{self.master.where}: another master sent {foreign.what} "
-            f"{time.monotonic() - foreign.seen:.2f} s ago: found two masters, expected one"
+            f"{self._now() - foreign.seen:.2f} s ago: found two masters, expected one"
         )
 
     def _make_ready(self, state: RobotState) -> None:
@@ -215,10 +215,10 @@ class CanopenDriver(Driver):
 
     def _quiet_sample(self) -> SyncSet:
         """Return a sample after a while without another master. Raises LinkError."""
-        begun = time.monotonic()
+        begun = self._now()
         quiet = self.settings.foreign_quiet
         while True:
-            foreign, now = self.foreign, time.monotonic()
+            foreign, now = self.foreign, self._now()
             if foreign is not None and (foreign.seen > begun or now - foreign.seen < quiet):
                 raise WriteError(self._two_masters(foreign))
             found = self.rhythm.exchange()
@@ -243,7 +243,7 @@ class CanopenDriver(Driver):
                 self.power.disable()
                 self.power.restore()
             raise
-        self._armed_at = self._moved_at = self._fresh_at = time.monotonic()
+        self._armed_at = self._moved_at = self._fresh_at = self._now()
         self._builder.forget()
 
     def _send(self, setpoint: Setpoint) -> None:
@@ -277,7 +277,7 @@ class CanopenDriver(Driver):
             raise WriteError(str(error)) from None
         finally:
             self._builder.forget()
-            self._fresh_at = time.monotonic()
+            self._fresh_at = self._now()
 
     def close(self) -> None:
         """Release where the link lives, end the drives' PDOs and leave the bus."""

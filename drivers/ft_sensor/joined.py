@@ -29,7 +29,7 @@ class DriverWithSensor(Driver):
     """
 
     def __init__(self, arm: Driver, settings: FtSensorSettings, model: Model) -> None:
-        super().__init__(arm.rate, model, arm.moves_arm)
+        super().__init__(arm.rate, model, arm.moves_arm, arm.clock)
         self.gate = arm.gate
         self.settings = settings
         self._arm = arm

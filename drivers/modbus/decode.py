@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from gapbridge.core.errors import InvalidStateError
 from gapbridge.drivers.modbus.encode import units_of
 from gapbridge.drivers.modbus.map import RegisterMap, place_in
-from gapbridge.drivers.modbus.plan import TURN, BlockPlan
 from gapbridge.drivers.modbus.profile import ECHO_WORDS, addresses, turns_of, vectors
 from gapbridge.drivers.modbus.registers import BIT_TABLES, UNITS, Coding, words_in
 from gapbridge.drivers.modbus.schema import Condition, Mailbox, Place, ProfileFile, Trouble, Vector
@@ -30,6 +29,7 @@ BOUNDS = {
     "force": LARGEST["force"], "moment": LARGEST["moment"], "echo": math.inf,
 }  # fmt: skip
 """Largest plausible magnitudes, SI, by the profile's names."""
+TURN = 2.0 * math.pi
 
 
 class Sample(NamedTuple):
@@ -70,10 +70,6 @@ class Decoder:
         if isinstance(profile.write, Mailbox):
             self._fields.append(self._echo(profile.write))
         self._sizes = [(block, 2 * block.count) for block in compiled.blocks]
-        # the block of the joints by its plan; vectors that lie elsewhere one by one
-        self._plan = BlockPlan(compiled.fast[0].count)
-        self._others = [field for field in self._fields if not self._planned(field)]
-        self._plan.compile()
         self._conditions = [(self._spot(c), c) for c in profile.status]
         self._looked = _getters(spot for spot, _ in self._conditions)
         self._last_bytes: list[Any] = []  # bytes of the conditions, last time
@@ -92,16 +88,6 @@ class Decoder:
             if clock is not None and clock.again is not None
             else None
         )
-
-    def _planned(self, field: _Field) -> bool:
-        """Add a vector to the block's plan; False where it does not lie there alone."""
-        if field.block != 0 or field.turn_block not in (None, 0):
-            return False
-        plan = self._plan
-        plan.add(field.name, field.indices, field.coding, field.sizes, BOUNDS[field.name])
-        if field.turn_coding is not None:
-            plan.add_turns(field.turn_indices, field.turn_coding)
-        return True
 
     def _field(self, name: str, entry: Vector, count: int) -> _Field:
         block, indices = self._indices(entry, count)
@@ -145,7 +131,7 @@ class Decoder:
         if clock is not None and not math.isfinite(clock):
             raise InvalidStateError(f"clock: found {clock:g}, expected a finite number")
         return Sample(
-            self._vectors(registers),
+            {field.name: self._vector(field, registers) for field in self._fields},
             clock,
             self._troubles_of(registers),
             tuple(
@@ -155,14 +141,6 @@ class Decoder:
             ),
             None if self._answer is None else _answer_of(registers, *self._answer),
         )
-
-    def _vectors(self, registers: Registers) -> dict[str, Array]:
-        found = self._plan.vectors(registers[0])
-        if found is None:  # the words for it
-            return {field.name: self._vector(field, registers) for field in self._fields}
-        for field in self._others:
-            found[field.name] = self._vector(field, registers)
-        return found
 
     def _troubles_of(self, registers: Registers) -> tuple[tuple[Trouble, str], ...]:
         """Return the conditions that are not met; looked at anew where a register has changed."""

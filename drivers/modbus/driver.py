@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.compensation import wanted_pose
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
 from gapbridge.core.model import Model
@@ -34,9 +33,9 @@ MARGIN = 2.0  # times the arm's own velocity limits: what no joint can pass
 class ModbusDriver(Driver):
     """One arm on Modbus. What lies where, and how setpoints get there, says the profile."""
 
-    def __init__(self, settings: ModbusSettings, model: Model) -> None:
+    def __init__(self, settings: ModbusSettings, model: Model, clock: Clock = SYSTEM) -> None:
         self.profile = profile = read_profile(settings.profile_path, model.arm.n)
-        super().__init__(settings.rate, model, profile.write.mode != "mailbox")
+        super().__init__(settings.rate, model, profile.write.mode != "mailbox", clock)
         self.settings = settings
         self.map = compile_map(profile)
         device = profile.device_id if settings.device_id is None else settings.device_id
@@ -46,7 +45,7 @@ class ModbusDriver(Driver):
         self._decoder = Decoder(profile, self.map)
         self._freshness = Freshness(profile)
         self._writer = make_writer(
-            profile, self.transport, self._rates, 0.5 * settings.connect_timeout
+            profile, self.transport, self._rates, 0.5 * settings.connect_timeout, clock
         )
         self._nominal = None if self.moves_arm else Nominal(model)
         self._first_block, *self._other_blocks = self.map.fast
@@ -83,10 +82,10 @@ class ModbusDriver(Driver):
         except LinkError:
             self.transport.close()
             raise
-        self._q, self._first = None, (sample.vectors["position"], time.monotonic())
+        self._q, self._first = None, (sample.vectors["position"], self._now())
         self._freshness.restart()
         self._connected = True
-        self._due = self._fresh_at = time.monotonic()
+        self._due = self._fresh_at = self._now()
 
     def _check_limits(self, q: Vector) -> None:
         """Refuse joints where the arm cannot be: units, word order or signs are wrong."""
@@ -98,14 +97,14 @@ class ModbusDriver(Driver):
         """Return the next new sample; see Driver.read_state."""
         if not self._connected:
             raise LinkError(f"{self.transport.name}: found no connection, expected connect() first")
-        now = time.monotonic()
+        now = self._now()
         self._due = max(self._due + 1.0 / self.rate, now)
         if self._due > now:
-            time.sleep(self._due - now)
+            self.clock.sleep(self._due - now)
         limit = max(self._fresh_at, now) + self.settings.state_timeout
         while True:
             sample = self._attempt()
-            received = time.monotonic()
+            received = self._now()
             if sample is not None:
                 q = sample.vectors["position"]
                 if self._freshness.is_new(sample.clock, q, sample.vectors.get("velocity")):
@@ -115,7 +114,7 @@ class ModbusDriver(Driver):
                     f"{self.transport.name}: found no new sample for "
                     f"{received - self._fresh_at:.3f} s"
                 )
-            time.sleep(min(self.profile.period / 4.0, 0.01))
+            self.clock.sleep(min(self.profile.period / 4.0, 0.01))
 
     def _attempt(self) -> Sample | None:
         """Return a sample, or None where the controller kept silent once.
@@ -124,17 +123,17 @@ class ModbusDriver(Driver):
         """
         if not self.transport.is_open:
             self.transport.open()  # raises LinkError where nobody is there any more
-        asked = time.monotonic()
+        asked = self._now()
         try:
             sample = self._decoder.decode(self._read_blocks())
         except StaleStateError:
             return None
-        self._answer = time.monotonic() - asked
+        self._answer = self._now() - asked
         return None if self._answer > self._longest_answer else sample
 
     def _read_blocks(self) -> list[bytes]:
         """Return the registers of one cycle: one block, where the profile's map allows it."""
-        now = time.monotonic()
+        now = self._now()
         if self.map.slow and now - self._slow_at > SLOW_EVERY:
             self._slow = [self.transport.read(block) for block in self.map.slow]
             self._slow_at = now
@@ -266,7 +265,7 @@ class ModbusDriver(Driver):
         if self._sample is None:
             raise WriteError(f"{self.transport.name}: found no state, expected read_state() first")
         try:
-            self._given = time.monotonic()
+            self._given = self._now()
             self._writer.write(setpoint, self._sample)
         except WriteError:
             raise

@@ -6,13 +6,13 @@ afterwards, not that a request was answered.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import (
     ForeignCommandError,
     IneffectiveWriteError,
@@ -53,8 +53,9 @@ class Writer(Protocol):
 
 
 def make_writer(
-    profile: ProfileFile, transport: Transport, rates: Rates, patience: float
-) -> Writer:
+    profile: ProfileFile, transport: Transport, rates: Rates, patience: float,
+    clock: Clock = SYSTEM,
+) -> Writer:  # fmt: skip
     """Return the writer of a profile.
 
     ``rates`` gives the cell's, m/s and rad/s; ``patience``: s until what an owner before has left
@@ -62,9 +63,9 @@ def make_writer(
     """
     write = profile.write
     if isinstance(write, Mailbox):
-        return MailboxWriter(write, transport, profile.function_23, rates, patience)
+        return MailboxWriter(write, transport, profile.function_23, rates, patience, clock)
     if isinstance(write, TargetTrigger):
-        return TargetWriter(write, transport)
+        return TargetWriter(write, transport, clock)
     return ReadOnlyWriter(profile, write, transport)
 
 
@@ -103,8 +104,10 @@ class MailboxWriter:
     """
 
     def __init__(
-        self, box: Mailbox, transport: Transport, together: bool, rates: Rates, patience: float
-    ) -> None:
+        self, box: Mailbox, transport: Transport, together: bool, rates: Rates, patience: float,
+        clock: Clock = SYSTEM,
+    ) -> None:  # fmt: skip
+        self._clock, self._now = clock, clock.monotonic
         self._box, self._transport, self._together = box, transport, together
         self._patience = patience
         self._cell_rates, self._rates = rates, [0, 0]
@@ -137,15 +140,15 @@ class MailboxWriter:
         # a number that the program cannot take for the one it has seen last
         self._sequence = (number + encode.SEQUENCES // 4) % (encode.SEQUENCES - 1) + 1
         self._counts = [0] * 6
-        until = time.monotonic() + self._box.echo
+        until = self._now() + self._box.echo
         while True:
             self._send(self._words())
             answer = look().answer or (0, 0)
             if answer == (self._sequence, encode.RUNNING):
                 break
-            if time.monotonic() > until:
+            if self._now() > until:
                 raise WriteError(self._silence(*answer))
-            time.sleep(ANNOUNCE)
+            self._clock.sleep(ANNOUNCE)
         self._awaited, self._sent, self._armed = 0, 0, True
 
     def _wait_bare(self, look: Callable[[], Sample]) -> int:
@@ -153,19 +156,19 @@ class MailboxWriter:
 
         Raises WriteError.
         """
-        until = time.monotonic() + self._patience
+        until = self._now() + self._patience
         while True:
             sample = look()
             length = float(np.abs(sample.vectors["echo"]).max())
             if length == 0.0:
                 return (sample.answer or (0, 0))[0]
-            if time.monotonic() > until:
+            if self._now() > until:
                 raise WriteError(
                     f"{self._transport.name}: the robot's program still applies an offset of "
                     f"{1e3 * length:.3f} mm or mrad, expected none before arming: it takes it out "
                     "by itself, at the rates it was last given"
                 )
-            time.sleep(ANNOUNCE)
+            self._clock.sleep(ANNOUNCE)
 
     def write(self, setpoint: Setpoint, sample: Sample) -> None:
         """Send one offset. Raises WriteError where the program does not take them."""
@@ -181,7 +184,7 @@ class MailboxWriter:
             self._sequence = encode.next_number(self._sequence)
             self._sent = min(self._sent + 1, encode.SEQUENCES // 4)
             if not self._awaited:
-                self._awaited, self._since = self._sequence, time.monotonic()
+                self._awaited, self._since = self._sequence, self._now()
         words = self._words()
         if self._together:
             self._pending = words
@@ -212,7 +215,7 @@ class MailboxWriter:
             ahead = (number - self._awaited) % (encode.SEQUENCES - 1)
             if ahead < encode.SEQUENCES // 2:
                 self._awaited = 0
-        late = self._awaited and time.monotonic() - self._since > self._box.echo
+        late = self._awaited and self._now() - self._since > self._box.echo
         if says != encode.RUNNING:
             self._armed = False
             raise WriteError(self._silence(number, says))
@@ -254,7 +257,8 @@ class MailboxWriter:
 class TargetWriter:
     """Joint targets in registers, and a trigger that starts the motion there."""
 
-    def __init__(self, entry: TargetTrigger, transport: Transport) -> None:
+    def __init__(self, entry: TargetTrigger, transport: Transport, clock: Clock = SYSTEM) -> None:
+        self._now = clock.monotonic
         self._entry, self._transport = entry, transport
         self._size = entry.target.scale * UNITS[entry.target.unit][1]
         self._armed = False
@@ -286,7 +290,7 @@ class TargetWriter:
         for first, words in encode.runs(registers):
             self._transport.write(entry.table, first, words, single=self._entry.single)
         self._order(self._entry.trigger)
-        self._sent, self._since = registers, time.monotonic()
+        self._sent, self._since = registers, self._now()
         self._target = np.round(setpoint.q / self._size) * self._size
 
     def _check(self, sample: Sample) -> None:
@@ -295,7 +299,7 @@ class TargetWriter:
             if what == "result" and self._target is not None:
                 self._armed = False
                 raise WriteError(f"{self._transport.name}: the last target failed: {words}")
-        if self._target is None or time.monotonic() - self._since < self._entry.following:
+        if self._target is None or self._now() - self._since < self._entry.following:
             return
         away = np.abs(sample.vectors["position"] - self._target)
         if (away > NEAR * abs(self._size) + 2e-3).any():

@@ -7,12 +7,12 @@ follow a setpoint, the sequence number that comes back.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 
+from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import WriteError
 from gapbridge.core.setpoint import Setpoint
 from gapbridge.core.state import RobotState
@@ -70,7 +70,8 @@ def check_ready(host: str, state: RobotState) -> None:
 class ServoWriter:
     """Joint setpoints by servoJ, through the control script that the library uploads."""
 
-    def __init__(self, settings: UrRtdeSettings) -> None:
+    def __init__(self, settings: UrRtdeSettings, clock: Clock = SYSTEM) -> None:
+        self._clock, self._now = clock, clock.monotonic
         self._settings = settings
         self._control: Any = None
         self._period = 1.0 / settings.rate
@@ -117,19 +118,19 @@ class ServoWriter:
 
     def _wait_running(self) -> None:
         """Wait until an uploaded script runs: the library returns before it does."""
-        until = time.monotonic() + 2.0
+        until = self._now() + 2.0
         while not self._control.isProgramRunning():
-            if time.monotonic() > until:
+            if self._now() > until:
                 raise WriteError(f"{self._settings.host}: the control script does not start")
-            time.sleep(0.01)
-        time.sleep(0.05)
+            self._clock.sleep(0.01)
+        self._clock.sleep(0.05)
 
     def keep_alive(self) -> None:
         """Kick the watchdog, which waits until the script has heard it.
 
         Before servoJ, which writes the same register: the command must be what stays in it.
         """
-        now = time.monotonic()
+        now = self._now()
         if now - self._kicked > KICK:
             self._running().kickWatchdog()
             self._kicked = now
@@ -150,7 +151,7 @@ class ServoWriter:
     def write(self, setpoint: Setpoint, state: RobotState) -> None:
         """Send one setpoint. Raises WriteError where the robot does not obey."""
         control, settings = self._running(), self._settings
-        if time.monotonic() - self._kicked > 0.4 / self._settings.watchdog:
+        if self._now() - self._kicked > 0.4 / self._settings.watchdog:
             self.keep_alive()  # for who does not call it
         self._check_following(setpoint, state)
         if not control.servoJ(
@@ -167,7 +168,7 @@ class ServoWriter:
         count, self._count = self._count, self._count + 1
         if count % DECIMATION:
             return
-        now = time.monotonic()
+        now = self._now()
         slot = count // DECIMATION % KEPT
         oldest = self._sent_at[slot] if count >= DECIMATION * KEPT else self._sent_at[0]
         self._sent[slot], self._sent_at[slot] = setpoint.q, now
@@ -209,7 +210,13 @@ class OffsetWriter:
     are the cell's: the program takes offsets in and out no faster, also when nobody sends any more.
     """
 
-    def __init__(self, settings: UrRtdeSettings, rates: Callable[[], tuple[float, float]]) -> None:
+    def __init__(
+        self,
+        settings: UrRtdeSettings,
+        rates: Callable[[], tuple[float, float]],
+        clock: Clock = SYSTEM,
+    ) -> None:
+        self._now = clock.monotonic
         self._settings, self._cell_rates = settings, rates
         self._io: Any = None
         self._sequence = self._rates = 0
@@ -265,9 +272,9 @@ class OffsetWriter:
 
         Raises WriteError.
         """
-        until = time.monotonic() + 0.5 * self._settings.connect_timeout
+        until = self._now() + 0.5 * self._settings.connect_timeout
         while (length := float(np.abs(self._applied).max(initial=0.0))) > registers.UNIT:
-            if time.monotonic() > until:
+            if self._now() > until:
                 raise WriteError(
                     f"{self._settings.host}: the robot's program still applies an offset of "
                     f"{1e3 * length:.3f} mm or mrad, expected none before arming: it takes it out "
@@ -278,7 +285,7 @@ class OffsetWriter:
     def _announce(self, look: Callable[[], None]) -> None:
         """Send rates and an offset of zero until the program answers. Raises WriteError."""
         self._set(lambda io: io.setInputIntRegister(registers.RATES, self._rates))
-        until = time.monotonic() + max(self._settings.echo, ANNOUNCED)
+        until = self._now() + max(self._settings.echo, ANNOUNCED)
         while True:
             self._sequence = registers.next_sequence(self._sequence)
             first = self._sequence
@@ -287,7 +294,7 @@ class OffsetWriter:
                 look()
                 if registers.reached(self._echo, first):
                     return
-            if time.monotonic() > until:
+            if self._now() > until:
                 raise WriteError(
                     f"{self._silence()}: is it the gapbridge_offset.script of this version?"
                 )
@@ -302,7 +309,7 @@ class OffsetWriter:
         self._check_echo()
         self._sequence = registers.next_sequence(self._sequence)
         if not self._awaited:
-            self._awaited, self._awaited_since = self._sequence, time.monotonic()
+            self._awaited, self._awaited_since = self._sequence, self._now()
         self._send(registers.counts(setpoint.offset_in_base.tolist()))
 
     def _send(self, units: list[int]) -> None:
@@ -334,7 +341,7 @@ class OffsetWriter:
         if registers.reached(self._echo, self._awaited):
             self._awaited = 0
             return
-        late = time.monotonic() - self._awaited_since
+        late = self._now() - self._awaited_since
         if late > self._settings.echo:
             raise WriteError(f"{self._silence()} (sent {late:.3f} s ago)")
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.compensation import wanted_pose
 from gapbridge.core.errors import InvalidStateError, LinkError, WriteError
 from gapbridge.core.model import Model
@@ -33,17 +34,17 @@ class UrRtdeDriver(Driver):
     link breaks. After a LinkError the object is finished; a new process makes a new one.
     """
 
-    def __init__(self, settings: UrRtdeSettings, model: Model) -> None:
-        super().__init__(settings.rate, model, moves_arm=settings.mode == "servoj")
+    def __init__(self, settings: UrRtdeSettings, model: Model, clock: Clock = SYSTEM) -> None:
+        super().__init__(settings.rate, model, settings.mode == "servoj", clock)
         if model.arm.n != 6:
             raise LinkError(f"link: found an arm of {model.arm.n} joints, a UR has 6")
         self.settings = settings
-        self.reader = StateReader(settings)
+        self.reader = StateReader(settings, clock)
         self._model, self._nominal = model, Nominal(model)
         self._writer: Writer = (
-            ServoWriter(settings)
+            ServoWriter(settings, clock)
             if settings.mode == "servoj"
-            else OffsetWriter(settings, self._rates)
+            else OffsetWriter(settings, self._rates, clock)
         )
         self._state: RobotState | None = None
 

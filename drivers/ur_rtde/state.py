@@ -9,7 +9,6 @@ two of them: the clock is read again after the last one, and a torn sample is re
 from __future__ import annotations
 
 import re
-import time
 from itertools import chain
 from typing import Any
 
@@ -17,6 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
 from gapbridge.core.kernels.reference import JIT
 from gapbridge.core.state import RobotState
@@ -63,7 +63,8 @@ def plausible(values, bounds, before, step):  # type: ignore[no-untyped-def]
 class StateReader:
     """The reading half of a link to one controller."""
 
-    def __init__(self, settings: UrRtdeSettings) -> None:
+    def __init__(self, settings: UrRtdeSettings, clock: Clock = SYSTEM) -> None:
+        self._now, self._sleep = clock.monotonic, clock.sleep
         self._settings = settings
         self._receive: Any = None
         self._fields: list[tuple[str, slice]] = []  # in the numbers of a sample
@@ -104,7 +105,7 @@ class StateReader:
         self._lay_out(names)
         if not self._receive.isConnected() or not self._receive.getTimestamp():
             raise LinkError(f"{settings.host}: the controller refused the RTDE session")
-        self._last, self._changed, self._q = -1.0, time.monotonic(), None
+        self._last, self._changed, self._q = -1.0, self._now(), None
 
     def _lay_out(self, names: list[str]) -> None:
         self._fields, self._sizes, self._getters, bounds, start = [], [], [], [], 0
@@ -134,7 +135,7 @@ class StateReader:
         """
         if self._receive is not None and self._receive.getTimestamp() != self._last:
             return 0.0
-        return time.monotonic() - self._changed
+        return self._now() - self._changed
 
     def read(self) -> RobotState:
         """Wait for a sample with a new timestamp. Raises StaleStateError, InvalidStateError."""
@@ -143,15 +144,15 @@ class StateReader:
             raise LinkError(f"{self._settings.host}: found no connection, expected connect() first")
         timestamp = receive.getTimestamp()
         while timestamp == self._last:
-            if time.monotonic() - self._changed > self._settings.state_timeout:
+            if self._now() - self._changed > self._settings.state_timeout:
                 raise StaleStateError(
                     f"{self._settings.host}: the controller's clock has stood still at "
                     f"{timestamp:.3f} s for {self.age:.3f} s"
                 )
-            time.sleep(POLL)
+            self._sleep(POLL)
             timestamp = receive.getTimestamp()
         backwards = timestamp < self._last
-        before, self._last, self._changed = self._last, timestamp, time.monotonic()
+        before, self._last, self._changed = self._last, timestamp, self._now()
         if backwards:
             self._q = None
             raise InvalidStateError(
@@ -179,7 +180,7 @@ class StateReader:
             self.torn += 1
             gap += after - timestamp
             timestamp = self._last = after
-            self._changed = time.monotonic()
+            self._changed = self._now()
         raise InvalidStateError(
             f"{self._settings.host}: found a new sample in each of {ATTEMPTS} readings, expected "
             "one that stands still while it is read: this process is too slow for its rate"

@@ -9,7 +9,6 @@ import socket
 import tempfile
 import threading
 import time
-from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -26,7 +25,6 @@ from gapbridge.drivers.simulated.can.hub import Hub
 from gapbridge.drivers.simulated.ft_sensor.robotous_node import RobotousNode
 
 MOVING, GOES_ON = ("ur_servoj", "can"), ("compensating",)
-REACH = 1.3  # m from the farthest joint's axis to the TCP, of the longer arm
 ROOM = 0.02  # rad that a joint has to its limit where a planner is to go beyond it
 LINE = 0.02  # s between two lines of a planner
 WEIGHT = (0.0, 0.0, 49.0, 0.0, 0.0, 0.0)  # N
@@ -88,14 +86,9 @@ class PlannedRig(Rig):
         """Ask for a setpoint that is too far away, and then again for where the arm stands.
 
         On its way there it is followed for as long as it is no faster than the joint may be, and
-        the tap takes that for an offset's: the envelope must hold all of it, the rate cannot.
+        then it brakes: the plan's motion, and no offset.
         """
-        bounds = self.checker.bounds
-        speed = self._fastest * REACH
-        self.checker.bounds = replace(
-            bounds, offset_rate=bounds.offset_rate + speed,
-            rotation_rate=bounds.rotation_rate + self._fastest,
-        )  # fmt: skip
+        self.checker.leave_to_plan(self.joint)
         home = list(self.goal)
         self.goal = [q + by * (i == self.joint) for i, q in enumerate(home)]
         self.pass_time(0.1)

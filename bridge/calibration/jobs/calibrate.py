@@ -20,13 +20,13 @@ from gapbridge.bridge.calibration.planning import metrology_of, planned
 from gapbridge.bridge.calibration.session.progress import seconds_left
 from gapbridge.bridge.document.provenance import fitted as fitted_on
 from gapbridge.bridge.document.provenance import provenance
+from gapbridge.core.calibration.accuracy_baseline import document_of
 from gapbridge.core.calibration.fit import SessionFit
-from gapbridge.core.calibration.lacking import Lack
+from gapbridge.core.calibration.missing_effects import MissingEffect
 from gapbridge.core.calibration.plan import Plan
-from gapbridge.core.calibration.promise import document_of
 from gapbridge.core.calibration.result import Errors
 from gapbridge.core.calibration.spread import Spread
-from gapbridge.core.calibration.telling import unsupported
+from gapbridge.core.calibration.summary import unsupported
 from gapbridge.core.log.log import read_log
 from gapbridge.core.ranges import range_of
 
@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 REFITS = 3  # times at most that the readings may ask for more
 
 
-def promise_beside(cell: Path) -> Path:
+def baseline_beside(cell: Path) -> Path:
     """Return where a calibrated cell's promise is kept."""
     return cell.with_name(f"{cell.stem}.promise.json")
 
@@ -85,10 +85,10 @@ class WholeJob(Job):
             needless = "" if count else " (not needed: nothing more is seen from there)"
             self.prompt.say(f"  place {i + 1}: ({place}) m in base, {count} stops{needless}")
 
-    def _wanted(self, lacks: tuple[Lack, ...]) -> bool:
+    def _wanted(self, missing: tuple[MissingEffect, ...]) -> bool:
         """Return whether effects that the fitted poses support are to be fitted as well."""
-        shares = ", ".join(f"{lack.name} {100 * lack.share:.0f} %" for lack in lacks)
-        names = ", ".join(lack.name for lack in lacks)
+        shares = ", ".join(f"{effect.name} {100 * effect.share:.0f} %" for effect in missing)
+        names = ", ".join(effect.name for effect in missing)
         self.prompt.say(
             f"on poses left out of its fit in turn, this takes off what is left: {shares}"
         )
@@ -103,10 +103,10 @@ class WholeJob(Job):
         asked: tuple[str, ...] = ()
         fallen: tuple[str, ...] = ()
         for _ in range(REFITS):
-            new = tuple(lack for lack in fit.lacks if lack.name not in (*asked, *fallen))
+            new = tuple(effect for effect in fit.missing if effect.name not in (*asked, *fallen))
             if not new or not self._wanted(new):
                 break
-            names = (*asked, *(lack.name for lack in new))
+            names = (*asked, *(effect.name for effect in new))
             further = fitted(self.cell, self.options, self.prompt, self.session, names)
             while unfit := unsupported(further.estimates(), names):
                 for name in unfit:
@@ -137,15 +137,15 @@ class WholeJob(Job):
         tell_calibration(prompt, found)
         metrology = metrology_of(self.cell, options.instrument, self.session.places)
         write_log(found.readings, metrology.registered, folder / "readings.csv")
-        promise = document_of(found, sigma=metrology.sigma)
-        write_document(folder / "promise.json", promise)
+        baseline = document_of(found, sigma=metrology.sigma)
+        write_document(folder / "promise.json", baseline)
         from gapbridge.bridge.calibration.jobs.facts import (
             session_facts,  # pictures take their time
         )
-        from gapbridge.bridge.calibration.report import write_report
+        from gapbridge.bridge.calibration.report import Material, write_report
 
         facts = session_facts(self.cell, options, self.session)
-        for file in write_report(found, self.session.plan, facts, folder):
+        for file in write_report(Material(found, self.session.plan, facts), folder):
             prompt.say(f"{file}: written")
         if not found.complete:
             prompt.warn(f"not complete: {found.remaining}")
@@ -159,7 +159,7 @@ class WholeJob(Job):
         sections = {"provenance": fitted_on(origin, range_of(log), spread)}
         target = self.hand_over(found.model, "the calibrated cell", sections)
         if target is not None:
-            write_document(promise_beside(target), promise)
+            write_document(baseline_beside(target), baseline)
             prompt.say(f"  months later: gapbridge calibrate {target} --verify")
 
 

@@ -86,12 +86,12 @@ class PayloadJob(Job):
         for note in found.notes:
             prompt.say(f"  note: {note}")
         from gapbridge.bridge.calibration.jobs.facts import session_facts
-        from gapbridge.bridge.calibration.report import write_payload
+        from gapbridge.bridge.calibration.report import ShortMaterial, write_report
 
         facts = session_facts(
             self.cell, self.options, self.session, ("the force sensor of the flange", "wrench")
         )
-        for file in write_payload(found, facts, self.folder, self.cell.model):
+        for file in write_report(ShortMaterial(found, facts, self.cell.model), self.folder):
             prompt.say(f"{file}: written")
         payload = {"mass": found.mass, "cog": [float(v) for v in found.cog]}
         self.hand_over(

@@ -83,12 +83,12 @@ class ToolJob(Job):
         for note in found.notes:
             prompt.say(f"  note: {note}")
         from gapbridge.bridge.calibration.jobs.facts import session_facts
-        from gapbridge.bridge.calibration.report import write_tool
+        from gapbridge.bridge.calibration.report import ShortMaterial, write_report
 
         facts = session_facts(
             self.cell, self.options, self.session, ("tip on a fixed point", "touch")
         )
-        for file in write_tool(found, facts, self.folder, model):
+        for file in write_report(ShortMaterial(found, facts, model), self.folder):
             prompt.say(f"{file}: written")
         applied = found.applied(model)
         tcp = {

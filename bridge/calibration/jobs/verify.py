@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.format import duration, millimetres, parameter
-from gapbridge.bridge.calibration.jobs.calibrate import promise_beside
+from gapbridge.bridge.calibration.jobs.calibrate import baseline_beside
 from gapbridge.bridge.calibration.jobs.job import Job, bare_plan
 from gapbridge.bridge.calibration.jobs.log_of import write_log
 from gapbridge.bridge.calibration.planning import (
@@ -22,8 +22,8 @@ from gapbridge.bridge.calibration.planning import (
     with_loads,
 )
 from gapbridge.bridge.calibration.session.progress import seconds_left
+from gapbridge.core.calibration.accuracy_baseline import baseline_in
 from gapbridge.core.calibration.plan import Plan, PlannedPose
-from gapbridge.core.calibration.promise import promise_in
 from gapbridge.core.calibration.verify import Verification, verify
 from gapbridge.core.errors import InputError
 from gapbridge.core.planning.candidates import candidates_of
@@ -38,7 +38,7 @@ class VerifyJob(Job):
 
     def _promise(self) -> dict[str, Any]:
         """Return what the calibration has promised. Raises InputError where nobody knows."""
-        path = promise_beside(self.cell.path)
+        path = baseline_beside(self.cell.path)
         try:
             found = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
@@ -55,10 +55,10 @@ class VerifyJob(Job):
 
     def plan(self, begin: Array | None, tell: Callable[[str, float], None]) -> Plan:
         """Return poses far from each other."""
-        promise = promise_in(self._promise())
+        promise = baseline_in(self._promise())
         if promise.kind != self.options.instrument.measures:
             raise InputError(
-                f"{promise_beside(self.cell.path)}: found a calibration by {promise.kind}, "
+                f"{baseline_beside(self.cell.path)}: found a calibration by {promise.kind}, "
                 f"expected one by {self.options.instrument.measures}: verify it as it was made"
             )
         loads = tuple(sorted(loads_of(self.cell), key=lambda load: load.mass))
@@ -103,10 +103,10 @@ class VerifyJob(Job):
         self._tell(found)
         write_log(readings, metrology.registered, folder / "readings.csv")
         from gapbridge.bridge.calibration.jobs.facts import session_facts
-        from gapbridge.bridge.calibration.report import write_verification
+        from gapbridge.bridge.calibration.report import VerificationMaterial, write_report
 
         facts = session_facts(self.cell, options, self.session)
-        for file in write_verification(found, facts, folder, readings):
+        for file in write_report(VerificationMaterial(found, facts, readings), folder):
             prompt.say(f"{file}: written")
         self.session.add("ended", holds=found.holds)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from gapbridge.bridge.document.axes import plain
-from gapbridge.bridge.report.words import unit_of
+from gapbridge.bridge.report.labels import unit_of
 from gapbridge.core.calibration.result import Estimate
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.report.facts import SessionFacts
-from gapbridge.core.calibration.budget.budget import Budget, Stated, budget, wild_readings
+from gapbridge.core.calibration.budget.budget import Budget, Stated, budget, outlier_readings
 from gapbridge.core.calibration.budget.pose_accuracy import KINDS, PoseAccuracy, pose_accuracies
 from gapbridge.core.calibration.plan import Plan
 from gapbridge.core.calibration.result import Calibration, Errors
@@ -68,7 +68,7 @@ class Material:
     @cached_property
     def wild(self) -> frozenset[int]:
         """Return the rows of readings that are blunders."""
-        return frozenset(int(r) for r in wild_readings(self.calibration))
+        return frozenset(int(r) for r in outlier_readings(self.calibration))
 
     @property
     def predicted_std(self) -> float:

@@ -8,6 +8,7 @@ from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
 from gapbridge.core.diagnosis.result import Cause
 from gapbridge.core.diagnosis.separation import Measurement
 from gapbridge.core.effects import Reported
+from gapbridge.core.log.columns import label
 
 VERDICTS = {
     "no_gap": "no gap: nothing stands above the noise",
@@ -23,8 +24,10 @@ CHANGED = 3  # parameters of a cause that changed between sessions
 def answer(diagnosis: Diagnosis) -> str:
     """Return the whole answer, lines joined; joints count from 1."""
     lines = [f"verdict: {VERDICTS[diagnosis.verdict]}"]
+    several = len(diagnosis.channels) > 1
     for channel in diagnosis.channels:
-        lines += ["", *_channel(channel, diagnosis.sessions)]
+        verdict = f": {VERDICTS[channel.verdict]}" if several else ""
+        lines += ["", f"{channel.channel}{verdict}", *_channel(channel, diagnosis.sessions)]
     if diagnosis.not_observable:
         lines.append("")
     for hidden in diagnosis.not_observable:
@@ -47,21 +50,28 @@ def size(value: float | None, unit: str) -> str:
     return f"{value * factor:.4g} {name}"
 
 
+def _both(channel: ChannelDiagnosis, rms: float | None) -> str:
+    """Return an rms per coordinate, beside it the same as a distance in space."""
+    if rms is None or channel.channel != "position":
+        return f"{size(rms, channel.unit)} rms per coordinate"
+    in_space = size(3**0.5 * rms, channel.unit)
+    return f"{size(rms, channel.unit)} rms per coordinate ({in_space} in space)"
+
+
 def _channel(channel: ChannelDiagnosis, sessions: tuple[str, ...]) -> list[str]:
     unit = channel.unit
+    most = "at most" if channel.channel != "position" else "at most in space"
     lines = [
-        f"{channel.channel}: {VERDICTS[channel.verdict]}",
-        f"  gap {size(channel.gap_rms, unit)} rms per coordinate, at most "
-        f"{size(channel.gap_max, unit)}, over {channel.samples} samples; noise "
-        f"{size(channel.noise_floor_rms, unit)}",
+        f"  gap {_both(channel, channel.gap_rms)}, {most} {size(channel.gap_max, unit)}, over "
+        f"{channel.samples} samples; noise {size(channel.noise_floor_rms, unit)} per coordinate",
     ]
     for cause in channel.causes:
         lines += [f"  {line}" for line in _cause(cause, unit)]
         lines += [f"    {line}" for line in _changed(channel, cause, sessions)]
     if channel.causes:
         lines.append(
-            f"  remaining {size(channel.remaining_rms, unit)}, on held-out samples "
-            f"{size(channel.remaining_rms_held_out, unit)}"
+            f"  remaining {_both(channel, channel.remaining_rms)}, on held-out samples "
+            f"{_both(channel, channel.remaining_rms_held_out)}"
         )
     lines += [f"  {line}" for line in _elsewhere(channel, sessions)]
     for stand_in in channel.stand_ins:
@@ -70,7 +80,9 @@ def _channel(channel: ChannelDiagnosis, sessions: tuple[str, ...]) -> list[str]:
             "that the fit did not see; --apply --stand-ins puts it into the model"
         )
     if channel.structured:
-        depends = ", ".join(f"{name} ({share:.0%})" for name, share in channel.depends_on[:4])
+        depends = ", ".join(
+            f"{label(name)} ({share:.0%})" for name, share in channel.depends_on[:4]
+        )
         lines.append(
             f"  unexplained: {size(channel.unexplained_rms, unit)} with structure"
             + (f"; it depends on {depends}" if depends else "")

@@ -28,7 +28,8 @@ from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.diagnosis.diagnosis import diagnose as diagnose_log
 from gapbridge.core.diagnosis.document import document
 from gapbridge.core.effects import effect_named
-from gapbridge.core.errors import InputError, LogError
+from gapbridge.core.errors import InputError
+from gapbridge.core.log.alignment import aligned
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.ranges import range_of
@@ -76,7 +77,7 @@ if TYPE_CHECKING:
     "--sim",
     type=click.Path(path_type=Path),
     metavar="SIM_LOG",
-    help="Take the prediction, row by row, from a log of your own simulator.",
+    help="Take the prediction from a log of your own simulator: rows of the same time.",
 )
 def diagnose(
     logs: tuple[Path, ...],
@@ -95,6 +96,11 @@ def diagnose(
     only where it shrinks the gap on poses that its fit did not see; what the catalogue does not
     explain is said, with what it depends on. Several logs (or a column session in one) are sessions
     that share the effects; each has a frame of its own, and with --remounted a tool point.
+
+    With --sim the prediction is your simulator's: its log has the simulated TCP in base as
+    measured_position_0..2 or actual_TCP_pose_0..5 (and ft_raw_wrench, actual_q, torques as far as
+    it goes), a row for each row of LOG: by timestamp, else one by one. Rows of another pose are
+    refused.
 
     Example: gapbridge diagnose log.csv --cell cell.yaml --out out/diagnosis --apply better.yaml
     """
@@ -117,14 +123,13 @@ def diagnose(
     click.echo(answer(found))
     origin = provenance({"log": logs, "cell": [cell], "sim": [sim] if sim else []})
     reported = document(found) | {"provenance": origin}
-    text = json.dumps(reported, indent=1, allow_nan=False) + "\n"
     if json_file is not None:
-        write_text(json_file, text)
+        write_text(json_file, _json(reported))
     if new_cell is not None:
         applied = found.with_stand_ins if stand_ins else found.model
         spread = spread_of(found).beside(given.spread)
         save_cell(given, new_cell, applied, {"provenance": fitted(origin, range_of(rows), spread)})
-    written = [] if out is None else _write_folder(out, text, found, given, rows)
+    written = [] if out is None else _write_folder(out, reported, found, given, rows)
     for file in (*written, json_file, new_cell):
         if file is not None:
             click.echo(f"{file}: written")
@@ -152,12 +157,7 @@ def _check_effects(names: tuple[str, ...]) -> None:
 
 def _simulated(path: Path, cell: Cell, log: Log) -> Log:
     """Return the simulator's log; raises LogError where its rows are not those of the log."""
-    simulated = open_log(path, cell)
-    if len(simulated) != len(log):
-        raise LogError(
-            f"{path}: found {len(simulated)} rows, expected {len(log)}: one per row of {log.path}"
-        )
-    return simulated
+    return aligned(open_log(path, cell), log)
 
 
 def _folder(path: Path) -> None:
@@ -172,13 +172,18 @@ def _folder(path: Path) -> None:
         raise InputError(f"{path}: folder cannot be made: {error.strerror}") from None
 
 
-def _write_folder(folder: Path, text: str, found: Diagnosis, cell: Cell, log: Log) -> list[Path]:
+def _json(reported: dict[str, Any]) -> str:
+    return json.dumps(reported, indent=1, allow_nan=False) + "\n"
+
+
+def _write_folder(
+    folder: Path, reported: dict[str, Any], found: Diagnosis, cell: Cell, log: Log
+) -> list[Path]:
     """Write diagnosis.json and report.html; returns their paths."""
-    from gapbridge.bridge.report import (
-        write_report,  # plotly takes its time, and only --out needs it
-    )
+    from gapbridge.bridge.report import write_report  # only --out needs it
 
     written = [folder / "diagnosis.json"]
-    write_text(written[0], text)
-    written.append(write_report(found, str(cell.path), log, cell.model, folder))
+    write_text(written[0], _json(reported))
+    origin = reported["provenance"]
+    written.append(write_report(found, str(cell.path), log, cell.model, folder, origin))
     return written

@@ -102,7 +102,7 @@ def print_identification(found: Identification) -> None:
     console = Console()
     console.print(table)
     click.echo(
-        f"gap per coordinate over {found.samples} poses, rms in mm: "
+        f"gap over {found.samples} poses, mm rms per coordinate (in space): "
         f"{_change(found.gap_rms, found.remaining_rms)}"
     )
     if np.isfinite(found.remaining_rms_held_out):
@@ -113,13 +113,18 @@ def print_identification(found: Identification) -> None:
         ("a new session", found.remaining_rms_new_session),
     ):
         if np.isfinite(left):
-            click.echo(f"to expect in {where}, rms in mm: {left * 1e3:.4f}")
+            click.echo(f"to expect in {where}, mm rms per coordinate (in space): {_mm(left)}")
     for line in (*found.notes, *found.combinations):
         click.echo(f"note: {line}")
 
 
 def _change(before: float, after: float) -> str:
-    return f"{before * 1e3:.4f} before, {after * 1e3:.4f} after"
+    return f"{_mm(before)} before, {_mm(after)} after"
+
+
+def _mm(rms: float) -> str:
+    """Return an rms per coordinate (m) in mm, beside it that of the distance in space."""
+    return f"{rms * 1e3:.4f} ({3**0.5 * rms * 1e3:.4f})"
 
 
 def _cells(value: float, std: float, shown: bool) -> tuple[str, str]:

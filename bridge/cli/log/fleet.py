@@ -12,9 +12,9 @@ import click
 from gapbridge.bridge.cli.progress import progress
 from gapbridge.bridge.fleet import diagnosing, fitting
 from gapbridge.bridge.fleet.cell_source import cell_source
+from gapbridge.bridge.fleet.ending import ending
 from gapbridge.bridge.fleet.folder import require_folder
 from gapbridge.bridge.fleet.journal import Journal
-from gapbridge.bridge.fleet.outcome_words import ending
 from gapbridge.bridge.fleet.runner import Done, run, tasks_of
 from gapbridge.bridge.fleet.session import Found, find_sessions
 from gapbridge.bridge.fleet.task import BAD, DONE, Outcome, Work

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.demo.bench import Bench
+from gapbridge.bridge.demo.hidden import Hidden
 from gapbridge.bridge.demo.poses import Load, Scene
 from gapbridge.bridge.demo.rests import SETTLING
 from gapbridge.bridge.demo.result import Resolution
@@ -35,10 +36,12 @@ class DemoLink(ABC):
     ports: ClassVar[tuple[int, ...]]  # of the simulated controller
     scene: ClassVar[Scene]
     settling: ClassVar[float] = SETTLING  # s from standing still until readings count
+    hides: ClassVar[tuple[str, ...]] = ("tool_frame",)  # one of these, drawn from the seed
     tells_joints: ClassVar[bool] = True  # joints as read are good enough to fit on
 
     def __init__(self, out: Path, seed: int) -> None:
         self.seed = seed
+        self.hidden = Hidden.drawn(seed, self.hides)  # beside the arm's flexibilities
         self.host = free_address(self.ports)
         self.cell = self._write_cell(out)
 

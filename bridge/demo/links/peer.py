@@ -42,6 +42,8 @@ class PeerLink(DemoLink):
         with tempfile.TemporaryDirectory(prefix="simulated-") as folder:
             hidden = Path(folder) / "cell.yaml"
             text = self.cell.path.read_text(encoding="utf-8") + self._hidden()
+            for key, values in self.hidden.simulation.items():
+                text += f"  {key}: [{', '.join(f'{v:.9e}' for v in values)}]\n"
             write_text(hidden, text)
             for name in self.files:
                 write_text(Path(folder) / name, (self.cell.path.parent / name).read_text("utf-8"))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +39,9 @@ class UrRtdeLink(DemoLink):
 
     def __init__(self, out: Path, seed: int) -> None:
         super().__init__(out, seed)
-        self._settings = server_settings(self.cell, seed=seed)
+        settings = server_settings(self.cell, seed=seed)
+        hidden: dict[str, Any] = dict(self.hidden.simulation)
+        self._settings = replace(settings, plant=replace(settings.plant, **hidden))
         self._folder = out
 
     @property

@@ -2,62 +2,79 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Sequence
 
+from gapbridge.bridge.document.axes import Chart, named, scale
+from gapbridge.bridge.document.blocks import (
+    Badge,
+    Bar,
+    Block,
+    Bullets,
+    Cell,
+    Heading,
+    Named,
+    Paragraph,
+    Pictures,
+    Strong,
+    Table,
+    Verdict,
+)
+from gapbridge.bridge.document.drawing import AFTER, LIMIT, PALE, Drawing
 from gapbridge.bridge.fleet.diagnosis_summary import Diagnosed, Onset, Recurrence
-from gapbridge.bridge.fleet.outcome_words import counted
-from gapbridge.bridge.fleet.report.shared_sections import unbroken
+from gapbridge.bridge.fleet.ending import counted
 from gapbridge.bridge.fleet.runner import Done
 from gapbridge.bridge.fleet.session import natural
 from gapbridge.bridge.fleet.task import DONE, Outcome
-from gapbridge.bridge.report.fragment import (
-    AFTER,
-    EXPLAINED,
-    Cell,
-    Figure,
-    Raw,
-    badge,
-    bar,
-    figure_block,
-    html_of,
-    paragraph,
-    table,
-)
-from gapbridge.bridge.report.words import (
-    CHANNELS,
+from gapbridge.bridge.report.answer import KINDS
+from gapbridge.bridge.report.labels import (
     VERDICTS,
-    effect_words,
-    joints_words,
+    effect_title,
+    joint_list,
     listed,
     percent,
-    told,
-)  # fmt: skip
+    with_unit,
+)
 
-KINDS = {"no_gap": "good", "explained": "good", "partly_explained": "doubtful",
-         "unexplained": "bad"}  # fmt: skip
 SESSION_HEADS = ("verdict", "samples", "gap", "unexplained", "causes")
 JOINTS = 4  # named of an effect's joints
 NAMED = 4  # drifting arms in the answer
 DRAWN = 14  # effects in the picture
 
 
-def answer(together: Diagnosed, done: Done) -> str:
-    """Return verdicts, and in a few sentences what recurs, drifts and stands out."""
+def answer(together: Diagnosed, done: Done) -> list[Block]:
+    """Return verdicts, what recurs, drifts and stands out in a few sentences, and what to do."""
     usable = sum(o.state == DONE for o in done.outcomes)
-    words = "".join(
-        f" {html_of(badge(f'{VERDICTS[verdict]}: {count}', KINDS[verdict]))}"
+    first, *rest = (
+        Badge(f"{VERDICTS[verdict]}: {count}", KINDS[verdict])
         for verdict, count in together.verdicts
     )
-    parts = [f'<p class="verdict">{words}</p>']
     sentences = [
         _recurs(together),
         _drifting(together),
         _standing_out(together),
         _skipped(done, usable),
     ]
-    parts.append(paragraph(" ".join(s for s in sentences if s), "lead"))
-    return "".join(parts)
+    text = " ".join(s for s in sentences if s)
+    return [
+        Verdict(first, text, tuple(rest)), Heading("What to do now"),
+        Bullets(tuple(_next_steps(together, done, usable))),
+    ]  # fmt: skip
+
+
+def _next_steps(together: Diagnosed, done: Done, usable: int) -> list[str]:
+    steps = []
+    if usable < len(done.outcomes):
+        steps.append("Mend or remove the logs that were skipped (“Sessions” says why).")
+    if together.drifts or together.onsets:
+        steps.append("Inspect the arms that drift, the surest first: something wears or loosens.")
+    if together.outliers:
+        steps.append("Diagnose the sessions that stand out one by one, with gapbridge diagnose.")
+    if together.recurrences:
+        steps.append(
+            "Put what recurs in all arms of a type into their cells, with gapbridge diagnose "
+            "--apply or, for flexibilities, gapbridge fleet fit --cells."
+        )
+    return steps or ["Nothing: no session shows an effect, a drift or an outlier."]
 
 
 def _recurs(together: Diagnosed) -> str:
@@ -66,9 +83,9 @@ def _recurs(together: Diagnosed) -> str:
         return "No effect is accused in any session."
     if not often:
         return "No effect recurs: none is accused in more than a tenth of the sessions."
-    told_ = [f"{effect_words(r.effect)} ({r.arms} of {counted(r.arms_looked, 'arm')})"
+    often_named = [f"{effect_title(r.effect)} ({r.arms} of {counted(r.arms_looked, 'arm')})"
              for r in often]  # fmt: skip
-    return f"What recurs most: {listed(told_)}."
+    return f"What recurs most: {listed(often_named)}."
 
 
 def _drifting(together: Diagnosed) -> str:
@@ -93,68 +110,62 @@ def _skipped(done: Done, usable: int) -> str:
     return f"{counted(left, 'session')} could not be used." if left else ""
 
 
-def recurring(together: Diagnosed) -> str:
+def recurring(together: Diagnosed) -> list[Block]:
     """Return the effects with how often they recur."""
     if not together.recurrences:
-        return paragraph("No effect is accused in any session.")
-    rows = [_row(r) for r in together.recurrences]
+        return [Paragraph("No effect is accused in any session.")]
+    caption = (
+        "Share of the sessions, and of the arms, in which the effect is accused, of those whose "
+        "logs could show it."
+    )
     heads = ("effect", "sessions", "arms", "always in", "joints (sessions)", "takes off the gap")
-    return figure_block(_picture(together.recurrences[:DRAWN])) + table(heads, rows)
+    return [
+        Pictures((_picture(together.recurrences[:DRAWN]),), caption),
+        Table(heads, [_row(r) for r in together.recurrences]),
+    ]
 
 
 def _row(one: Recurrence) -> list[Cell]:
     joints = [f"{j} ({n})" for j, n in one.joints[:JOINTS]]
     tied = f", {one.tied} tied" if one.tied else ""
     return [
-        Raw(f"<b>{html_of(effect_words(one.effect))}</b><br>"
-            f"<code>{html_of(one.effect)}</code> · {html_of(CHANNELS[one.channel].lower())}"),
-        bar(one.sessions / one.looked, f"{one.sessions} of {one.looked}{tied}", AFTER),
-        bar(one.arms / one.arms_looked, f"{one.arms} of {one.arms_looked}", AFTER),
-        f"{counted(one.always, 'arm')}",
+        Named(effect_title(one.effect), code=f"{one.effect}, {one.channel}"),
+        Bar(one.sessions / one.looked, f"{one.sessions} of {one.looked}{tied}"),
+        Bar(one.arms / one.arms_looked, f"{one.arms} of {one.arms_looked}"),
+        counted(one.always, "arm"),
         ", ".join(joints) + (" …" if len(one.joints) > JOINTS else "") or "–",
-        bar(one.shrink, percent(one.shrink), EXPLAINED),
-    ]  # fmt: skip
+        Bar(one.shrink, percent(one.shrink), LIMIT),
+    ]
 
 
-def _picture(found: Sequence[Recurrence]) -> Figure:
+def _picture(found: Sequence[Recurrence]) -> Drawing:
     shown = list(reversed(found))
     # an effect that two channels show stands once for each
-    names = [_label(r) for r in shown]
-    traces = [
-        {"type": "bar", "orientation": "h", "name": title, "y": names, "x": values,
-         "marker": {"color": colour}, "hovertemplate": "%{y}: %{x:.0f} %<extra></extra>"}
-        for title, values, colour in (
-            ("of sessions", [100 * r.sessions / r.looked for r in shown], AFTER),
-            ("of arms", [100 * r.arms / r.arms_looked for r in shown], "#a9cbe6"),
-        )
-    ]  # fmt: skip
-    return Figure(
-        traces,
-        {"xaxis": {"title": {"text": "share that has it (%)"}, "range": [0, 102]},
-         "yaxis": {"automargin": True}, "barmode": "group", "bargap": 0.35,
-         "margin": {"l": 10, "r": 16, "t": 30, "b": 44}},
-        "Share of the sessions, and of the arms, in which the effect is accused, of those whose "
-        "logs could show it.", 110 + 44 * len(shown),
-    )  # fmt: skip
+    labels = [
+        effect_title(r.effect) + ("" if r.channel == "position" else f" ({r.channel})")
+        for r in shown
+    ]
+    left = 16 + 5.4 * max(len(label) for label in labels)
+    chart = Chart("", scale("share that has it, %", [0, 100]), named("", labels),
+                  width=left + 300, height=80 + 30.0 * len(shown), left=left)  # fmt: skip
+    for i, r in enumerate(shown):
+        chart.bar(i + 0.18, 100 * r.sessions / r.looked, AFTER, 0.32, f"{r.sessions} sessions")
+        chart.bar(i - 0.18, 100 * r.arms / r.arms_looked, PALE, 0.32, f"{r.arms} arms")
+    chart.legend((("of sessions", AFTER), ("of arms", PALE)))
+    return chart.drawing
 
 
-def _label(one: Recurrence) -> str:
-    """Return an effect's name in lines that a phone has room for."""
-    words = effect_words(one.effect) + ("" if one.channel == "position" else f" ({one.channel})")
-    return "<br>".join(textwrap.wrap(words, 20))
-
-
-def onsets(found: Sequence[Onset]) -> str:
+def onsets(found: Sequence[Onset]) -> list[Block]:
     """Return the effects that arms have from some session on."""
     if not found:
-        return ""
+        return []
     rows: list[list[Cell]] = [
-        [Raw(f"<b>{html_of(o.arm)}</b>"), effect_words(o.effect),
-         o.since.removeprefix(f"{o.arm}/"),
+        [Strong(o.arm), effect_title(o.effect), o.since.removeprefix(f"{o.arm}/"),
          f"{counted(o.before, 'session')} without, {o.after} with"]
         for o in found
     ]  # fmt: skip
-    return "<h3>Effects that set in</h3>" + table(("arm", "effect", "since session", ""), rows)
+    heads = ("arm", "effect", "since session", "")
+    return [Heading("Effects that set in"), Table(heads, rows)]
 
 
 def session_cells(outcome: Outcome) -> list[Cell]:
@@ -162,9 +173,11 @@ def session_cells(outcome: Outcome) -> list[Cell]:
     result = outcome.result
     channel = result["channels"][0]
     causes = {(r["effect"], tuple(r["joints"])) for r in result["rows"] if r["accused"]}
-    words = [f"{effect_words(e)}{', ' + joints_words(j) if j else ''}" for e, j in sorted(causes)]
+    named_causes = [
+        f"{effect_title(e)}{', ' + joint_list(j) if j else ''}" for e, j in sorted(causes)
+    ]
     return [
-        badge(VERDICTS[result["verdict"]], KINDS[result["verdict"]]),
-        str(channel["samples"]), unbroken(told(channel["gap_rms"], channel["unit"])),
-        unbroken(told(channel["remaining_rms"], channel["unit"])), "; ".join(words) or "–",
+        Badge(VERDICTS[result["verdict"]], KINDS[result["verdict"]]),
+        str(channel["samples"]), with_unit(channel["gap_rms"], channel["unit"]),
+        with_unit(channel["remaining_rms"], channel["unit"]), "; ".join(named_causes) or "–",
     ]  # fmt: skip

@@ -3,103 +3,109 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
-from gapbridge.bridge.fleet.fit_summary import Fitted, FittedArm, FittedSession, FittedType
-from gapbridge.bridge.fleet.outcome_words import counted
-from gapbridge.bridge.fleet.report.parameter_words import parameter_words, type_words
-from gapbridge.bridge.fleet.report.shared_sections import MOST, unbroken
-from gapbridge.bridge.fleet.task import Outcome
-from gapbridge.bridge.report.fragment import (
-    AFTER,
-    BEFORE,
-    FLOOR,
+from gapbridge.bridge.document.axes import Chart, named, scale
+from gapbridge.bridge.document.blocks import (
+    Bar,
+    Block,
+    Bullets,
     Cell,
-    Choice,
-    Figure,
-    Raw,
-    bar,
-    figure_block,
-    html_of,
-    paragraph,
-    table,
+    Gallery,
+    Heading,
+    Paragraph,
+    Strong,
+    Table,
 )
-from gapbridge.bridge.report.words import number, percent, told
+from gapbridge.bridge.document.drawing import AFTER, BEFORE, EDGE, PALE, Drawing
+from gapbridge.bridge.fleet.ending import counted
+from gapbridge.bridge.fleet.fit_summary import Fitted, FittedArm, FittedSession, FittedType
+from gapbridge.bridge.fleet.report.shared_sections import MOST, type_title
+from gapbridge.bridge.fleet.task import Outcome
+from gapbridge.bridge.report.labels import number, percent, with_unit
+from gapbridge.bridge.report.names import parameter_title
 
-SESSION_HEADS = ("poses", "gap with the cell", "with the fit", "fopredicted by the others")
+SESSION_HEADS = ("poses", "gap with the cell", "with the fit", "predicted by the others")
 MICRO = 1e6
-DRAWN = 80  # arms in the picture
+DRAWN = 40  # arms in the picture
+NEXT_STEPS = (
+    "Write each arm's flexibilities into a cell of its own with --cells FOLDER, and check one of "
+    "them on a log that was not fitted: gapbridge diagnose LOG --cell CELL.",
+    "Look at the arms that drift or stand out before their cells are used.",
+)
 
 
-def answer(together: Fitted) -> str:
-    """Return what the fit does to the gap, and how alike the arms are."""
-    parts = []
-    for kind in together.types:
-        sessions = [s for arm in kind.arms for s in arm.sessions]
-        before, after, held = (
-            float(np.sqrt(np.mean([getattr(s, name) ** 2 for s in sessions])))
-            for name in ("gap_before", "gap_after", "gap_held_out")
-        )
-        shown = kind.scatter.shown
-        spread = kind.scatter.between_arms[shown] / np.maximum(kind.scatter.mean[shown], 1e-12)
-        parts.append(paragraph(
-            f"{type_words(kind.name)}: {counted(len(kind.arms), 'arm')}, "
-            f"{counted(len(sessions), 'session')}. With the flexibilities of the cells the gap is "
-            f"{told(before, 'm')} a coordinate; with those found {told(after, 'm')}; a session is "
-            f"predicted by the others, which did not see it, to {told(held, 'm')}. The noise of "
-            f"one coordinate is {told(kind.scatter.noise, 'm')}."
-            + (f" Arms of the type scatter by {percent(float(np.median(spread)))}." if len(spread)
-               else " No session shows any flexibility."), "lead",
-        ))  # fmt: skip
-    return "".join(parts)
+def answer(together: Fitted) -> list[Block]:
+    """Return what the fit does to the gap, how alike the arms are, and what to do."""
+    leads = [Paragraph(_lead(kind), "lead") for kind in together.types]
+    return [*leads, Heading("What to do now"), Bullets(NEXT_STEPS)]
 
 
-def types(together: Fitted) -> str:
+def _lead(kind: FittedType) -> str:
+    sessions = [s for arm in kind.arms for s in arm.sessions]
+    before, after, held = (
+        with_unit(float(np.sqrt(np.mean([getattr(s, name) ** 2 for s in sessions]))), "m")
+        for name in ("gap_before", "gap_after", "gap_held_out")
+    )
+    shown = kind.scatter.shown
+    spread = kind.scatter.between_arms[shown] / np.maximum(kind.scatter.mean[shown], 1e-12)
+    alike = (
+        f"Arms of the type scatter by {percent(float(np.median(spread)))}." if len(spread)
+        else "No session shows any flexibility."
+    )  # fmt: skip
+    return (
+        f"{type_title(kind.name)}: {counted(len(kind.arms), 'arm')}, "
+        f"{counted(len(sessions), 'session')}. With the flexibilities of the cells the gap is "
+        f"{before} a coordinate; with those found {after}; a session is predicted by the others, "
+        f"which did not see it, to {held}. The noise of one coordinate is "
+        f"{with_unit(kind.scatter.noise, 'm')}. {alike}"
+    )
+
+
+def _type_heading(together: Fitted, kind: FittedType) -> list[Block]:
+    return [Heading(type_title(kind.name))] if len(together.types) > 1 else []
+
+
+def types(together: Fitted) -> list[Block]:
     """Return a table of each type's flexibilities."""
-    parts = []
+    blocks: list[Block] = []
+    heads = ("flexibility", "of the type", "arms scatter by", "sessions scatter by")
     for kind in together.types:
-        if len(together.types) > 1:
-            parts.append(f"<h3>{html_of(type_words(kind.name))}</h3>")
-        parts.append(table(
-            ("flexibility", "of the type", "arms scatter by", "sessions scatter by"),
-            [_parameter(kind, j) for j in range(len(kind.parameters))],
-        ))  # fmt: skip
-    return "".join(parts)
+        rows = [_parameter(kind, j) for j in range(len(kind.parameters))]
+        blocks += [*_type_heading(together, kind), Table(heads, rows)]
+    return blocks
 
 
 def _parameter(kind: FittedType, j: int) -> list[Cell]:
     scatter = kind.scatter
     if not scatter.shown[j]:
-        return [parameter_words(kind.parameters[j]), "not identifiable from any session", "–", "–"]
+        return [parameter_title(kind.parameters[j]), "not identifiable from any session", "–", "–"]
     mean, std = scatter.mean[j] * MICRO, np.sqrt(scatter.covariance[j, j]) * MICRO
     share = [float(s[j] / max(scatter.mean[j], 1e-12))
              for s in (scatter.between_arms, scatter.between_sessions)]  # fmt: skip
     repeated = scatter.sessions > scatter.arms
     return [
-        parameter_words(kind.parameters[j]), f"{number(mean)} ± {number(std, 2)} µrad/Nm",
-        bar(share[0], percent(share[0]), AFTER),
-        bar(share[1], percent(share[1]), FLOOR) if repeated else "–",
+        parameter_title(kind.parameters[j]), f"{number(mean)} ± {number(std, 2)} µrad/Nm",
+        Bar(share[0], percent(share[0])),
+        Bar(share[1], percent(share[1]), EDGE) if repeated else "–",
     ]  # fmt: skip
 
 
-def arms(together: Fitted) -> str:
+def arms(together: Fitted) -> list[Block]:
     """Return a picture and a table of each type's arms."""
-    parts = [paragraph(
+    blocks: list[Block] = [Paragraph(
         "“Own” says how much of an arm's value comes from its own data; the rest is borrowed from "
         "the other arms of its type.", "note",
     )]  # fmt: skip
+    heads = ("arm", "sessions", "poses", "own", "farthest from the type")
     for kind in together.types:
-        if len(together.types) > 1:
-            parts.append(f"<h3>{html_of(type_words(kind.name))}</h3>")
-        parts.append(figure_block(_picture(kind)))
-        heads = ("arm", "sessions", "poses", "own", "farthest from the type")
-        parts.append(table(heads, [_arm(kind, arm) for arm in kind.arms[:MOST]]))
+        blocks += [*_type_heading(together, kind), _pictures(kind)]
+        blocks.append(Table(heads, [_arm(kind, arm) for arm in kind.arms[:MOST]]))
         if len(kind.arms) > MOST:
-            more = len(kind.arms) - MOST
-            parts.append(paragraph(f"{more} more are in results.parquet.", "note"))
-    return "".join(parts)
+            more = f"{len(kind.arms) - MOST} more are in results.parquet."
+            blocks.append(Paragraph(more, "note"))
+    return blocks
 
 
 def _arm(kind: FittedType, arm: FittedArm) -> list[Cell]:
@@ -109,10 +115,10 @@ def _arm(kind: FittedType, arm: FittedArm) -> list[Cell]:
     if len(shown):
         j = int(shown[np.argmax(np.abs(arm.fit.beside_type[shown]))])
         more = arm.fit.flexibility[j] / max(kind.scatter.mean[j], 1e-12) - 1
-        far = (f"{parameter_words(kind.parameters[j])}: "
+        far = (f"{parameter_title(kind.parameters[j])}: "
                f"{percent(abs(float(more)))} {'more' if more > 0 else 'less'}")  # fmt: skip
-    return [Raw(f"<b>{html_of(arm.name)}</b>"), str(len(arm.sessions)), str(arm.poses),
-            bar(own, percent(own), AFTER), far]  # fmt: skip
+    return [Strong(arm.name), str(len(arm.sessions)), str(arm.poses),
+            Bar(own, percent(own)), far]  # fmt: skip
 
 
 def _drawn(kind: FittedType) -> Sequence[FittedArm]:
@@ -130,52 +136,38 @@ def _which(drawn: Sequence[FittedArm], kind: FittedType) -> str:
     return f"The {len(drawn)} arms farthest from their type, of {len(kind.arms)}: each one's"
 
 
-def _picture(kind: FittedType) -> Figure:
+def _pictures(kind: FittedType) -> Gallery:
     """Return each arm's flexibilities with their intervals; the menu says which."""
     drawn = _drawn(kind)
-    names = [arm.name for arm in drawn]
-    value = np.array([arm.fit.flexibility for arm in drawn]) * MICRO
-    std = np.array([arm.fit.std for arm in drawn]) * MICRO
     own = np.mean([arm.fit.own for arm in kind.arms], axis=0)
-    order = sorted(
-        range(len(kind.parameters)),
-        key=lambda j: (not kind.scatter.shown[j], -own[j]),
+    order = sorted(range(len(kind.parameters)), key=lambda j: (not kind.scatter.shown[j], -own[j]))
+    titles = tuple(parameter_title(kind.parameters[j]) for j in order)
+    return Gallery(
+        (("Show", titles),), tuple(_picture(kind, drawn, j) for j in order),
+        f"{_which(drawn, kind)} flexibility with its 95 % interval; the dashed line is the type.",
     )  # fmt: skip
-    mean = kind.scatter.mean * MICRO
 
-    def band(j: int) -> list[np.ndarray[Any, np.dtype[np.float64]]]:
-        low = np.maximum(value[:, j] - 1.96 * std[:, j], 0)
-        return [np.column_stack([low, value[:, j] + 1.96 * std[:, j],
-                                 np.full(len(names), np.nan)]).ravel(),
-                value[:, j], np.full(len(names), mean[j])]  # fmt: skip
 
-    choices = [Choice(parameter_words(kind.parameters[j]),
-                      f"{parameter_words(kind.parameters[j])} (µrad/Nm)", band(j))
-               for j in order]  # fmt: skip
-    first = choices[0]
-    traces: list[dict[str, Any]] = [
-        {"type": "scatter", "mode": "lines", "name": "95 % interval", "y": first.values[0],
-         "x": [n for n in names for _ in range(3)], "hoverinfo": "skip",
-         "line": {"color": "#a9cbe6", "width": 5}},
-        {"type": "scatter", "mode": "markers", "name": "arm", "x": names, "y": first.values[1],
-         "marker": {"color": AFTER, "size": 8},
-         "hovertemplate": "%{x}: %{y:.4g} µrad/Nm<extra></extra>"},
-        {"type": "scatter", "mode": "lines", "name": "type", "x": names, "y": first.values[2],
-         "line": {"color": BEFORE, "dash": "dot", "width": 2}, "hoverinfo": "skip"},
-    ]  # fmt: skip
-    return Figure(
-        traces,
-        {"xaxis": {"type": "category", "tickangle": -45 if len(names) > 12 else 0,
-                   "automargin": True},
-         "yaxis": {"title": {"text": first.title}, "rangemode": "tozero"}},
-        f"{_which(drawn, kind)} flexibility with what is believed of it; the dotted line is the "
-        "type.", 400,
-        {"y": choices},
+def _picture(kind: FittedType, drawn: Sequence[FittedArm], j: int) -> Drawing:
+    value = np.array([arm.fit.flexibility[j] for arm in drawn]) * MICRO
+    side = 1.96 * MICRO * np.array([arm.fit.std[j] for arm in drawn])
+    step = max(1, len(drawn) // 8)
+    labels = [arm.name if i % step == 0 else "" for i, arm in enumerate(drawn)]
+    chart = Chart(
+        parameter_title(kind.parameters[j]), named("arm", labels),
+        scale("µrad/Nm", [*value, *(value + side)]), width=430, height=260,
     )  # fmt: skip
+    for i, arm in enumerate(drawn):
+        band = [max(float(value[i] - side[i]), 0.0), float(value[i] + side[i])]
+        chart.line([i, i], band, PALE, width=5)
+        chart.points([i], [value[i]], AFTER, radius=3.2, opacity=1.0,
+                     hints=[f"{arm.name}: {number(value[i])} µrad/Nm"])  # fmt: skip
+    chart.level(float(kind.scatter.mean[j]) * MICRO, "type", BEFORE)
+    return chart.drawing
 
 
 def session_cells(together: Fitted) -> Callable[[Outcome], Sequence[Cell]]:
-    """Return what writes a session's cells in the table of sessions."""
+    """Return the function that gives a session's cells in the table of sessions."""
     fits: dict[str, FittedSession] = {
         s.outcome.session: s for kind in together.types for arm in kind.arms for s in arm.sessions
     }
@@ -184,6 +176,6 @@ def session_cells(together: Fitted) -> Callable[[Outcome], Sequence[Cell]]:
         one = fits[outcome.session]
         gaps = (one.gap_before, one.gap_after, one.gap_held_out)
         poses = str(outcome.result["evidence"]["poses"])
-        return [poses, *(unbroken(told(gap, "m")) for gap in gaps)]
+        return [poses, *(with_unit(gap, "m") for gap in gaps)]
 
     return cells

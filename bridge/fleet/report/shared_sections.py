@@ -1,132 +1,146 @@
-"""Sections that both reports have: drifts, outliers, sessions."""
+"""Sections that both reports have: drifts, outliers, sessions, origin."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
-from gapbridge.bridge.fleet.drift import Drift
+from gapbridge.bridge.document.axes import Chart, scale
+from gapbridge.bridge.document.blocks import (
+    BAD,
+    Badge,
+    Block,
+    Cell,
+    Heading,
+    Paragraph,
+    Part,
+    Pictures,
+    Strong,
+    Table,
+)
+from gapbridge.bridge.document.drawing import AFTER, BAD_DOT, BEFORE, LIMIT, SOFT, VIOLET, Drawing
+from gapbridge.bridge.fleet.drift import ChannelFigure, Drift, Quantity
+from gapbridge.bridge.fleet.ending import STATES
 from gapbridge.bridge.fleet.outlying import Outlier
-from gapbridge.bridge.fleet.report.parameter_words import parameter_words
 from gapbridge.bridge.fleet.runner import Done
 from gapbridge.bridge.fleet.task import DONE, Outcome
-from gapbridge.bridge.report.fragment import (
-    AFTER,
-    Cell,
-    Figure,
-    Raw,
-    badge,
-    figure_block,
-    html_of,
-    paragraph,
-    table,
-)
-from gapbridge.bridge.report.words import number, told, unit_of
+from gapbridge.bridge.report.labels import CHANNELS, number, with_unit
+from gapbridge.bridge.report.names import parameter_title
 
 MOST = 40  # rows of a table: the Parquet files have all
 DRAWN = 6  # drifts in the picture
-COLOURS = (AFTER, "#d9822b", "#2f9e62", "#8e5bb5", "#c43d3d", "#5b6770")
-STATES = {"bad": "cannot be used", "crashed": "failed", "died": "took its workers along"}
+COLOURS = (AFTER, BEFORE, LIMIT, VIOLET, BAD_DOT, SOFT)
 
 
-def drifts(found: Sequence[Drift]) -> str:
+def quantity_title(quantity: Quantity) -> str:
+    """Return what drifts or stands out, for people."""
+    if isinstance(quantity, ChannelFigure):
+        return f"{CHANNELS[quantity.channel].lower()}: {quantity.figure.value}"
+    return parameter_title(quantity)
+
+
+def type_title(name: str) -> str:
+    """Return an arm type's name; DH rows have none but a number."""
+    kind, _, rest = name.partition(" ")
+    return f"Arms of DH rows ({rest})" if kind == "dh" and rest else name
+
+
+def drifts(found: Sequence[Drift]) -> list[Block]:
     """Return the table of what drifts, and a picture of the surest."""
     if not found:
-        return paragraph("Nothing drifts by more than sessions scatter anyway.")
+        return [Paragraph("Nothing drifts by more than sessions scatter anyway.")]
     rows: list[list[Cell]] = [
         [
-            Raw(f"<b>{html_of(d.arm)}</b>"), parameter_words(d.quantity),
-            f"{told(d.slope, d.unit)} a {d.per}", f"± {told(d.std, d.unit)}",
-            f"{told(d.change, d.unit)} over {len(d.at)} sessions", _surely(d.p_value),
+            Strong(d.arm), quantity_title(d.quantity),
+            f"{with_unit(d.slope, d.unit)} a {d.per}", f"± {with_unit(d.std, d.unit)}",
+            f"{with_unit(d.change, d.unit)} over {len(d.at)} sessions", _by_chance(d.p_value),
         ]
         for d in found[:MOST]
     ]  # fmt: skip
     heads = ("arm", "what", "changes by", "1 sigma", "in all", "by chance")
-    return table(heads, rows) + _rest(len(found)) + figure_block(_drawn(found[:DRAWN]))
+    picture = Pictures((_drawn(found[:DRAWN]),), "The surest drifts.")
+    return [Table(heads, rows), *_rest(len(found)), picture]
 
 
-def _surely(p_value: float) -> str:
+def _by_chance(p_value: float) -> str:
     return "under 1 in 10⁶" if p_value < 1e-6 else f"1 in {number(1 / p_value, 2)}"
 
 
-def _drawn(found: Sequence[Drift]) -> Figure:
-    """Return the surest drifts, each in its own 1 sigma about its first session."""
-    traces: list[dict[str, Any]] = []
-    for i, drift in enumerate(found):
-        at, value = np.array(drift.at), np.array(drift.value)
-        first = value[0]
-        name, factor = unit_of(drift.unit)
-        traces.append({
-            "type": "scatter", "mode": "lines+markers",
-            "name": f"{drift.arm}: {parameter_words(drift.quantity)}",
-            "x": at + (0 if drift.per == "day" else 1),
-            "y": (value - first) / max(abs(first), 1e-300) * 100,
-            "customdata": value * factor, "text": list(drift.sessions),
-            "hovertemplate": f"%{{text}}: %{{customdata:.4g}} {name}<extra></extra>",
-            "line": {"color": COLOURS[i % len(COLOURS)], "width": 2}, "marker": {"size": 6},
-        })  # fmt: skip
-    per = {d.per for d in found}
-    title = "days since the first session" if per == {"day"} else "session of the arm"
-    return Figure(
-        traces,
-        {"xaxis": {"title": {"text": title}} | ({} if per == {"day"} else {"dtick": 1}),
-         "showlegend": True,
-         "yaxis": {"title": {"text": "change since the first session (%)"}},
-         "legend": {"orientation": "h", "y": -0.22, "x": 0, "yanchor": "top"},
-         "margin": {"l": 60, "r": 16, "t": 16, "b": 40}},
-        "The surest drifts. Point at a session for its value.", 420,
+def _drawn(found: Sequence[Drift]) -> Drawing:
+    """Return the surest drifts, each relative to its first session."""
+    per_day = {d.per for d in found} == {"day"}
+    x = [np.array(d.at) + (0 if d.per == "day" else 1) for d in found]
+    y = [
+        (np.array(d.value) - d.value[0]) / max(abs(d.value[0]), 1e-300) * 100 for d in found
+    ]  # fmt: skip
+    chart = Chart(
+        "Change since the first session",
+        scale("days since the first session" if per_day else "session of the arm",
+              [v for one in x for v in one], zero=False),
+        scale("change, %", [v for one in y for v in one]), width=430, height=260,
     )  # fmt: skip
+    for drift, at, change, colour in zip(found, x, y, COLOURS, strict=False):
+        chart.line([*at], [*change], colour)
+        hints = [
+            f"{session}: {with_unit(value, drift.unit)}"
+            for session, value in zip(drift.sessions, drift.value, strict=True)
+        ]
+        chart.points([*at], [*change], colour, hints=hints)
+    chart.legend_below(
+        [(f"{d.arm}: {quantity_title(d.quantity)}", c)
+         for d, c in zip(found, COLOURS, strict=False)]
+    )  # fmt: skip
+    return chart.drawing
 
 
-def outliers(found: Sequence[Outlier]) -> str:
+def outliers(found: Sequence[Outlier]) -> list[Block]:
     """Return the table of what stands out."""
     if not found:
-        return paragraph("No arm and no session is far from the others.")
+        return [Paragraph("No arm and no session is far from the others.")]
     rows: list[list[Cell]] = [
         [
-            Raw(f"<b>{unbroken(o.arm).html}</b>"), unbroken(_short(o)), parameter_words(o.what),
-            unbroken(told(o.value, o.unit)), unbroken(told(o.usual, o.unit)),
-            f"{abs(o.deviations):.1f}",
+            Strong(o.arm), _short(o.session, o.arm) or "all", quantity_title(o.quantity),
+            with_unit(o.value, o.unit), with_unit(o.usual, o.unit), f"{abs(o.deviations):.1f}",
         ]
         for o in found[:MOST]
     ]  # fmt: skip
     heads = ("arm", "session", "what", "found", "usual", "deviations away")
-    return table(heads, rows) + _rest(len(found))
+    return [Table(heads, rows, numbers=(3, 4, 5)), *_rest(len(found))]
 
 
-def _short(outlier: Outlier) -> str:
-    return outlier.session.removeprefix(f"{outlier.arm}/") or "all"
-
-
-def sessions(done: Done, heads: Sequence[str], cells: Callable[[Outcome], Sequence[Cell]]) -> str:
+def sessions(
+    done: Done, heads: Sequence[str], cells: Callable[[Outcome], Sequence[Cell]]
+) -> list[Block]:
     """Return the sessions that were skipped, with the reason, and a table of the others."""
     bad = [o for o in done.outcomes if o.state != DONE]
     good = [o for o in done.outcomes if o.state == DONE]
-    parts = []
-    rows: list[list[Cell]]
+    blocks: list[Block] = []
     if bad:
-        parts.append(f"<h3>Skipped ({len(bad)})</h3>")
-        rows = [[*_whose(o), badge(STATES[o.state], "bad"), o.error] for o in bad[:MOST]]
-        parts += [table(("arm", "session", "state", "why"), rows), _rest(len(bad))]
-        parts.append(f"<h3>Used ({len(good)})</h3>")
-    rows = [[*_whose(o), *cells(o)] for o in good[:MOST]]
-    parts += [table(("arm", "session", *heads), rows), _rest(len(good))]
-    return "".join(parts)
+        rows = [[*_names(o), Badge(STATES[o.state], BAD), o.error] for o in bad[:MOST]]
+        skipped = Table(("arm", "session", "state", "why"), rows, (1, 1, 1, 4))
+        blocks += [Heading(f"Skipped ({len(bad)})"), skipped, *_rest(len(bad))]
+        blocks.append(Heading(f"Used ({len(good)})"))
+    used = [[*_names(o), *cells(o)] for o in good[:MOST]]
+    return [*blocks, Table(("arm", "session", *heads), used), *_rest(len(good))]
 
 
-def _whose(outcome: Outcome) -> tuple[Cell, Cell]:
-    name = outcome.session.removeprefix(f"{outcome.arm}/")
-    return Raw(f"<b>{unbroken(outcome.arm).html}</b>"), unbroken(name)
+def _names(outcome: Outcome) -> tuple[Cell, Cell]:
+    return Strong(outcome.arm), _short(outcome.session, outcome.arm)
 
 
-def unbroken(text: str) -> Raw:
-    """Return a text that stays on one line."""
-    return Raw(f'<span style="white-space:nowrap">{html_of(text)}</span>')
+def _short(session: str, arm: str) -> str:
+    """Return a session's name below the folder of its arm."""
+    return session.removeprefix(f"{arm}/")
 
 
-def _rest(count: int) -> str:
+def part(key: str, title: str, about: str, blocks: Sequence[Block]) -> Part:
+    """Return one section."""
+    return Part(key, title, about, tuple(blocks))
+
+
+def _rest(count: int) -> list[Block]:
     if count <= MOST:
-        return ""
-    return paragraph(f"{count - MOST} more are in results.parquet and sessions.parquet.", "note")
+        return []
+    more = f"{count - MOST} more are in results.parquet and sessions.parquet."
+    return [Paragraph(more, "note")]

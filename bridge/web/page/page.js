@@ -1,6 +1,7 @@
 // The page: takes the daemon's messages, fills in words and figures, draws.
 import { MEANING, clock, count, duration, inWords, number } from './words.js';
-import { Lines, drawHistogram, forgetColours } from './drawing.js';
+import { Lines, colour, drawHistogram, forgetColours } from './drawing.js';
+import { View } from './view.js';
 
 const $ = (id) => document.getElementById(id);
 const KEPT = 600;  // s
@@ -113,10 +114,11 @@ function showState() {
   const { state, why, phase } = seen.now;
   document.body.dataset.state = state;
   text($('state'), state);
-  const starting = state === 'disconnected' && phase === 'starting';
-  text($('meaning'), starting ? 'The loop is starting.' : MEANING[state] || '');
   const status = seen.status;
-  const cause = why.cause ? [why.cause, why.detail].filter(Boolean).join(': ') : status.why || '';
+  const cause = [why.cause, why.detail].filter(Boolean).join(': ') || status.why || '';
+  // a loop that starts again because one has ended says why, and not that it starts
+  const starting = state === 'disconnected' && phase === 'starting' && !cause;
+  text($('meaning'), starting ? 'The loop is starting.' : MEANING[state] || '');
   const since = why.time || status.since;
   const parts = [];
   if (since) parts.push(`since ${clock(since)} (${duration(seen.now.time - since)})`);
@@ -190,6 +192,33 @@ function showGauges() {
   text($('force-caption'), seen.now.sensor === 'ft_raw_wrench'
     ? 'N, flange sensor and axes; predicted: weight of the payload and pull on the tool'
     : 'N, pull on the tool in base; no flange sensor here, so nothing to predict');
+}
+
+let view = null;
+function showArm(arm) {
+  if (view) view.set(arm.scene);
+  else view = new View($('arm'), arm.scene, colour);
+  text($('arm-caption'), arm.factor > 1 ? `bend drawn ${count(arm.factor)} times larger` : '');
+  const along = (values, scale, digits) => values.map((v) => (scale * v).toFixed(digits)).join(', ');
+  $('arm-figures').replaceChildren(
+    row('TCP in base, x, y, z', `${along(arm.tcp, 1e3, 1)} mm`),
+    row('rotation vector', `${along(arm.rotation, 1, 4)} rad`),
+    row('bend at the tool', `${number(1e3 * arm.bend)} mm`),
+    row(arm.declared ? 'load, as the controller has it' : 'load, as the cell has it',
+      `${number(arm.mass)} kg at ${along(arm.cog, 1e3, 0)} mm`),
+    row('pull on the tool', `${number(arm.force)} N`),
+  );
+  $('joints').replaceChildren(...arm.q.map((angle, i) => {
+    const line = document.createElement('tr'), warm = arm.temperature[i];
+    const words = [`${i + 1}`, `${(angle * 180 / Math.PI).toFixed(2)}°`,
+      warm === null ? '–' : `${warm.toFixed(1)} °C`];
+    line.append(...words.map((word) => {
+      const cell = document.createElement('td');
+      cell.textContent = word;
+      return cell;
+    }));
+    return line;
+  }));
 }
 
 function row(name, value, bad = false) {
@@ -320,6 +349,7 @@ function connect() {
   });
   on('hello', hello);
   on('tick', (data) => { if (seen.about) tick(data); });
+  on('arm', showArm);
   on('status', (data) => { seen.status = data; showHealth(); });
   on('timing', (data) => { seen.timing = data; showTiming(); showHealth(); });
   on('event', (data) => { seen.events = [...seen.events, data].slice(-200); showEvents(); });

@@ -19,12 +19,12 @@ from gapbridge.core.calibration.budget.inputs import (
     Stated,
     instrument_error,
     model_remainder,
+    outlier_readings,
     parameters_of_model,
     payload_mass,
     reading_noise,
     repeatability_of_arm,
     temperature_growth,
-    wild_readings,
 )
 from gapbridge.core.calibration.budget.pose_accuracy import KINDS
 from gapbridge.core.calibration.budget.sensitivity import Sensitivities, sensitivities
@@ -117,7 +117,7 @@ def _looked_at(calibration: Calibration) -> Array:
     held = calibration.held_out_after
     if calibration.readings.kind not in KINDS:
         return np.zeros(0)
-    return np.abs(held.vector[~np.isin(held.rows, wild_readings(calibration))]).ravel()
+    return np.abs(held.vector[~np.isin(held.rows, outlier_readings(calibration))]).ravel()
 
 
 def _effective(inputs: list[Input], combined: float) -> float:
@@ -129,4 +129,4 @@ def _coverage(freedom: float) -> float:
     return float(1 - 2 * stdtr(freedom if np.isfinite(freedom) else 1e9, -COVERAGE))
 
 
-__all__ = ["Budget", "Input", "Stated", "budget", "wild_readings"]
+__all__ = ["Budget", "Input", "Stated", "budget", "outlier_readings"]

@@ -46,7 +46,7 @@ class Input:
         return abs(self.sensitivity) * self.std
 
 
-def wild_readings(calibration: Calibration) -> NDArray[np.int64]:
+def outlier_readings(calibration: Calibration) -> NDArray[np.int64]:
     """Return the rows of readings that no budget can speak for: blunders, not uncertainty.
 
     Those that the fit down-weighted, and single held-out ones far beyond all others.
@@ -107,20 +107,20 @@ def model_remainder(calibration: Calibration, parameters: float, noise: float) -
     """Return what the held-out poses show beyond parameters, arm and instrument."""
     held_out = len(calibration.held_out_after.vector) > 0
     chosen = calibration.held_out_after if held_out else calibration.after
-    wild = np.intersect1d(wild_readings(calibration), chosen.rows)
-    errors = chosen.vector[~np.isin(chosen.rows, wild)]
+    outliers = np.intersect1d(outlier_readings(calibration), chosen.rows)
+    errors = chosen.vector[~np.isin(chosen.rows, outliers)]
     # of readings that show no place the parameters' share is not known: none is taken off
     share = parameters if held_out and calibration.readings.kind in KINDS else 0.0
     excess = float(np.mean(errors**2)) - noise**2 - share**2
     std = float(np.sqrt(max(excess, 0.0)))
     where = "held-out poses" if held_out else "fitted poses (none were held out)"
-    if len(wild):
-        rows = ", ".join(str(int(r) + 1) for r in wild)
+    if len(outliers):
+        rows = ", ".join(str(int(r) + 1) for r in outliers)
         where += f", without outliers (reading {rows})"
-    told = "nothing found beyond the lines above" if std == 0 else "what is beyond the lines above"
+    found = "nothing found beyond the lines above" if std == 0 else "what is beyond the lines above"
     return Input(
         "what the model does not explain", "A", "normal", std, "m", 1.0, float(errors.size),
-        f"{errors.size} coordinates of the {where}: {told}",
+        f"{errors.size} coordinates of the {where}: {found}",
     )  # fmt: skip
 
 

@@ -146,9 +146,9 @@ class Observable(ABC):
         """
         self._require(readings)
         poses = model.predict(readings.q, readings.loads)
-        return self.settled(poses, readings, self.guess(poses, readings))
+        return self.refined(poses, readings, self.guess(poses, readings))
 
-    def settled(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Nuisance:
+    def refined(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Nuisance:
         """Return the nuisance moved to where it fits best (Gauss-Newton, Cauchy weights)."""
         layout = self.layout(readings)
         if not layout.size:

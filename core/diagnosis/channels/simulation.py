@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.effects import Term
 from gapbridge.core.errors import LogError
+from gapbridge.core.log.alignment import aligned
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
@@ -33,12 +34,10 @@ PREFIX = "simulated "
 def joined(log: Log, simulated: Log) -> Log:
     """Return the log with the simulator's values beside its own.
 
-    Raises LogError where the two have not the same rows, or the simulator's has nothing to compare.
+    Raises LogError where a row has no counterpart or one of another pose, or the simulator's has
+    nothing to compare.
     """
-    if len(simulated) != len(log):
-        raise LogError(
-            f"{simulated.path}: found {len(simulated)} rows, expected {len(log)} as in {log.path}"
-        )
+    simulated = aligned(simulated, log)
     found = {
         PREFIX + name: simulated.require(name) for name in SHOWN_BY.values() if simulated.has(name)
     }

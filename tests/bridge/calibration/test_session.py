@@ -138,9 +138,9 @@ def _kept(folder: Path) -> list[dict[str, object]]:
 def _same_within_intervals(one: Path, other: Path) -> None:
     import json
 
-    from gapbridge.core.calibration.promise import promise_in
+    from gapbridge.core.calibration.accuracy_baseline import baseline_in
 
-    a, b = (promise_in(json.loads((p / "promise.json").read_text())) for p in (one, other))
+    a, b = (baseline_in(json.loads((p / "promise.json").read_text())) for p in (one, other))
     assert a.names == b.names
     spread = np.sqrt(np.diag(a.covariance) + np.diag(b.covariance))
     assert (np.abs(a.values - b.values) < 3.5 * spread).all()

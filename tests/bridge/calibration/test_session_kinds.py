@@ -17,10 +17,10 @@ from played import AXIAL, FRAME, Played, plan_in, play, truth, typed, write_cell
 from gapbridge.bridge.calibration.planning import observable_of
 from gapbridge.bridge.calibration.session.journal import FILE, read_entries
 from gapbridge.bridge.cell import load_cell
+from gapbridge.core.calibration.accuracy_baseline import baseline_in
 from gapbridge.core.calibration.observables import Nuisance, fixed_at
 from gapbridge.core.calibration.observables.foreseen import foreseen
 from gapbridge.core.calibration.plan import Plan
-from gapbridge.core.calibration.promise import promise_in
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.loads import Loads
 
@@ -96,7 +96,7 @@ def finds_the_arm(session: Session, played: Played, of: str = "") -> None:
     assert (session.folder / "s" / "calibration.html").exists()
     assert "kept" in played.out
     reported = json.loads((session.folder / "s" / "promise.json").read_text())
-    promise = promise_in(reported)
+    promise = baseline_in(reported)
     true = {**OFFSETS, **{f"axial_compliance_{i + 1}": c for i, c in enumerate(AXIAL)}}
     apart = promise.values - [true.get(name, 0.0) for name in promise.names]
     own = np.array([name.startswith(of) for name in promise.names])

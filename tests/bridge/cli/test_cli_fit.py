@@ -100,5 +100,7 @@ def test_a_fit_writes_no_tool_point_no_frame_and_exact_zeros(tmp_path: Path) -> 
     assert all(v == 0 or v > 1e-9 for v in (*axial, *radial))
     assert "e-30" not in new.read_text(encoding="utf-8")
     assert "-0.0" not in answer.out
-    before, after = re.findall(r"left out of the fit: (\S+) before, (\S+) after", answer.out)[0]
+    before, after = re.findall(r"left out of the fit: (\S+) \(\S+\) before, (\S+) \(", answer.out)[
+        0
+    ]
     assert float(after) < 0.03 < 0.1 < float(before)  # mm

@@ -13,7 +13,7 @@ from cli_runs import CELL, cell_in, columns_of, gapbridge, log_in, measured, nam
 from cli_runs import table_of as read
 
 from gapbridge.bridge.cell import load_cell
-from gapbridge.bridge.report.words import effect_words
+from gapbridge.bridge.report.labels import effect_title
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.compensation import Compensator
 from gapbridge.core.dynamics import predict_torque, predict_tracking, predict_wrench, with_pieces
@@ -128,7 +128,7 @@ def test_it_is_explained_found_applied_and_predicted(channel: str, tmp_path: Pat
     answer = gapbridge("explain", term.effect)
     assert answer.code == 0
     assert f"shows in: {channel}" in answer.out
-    assert effect_words(term.effect) == "something new"
+    assert effect_title(term.effect) == "something new"
     cell, new, file = cell_in(tmp_path, LOADED), tmp_path / "new.yaml", tmp_path / "d.json"
     log = log_of(channel, truth, tmp_path)
     answer = gapbridge("diagnose", log, "--cell", cell, "--json", file, "--apply", new)

@@ -50,6 +50,9 @@ def test_the_demo_shows_what_it_states(tmp_path: Path) -> None:
     assert error["without"]["rms"] > 20 * error["with"]["rms"]
     assert error["with"]["rms"] < 1.5 * repeatability
     assert error["with"]["max"] < error["without"]["max"]
+    assert error["fitted"]["rms"] > 10 * error["with"]["rms"]  # a bent tool, which no fit knows
+    for name, true in summary["hidden"].items():
+        assert summary["accused"][name]["value"] == pytest.approx(true, abs=6e-5)
     assert 0.01 < repeatability < 0.1
     slower = 2 ** " ".join(ran.stdout.split()).count("which this machine may keep")
     assert 0.9 * 500 / slower < summary["loop"]["rate_hz"] < 1.01 * 500
@@ -57,8 +60,10 @@ def test_the_demo_shows_what_it_states(tmp_path: Path) -> None:
     rigid, calibrated = load_cell(out / "cell.yaml"), load_cell(out / "calibrated.yaml")
     assert rigid.model.terms == ()
     assert len(calibrated.model.terms) > 6
+    explained = load_cell(out / "explained.yaml")
+    assert "tool_frame" in {term.effect for term in explained.model.terms}
     diagnosis = json.loads((out / "diagnosis" / "diagnosis.json").read_text())
-    assert diagnosis["verdict"] != "no_gap"
+    assert diagnosis["verdict"] in ("explained", "partly_explained")
     assert diagnosis["channels"][0]["gap_rms"] > 3e-4
     assert summary["setpoints_written"] > 20_000 / slower
     log = read_log(out / "calibration.csv", 6)

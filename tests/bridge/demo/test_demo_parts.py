@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.demo.hidden import Accused, Hidden
 from gapbridge.bridge.demo.page import page
 from gapbridge.bridge.demo.picture import picture
 from gapbridge.bridge.demo.poses import CALIBRATION_LOADS, TEST_LOADS, candidates, plan
 from gapbridge.bridge.demo.rests import Rests, joined, rests, write_log
 from gapbridge.bridge.demo.result import LoopFigures, Result, repeatability
 from gapbridge.bridge.demo.session import Session
-from gapbridge.bridge.demo.terminal import bar
+from gapbridge.bridge.demo.terminal import bar, show
 from gapbridge.bridge.demo.trajectory import ACCELERATION, PERIOD, SPEED, visits, write_trajectory
+from gapbridge.bridge.document.svg import svg_file
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.compensation import correct
 from gapbridge.core.errors import RunError
@@ -165,12 +169,12 @@ def test_the_summary_holds_what_was_measured(result: Result) -> None:
 
 
 def test_the_picture_is_sound_xml_and_shows_every_pose(result: Result) -> None:
-    root = ElementTree.fromstring(picture(result))
+    root = ElementTree.fromstring(svg_file(picture(result)))
     texts = [e.text for e in root.iter("{http://www.w3.org/2000/svg}text")]
     poses = len(np.unique(result.without.nominal_q, axis=0))
     assert sum(str(t).startswith("pose ") for t in texts) == poses
     bars = [
-        e for e in root.iter("{http://www.w3.org/2000/svg}rect") if float(e.get("height", 0)) > 9
+        e for e in root.iter("{http://www.w3.org/2000/svg}rect") if float(e.get("height", 0)) > 4
     ]
     assert len(bars) > 2 * poses
 
@@ -179,7 +183,7 @@ def test_the_page_needs_nothing_from_elsewhere(result: Result) -> None:
     text = page(result, "verdict: <explained>")
     assert "verdict: &lt;explained&gt;" in text
     assert "<script src" not in text
-    assert "<link" not in text
+    assert text.count("<link") == text.count('<link rel="icon" href="data:,">')
 
 
 def test_bars_grow_with_their_share() -> None:
@@ -245,3 +249,52 @@ def test_a_machine_that_cannot_keep_a_fourth_of_the_rate_is_reported():
     session._link = Hall()
     with pytest.raises(RunError, match="deadlines missed"):
         session.visit(cell, TEST_LOADS[0], HOME[None])
+
+
+def accused(*parameters: tuple[str, float, float], effect: str = "tool_frame") -> Accused:
+    return Accused(effect, (), tuple((name, value, std, "m") for name, value, std in parameters))
+
+
+def bent(**shift: float) -> Hidden:
+    truth = {f"tool_frame_{axis}": value for axis, value in shift.items()}
+    return Hidden("tool_frame", "bent", truth, {"tool_shift": tuple(shift.values())})
+
+
+def test_a_bent_tool_is_drawn_from_the_seed() -> None:
+    drawn = [Hidden.drawn(seed, ("tool_frame",)) for seed in range(20)]
+    assert drawn[3] == Hidden.drawn(3, ("tool_frame",)) != drawn[4]
+    sizes = [np.linalg.norm(hidden.simulation["tool_shift"]) for hidden in drawn]
+    assert 1e-3 <= min(sizes) <= max(sizes) <= 2.5e-3
+
+
+def test_every_accusation_is_held_to_the_truth() -> None:
+    hidden = bent(x=1e-3, y=0.0, z=-5e-4)
+    right = accused(("tool_frame_x", 1.001e-3, 3e-6), ("tool_frame_z", -5.01e-4, 3e-6))
+    bends = accused(effect="axial_compliance")
+    assert hidden.denials([right, bends]) == []
+    assert (
+        "link_flexibility is accused"
+        in hidden.denials([right, accused(effect="link_flexibility")])[0]
+    )
+    assert "not named" in hidden.denials([bends])[0]
+    wrong = accused(("tool_frame_x", 1.2e-3, 3e-6))
+    assert "tool_frame_x" in hidden.denials([wrong])[0]
+
+
+def test_three_rounds_of_visits_and_the_truth_are_shown(
+    result: Result, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = accused(("tool_frame_x", 1.001e-3, 3e-6))
+    whole = replace(
+        result, explained=result.compensated, hidden=bent(x=1e-3, y=0.0, z=0.0), accused=(told,)
+    )
+    show(whole, Console(width=140))
+    said = capsys.readouterr().out
+    assert "fit and diagnosis" in said
+    assert "tool_frame_x: truly +1 mm, found +1 ± 0.003 mm" in said
+    drawn = svg_file(picture(whole))
+    assert all(f'fill="var(--{c})"' in drawn for c in ("bad-dot", "before", "limit"))
+    html = page(whole, "")
+    assert "+1 ± 0.003 mm" in html
+    assert whole.summary()["tcp_error_mm"]["fitted"]["rms"] > 0
+    assert whole.summary()["hidden"]["tool_frame_x"] == 1e-3

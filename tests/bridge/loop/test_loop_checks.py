@@ -25,6 +25,7 @@ from gapbridge.bridge.loop.link_monitor import LinkMonitor, SampleCheck, hold_ti
 from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.supervisor import State, Supervisor
 from gapbridge.core.arm import builtin_arm
+from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import InvalidStateError, StaleStateError
 from gapbridge.core.limits import ENVELOPE, RATE
 from gapbridge.core.model import Model
@@ -203,8 +204,8 @@ def test_while_only_observing_a_finding_is_reported_and_changes_nothing(page: Sh
 class Scripted(Driver):
     """A driver that does what it is asked to; no wire could be so exact about three in a row."""
 
-    def __init__(self) -> None:
-        super().__init__(500.0, Model(ARM))
+    def __init__(self, clock: Clock = SYSTEM) -> None:
+        super().__init__(500.0, Model(ARM), clock=clock)
         self.next: RobotState | Exception = state(0.0)
 
     def connect(self) -> None: ...
@@ -220,9 +221,15 @@ class Scripted(Driver):
     def close(self) -> None: ...
 
 
-def watched(page: SharedMemory) -> tuple[Scripted, Supervisor, LinkMonitor, list[dict[str, Any]]]:
+def watched(
+    page: SharedMemory, now: list[float] | None = None
+) -> tuple[Scripted, Supervisor, LinkMonitor, list[dict[str, Any]]]:
+    """``now``: the time, s, where it is not the system's."""
     events: list[dict[str, Any]] = []
-    driver, supervisor = Scripted(), Supervisor(lambda *_: None)
+    clock = Clock()
+    if now is not None:
+        clock.monotonic = lambda: now[0]
+    driver, supervisor = Scripted(clock), Supervisor(lambda *_: None)
     supervisor.state = State.COMPENSATING
     watch = LinkMonitor(driver, ARM, supervisor, Reports(page, events.append))
     return driver, supervisor, watch, events
@@ -243,12 +250,9 @@ def test_two_bad_samples_are_dropped_and_three_in_a_row_hold(page: SharedMemory)
     assert [event["what"] for event in events] == ["dropped_torn"]  # not five times
 
 
-def test_a_state_that_is_late_is_counted_and_only_a_stale_one_holds(
-    page: SharedMemory, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_state_that_is_late_is_counted_and_only_a_stale_one_holds(page: SharedMemory) -> None:
     clock = [100.0]
-    monkeypatch.setattr("gapbridge.bridge.loop.link_monitor.time.monotonic", lambda: clock[0])
-    driver, supervisor, watch, _ = watched(page)
+    driver, supervisor, watch, _ = watched(page, clock)
     driver.next = StaleStateError("the clock stands still")
     seen = []
     for _ in range(30):
@@ -363,12 +367,9 @@ def test_the_controllers_settings_are_compared_every_second_while_armed(page: Sh
     assert bench.changes[0][3] == driver.phrase
 
 
-def test_a_hiccup_while_observing_latches_no_fault(
-    page: SharedMemory, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_hiccup_while_observing_latches_no_fault(page: SharedMemory) -> None:
     clock = [100.0]
-    monkeypatch.setattr("gapbridge.bridge.loop.link_monitor.time.monotonic", lambda: clock[0])
-    driver, supervisor, watch, events = watched(page)
+    driver, supervisor, watch, events = watched(page, clock)
     supervisor.state = State.OBSERVING
     good = driver.next
     driver.next = StaleStateError("the clock stands still")

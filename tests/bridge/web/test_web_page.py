@@ -8,6 +8,7 @@ from contextlib import contextmanager
 import pytest
 from watched_feed import Feed
 
+from gapbridge.bridge.ipc.shared_memory import Phase
 from gapbridge.bridge.loop.supervisor import State
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -102,6 +103,48 @@ def test_figures_lines_and_health_are_those_of_the_cycles(browser, feed):
         assert 0.5 < float(text.split(" ")[0]) < 3.0
         assert "of 10.0 mm" in text
         assert complaints == []
+
+
+def test_the_arm_its_joints_tcp_and_load_are_shown_and_it_can_be_turned(browser, feed):
+    with opened(browser, feed) as (page, _, complaints):
+        live(page)
+        page.wait_for_selector("#arm[data-drawn=yes]", timeout=60_000)
+        assert page.evaluate(COLOURS, "arm") >= 3
+        assert "times larger" in page.locator("#arm-caption").inner_text()
+        figures = page.locator("#arm-figures").inner_text()
+        assert "TCP in base" in figures
+        assert "5.00 kg at 0, 0, 60 mm" in figures
+        assert page.locator("#joints tr").count() == 6
+        box = page.locator("#arm").bounding_box()
+        seen = page.evaluate("document.getElementById('arm').toDataURL()")
+        page.mouse.move(box["x"] + 100, box["y"] + 100)
+        page.mouse.down()
+        page.mouse.move(box["x"] + 250, box["y"] + 130, steps=4)
+        page.mouse.up()
+        assert page.evaluate("document.getElementById('arm').toDataURL()") != seen
+        assert complaints == []
+
+
+def test_a_loop_that_was_killed_is_shown_with_time_and_cause_until_the_next_one_connects(
+    browser, feed
+):
+    with opened(browser, feed) as (page, _, _):
+        live(page)
+        feed.change(State.COMPENSATING, "writing")
+        page.wait_for_selector('body[data-state="compensating"]', timeout=15_000)
+        feed.emit(kind="fault", cause="loop", detail="the loop's process was ended by SIGKILL")
+        page.wait_for_selector('body[data-state="disconnected"]', timeout=15_000)
+        shown = "c => document.querySelector('#why').textContent.includes(c)"
+        page.wait_for_function(shown, arg="because: the loop's process was ended by SIGKILL")
+        since = page.locator("#why").inner_text().split(" (")[0]
+        feed.page.enter(Phase.STARTING)
+        feed.emit(kind="failure", detail="could not connect to 127.0.0.2: refused")
+        page.wait_for_function(shown, arg="could not connect to 127.0.0.2: refused")
+        assert page.locator("#why").inner_text().split(" (")[0] == since
+        assert "starting" not in page.locator("#meaning").inner_text()
+        feed.page.enter(Phase.RUNNING)
+        feed.change(State.OBSERVING, "connected")
+        page.wait_for_selector('body[data-state="observing"]', timeout=15_000)
 
 
 COLOURS = """name => {

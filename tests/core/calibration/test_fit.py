@@ -203,11 +203,12 @@ def test_what_is_left_to_be_added_is_named_and_then_completes_it(
     readings = replace(readings, loads=replace(readings.loads, approach=approach))
     found = calibrate(model, readings, parameters, METROLOGY, diagnose=False)
     assert not found.complete
-    assert found.lacking == ("backlash_3",)
-    more = Parameters.of(model, (*DEFAULT, *found.lacking), observable=make_observable("position"))
+    assert found.missing_effects == ("backlash_3",)
+    names = (*DEFAULT, *found.missing_effects)
+    more = Parameters.of(model, names, observable=make_observable("position"))
     whole = calibrate(model, readings, more, METROLOGY, diagnose=False)
     assert whole.complete
-    assert whole.lacking == ()
+    assert whole.missing_effects == ()
     play = next(e for e in whole.estimates if e.name == "backlash_3")
     assert play.interval[0] < 8e-4 < play.interval[1]
 

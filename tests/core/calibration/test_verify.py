@@ -22,10 +22,10 @@ from benchmarks.calibration.laid_out import (
     readings_of,
     with_values,
 )
+from gapbridge.core.calibration.accuracy_baseline import baseline_in, document_of
 from gapbridge.core.calibration.fit import calibrate
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import Parameters
-from gapbridge.core.calibration.promise import document_of, promise_in
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.result import Calibration
 from gapbridge.core.calibration.spread import effects_of
@@ -133,9 +133,9 @@ def test_too_few_readings_say_so(calibrated: Calibrated) -> None:
 def test_a_document_that_is_none_is_named(calibrated: Calibrated) -> None:
     document = calibrated[1]
     with pytest.raises(InputError, match="schema"):
-        promise_in({"schema": "other"}, "calibration.json")
+        baseline_in({"schema": "other"}, "calibration.json")
     with pytest.raises(InputError, match="'noise'"):
-        promise_in({k: v for k, v in document.items() if k != "noise"}, "calibration.json")
+        baseline_in({k: v for k, v in document.items() if k != "noise"}, "calibration.json")
 
 
 def test_effects_are_read_off_the_parameters_names() -> None:

@@ -21,7 +21,7 @@ def searched():
 
 def on_all(selection, judgement):
     """Return the selection on all rows, and its held-out figures."""
-    whole = on_every_row(selection, judgement.accused, selection.observation, small.model_of())
+    whole = on_every_row(selection, judgement, selection.observation, small.model_of())
     return whole, HeldOut(whole)
 
 

@@ -6,31 +6,25 @@ import numpy as np
 
 from gapbridge.bridge.calibration.report.figures import fixed, mm
 from gapbridge.bridge.calibration.report.material import Material
-from gapbridge.bridge.document.axes import Chart, logarithmic, named, scale, visible
+from gapbridge.bridge.document.axes import Chart, distribution, named, scale
 from gapbridge.bridge.document.blocks import Block, Paragraph, Pictures, Table
 from gapbridge.bridge.document.drawing import AFTER, BEFORE, Drawing
-from gapbridge.bridge.document.section import Section
 from gapbridge.core.calibration.result import Errors
 
 LEGEND = (("before", BEFORE), ("after", AFTER))
 
 
-class ErrorsSection(Section[Material]):
-    """How large the errors were and are."""
-
-    key, title = "errors", "Before and after"
-
-    def blocks(self, material: Material) -> list[Block]:
-        """Return the table of figures, the distribution and the axes."""
-        pictures = [_distribution(material)]
-        if len(material.axes) > 1:
-            pictures.append(_axes(material))
-        words = material.error_words
-        return [
-            Paragraph(f"{words[:1].upper()}{words[1:]}.", "note"),
-            _table(material),
-            Pictures(tuple(pictures), _caption(material)),
-        ]
+def before_and_after(material: Material) -> list[Block]:
+    """Return the table of figures, the distribution and the axes."""
+    pictures = [_distribution(material)]
+    if len(material.axes) > 1:
+        pictures.append(_axes(material))
+    words = material.error_words
+    return [
+        Paragraph(f"{words[:1].upper()}{words[1:]}.", "note"),
+        _table(material),
+        Pictures(tuple(pictures), _caption(material)),
+    ]
 
 
 def _caption(material: Material) -> str:
@@ -68,18 +62,9 @@ def _row(name: str, errors: Errors) -> list[str]:
 
 
 def _distribution(material: Material) -> Drawing:
-    before, after = (np.sort(e.norm) * 1e3 for e in material.judged)
-    chart = Chart(
-        "Distribution of the error", logarithmic("error, mm", visible([*before, *after])),
-        scale("share of the readings, %", [0, 100]),
-    )  # fmt: skip
-    for values, colour in ((before, BEFORE), (after, AFTER)):
-        share = np.arange(len(values) + 1) / len(values) * 100
-        x = np.repeat(values, 2)
-        y = np.repeat(share, 2)[1:-1]
-        chart.line([chart.x.low, *x, chart.x.high], [0.0, *y, 100.0], colour, width=2.0)
-    chart.legend(LEGEND)
-    return chart.drawing
+    before, after = (e.norm * 1e3 for e in material.judged)
+    series = [("before", before, BEFORE), ("after", after, AFTER)]
+    return distribution("Distribution of the error", "error, mm", series).drawing
 
 
 def _axes(material: Material) -> Drawing:

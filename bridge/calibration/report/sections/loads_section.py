@@ -10,27 +10,20 @@ from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.document.axes import Chart, logarithmic, named, plain, visible
 from gapbridge.bridge.document.blocks import Block, Pictures, Table
 from gapbridge.bridge.document.drawing import AFTER, BEFORE, Drawing
-from gapbridge.bridge.document.section import Section
 
 Index = NDArray[np.int64]
 
 
-class LoadsSection(Section[Material]):
-    """How the errors go with the load."""
-
-    key, title = "loads", "Over the load"
-    about = "Errors by what hung on the flange; outliers are left out."
-
-    def blocks(self, material: Material) -> list[Block]:
-        """Return a picture and a table, one column and one row a load."""
-        before, _ = material.calm
-        load = material.calibration.readings.load[before.rows]
-        numbers = [int(k) for k in np.unique(load)]
-        return [
-            Pictures((_picture(material, load, numbers),),
-                     "One dot a reading, a line at the mean; powers of ten upwards."),
-            _table(material, load, numbers),
-        ]  # fmt: skip
+def over_the_load(material: Material) -> list[Block]:
+    """Return a picture and a table, one column and one row a load."""
+    before, _ = material.calm
+    load = material.calibration.readings.load[before.rows]
+    numbers = [int(k) for k in np.unique(load)]
+    return [
+        Pictures((_picture(material, load, numbers),),
+                 "One dot a reading, a line at the mean; powers of ten upwards."),
+        _table(material, load, numbers),
+    ]  # fmt: skip
 
 
 def _picture(material: Material, load: Index, numbers: list[int]) -> Drawing:

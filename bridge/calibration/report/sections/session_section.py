@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from gapbridge.bridge.calibration.report.facts import SessionFacts
 from gapbridge.bridge.calibration.report.figures import load_words, mm
 from gapbridge.bridge.calibration.report.material import Material
-from gapbridge.bridge.calibration.report.names import sentence
 from gapbridge.bridge.document.axes import plain
 from gapbridge.bridge.document.blocks import Block, Bullets, Columns, Heading, Pairs
-from gapbridge.bridge.document.section import Section
+from gapbridge.bridge.report.names import sentence
 
 KINDS = {
     "position": "position of a target on the tool, three coordinates",
@@ -24,21 +23,16 @@ KINDS = {
 }
 
 
-class SessionSection(Section[Material]):
-    """Who, where, when, with what."""
-
-    key, title = "session", "Session and instrument"
-
-    def blocks(self, material: Material) -> list[Block]:
-        """Return the facts as on the front of a certificate."""
-        c, facts = material.calibration, material.session
-        counts = [
-            ("poses", _poses_words(material)),
-            ("readings", _readings_words(material)),
-            ("loads", _loads_words(material)),
-        ]
-        notes = (*c.notes, *(material.plan.notes if material.plan else ()))
-        return facts_blocks(facts, counts, len(c.stations), notes)
+def session_and_instrument(material: Material) -> list[Block]:
+    """Return the facts as on the front of a certificate."""
+    c, facts = material.calibration, material.session
+    counts = [
+        ("poses", _poses_words(material)),
+        ("readings", _readings_words(material)),
+        ("loads", _loads_words(material)),
+    ]
+    notes = (*c.notes, *(material.plan.notes if material.plan else ()))
+    return facts_blocks(facts, counts, len(c.stations), notes)
 
 
 def facts_blocks(

@@ -9,8 +9,8 @@ import numpy as np
 from calibration_report_cases import JOINT, SIGMA, calibration
 
 from gapbridge.core.arm import builtin_arm
+from gapbridge.core.calibration.accuracy_baseline import document_of
 from gapbridge.core.calibration.payload_session import PayloadCalibration, calibrate_payload
-from gapbridge.core.calibration.promise import document_of
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.tool_session import ToolCalibration, calibrate_tool
 from gapbridge.core.calibration.verify import Verification, verify

@@ -11,7 +11,7 @@ from gapbridge.bridge.calibration.report.figures import (
     load_words,
     mm,
 )
-from gapbridge.bridge.calibration.report.names import parameter_words, sentence, spoken
+from gapbridge.bridge.report.names import parameter_title, sentence, with_titles
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.result import Estimate
@@ -22,22 +22,22 @@ from gapbridge.core.model import Model
 def test_every_parameter_that_a_session_can_find_has_words_of_its_own():
     effects = [e for e, effect in CATALOGUE.items() if effect.calibratable]
     names = Parameters.every(Model(builtin_arm("ur10e")), effects).names
-    words = [parameter_words(name) for name in names]
+    words = [parameter_title(name) for name in names]
     assert len(set(words)) == len(names)
     assert not [w for w in words if "_" in w or w.endswith((":", "("))]
 
 
 def test_a_few_names_as_they_are_told():
-    assert parameter_words("joint_offset_3") == "zero of joint 3"
-    assert parameter_words("link_geometry_2_alpha") == "twist alpha of link 2"
-    assert parameter_words("tool_frame_rx") == "tool turn about x"
-    assert parameter_words("payload") == "mass of the load beyond the declared one"
-    assert parameter_words("made_up") == "made_up"
+    assert parameter_title("joint_offset_3") == "zero of joint 3"
+    assert parameter_title("link_geometry_2_alpha") == "twist alpha of link 2"
+    assert parameter_title("tool_frame_rx") == "tool turn about x"
+    assert parameter_title("payload") == "mass of the load beyond the declared one"
+    assert parameter_title("made_up") == "made_up"
 
 
 def test_names_inside_texts_are_told_in_words_and_common_words_stay():
     text = "joint_offset_1 and link_geometry_3_d: backlash and payload stay"
-    assert spoken(text) == "zero of joint 1 and offset d of link 3: backlash and payload stay"
+    assert with_titles(text) == "zero of joint 1 and offset d of link 3: backlash and payload stay"
     assert sentence("the error falls") == "The error falls."
     assert sentence("Done!") == "Done!"
 

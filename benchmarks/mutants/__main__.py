@@ -1,0 +1,64 @@
+"""``python -m benchmarks.mutants``: how many of the listed mistakes the tests notice, by folder."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections import defaultdict
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+
+from benchmarks.mutants.mutant import read_mutants
+from benchmarks.mutants.trial import Trial, Verdict
+from gapbridge.core.errors import InputError
+
+
+@click.command()
+@click.option("--only", default="", help="Those whose file, text or list has this in it.")
+@click.option("--out", type=click.Path(path_type=Path), help="JSON lines, one a mutant.")
+def main(only: str, out: Path | None) -> None:
+    """Make each listed mistake in a copy of the checkout and run the tests that must notice it.
+
+    A test counts only where it passes without the mistake. Exit 1 where one goes unnoticed.
+    """
+    mutants = [m for m in read_mutants() if only in m.file or only in m.what]
+    if not mutants:
+        raise InputError(f"--only: found no mutant with {only!r}")
+    begun, verdicts = time.monotonic(), []
+    with tempfile.TemporaryDirectory() as folder:
+        trial = Trial(Path(folder))
+        for number, mutant in enumerate(mutants, 1):
+            verdict = trial.judge(mutant)
+            verdicts.append(verdict)
+            word = "noticed" if verdict.killed else "UNNOTICED"
+            click.echo(f"{number:3}/{len(mutants)} {word:9} {mutant.file}: {mutant.what}")
+            click.echo(f"        {verdict.detail}", err=verdict.killed)
+            if out is not None:
+                with out.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(asdict(verdict)) + "\n")
+    click.echo("\n".join(["", *table(verdicts), f"{time.monotonic() - begun:.0f} s"]))
+    if not all(v.killed for v in verdicts):
+        raise SystemExit(1)
+
+
+def table(verdicts: list[Verdict]) -> list[str]:
+    """Return the shares by folder, as the lines of a Markdown table."""
+    by_folder: dict[str, list[bool]] = defaultdict(list)
+    for verdict in verdicts:
+        by_folder[verdict.mutant.folder].append(verdict.killed)
+    by_folder["all"] = [verdict.killed for verdict in verdicts]
+    rows = ["| folder | mutants | noticed |", "| --- | --- | --- |"]
+    for folder, killed in sorted(by_folder.items(), key=lambda item: (item[0] == "all", item[0])):
+        share = f"{sum(killed)} ({100 * sum(killed) / len(killed):.0f} %)"
+        rows.append(f"| {folder} | {len(killed)} | {share} |")
+    return rows
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InputError as problem:
+        raise SystemExit(f"error: {problem}") from None

@@ -1,0 +1,230 @@
+"""CAN: a bus in memory between the product's driver and the simulated PiPER."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections import deque
+from typing import Any
+
+import can as python_can
+
+from benchmarks.simulation.links import SimulatedLink
+from benchmarks.simulation.world import Process
+from gapbridge.core.errors import LinkError
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.can.driver import CanDriver
+from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.simulated.can.frame import Frame
+from gapbridge.drivers.simulated.can.piper_node import TARGETS, UNIT, PiperNode
+
+CONTROL = (0x150, 0x151, 0x155, 0x156, 0x157, 0x471)
+MOST_WAITING = 5000  # frames that the kernel keeps
+
+
+class _Node(PiperNode):
+    """The arm, whose frames go to the link's wires."""
+
+    link: CanLink
+
+    def _receive(self) -> Frame | None:
+        inbox = self.link.inbox
+        return inbox.popleft() if inbox else None
+
+    def send(self, identifier: int, data: bytes) -> None:
+        """Send one frame."""
+        if identifier not in self.withheld and identifier not in self._lost:
+            self.link.down.send((identifier, data, self.link.world.now))
+
+
+class _Bus:
+    """The client's end, as python-can gives it."""
+
+    def __init__(self, link: CanLink) -> None:
+        self._link, self.generation = link, link.generation
+        self.frames: deque[tuple[int, bytes, float]] = deque(maxlen=MOST_WAITING)
+
+    def recv(self, timeout: float) -> Any:
+        link, world = self._link, self._link.world
+        if self.generation != link.generation:
+            raise python_can.CanOperationError("Connection reset by peer")
+        until = world.now + timeout
+        while not self.frames:
+            left = until - world.now
+            if left <= 0.0:
+                return None
+            process = world.current
+            assert process is not None
+            link.waiting = process
+            process.sleep(left)
+            if self.generation != link.generation:
+                raise python_can.CanOperationError("Connection reset by peer")
+        identifier, data, sampled = self.frames.popleft()
+        link.last_sampled = sampled
+        return python_can.Message(
+            timestamp=world.now, arbitration_id=identifier, is_extended_id=False, data=data,
+            check=False,
+        )  # fmt: skip
+
+    def send(self, frame: Any, timeout: float | None = None) -> None:
+        link = self._link
+        if self.generation != link.generation:
+            raise python_can.CanOperationError("Connection reset by peer")
+        if link.refuses_frames and link.world.random.random() < 0.5:
+            raise python_can.CanOperationError("No buffer space available")
+        link.note(frame.arbitration_id, bytes(frame.data))
+        link.up.send((frame.arbitration_id, bytes(frame.data)))
+
+    def shutdown(self) -> None: ...
+
+
+class CanLink(SimulatedLink):
+    """One PiPER on a bus."""
+
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self.up.jitter = self.down.jitter = 0.0
+        self.generation = 0
+        self.inbox: deque[Frame] = deque()
+        self.bus: _Bus | None = None
+        self.waiting: Process | None = None
+        self.last_sampled = self.world.now
+        self.refuses_frames = False
+        self._goal = list(self.controller.q)
+        self._seen: dict[int, tuple[float, float]] = {}
+        self._safe = True
+        link: Any = self.setting.cell.link
+        self.node = _Node(link, "127.0.0.9", self.controller)
+        self.node.link = self
+        self.node._bus = self  # its frames go through ``_receive`` and ``send`` above
+
+    def driver(self) -> Driver:
+        """See SimulatedLink.driver."""
+        setting, link = self.setting, self
+        found = CanDriver(setting.cell.link, setting.cell.model, self.clock)  # type: ignore[arg-type]
+
+        def open_bus() -> None:
+            link.clock.sleep(0.005)
+            if not link.reachable:
+                raise LinkError("can: cannot be reached: refused")
+            link.reconnected()
+            found.reader.bus = link.bus = _Bus(link)
+            found.reader._empty = link.world.now
+
+        read = found.read_state
+
+        def read_state() -> RobotState:
+            state = read()
+            link._sampled[state.received] = link.last_sampled
+            return state
+
+        found.reader.open = open_bus  # type: ignore[method-assign]
+        found.read_state = read_state  # type: ignore[method-assign]
+        return found
+
+    def note(self, identifier: int, data: bytes) -> None:
+        """Report a frame that leaves the client; the last of three makes a setpoint."""
+        if identifier not in CONTROL or identifier == 0x150:
+            self.wrote("forbidden" if identifier != 0x150 else "other", (), f"{identifier:#x}")
+            return
+        first = TARGETS.get(identifier)
+        if first is None:
+            self.wrote("other", (), f"{identifier:#x}")
+            return
+        for i, value in enumerate(struct.unpack(">ii", data), first):
+            self._goal[i] = self.node.joint(i, value, UNIT)
+        if first == 4:
+            self.wrote("joints", tuple(self._goal), "0x155-0x157")
+        else:
+            self.wrote("other", (), f"{identifier:#x}")
+
+    def cycle(self) -> None:
+        """Have the arm take its frames and send its own."""
+        if self.freezes_values:
+            kept = self.node._kept
+            self.node.cycle(self.controller)
+            self.node._kept = kept
+        else:
+            self.node.cycle(self.controller)
+
+    def publish(self) -> None:
+        """Send nothing more: the node has."""
+
+    def _on_up(self, message: tuple[int, bytes]) -> None:
+        if self.world.now >= self.rebooting_until:
+            self.inbox.append(Frame(message[0], message[1], False))
+
+    def _on_down(self, message: tuple[int, bytes, float]) -> None:
+        bus = self.bus
+        if bus is None or bus.generation != self.generation:
+            return
+        bus.frames.append(message)
+        self._look(*message)
+        if self.waiting is not None:
+            waiting, self.waiting = self.waiting, None
+            waiting.wake()
+
+    def _look(self, identifier: int, data: bytes, _: float) -> None:
+        """See what a checker sees of a frame: joints in three, the arm's state in one."""
+        if identifier == 0x2A1 and len(data) == 8:
+            self._safe = data[1] == 0
+        place = identifier - 0x2A5
+        if not 0 <= place < 3 or len(data) != 8:
+            return
+        first, second = struct.unpack(">ii", data)
+        joint = self.node.joint
+        self._seen[place] = (
+            joint(2 * place, first, UNIT), joint(2 * place + 1, second, UNIT),
+        )  # fmt: skip
+        if place == 2 and len(self._seen) == 3:
+            q = [v for k in range(3) for v in self._seen[k]]
+            self._seen.clear()
+            self.see((math.nan, q, q, self._safe))
+
+    def disconnect(self) -> None:
+        """See SimulatedLink.disconnect."""
+        super().disconnect()
+        self.generation += 1
+        if self.waiting is not None:
+            self.waiting.wake()
+
+    def forget_client(self) -> None:
+        """See SimulatedLink.forget_client."""
+        super().forget_client()
+        self.node.control_mode, self.node.enabled = 0, [False] * 6
+
+    def heal(self) -> None:
+        """See SimulatedLink.heal."""
+        super().heal()
+        self.node.withheld.clear()
+        self.refuses_frames = False
+
+    def key_of(self, state: RobotState) -> float:
+        """See SimulatedLink.key_of."""
+        return state.received
+
+    def foreign(self, seconds: float) -> None:
+        """Have another commander send targets, for a while."""
+        until = self.world.now + seconds
+
+        def send() -> None:
+            wire = [round(v / UNIT) for v in self.controller.q[:2]]
+            data = struct.pack(">ii", *wire)
+            self.down.send((0x155, data, self.world.now))
+            if self.world.now < until:
+                self.world.after(0.02, send)
+
+        send()
+
+
+def spoiled(message: tuple[int, bytes, float], draw: Any) -> tuple[int, bytes, float]:
+    """Return a frame that is wrong in one way."""
+    identifier, data, sampled = message
+    kind = draw.randrange(3)
+    if kind == 0:
+        return identifier, data[: draw.randrange(len(data))] if data else data, sampled
+    if kind == 1:
+        return draw.choice((0x2A5, 0x2A6, 0x2A7, 0x2A1)), data, sampled
+    at = draw.randrange(len(data)) if data else 0
+    changed = data[:at] + bytes([data[at] ^ (1 << draw.randrange(8))]) + data[at + 1 :]
+    return identifier, changed, sampled

@@ -1,0 +1,168 @@
+"""What must hold in every run, one list; each has a test that breaks the product and finds it."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from typing import Any
+
+from benchmarks.faults.invariants import Checker
+from benchmarks.faults.wire.seen import Fresh, Numbers, Write
+from gapbridge.bridge.loop.link_monitor import DRIFT, hold_time
+from gapbridge.bridge.loop.supervisor import HEALED_BY_RECONNECTING, TRANSITIONS, Cause, State
+from gapbridge.core.setpoint import Setpoint
+
+MARGIN = 0.01  # s: a cycle of the controller and what computing takes
+LONGEST_LIST = 20
+
+INVARIANTS: dict[str, str] = {
+    "envelope": "no offset on the wire is larger than the cell's, counted from where the arm was "
+    "wanted before the first stream, over restarts and deaths of processes",
+    "rate": "no offset on the wire changes faster than at the cell's rates, nor by a step",
+    "start": "a stream of joints begins where the arm stands",
+    "limits": "no joint setpoint is outside the joint limits, or no number",
+    "allowed": "nothing leaves but what the driver's list allows, whole, with its checksum",
+    "state": "setpoints leave in the states compensating and holding only",
+    "stopped": "nothing is written to a robot that has said that it must not move",
+    "fresh": "behind each write is a state that came at most 40 ms or five cycles before it, and "
+    "there are never more writes than states",
+    "age": "a state behind a write was sampled by the controller at most twice that long before",
+    "asked": "writing begins after a person has asked for it, anew after each time that it ended",
+    "latched": "a fault that does not end with its link stays until a person has acknowledged it, "
+    "over the deaths of all processes",
+    "table": "the state changes as the table of states says, and in no other way",
+    "taken": "what a person asks for is taken by a loop, and what is answered is so",
+    "ends": "a stop ends in time, with a summary, and the arm without an offset of ours growing",
+    "crash": "no process ends by an exception that is none of the product's",
+    "recorded": "the cycles handed to the recorder say of each setpoint whether it left",
+    "recovers": "once robot, network and machine are healed, a person can arm again",
+}
+
+
+@dataclass(frozen=True)
+class Violation:
+    """One invariant that did not hold."""
+
+    invariant: str
+    time: float  # s since the begin of the run
+    words: str
+
+    def __str__(self) -> str:
+        return f"{self.invariant} at {self.time:.4f} s: {self.words}"
+
+
+_KINDS = (
+    ("allowed", r"(broken|forbidden) write"),
+    ("state", r"write in state"),
+    ("stopped", r"must not move"),
+    ("fresh", r"last fresh state|before any state|more writes than states"),
+    ("start", r"a stream began"),
+    ("limits", r"outside its limits|nan|inf"),
+    ("envelope", r", allowed"),
+    ("rate", r"at once|within"),
+)
+"""What benchmarks/faults/invariants.py says -> which invariant that is."""
+
+
+class Judge:
+    """Watches a run; ``violations`` are what it has found."""
+
+    def __init__(self, checker: Checker, begin: float, rate: float) -> None:
+        self.violations: list[Violation] = []
+        self._checker, self._begin = checker, begin
+        self._known = 0
+        self._now = begin
+        self._most_age = 2.0 * hold_time(rate) + MARGIN
+        self._asked = False  # since writing ended last
+        self._acknowledged = False  # since the fault began
+        self._fault: str | None = None  # that is latched
+        self._heals = False
+        self._last: Numbers = ()  # the values of the last write
+        self.writes_noted = 0  # setpoints seen on the wire
+        self.oldest = 0.0  # s
+
+    def violate(self, invariant: str, words: str) -> None:
+        """Note that an invariant did not hold."""
+        assert invariant in INVARIANTS, invariant
+        if len(self.violations) < LONGEST_LIST:
+            self.violations.append(Violation(invariant, self._now - self._begin, words))
+
+    # -- the wire ---------------------------------------------------------------------------------
+
+    def saw(self, seen: Fresh | Write) -> None:
+        """Take what goes over the wire, as it does."""
+        self._now = seen.time
+        checker = self._checker
+        checker.take([seen])
+        if checker.doubts:  # the loop's state is known exactly here
+            doubt = checker.doubts.pop()
+            checker.doubts.clear()
+            holds = isinstance(seen, Write) and seen.values == self._last  # as it lets go
+            if not holds:
+                self.violate("state", f"write in state {State(doubt.state).name}")
+        if isinstance(seen, Write) and seen.kind in ("offset", "joints"):
+            self.writes_noted += 1
+            self._last = seen.values
+        found = checker.found
+        if found.violated > self._known:
+            for words in found.violations[self._known - found.violated :]:
+                self.violate(_kind_of(words), words.split(" [")[0])
+            self._known = found.violated
+
+    def sent(self, setpoint: Setpoint, sampled: float, now: float) -> None:
+        """Take a setpoint as it is handed to the driver, and when its state was sampled, s."""
+        self._now = now
+        if math.isnan(sampled):
+            self.violate("age", "a setpoint of a state that no controller has sampled")
+            return
+        age = now - sampled
+        self.oldest = max(self.oldest, age)
+        if age > self._most_age + DRIFT * (now - self._begin):
+            self.violate("age", f"a setpoint of a state sampled {age:.3f} s before")
+
+    # -- what the daemon hears --------------------------------------------------------------------
+
+    def heard(self, event: dict[str, Any]) -> None:
+        """Take an event of the daemon's log."""
+        self._now = float(event["seen"])
+        kind = event["kind"]
+        if kind == "request":
+            self._asked |= event["command"] == "arm"
+            self._acknowledged |= event["command"] == "disarm"
+        elif kind == "transition":
+            self._changed(State[event["from"]], State[event["to"]], Cause(event["cause"]))
+        elif kind in ("failure", "fault") and self._heals:
+            self._fault = None  # the link has ended, and such a fault with it
+
+    def _changed(self, before: State, after: State, cause: Cause) -> None:
+        if TRANSITIONS.get((before, cause)) != after:
+            self.violate("table", f"{before.name} -> {after.name} by {cause}")
+        if after == State.ARMED:
+            if not self._asked:
+                self.violate("asked", "armed without anybody having asked")
+            self._asked = False
+        if after == State.COMPENSATING and before not in (State.ARMED, State.HOLDING):
+            self.violate("asked", f"{before.name} -> {after.name}")
+        if after == State.FAULT:
+            if cause != Cause.LATCHED:
+                self._fault, self._heals = f"{cause}", cause in HEALED_BY_RECONNECTING
+                self._acknowledged = False
+        elif before == State.FAULT:
+            if after == State.OBSERVING and not self._acknowledged:
+                self.violate("latched", f"{self._fault} was left by {cause}, not acknowledged")
+            if after == State.OBSERVING:
+                self._fault = None
+            if after == State.DISCONNECTED and self._heals:
+                self._fault = None
+        elif self._fault is not None and not self._heals and after in (State.ARMED,):
+            self.violate("latched", f"{self._fault} waits to be acknowledged, and it was armed")
+
+
+def _kind_of(words: str) -> str:
+    return next((name for name, pattern in _KINDS if re.search(pattern, words)), "limits")
+
+
+def as_markdown() -> str:
+    """Return the list as it stands in docs/reliability.md."""
+    return "\n".join(f"- **{name}**: {words}" for name, words in INVARIANTS.items())

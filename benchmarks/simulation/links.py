@@ -1,0 +1,182 @@
+"""The four links, with a controller and wires in memory; the drivers are the product's own."""
+
+from __future__ import annotations
+
+import functools
+import math
+import shutil
+import tempfile
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.faults.invariants import Bounds
+from benchmarks.faults.links import LINKS as WIRED
+from benchmarks.faults.wire.seen import Fresh, Numbers, Write
+from benchmarks.simulation.wires import Wire
+from benchmarks.simulation.world import SimulatedClock, World
+from gapbridge.bridge.cell import Cell, load_cell
+from gapbridge.bridge.cell.run_settings import Configuration, configuration_for, settings_of
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.simulated.server.arm_controller import ArmController, make_controller
+from gapbridge.drivers.simulated.ur.settings import simulated_arm
+
+PAYLOAD: dict[str, tuple[float, tuple[float, float, float]]] = {
+    "can": (1.0, (0.0, 0.0, 0.06)),
+}
+UR_PAYLOAD = (5.0, (0.0, 0.0, 0.06))
+SIMULATED_RATE = {"ur_servoj": 125.0, "ur_offset": 125.0, "modbus": 50.0, "can": 100.0}  # Hz
+RESTARTS = (0.05, 0.4)  # s: the daemon's backoff
+Saw = Callable[[Fresh | Write], None]
+
+
+class Setting:
+    """What all runs of a link share: its cell, read once."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.wired = WIRED[name](SIMULATED_RATE[name])
+        self._folder = tempfile.TemporaryDirectory(prefix="simulation-")
+        path, _ = self.wired.write_cells(Path(self._folder.name), "127.0.0.9", "127.0.0.9", "")
+        shutil.copymode(path, path)
+        self.cell: Cell = load_cell(path)
+        settings = settings_of(self.cell).model_copy(
+            update={"backoff": RESTARTS, "hang_timeout": 1.0}
+        )
+        self.configuration: Configuration = configuration_for(settings)
+        self.bounds: Bounds = self.wired.bounds(path)
+        mass, cog = PAYLOAD.get(name, UR_PAYLOAD)
+        tcp = (*self.cell.file.tool.tcp.xyz, 0.0, 0.0, 0.0)
+        self.arm = simulated_arm(
+            self.cell.arm, 11, self.wired.start_q, payload_mass=mass, payload_cog=cog, tcp=tcp
+        )
+
+
+@functools.cache
+def setting_of(name: str) -> Setting:
+    """Return what all runs of a link share."""
+    return Setting(name)
+
+
+class SimulatedLink(ABC):
+    """One controller, its wires, and the driver's edge to them.
+
+    ``saw`` is called with each state as it reaches the client and each write as it leaves it.
+    """
+
+    carries_corruption = True  # of single numbers, as the wire's own checks do not show
+
+    def __init__(self, world: World, clock: SimulatedClock, setting: Setting, saw: Saw) -> None:
+        self.world, self.clock, self.setting, self.saw = world, clock, setting, saw
+        self.period = 1.0 / setting.wired.rate
+        self.controller: ArmController = make_controller(*setting.arm, self.period)
+        self.up: Wire[Any] = Wire(world, self._on_up)  # from the client
+        self.down: Wire[Any] = Wire(world, self._on_down)
+        self.pace = 1.0  # of the controller's clock
+        self.rebooting_until = 0.0
+        self.refuses_until = 0.0  # no new connection before
+        self.freezes_values = False
+        self.foreign_until = 0.0
+        self.supervisor_state: Callable[[], int] = lambda: -1
+        self._sampled: dict[float, float] = {}  # by what a driver stamps its state with -> truth, s
+        world.every(lambda: self.period, self._tick)
+
+    # -- what the client sees ---------------------------------------------------------------------
+
+    def see(self, fresh: tuple[float, Sequence[float], Sequence[float], bool]) -> None:
+        """Report a state that has reached the client: controller's clock, joints, target, safe."""
+        stamp, q, target, safe = fresh
+        state = self.supervisor_state()
+        self.saw(Fresh(self.world.now, stamp, tuple(q), tuple(target), safe, True, state))
+
+    def wrote(self, kind: Any, values: Numbers, where: str) -> None:
+        """Report a write that leaves the client. Raises KilledError where that is dead."""
+        process = self.world.current
+        if process is not None:
+            process.check()
+        self.saw(Write(self.world.now, kind, values, where, self.supervisor_state()))
+
+    @property
+    def reachable(self) -> bool:
+        """Return whether a new connection comes about."""
+        return self.world.now >= max(self.rebooting_until, self.refuses_until)
+
+    def sampled_at(self, state: RobotState) -> float:
+        """Return when the controller sampled a state, s of the world; NaN where nobody knows."""
+        return self._sampled.get(self.key_of(state), math.nan)
+
+    def key_of(self, state: RobotState) -> float:
+        """Return what a state is known again by."""
+        return state.timestamp
+
+    @abstractmethod
+    def driver(self) -> Driver:
+        """Return the product's driver, its edge being this link's wires; for a new process."""
+
+    @abstractmethod
+    def publish(self) -> None:
+        """Send what the controller sends in a cycle."""
+
+    @abstractmethod
+    def _on_up(self, message: Any) -> None: ...
+
+    @abstractmethod
+    def _on_down(self, message: Any) -> None: ...
+
+    # -- the controller ---------------------------------------------------------------------------
+
+    def _tick(self) -> None:
+        controller, now = self.controller, self.world.now
+        if now < self.rebooting_until or controller.stalled:
+            controller.running += self.period
+            return
+        controller.period = self.period * self.pace
+        controller.cycle()
+        controller.period = self.period
+        self.cycle()
+        self.publish()
+
+    def cycle(self) -> None:
+        """Run the robot's side of the link."""
+
+    def restart(self, seconds: float) -> None:
+        """Have the controller start anew: its clock too; connections are lost."""
+        self.rebooting_until = self.world.now + seconds
+        self.controller.clock = 0.0
+        self.disconnect()
+        self.forget_client()
+
+    def disconnect(self) -> None:
+        """Break every connection."""
+        self.up.cut()
+        self.down.cut()
+
+    def reconnected(self) -> None:
+        """Have wires carry again: a client has connected."""
+        self.up.is_cut = self.down.is_cut = False
+
+    def forget_client(self) -> None:
+        """Have the controller forget all that a client told it."""
+        self.controller.let_go()
+
+    def heal(self) -> None:
+        """Do what a person does until robot and network are as they were."""
+        cut = self.up.is_cut
+        self.up.heal()
+        self.down.heal()
+        self.up.is_cut = self.down.is_cut = cut  # connections do not come back by themselves
+        controller = self.controller
+        controller.frozen, self.freezes_values, self.pace = False, False, 1.0
+        controller.release_emergency_stop()
+        controller.unlock()
+        self.refuses_until = self.foreign_until = 0.0
+        self.declare(self.setting.arm[1].payload_mass)
+
+    def declare(self, mass: float) -> None:
+        """Declare another payload in the controller, kg."""
+        self.controller.declared.payload_mass = mass
+
+    def foreign(self, seconds: float) -> None:
+        """Have somebody else command the arm, as far as the link lets them."""

@@ -1,0 +1,242 @@
+"""Modbus through the mailbox: requests and answers in memory, to the simulated robot's program."""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any
+
+from benchmarks.simulation.links import SimulatedLink
+from benchmarks.simulation.world import Process
+from gapbridge.core.errors import InvalidStateError, LinkError
+from gapbridge.core.state import RobotState
+from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.modbus import encode
+from gapbridge.drivers.modbus.driver import ModbusDriver
+from gapbridge.drivers.modbus.profile import MAILBOX_WORDS
+from gapbridge.drivers.modbus.transport import Transport
+from gapbridge.drivers.simulated.modbus.programs import MailboxProgram
+from gapbridge.drivers.simulated.modbus.server import ModbusServer
+
+ADDRESS_MISSING = 2  # exception code
+
+
+class _Closable:
+    def close(self) -> None: ...
+
+
+class _Transport(Transport):
+    """The product's, whose connection is the link's wires."""
+
+    link: ModbusLink
+
+    def open(self) -> None:
+        """Connect. Raises LinkError."""
+        self.close()
+        self.link.clock.sleep(0.002)
+        if not self.link.reachable:
+            raise LinkError(f"{self.name}: cannot be reached: refused")
+        self.link.reconnected()
+        self._client = _Closable()
+        self._tcp = _Requests(self.link, self._settings.timeout)  # type: ignore[assignment]
+
+
+class _Requests:
+    """Asks one question after the other, as TcpRequests does."""
+
+    def __init__(self, link: ModbusLink, timeout: float) -> None:
+        self._link, self._timeout, self._number = link, timeout, 0
+        self._generation = link.generation
+        self._answer: tuple[int, bytes] | None = None
+
+    def ask(self, request: bytes) -> bytes:
+        """Return the answer. Raises TimeoutError, OSError, InvalidStateError."""
+        link, world = self._link, self._link.world
+        if link.up.is_cut or self._generation != link.generation:
+            raise ConnectionResetError(104, "Connection reset by peer")
+        self._number += 1
+        link.note_request(request)
+        process = world.current
+        assert process is not None
+        link.waiting = (process, self)
+        link.up.send((self._number, self._generation, request))
+        until = world.now + self._timeout
+        while self._answer is None or self._answer[0] != self._number:
+            left = until - world.now
+            if left <= 0.0:
+                raise TimeoutError
+            if self._generation != link.generation:
+                raise ConnectionResetError(104, "Connection reset by peer")
+            process.sleep(left)
+        if self._answer[1] == b"":
+            raise InvalidStateError("found the answer to another request")
+        return self._answer[1]
+
+    def take(self, number: int, answer: bytes) -> None:
+        """Take what has come."""
+        self._answer = (number, answer)
+
+
+class ModbusLink(SimulatedLink):
+    """One controller with a Modbus server and the mailbox program."""
+
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self.period = 0.008  # s: the server's, whatever the client's rate
+        self.generation = 0
+        self.waiting: tuple[Process, _Requests] | None = None
+        self._server: ModbusServer | None = None
+        self._published = self.world.now
+        self._image_sampled = self.world.now
+        self._asked_image = self.world.now  # sampling time of the image last answered
+
+    @property
+    def server(self) -> ModbusServer:
+        """Return the simulated robot's side; nothing of it listens."""
+        if self._server is None:
+            settings = self.setting.cell.link
+            driver = ModbusDriver(settings, self.setting.cell.model)  # type: ignore[arg-type]
+            self._server = ModbusServer(driver.profile, "127.0.0.9", 15020)
+            self._server._publish(self.controller)
+        return self._server
+
+    @property
+    def program(self) -> MailboxProgram:
+        """Return the robot's program."""
+        assert isinstance(self.server.program, MailboxProgram)
+        return self.server.program
+
+    def driver(self) -> Driver:
+        """See SimulatedLink.driver."""
+        setting = self.setting
+        found = ModbusDriver(setting.cell.link, setting.cell.model, self.clock)  # type: ignore[arg-type]
+        found.transport.__class__ = _Transport
+        found.transport.link = self  # type: ignore[attr-defined]
+        link, read = self, found.read_state
+
+        def read_state() -> RobotState:
+            state = read()
+            link._sampled[state.received] = link._asked_image
+            return state
+
+        found.read_state = read_state  # type: ignore[method-assign]
+        return found
+
+    def key_of(self, state: RobotState) -> float:
+        """See SimulatedLink.key_of."""
+        return state.received
+
+    def note_request(self, request: bytes) -> None:
+        """Report a request that leaves the client."""
+        function = request[0]
+        if function in (16, 23):
+            at = 1 if function == 16 else 5
+            address, count = struct.unpack_from(">HH", request, at)
+            words = list(struct.unpack_from(f">{count}H", request, at + 5))
+            self._note_mailbox(address, words)
+
+    def _note_mailbox(self, address: int, words: list[int]) -> None:
+        box: Any = self.server.profile.write
+        if address != box.address or len(words) != MAILBOX_WORDS:
+            self.wrote("forbidden", (), f"holding {address}")
+            return
+        if encode.checksum(words[:-1]) != words[-1]:
+            self.wrote("broken", (), "mailbox")
+            return
+        self.wrote("offset", tuple(float(v) for v in encode.offset_of(box, words[1:7])), "mailbox")
+
+    def cycle(self) -> None:
+        """Have the robot scan its registers."""
+        self.server.cycle(self.controller)
+        self._image_sampled = self.world.now
+
+    def publish(self) -> None:
+        """Send nothing: it only answers."""
+
+    def _on_up(self, message: tuple[int, int, bytes]) -> None:
+        number, generation, request = message
+        if self.controller.stalled or self.world.now < self.rebooting_until:
+            return
+        self.down.send((number, generation, self._answer(request), self._image_sampled))
+
+    def _answer(self, request: bytes) -> bytes:
+        function, server = request[0], self.server
+        if function == 16:
+            address, count = struct.unpack_from(">HH", request, 1)
+            words = list(struct.unpack_from(f">{count}H", request, 6))
+            server._queue.append(("holding", address, words))
+            return struct.pack(">BHH", 16, address, count)
+        if function == 23:
+            first, count, address, size = struct.unpack_from(">HHHH", request, 1)
+            words = list(struct.unpack_from(f">{size}H", request, 10))
+            server._queue.append(("holding", address, words))
+        else:
+            first, count = struct.unpack_from(">HH", request, 1)
+        table = server._image["input" if function == 4 else "holding"]
+        values = [table.get(a, 0) & 0xFFFF for a in range(first, first + count)]
+        return struct.pack(f">BB{count}H", function, 2 * count, *values)
+
+    def _on_down(self, message: tuple[int, int, bytes, float]) -> None:
+        number, generation, answer, sampled = message
+        if self.waiting is None or generation != self.generation:
+            return
+        process, requests = self.waiting
+        self._asked_image = sampled
+        controller = self.controller
+        if answer[:1] in (b"\x03", b"\x17"):
+            safe = controller.can_move
+            self.see((math.nan, controller.q, controller.target_q, safe))
+        requests.take(number, answer)
+        process.wake()
+
+    def disconnect(self) -> None:
+        """See SimulatedLink.disconnect."""
+        super().disconnect()
+        self.generation += 1
+        if self.waiting is not None:
+            self.waiting[0].wake()
+
+    def forget_client(self) -> None:
+        """See SimulatedLink.forget_client."""
+        super().forget_client()
+        self.program.running = False
+
+    def heal(self) -> None:
+        """See SimulatedLink.heal."""
+        super().heal()
+        self.program.running = True
+
+    def foreign(self, seconds: float) -> None:
+        """Have somebody else write the mailbox, for a while."""
+        box: Any = self.server.profile.write
+        until = self.world.now + seconds
+
+        def write(number: int) -> None:
+            words = encode.mailbox_words(
+                number % 60000 + 1, [0] * 6, number % 60000 + 1, [200, 800]
+            )
+            self.server._queue.append(("holding", box.address, words))
+            if self.world.now < until:
+                self.world.after(0.01, lambda: write(number + 1))
+
+        write(31000)
+
+
+def spoiled(message: tuple[int, int, bytes, float], draw: Any) -> tuple[int, int, bytes, float]:
+    """Return an answer that is wrong in one way."""
+    number, generation, answer, sampled = message
+    kind = draw.randrange(6)
+    if kind == 0:
+        answer = answer[:-2]
+    elif kind == 1:
+        answer = bytes([answer[0] ^ 1]) + answer[1:]
+    elif kind == 2:
+        answer = bytes([answer[0] | 0x80, ADDRESS_MISSING])
+    elif kind == 3:
+        answer = b""
+    elif kind == 4:
+        at = draw.randrange(len(answer))
+        answer = answer[:at] + bytes([answer[at] ^ (1 << draw.randrange(8))]) + answer[at + 1 :]
+    else:
+        answer = answer[:2] + bytes(len(answer) - 2)
+    return number, generation, answer, sampled

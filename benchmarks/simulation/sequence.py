@@ -1,0 +1,226 @@
+"""One run from its seed: begin, faults, healing, the end; judged all along."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from benchmarks.faults.invariants import Checker
+from benchmarks.simulation.can import CanLink
+from benchmarks.simulation.faults import FAULTS, Fault, drawn
+from benchmarks.simulation.invariants import Judge, Violation
+from benchmarks.simulation.links import SimulatedLink, setting_of
+from benchmarks.simulation.modbus import ModbusLink
+from benchmarks.simulation.processes import PLANNED_JOINT, Run
+from benchmarks.simulation.ur import UrLink, library
+from benchmarks.simulation.world import BEGIN, Process, SimulatedClock, World
+from gapbridge.bridge.ipc.control_socket import Peer
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.core.setpoint import Setpoint
+
+LINKS: dict[str, type[SimulatedLink]] = {
+    "ur_servoj": UrLink, "ur_offset": UrLink, "modbus": ModbusLink, "can": CanLink,
+}  # fmt: skip
+MOST_FAULTS = 4
+FIRST, SPAN = 1.6, 1.2  # s: when faults begin, over what time they are spread
+RECOVERY = 25.0  # s until a healed run compensates again
+ENDING = 8.0  # s until a stopped run is over
+LOOK = 0.02  # s
+Plan = list[tuple[float, Fault]]
+
+
+@dataclass
+class Outcome:
+    """What came of a run."""
+
+    seed: int
+    link: str
+    faults: list[str] = field(default_factory=list)
+    violations: list[Violation] = field(default_factory=list)
+    writes: int = 0
+    oldest: float = 0.0  # s, state behind a write
+    seconds: float = 0.0  # of simulated time
+
+    def __str__(self) -> str:
+        what = "; ".join(self.faults) or "no faults"
+        lines = [f"seed {self.seed}, {self.link}: {what}", *(f"  {v}" for v in self.violations)]
+        return "\n".join(lines)
+
+
+def run(seed: int, say: Any = None, plan: Sequence[tuple[float, str]] | None = None) -> Outcome:
+    """Run one seed; ``say`` gets every event.
+
+    ``plan``: faults by name, each with its moment (s after the first could be), in place of those
+    that the seed draws.
+    """
+    draw = random.Random(f"faults {seed}")
+    name = list(LINKS)[seed % len(LINKS)]
+    world = World(seed)
+    clock = SimulatedClock(world)
+    setting = setting_of(name)
+    planned = setting.wired.moves_arm and draw.random() < 0.4
+    checker = Checker(setting.bounds)
+    if planned:  # offsets are what the other joints do
+        checker._planned = (PLANNED_JOINT, setting.wired.start_q[PLANNED_JOINT])
+    judge = Judge(checker, BEGIN, setting.wired.rate)
+    link = LINKS[name](world, clock, setting, judge.saw)
+    modules = link.modules() if isinstance(link, UrLink) else {}
+    outcome = Outcome(seed, name)
+    with library(modules):
+        found = Run(world, clock, link, planned)
+        _listen(found, judge, say)
+        person = Person(found, judge, draw, outcome, _planned(draw, name, plan))
+        try:
+            world.run(BEGIN + FIRST + SPAN + 3 * RECOVERY, lambda: person.done)
+            _judge_end(found, judge, person)
+        finally:
+            world.end()
+            found.daemon._commands.close()
+            found.daemon.page.close()
+    outcome.violations, outcome.writes = judge.violations, judge.writes_noted
+    outcome.oldest, outcome.seconds = judge.oldest, world.now - BEGIN
+    return outcome
+
+
+def _planned(draw: random.Random, link: str, given: Sequence[tuple[float, str]] | None) -> Plan:
+    """Return which faults happen when, s after the first could."""
+    if given is not None:
+        by_name = {fault.name: fault for fault in FAULTS}
+        return [(moment, by_name[name]) for moment, name in given]
+    faults = drawn(draw, link, draw.randint(0, MOST_FAULTS))
+    return list(zip(sorted(draw.uniform(0.0, SPAN) for _ in faults), faults, strict=True))
+
+
+def _listen(run: Run, judge: Judge, say: Any) -> None:
+    events, link = run.daemon.event_log, run.link
+
+    def heard(event: dict[str, Any]) -> None:
+        whole = {**event, "seen": run.world.now}
+        judge.heard(whole)
+        if say is not None and event["kind"] != "status":
+            keys = ("kind", "from", "to", "cause", "command", "detail")
+            words = " ".join(str(event[k]) for k in keys if k in event)
+            say(f"{run.world.now - BEGIN:9.4f} {words}")
+
+    def sent(setpoint: Setpoint) -> None:
+        key = setpoint.state_timestamp if isinstance(link, UrLink) else setpoint.state_received
+        judge.sent(setpoint, link._sampled.get(key, float("nan")), run.world.now)
+
+    events._listeners = (*events._listeners, heard)
+    run.on_send = sent
+
+
+class Person(Process):
+    """Arms, has faults happen, heals, arms again, stops."""
+
+    def __init__(
+        self, run: Run, judge: Judge, draw: random.Random, outcome: Outcome, plan: Plan
+    ) -> None:
+        self._plan = plan
+        self._of, self._judge, self._draw, self._outcome = run, judge, draw, outcome
+        self.done = False
+        self.ended_in_time = True
+        super().__init__(run.world, "person", self._act)
+
+    def _act(self) -> None:
+        run, world, draw = self._of, self.world, self._draw
+        self._wait_for(State.OBSERVING, RECOVERY)
+        self._ask("arm")
+        begin = max(world.now, BEGIN + FIRST)
+        for moment, fault in self._plan:
+            self._until(begin + moment)
+            if self._over or not run.loops:
+                break
+            words = fault.make(run, draw)
+            self._outcome.faults.append(
+                f"{fault.name} ({words}) at {world.now - BEGIN:.3f} s" if words
+                else f"{fault.name} at {world.now - BEGIN:.3f} s"
+            )  # fmt: skip
+        self._until(begin + SPAN + draw.uniform(0.0, 1.0))
+        if not self._over:
+            self._recover()
+        asked = world.now
+        run.daemon.stop()
+        while not self._over and world.now < asked + ENDING:
+            self.sleep(LOOK)
+        self.ended_in_time = self._over
+        self.done = True
+
+    @property
+    def _over(self) -> bool:
+        return self._of.process.over
+
+    def _until(self, time: float) -> None:
+        while self.world.now < time and not self._over:
+            self.sleep(min(LOOK, time - self.world.now))
+
+    def _wait_for(self, state: State, limit: float) -> bool:
+        until = self.world.now + limit
+        while self._of.daemon.state != state:
+            if self.world.now > until or self._over:
+                return False
+            self.sleep(LOOK)
+        return True
+
+    def _ask(self, command: str) -> dict[str, Any]:
+        """Ask as the control socket does, and see whether what is answered is so."""
+        daemon = self._of.daemon
+        answer = daemon.control.answer(command, Peer(1, 1000))
+        observes = answer["ok"] and str(answer["answer"]).endswith("observing")
+        if observes and (daemon.state != State.OBSERVING or daemon.latched):
+            self._judge.violate("taken", f"{command}: {answer}, in {daemon.state.name}")
+        return answer
+
+    def _recover(self) -> None:
+        """Heal everything, acknowledge, and arm until it compensates."""
+        run, until = self._of, self.world.now + RECOVERY
+        run.link.heal()
+        run.link.down._ordered = True
+        if run.planner is not None:
+            run.planner.silent_until, run.planner.nonsense = 0.0, None
+        answer: dict[str, Any] = {}
+        if run.daemon._stopping.is_set():
+            return
+        compensators = [p.loop._stream._compensator for p in run.loops if p.loop is not None]
+        for compensator in compensators:
+            compensator.__dict__.pop("correct", None)
+        while self.world.now < until and not self._over:
+            self.sleep(0.3)
+            if run.daemon.state == State.COMPENSATING:
+                return
+            run.link.heal()
+            self._ask("disarm")
+            answer = self._ask("arm")
+            if run.daemon.state == State.COMPENSATING:
+                return
+        words = f"{run.daemon.state.name} in the end; {answer.get('error') or answer}"
+        if self._over:
+            words = f"the daemon ended: {run.process.error or run.process.result}"
+        self._judge.violate("recovers", words)
+
+
+def _judge_end(run: Run, judge: Judge, person: Person) -> None:
+    """Judge what can be judged only when all is over."""
+    judge._now = run.world.now
+    for process in (run.process, person, *(loop.process for loop in run.loops)):
+        if process.error:
+            last = process.error.strip().splitlines()
+            judge.violate("crash", f"{process.name}: {last[-1]} ({' '.join(last[-3:-1])})")
+    if not person.done:
+        judge.violate("ends", "the run did not come to its end")
+    elif not person.ended_in_time:
+        judge.violate("ends", f"not over {ENDING:g} s after the stop")
+    elif not run.process.error and run.process.result is None:
+        judge.violate("ends", "there is no summary")
+    taken, last = run.daemon.taken, run.daemon._commands.last
+    if person.done and taken > last:
+        judge.violate("taken", f"{taken} taken of {last}")
+    slices = run.daemon.page.slices
+    written = run.daemon.page.written
+    rows, _ = run.daemon.page.rows(0, written)
+    left = int((rows[:, slices["written"]] == 1.0).sum())
+    deaths = sum(loop.process.dead for loop in run.loops)
+    if not left <= run.left <= left + deaths:
+        judge.violate("recorded", f"{run.left} setpoints were sent, {left} are recorded")

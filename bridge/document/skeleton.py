@@ -1,0 +1,34 @@
+"""The arm as a line through its joints, bent by its load or not: pictures are made of it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapbridge.core.kernels import reference as kernel
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
+
+Array = NDArray[np.float64]
+
+
+def skeleton(model: Model, q: Array, loads: Loads | None = None) -> Array:
+    """Return base, joint origins, flange and TCP (n + 3, 3), m in base, at ``q`` (n,) rad.
+
+    ``loads`` are those of one row; None: the model's payload and nothing more.
+    """
+    shape = kernel.new_shape(model.arm.n)
+    rows = model.rows(np.asarray(q, dtype=np.float64)[None], loads or Loads())
+    kernel.equilibrium(model.chain(), rows, 0, shape)
+    return np.vstack([np.zeros(3), shape.origin, shape.tcp_position])
+
+
+def reach(model: Model) -> float:
+    """Return the length of the stretched arm, m, without its tool."""
+    return max(float(np.linalg.norm(model.arm.link_in_link[:, :3, 3], axis=1).sum()), 0.1)
+
+
+def round_factor(wanted: float) -> float:
+    """Return the next lower round number (one digit), at least 1: for what is drawn larger."""
+    size = 10 ** np.floor(np.log10(max(wanted, 1.0)))
+    return float(max(np.floor(wanted / size) * size, 1.0))

@@ -1,0 +1,144 @@
+"""Words: effects, quantities and values as people say them."""
+
+from __future__ import annotations
+
+import math
+import re
+
+from gapbridge.core.effects import CATALOGUE
+
+CHANNELS = {
+    "position": "Position of the tool",
+    "wrench": "Force at the flange",
+    "tracking": "Following the command",
+    "torque": "Joint torques",
+}
+VERDICTS = {
+    "no_gap": "No gap",
+    "explained": "Explained",
+    "partly_explained": "Partly explained",
+    "unexplained": "Not explained",
+}
+UNITS: dict[str, tuple[str, float]] = {
+    "m": ("mm", 1e3),
+    "rad": ("mrad", 1e3),
+    "s": ("ms", 1e3),
+    "rad/Nm": ("µrad/Nm", 1e6),
+    "1/K": ("ppm/K", 1e6),
+    "1/(N m2)": ("1/(MN m²)", 1e6),
+    "1/(Nm)2": ("1/(kNm)²", 1e6),
+    "N/s": ("N/h", 3600.0),
+    "Nm/s": ("Nm/h", 3600.0),
+    "kg m2": ("kg m²", 1.0),
+    "Nm s/rad": ("Nm s/rad", 1.0),
+    "": ("%", 1e2),
+}
+_COLUMNS = {
+    "actual_q": "angle of joint",
+    "target_q": "commanded angle of joint",
+    "actual_qd": "speed of joint",
+    "joint_temperatures": "temperature of joint",
+    "approach": "last motion of joint",
+    "held_torque": "torque held by joint",
+}
+_VECTORS = {
+    "payload_cog": "centre of gravity of the load",
+    "measured_position": "measured position",
+    "actual_TCP_force": "outside force",
+    "ft_raw_wrench": "sensor reading",
+}
+_AXES = ("x", "y", "z", "about x", "about y", "about z")
+
+
+def effect_title(identifier: str) -> str:
+    """Return an effect in plain words; its identifier where there are none."""
+    effect = CATALOGUE.get(identifier)
+    return (effect.title if effect else "") or identifier.replace("_", " ")
+
+
+def quantity_title(name: str) -> str:
+    """Return a log column in plain words, joints counted from 1."""
+    if name == "timestamp":
+        return "time"
+    if name == "payload":
+        return "declared load"
+    match = re.fullmatch(r"(.+)_(\d+)", name)
+    if match and match[1] in _COLUMNS:
+        return f"{_COLUMNS[match[1]]} {int(match[2]) + 1}"
+    if match and match[1] in _VECTORS and int(match[2]) < 6:
+        return f"{_VECTORS[match[1]]} {_AXES[int(match[2])]}"
+    return name.replace("_", " ")
+
+
+def quantity_unit(name: str) -> tuple[str, float]:
+    """Return the unit in which a log column is shown, and its factor."""
+    if name.startswith(("actual_q_", "target_q_")):
+        return "deg", 180 / math.pi
+    units = {
+        "actual_qd": "rad/s", "joint_temperatures": "°C", "actual_TCP_force": "N",
+        "timestamp": "s", "approach": "", "held_torque": "Nm",
+    }  # fmt: skip
+    for start, unit in units.items():
+        if name.startswith(start):
+            return unit, 1.0
+    if name.startswith(("payload_cog", "measured_position")):
+        return "mm", 1e3
+    return ("kg", 1.0) if name == "payload" else ("", 1.0)
+
+
+def unit_of(unit: str) -> tuple[str, float]:
+    """Return the unit that people use for an SI unit, and the factor to it."""
+    return UNITS.get(unit, (unit, 1.0))
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Return a number with so many significant digits, without an exponent where one can."""
+    if not math.isfinite(value):
+        return "unknown"
+    if value == 0:
+        return "0"
+    size = math.floor(math.log10(abs(value)))
+    if size < -4 or size > 6:
+        return f"{value:.{digits - 1}e}"
+    text = f"{value:.{max(digits - 1 - size, 0)}f}"
+    return text.replace("-", "−")
+
+
+def with_unit(value: float | None, unit: str) -> str:
+    """Return a value (SI) in the unit that people use; "unknown" for None."""
+    if value is None:
+        return "unknown"
+    name, factor = unit_of(unit)
+    return f"{number(value * factor)} {name}"
+
+
+def percent(share: float | None) -> str:
+    """Return a share as percent."""
+    if share is None or not math.isfinite(share):
+        return "unknown"
+    return f"{round(share * 100)} %".replace("-", "−")
+
+
+def likelihood(probability: float) -> str:
+    """Return a probability as percent, without claiming certainty."""
+    if not math.isfinite(probability):
+        return "unknown"
+    if probability > 0.999:
+        return "over 99.9 %"
+    if probability < 0.001:
+        return "under 0.1 %"
+    return f"{probability * 100:.1f} %"
+
+
+def listed(items: list[str], last: str = "and") -> str:
+    """Return words joined as in a sentence."""
+    if len(items) < 2:
+        return "".join(items)
+    return f"{', '.join(items[:-1])} {last} {items[-1]}"
+
+
+def joint_list(joints: tuple[int, ...]) -> str:
+    """Return "joint 2" or "joints 2 and 3"; empty for none."""
+    if not joints:
+        return ""
+    return f"joint{'s' if len(joints) > 1 else ''} {listed([str(j) for j in joints])}"

@@ -1,0 +1,266 @@
+"""Runs in simulated time: nothing that must hold is broken; and what is broken is found.
+
+``make simulate SEEDS=100000`` runs more of them; a seed that fails is one line to run again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.simulation.faults import FAULTS
+from benchmarks.simulation.invariants import INVARIANTS, as_markdown
+from benchmarks.simulation.sequence import LINKS, run
+from gapbridge.bridge.daemon import daemon as daemon_module
+from gapbridge.bridge.daemon.control import Control
+from gapbridge.bridge.daemon.processes import LoopProcess
+from gapbridge.bridge.daemon.status import DaemonStatus
+from gapbridge.bridge.ipc.command_page import Command, Commands
+from gapbridge.bridge.loop.checks import LoopChecks
+from gapbridge.bridge.loop.link_monitor import ControllerClock, LinkMonitor
+from gapbridge.bridge.loop.loop import Loop
+from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
+from gapbridge.core.errors import StaleStateError
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.drivers.modbus import encode
+from gapbridge.drivers.ur_rtde.command import OffsetWriter, ServoWriter
+from gapbridge.drivers.ur_rtde.driver import UrRtdeDriver
+from gapbridge.drivers.ur_rtde.state import StateReader
+
+DOCS = Path(__file__).parents[2] / "docs" / "reliability.md"
+SEEDS = 200
+PARTS = 8  # so that two processes share them
+SERVOJ, OFFSET, MODBUS, CAN = range(4)  # seeds of each link
+Patch = pytest.MonkeyPatch
+Break = Callable[[Patch], None]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", range(PARTS))
+def test_what_must_hold_holds_whatever_goes_wrong(part: int) -> None:
+    found = [run(seed) for seed in range(part, SEEDS, PARTS)]
+    assert not [str(outcome) for outcome in found if outcome.violations]
+    assert sum(outcome.writes for outcome in found) > 50 * len(found)
+
+
+def test_a_seed_is_the_same_run_each_time() -> None:
+    first, second = list[str](), list[str]()
+    assert str(run(5, first.append)) == str(run(5, second.append))
+    assert first == second
+    assert len(first) > 5
+
+
+@pytest.mark.parametrize("link", LINKS)
+def test_a_run_without_faults_compensates_on_every_link(link: str) -> None:
+    outcome = run(list(LINKS).index(link), plan=[])
+    assert not outcome.violations
+    assert outcome.writes > 30
+    assert outcome.oldest < 0.04
+
+
+def test_every_fault_can_happen_on_some_link() -> None:
+    assert all(fault.links for fault in FAULTS)
+    assert {link for fault in FAULTS for link in fault.links} == set(LINKS)
+
+
+def test_the_page_has_the_list() -> None:
+    assert as_markdown() in DOCS.read_text(encoding="utf-8")
+
+
+# -- each of the list is found where the product is broken -----------------------------------------
+
+
+def _changed_offsets(change: Callable[[int, np.ndarray], np.ndarray]) -> Break:
+    """Have the writer of offsets send others than it is given."""
+
+    def apply(patch: Patch) -> None:
+        write, count = OffsetWriter.write, [0]
+
+        def other(self: Any, setpoint: Setpoint, state: Any) -> None:
+            count[0] += 1
+            offset = change(count[0], setpoint.offset_in_base)
+            write(self, setpoint._replace(offset_in_base=offset), state)
+
+        patch.setattr(OffsetWriter, "write", other)
+
+    return apply
+
+
+def _changed_joints(change: Callable[[int, np.ndarray], np.ndarray]) -> Break:
+    """Have the writer of joints send others than it is given."""
+
+    def apply(patch: Patch) -> None:
+        write, count = ServoWriter.write, [0]
+
+        def other(self: Any, setpoint: Setpoint, state: Any) -> None:
+            count[0] += 1
+            write(self, setpoint._replace(q=change(count[0], setpoint.q)), state)
+
+        patch.setattr(ServoWriter, "write", other)
+
+    return apply
+
+
+def _wrong_checksum(patch: Patch) -> None:
+    words = encode.mailbox_words
+    patch.setattr(
+        encode, "mailbox_words", lambda *given: [*(w := words(*given))[:-1], (w[-1] + 1) % 65521]
+    )
+
+
+def _writes_whenever_it_reads(patch: Patch) -> None:
+    read = UrRtdeDriver.read_state
+
+    def eager(self: Any) -> Any:
+        writer: Any = self._writer
+        if writer._io is not None:
+            writer._sequence += 1
+            writer._send([20000, 0, 0, 0, 0, 0])
+        return read(self)
+
+    patch.setattr(UrRtdeDriver, "read_state", eager)
+
+
+def _sees_no_stop(patch: Patch) -> None:
+    def check(self: Any, state: Any) -> None:
+        self.fine, self.robot = True, ""
+
+    patch.setattr(LoopChecks, "_check_robot", check)
+
+
+def _takes_old_states(patch: Patch) -> None:
+    """Go on with the last state where none comes, as if it were new."""
+    read = StateReader.read
+
+    def again(self: Any) -> Any:
+        try:
+            self.kept = read(self)
+        except StaleStateError:
+            self._changed = self._now()
+            now = self._now()
+            self.kept = self.kept._replace(timestamp=self.kept.timestamp + 0.008, received=now)
+        return self.kept
+
+    patch.setattr(StateReader, "read", again)
+    patch.setattr(ControllerClock, "expiry", lambda *_: math.inf)
+    patch.setattr(LinkMonitor, "believe", lambda *_: True)
+    patch.setattr(OffsetWriter, "_check_echo", lambda _: None)
+
+
+def _ties_clocks_while_writing(patch: Patch) -> None:
+    take = ControllerClock.take
+    patch.setattr(ControllerClock, "take", lambda self, state, writes=False: take(self, state))
+    patch.setattr(OffsetWriter, "_check_echo", lambda _: None)
+    patch.setattr(Supervisor, "take", _without(Supervisor.take, Cause.STALE))
+
+
+def _without(take: Any, cause: Cause) -> Any:
+    return lambda self, found, detail="": found != cause and take(self, found, detail)
+
+
+def _arms_by_itself(patch: Patch) -> None:
+    take = Commands.take
+
+    def eager(self: Any) -> list[Command]:
+        found = take(self)
+        self.eager = getattr(self, "eager", False) or Command.ARM in found
+        return found or ([Command.ARM] if self.eager else [])
+
+    patch.setattr(Commands, "take", eager)
+
+
+def _forgets_faults(patch: Patch) -> None:
+    lost = DaemonStatus.lost_loop
+
+    def forgetting(self: Any) -> None:
+        lost(self)
+        self.latched = ""
+
+    patch.setattr(DaemonStatus, "lost_loop", forgetting)
+
+
+def _leaves_the_table(patch: Patch) -> None:
+    take = Supervisor.take
+
+    def other(self: Any, cause: Cause, detail: str = "") -> bool:
+        before = self.state
+        if cause == Cause.DISARM and before == State.COMPENSATING:
+            self.state = State.OBSERVING
+            self._listener(before, State.OBSERVING, cause, detail)
+            return True
+        return bool(take(self, cause, detail))
+
+    patch.setattr(Supervisor, "take", other)
+
+
+def _answers_at_once(patch: Patch) -> None:
+    patch.setattr(Control, "_comes", lambda *_: True)
+
+
+def _never_stops(patch: Patch) -> None:
+    patch.setattr(LoopProcess, "ask_to_stop", lambda _: None)
+    patch.setattr(daemon_module, "STOP_MARGIN", 1e9)
+
+
+def _fails_at_doubt(patch: Patch) -> None:
+    def doubt(self: Any, detail: str, reason: Any = None) -> None:
+        raise KeyError(detail)
+
+    patch.setattr(LinkMonitor, "doubt", doubt)
+
+
+def _records_too_little(patch: Patch) -> None:
+    record = Loop._record
+
+    def other(self: Any, given: Any, setpoint: Any, attempted: bool = False, *_: Any) -> None:
+        record(self, given, setpoint, attempted, left=False)
+
+    patch.setattr(Loop, "_record", other)
+
+
+def _keeps_faults(patch: Patch) -> None:
+    patch.setattr(Loop, "_acknowledge", lambda _: None)
+
+
+BREAKS: list[tuple[str, int, list[tuple[float, str]], Break]] = [
+    ("envelope", OFFSET, [], _changed_offsets(lambda _, offset: 10.0 * offset)),
+    ("rate", OFFSET, [], _changed_offsets(lambda i, offset: offset * (i % 7 > 0))),
+    ("start", SERVOJ, [], _changed_joints(lambda i, q: q + 0.05)),
+    ("limits", SERVOJ, [], _changed_joints(lambda i, q: q * (math.nan if i == 20 else 1.0))),
+    ("allowed", MODBUS, [], _wrong_checksum),
+    ("state", OFFSET, [(0.1, "disarm")], _writes_whenever_it_reads),
+    ("stopped", OFFSET, [(0.1, "protective stop")], _sees_no_stop),
+    ("fresh", OFFSET, [(0.1, "controller's clock stands")], _takes_old_states),
+    ("age", OFFSET, [(0.1, "delay step")], _ties_clocks_while_writing),
+    ("asked", OFFSET, [(0.1, "disarm")], _arms_by_itself),
+    ("latched", CAN, [(0.1, "protective stop"), (0.3, "loop dies")], _forgets_faults),
+    ("table", OFFSET, [(0.1, "disarm")], _leaves_the_table),
+    ("taken", OFFSET, [(0.1, "protective stop")], _answers_at_once),
+    ("ends", MODBUS, [], _never_stops),
+    ("crash", MODBUS, [(0.1, "corruption")], _fails_at_doubt),
+    ("recorded", CAN, [], _records_too_little),
+    ("recovers", CAN, [(0.1, "protective stop")], _keeps_faults),
+]
+
+
+@pytest.mark.parametrize(
+    ("invariant", "seed", "plan", "breaks"), BREAKS, ids=[b[0] for b in BREAKS]
+)
+def test_a_broken_product_is_found(
+    monkeypatch: Patch, invariant: str, seed: int, plan: list[tuple[float, str]], breaks: Break
+) -> None:
+    breaks(monkeypatch)
+    for more in range(0, 20 * len(LINKS), len(LINKS)):  # faults draw their sizes by the seed
+        outcome = run(seed + more, plan=plan)
+        if any(violation.invariant == invariant for violation in outcome.violations):
+            return
+    pytest.fail(f"{invariant}: not found in {outcome}")
+
+
+def test_every_invariant_has_a_break() -> None:
+    assert [name for name, *_ in BREAKS] == list(INVARIANTS)

@@ -1,0 +1,129 @@
+"""What the demo hides in its arm is named: its fit and its diagnosis, on what its plant shows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gapbridge.bridge.cell import Cell, load_cell, save_cell
+from gapbridge.bridge.cell.simulation import _plant
+from gapbridge.bridge.demo.hidden import Accused
+from gapbridge.bridge.demo.job import _fit_again
+from gapbridge.bridge.demo.links import LINKS, DemoLink
+from gapbridge.bridge.demo.links.can import SOFTNESS
+from gapbridge.bridge.demo.poses import plan
+from gapbridge.bridge.demo.rests import Rests, joined, write_log
+from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.errors import CellError
+from gapbridge.core.estimation.identification import identify_compliance
+from gapbridge.core.log.log import read_log
+from gapbridge.core.rotation import rotation_vector
+from gapbridge.drivers.simulated.plant.plant import Load, Plant
+from gapbridge.drivers.simulated.plant.plant_arm import plant_arm
+from gapbridge.drivers.simulated.plant.plant_settings import draw_plant_settings
+
+TRACKER = 5e-6  # m, 1 sigma of the mean of a rest's readings
+
+
+def plant_of(link: DemoLink) -> Plant:
+    """Return the plant that the link serves, built without its server."""
+    arm = plant_arm(link.cell.arm)
+    settings = replace(draw_plant_settings(arm, link.seed), **_plant(link.cell))
+    if link.name == "can":
+        settings = replace(
+            settings, axial=tuple(SOFTNESS * v for v in settings.axial),
+            radial=tuple(SOFTNESS * v for v in settings.radial),
+        )  # fmt: skip
+    hidden: dict[str, Any] = dict(link.hidden.simulation)
+    return Plant(arm, replace(settings, **hidden), link.home)
+
+
+def measured(link: DemoLink, plant: Plant) -> Rests:
+    """Return the rests that the demo measures for its fit."""
+    rng = np.random.default_rng((link.seed, 5))
+    scene, parts = link.scene, []
+    planned = plan(link.cell.model, link.home, link.seed, scene)
+    for load, poses in zip(scene.calibration_loads, planned.calibration, strict=True):
+        plant.load = Load(load.mass, load.cog, load.wrench[:3], load.wrench[3:])
+        frames = []
+        for q in poses:
+            plant.q, plant.scatter = tuple(q), plant._draw_scatter()
+            frames.append(plant.true_tcp())
+        rows = load.rows(len(poses))
+        parts.append(Rests(
+            np.zeros(len(poses)), poses, poses, rows.payload_mass, rows.payload_cog, rows.wrench,
+            np.array([f.origin for f in frames]) + rng.normal(0, TRACKER, (len(poses), 3)),
+            np.array([rotation_vector(np.reshape(f.rotation, (3, 3))) for f in frames]),
+        ))  # fmt: skip
+    whole = joined(parts)
+    return replace(whole, timestamp=3.0 * np.arange(len(whole)))
+
+
+def errors(link: DemoLink, plant: Plant, cell: Cell) -> np.ndarray:
+    """Return the model's distance (m) from the plant over the demo's test poses."""
+    scene, found = link.scene, []
+    planned = plan(link.cell.model, link.home, link.seed, scene)
+    plant.scatter = (0.0,) * len(plant.q)
+    for load, poses in zip(scene.test_loads, planned.test, strict=True):
+        plant.load = Load(load.mass, load.cog, load.wrench[:3], load.wrench[3:])
+        expected = cell.model.predict(poses, load.rows(len(poses))).position
+        for q, position in zip(poses, expected, strict=True):
+            plant.q = tuple(q)
+            found.append(np.linalg.norm(position - plant.true_tcp().origin))
+    return np.array(found)
+
+
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [("ur_rtde", 5), ("can", 3), ("modbus", 3)]
+    + [pytest.param(n, s, marks=pytest.mark.slow) for n in sorted(LINKS) for s in range(6, 12)],
+)
+def test_what_is_hidden_is_named_on_every_link(tmp_path: Path, name: str, seed: int) -> None:
+    link = LINKS[name](tmp_path, seed)
+    plant, path = plant_of(link), tmp_path / "calibration.csv"
+    write_log(path, measured(link, plant), link.tells_joints)
+    log = read_log(path, link.cell.arm.n)
+    fitted = identify_compliance(link.cell.model, log, link.cell.metrology).model
+    save_cell(link.cell, tmp_path / "calibrated.yaml", fitted)
+    calibrated = load_cell(tmp_path / "calibrated.yaml")
+    causes = [c for ch in diagnose(calibrated.model, log, calibrated.metrology).channels
+              for c in ch.causes]  # fmt: skip
+    accused = [
+        Accused(
+            c.effect, c.joints, tuple((p.name, p.value, p.std or 0.0, p.unit) for p in c.parameters)
+        )
+        for c in causes
+    ]
+    assert link.hidden.denials(accused) == []
+    terms = [term for c in causes for term in c.terms]
+    save_cell(calibrated, tmp_path / "explained.yaml", calibrated.model.with_terms(terms))
+    corrected = _fit_again(path, load_cell(tmp_path / "explained.yaml"), tmp_path)
+    alone, both = (errors(link, plant, cell) for cell in (calibrated, corrected))
+    assert np.sqrt(np.mean(alone**2)) > 1e-3
+    assert np.sqrt(np.mean(both**2)) < 5e-5
+
+
+def test_simulated_zeros_and_a_bent_tool_move_the_true_tcp(tmp_path: Path) -> None:
+    link = LINKS["modbus"](tmp_path, 1)
+    text = link.cell.path.read_text()
+    link.cell.path.write_text(
+        text + "  zero: [0.001, 0, 0, 0, 0, 0]\n  tool_shift: [0, 0, 0.002]\n"
+    )
+    fields = _plant(load_cell(link.cell.path))
+    settings = replace(draw_plant_settings(plant_arm(link.cell.arm), 1), **_plant(link.cell))
+    plain, other = (
+        Plant(plant_arm(link.cell.arm), s, link.home)
+        for s in (settings, replace(settings, **fields))
+    )
+    plain.scatter = other.scatter = (0.0,) * 6
+    here = plain.true_tcp()
+    turned = np.array(here.origin) + 0.001 * np.cross([0, 0, 1], here.origin)
+    along = np.reshape(here.rotation, (3, 3))[:, 2]
+    np.testing.assert_allclose(other.true_tcp().origin, turned + 0.002 * along, atol=3e-6)
+    link.cell.path.write_text(text + "  zero: [0.001]\n")
+    with pytest.raises(CellError, match=r"simulation.zero: found 1 values, expected 6"):
+        _plant(load_cell(link.cell.path))
