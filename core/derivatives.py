@@ -21,6 +21,7 @@ LONGEST = 0.3  # s, no window reaches further either side
 BIAS_SHARE = 0.5  # of the noise: how much flattening a longer window may bring
 SMOOTH_SHARE = 0.7  # of the rows decide on the window; the rest may hold jumps
 TRIMMED = 0.3096  # mean square of the smallest 70 % of normal deviates, sigma 1
+FALLING, AHEAD = 0.7, 3  # times a change, within so many windows: below, it is noise that falls
 CLEAR = 4.5  # sigma of the noise beyond which windows disagree
 COARSE = 0.01  # of the derivative's rms: a smaller disagreement matters to nobody
 
@@ -63,13 +64,17 @@ def differentiate(signal: Array, step: float, order: int, longest: float = LONGE
     value, noise = np.empty((count, n)), np.zeros(n)
     chosen, unsure = np.zeros(n, dtype=int), np.zeros((count, n), dtype=bool)
     for j in range(n):
-        k = _widest([d[:, j] for d in tried], float(sigma[j]), filters)
+        changes = _changes([d[:, j] for d in tried])
+        k = _widest(changes, float(sigma[j]), filters)
         value[:, j], chosen[j] = tried[k][:, j], halves[k]
-        noise[j] = sigma[j] * np.linalg.norm(filters[k])
+        # a jittering clock, held samples and vibration are no white noise: more passes a window
+        passed = changes[k - 1] / _difference(filters[k - 1], filters[k]) if k else 0.0
+        spread = max(float(sigma[j]), float(np.sqrt(passed)))
+        noise[j] = spread * np.linalg.norm(filters[k])
         other = k - 1 if k else min(1, len(halves) - 1)
         change = np.abs(tried[other][:, j] - tried[k][:, j])
         typical = float(np.sqrt(np.mean(value[:, j] ** 2)))
-        unsure[:, j] = _jumps(change, typical, sigma[j], filters[other], filters[k])
+        unsure[:, j] = _jumps(change, typical, spread, filters[other], filters[k])
     return Derivative(value, noise, int(chosen.max(initial=3)), unsure)
 
 
@@ -93,20 +98,29 @@ def _filtered(signal: Array, half: int, order: int, step: float) -> Array:
     )
 
 
-def _widest(tried: list[Array], sigma: float, filters: list[Array]) -> int:
-    """Return the number of the widest window before the motion itself is flattened.
+def _changes(tried: list[Array]) -> list[float]:
+    """Return the mean square change of a derivative from each window to the next wider one.
 
-    A change from window to window is noise where white noise explains it, or where it still falls
-    steeply with the width (quantised angles are no white noise).
+    The rows that change most are left out: the motion may jump there.
     """
     changes = []
     for one, other in pairwise(tried):
         squares = np.sort((other - one) ** 2)[: int(SMOOTH_SHARE * len(one))]
         changes.append(float(squares.mean()) / TRIMMED)
+    return changes
+
+
+def _widest(changes: list[float], sigma: float, filters: list[Array]) -> int:
+    """Return the number of the widest window before the motion itself is flattened.
+
+    A change from window to window is noise where white noise explains it, or where it still falls
+    with the width: that of a motion being flattened grows (as the width squared).
+    """
     for k, change in enumerate(changes):
         explained = 1.1 * _difference(filters[k], filters[k + 1])
         allowed = BIAS_SHARE**2 * float(filters[k + 1] @ filters[k + 1])
-        falls = k + 1 < len(changes) and changes[k + 1] < 0.5 * change
+        ahead = changes[k + 1 : k + 1 + AHEAD]
+        falls = bool(ahead) and min(ahead) < FALLING * change
         if change > sigma**2 * (explained + allowed) and not falls:
             return k
     return len(changes)
@@ -115,11 +129,14 @@ def _widest(tried: list[Array], sigma: float, filters: list[Array]) -> int:
 def _jumps(
     change: Array, typical: float, sigma: float, h: Array, other: Array
 ) -> NDArray[np.bool_]:
-    """Return where (N,) two windows disagree, and the rows beside that the wider one mixes in."""
+    """Return where (N,) two windows disagree, and the rows between within reach of the wider one.
+
+    Around a jump the disagreement changes its sign; beyond its ends the windows agree again.
+    """
     limit = max(CLEAR * sigma * np.sqrt(_difference(h, other)), COARSE * typical)
-    clear = (change > limit).astype(float)
-    half = max(len(h), len(other)) // 2
-    return np.asarray(np.convolve(clear, np.ones(2 * half + 1), mode="same") > 0.5)
+    reach = np.ones(2 * (max(len(h), len(other)) // 2) + 1)
+    within = np.convolve(change > limit, reach, mode="same") > 0.5
+    return np.asarray(np.convolve(~within, reach, mode="same") < 0.5)
 
 
 def _difference(h: Array, wider: Array) -> float:

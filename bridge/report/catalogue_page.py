@@ -12,7 +12,7 @@ from pathlib import Path
 from gapbridge.bridge.report.labels import CHANNELS as CHANNEL_TITLES
 from gapbridge.bridge.report.labels import effect_title
 from gapbridge.core.arm import builtin_arm
-from gapbridge.core.effects import CATALOGUE, CHANNELS, Effect
+from gapbridge.core.effects import CATALOGUE, CHANNELS, Effect, ties_of
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "catalogue.md"
 HEAD = """\
@@ -53,6 +53,8 @@ def _effect(effect: Effect) -> str:
     lines.append(f"- shows in: {', '.join(effect.channels)}; sits at: {_place(effect)}")
     if effect.motion:
         lines.append(f"- the log must hold: {effect.motion}")
+    for other, data in ties_of(effect.identifier).items():
+        lines.append(f"- looks the same as `{other}` on: {data}")
     if effect.needs:
         lines.append(f"- columns beyond the channel's own: {', '.join(effect.needs)}")
     names = [

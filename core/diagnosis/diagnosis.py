@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from gapbridge.core.diagnosis.carrying import Carried, carried
 from gapbridge.core.diagnosis.channels import position, torque, tracking, wrench
 from gapbridge.core.diagnosis.channels.simulation import joined, predicted_by
-from gapbridge.core.diagnosis.every_row import on_every_row, still_accused
+from gapbridge.core.diagnosis.every_row import on_every_row, still_accused, with_vague
 from gapbridge.core.diagnosis.generalisation import NOWHERE, Generalisation, generalisation
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import (
@@ -278,6 +278,7 @@ def _channel(
     if whole is not seen:
         if progress:
             progress(f"{seen.channel}: all {len(whole.rows)} rows")
+        verdict = with_vague(verdict)
         selection = on_every_row(searched, verdict, whole, model)
         held = HeldOut(selection)
         selection, verdict = still_accused(selection, verdict, held, model)

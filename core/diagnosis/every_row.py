@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.diagnosis.criteria import TIE
+from gapbridge.core.diagnosis.criteria import OWN_SIGMAS, SIGMAS, TIE
 from gapbridge.core.diagnosis.held_out import HeldOut
-from gapbridge.core.diagnosis.judgement import Judgement
+from gapbridge.core.diagnosis.judgement import VAGUE, Judgement
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.regions import regions
 from gapbridge.core.diagnosis.selection.candidate import Candidate
@@ -24,7 +24,7 @@ from gapbridge.core.diagnosis.selection.local_search import rivals
 from gapbridge.core.diagnosis.selection.noise import carried_to
 from gapbridge.core.diagnosis.selection.outliers import inliers
 from gapbridge.core.diagnosis.selection.problem import fit
-from gapbridge.core.diagnosis.selection.refit import Remainder, refit
+from gapbridge.core.diagnosis.selection.refit import Remainder, refit, worth
 from gapbridge.core.diagnosis.selection.selection import Selection, standing
 from gapbridge.core.diagnosis.selection.state import Work, sample_space
 from gapbridge.core.effects import Term
@@ -32,6 +32,15 @@ from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 MOST_RIVALS = 12  # of all causes together
+
+
+def with_vague(judgement: Judgement) -> Judgement:
+    """Return the judgement with what was too vague on some rows accused: all rows decide on it."""
+    vague = tuple(p for p, why in judgement.withdrawn if why == VAGUE)
+    return replace(
+        judgement, accused=(*judgement.accused, *vague), vague=vague,
+        withdrawn=tuple((p, why) for p, why in judgement.withdrawn if p not in vague),
+    )  # fmt: skip
 
 
 def on_every_row(
@@ -85,8 +94,10 @@ def still_accused(
 ) -> tuple[Selection, Judgement]:
     """Return what all rows leave accused: effects that shrink the gap where nothing was fitted.
 
-    The weakest goes first. Ties that all rows decide are none any more.
+    The weakest goes first; of what was vague before, it has to be sure now. Ties that all rows
+    decide are none any more.
     """
+    selection, judgement = _sure(selection, judgement, model)
     accused, withdrawn = list(judgement.accused), list(judgement.withdrawn)
     while accused and held.possible:
         effects = dict.fromkeys(selection.terms[p].effect for p in accused)
@@ -103,15 +114,36 @@ def still_accused(
         accused = [p for p in accused if p not in gone]
         withdrawn += [(p, "over all rows the gap does not shrink by it") for p in gone]
     if tuple(accused) != judgement.accused:
-        whole = standing(selection, model.arm, accused)
-        links = {p: own for p, own in selection.prior.items() if p in accused}
-        whole = replace(whole, prior=links)
-        single = tuple(p for p in accused if p not in links)
-        selection = replace(whole, found=fit(whole.working, single))
+        selection = _alone(selection, accused, model)
     ties = {p: _ties(selection, p) for p in accused if p not in selection.prior}
     return selection, replace(
         judgement, accused=tuple(accused), withdrawn=tuple(withdrawn), ties=ties
     )
+
+
+def _sure(selection: Selection, judgement: Judgement, model: Model) -> tuple[Selection, Judgement]:
+    """Return what stays of effects that were vague on some rows: values that are many sigmas."""
+    accused, withdrawn, vague = list(judgement.accused), list(judgement.withdrawn), judgement.vague
+    least = (SIGMAS / OWN_SIGMAS) ** 2
+    while True:
+        sure = {
+            p: worth(selection.terms[p], selection.covariance[p]) for p in vague if p in accused
+        }
+        weakest = min(sure, key=lambda p: sure[p], default=None)
+        if weakest is None or sure[weakest] >= least:
+            return selection, replace(judgement, accused=tuple(accused), withdrawn=tuple(withdrawn))
+        accused.remove(weakest)
+        withdrawn.append((weakest, VAGUE))
+        selection = _alone(selection, accused, model)
+
+
+def _alone(selection: Selection, accused: Sequence[int], model: Model) -> Selection:
+    """Return the selection on all rows with some of its terms refitted as all there is."""
+    whole = standing(selection, model.arm, accused)
+    links = {p: own for p, own in selection.prior.items() if p in accused}
+    whole = replace(whole, prior=links)
+    single = tuple(p for p in accused if p not in links)
+    return replace(whole, found=fit(whole.working, single))
 
 
 def _ties(selection: Selection, position: int) -> tuple[str, ...]:

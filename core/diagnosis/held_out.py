@@ -73,9 +73,10 @@ class HeldOut:
         A = np.hstack([self._raw.columns(self._space, chosen), self._nuisance])
         if not A.shape[1]:
             return self._target
-        unit = 1 / np.sqrt(np.einsum("ij,ij->j", A, A) + 1e-300)
-        A = A * unit
         pull = np.concatenate([self._pull(chosen), np.zeros(self._nuisance.shape[1])])
+        # with the pull: of a number that moves nothing only the pull is there
+        unit = 1 / np.sqrt(np.einsum("ij,ij->j", A, A) + pull**2 + 1e-300)
+        A = A * unit
         whole, g = A.T @ A + np.diag((pull * unit) ** 2), A.T @ self._target
         left = np.empty_like(self._target)
         for k in range(self._folds):

@@ -52,6 +52,7 @@ from gapbridge.core.diagnosis.selection.selection import Selection, standing
 from gapbridge.core.errors import InputError
 
 Array = NDArray[np.float64]
+VAGUE = "its value may as well be none"
 BESIDE = "it does not keep its value beside the unknown that is left"
 
 
@@ -68,6 +69,7 @@ class Judgement:
     ties: dict[int, tuple[str, ...]]  # position -> effects that would do as well
     withdrawn: tuple[tuple[int, str], ...]  # position, reason
     remainder: Remainder | None = None  # unnamed functions that account for what is left
+    vague: tuple[int, ...] = ()  # positions that some rows leave vague: all rows decide
     stand_ins: tuple[
         int, ...
     ] = ()  # positions not accused that shrink the gap in regions not fitted
@@ -165,7 +167,7 @@ def _no_value(selection: Selection) -> dict[int, str]:
         ):
             found[position] = "its value stands on its bound"
         if worth(term, spread) < 1:
-            found[position] = "its value may as well be none"
+            found[position] = VAGUE
         usual = [p.scale for p in candidate.parameters]
         if candidate.curve is None and all(
             abs(v) < MINUTE * size for v, size in zip(term.values, usual, strict=False)

@@ -81,6 +81,15 @@ CATALOGUE: dict[str, Effect] = {
 }
 
 
+def ties_of(identifier: str) -> dict[str, str]:
+    """Return the effects that look the same on some data as this one, and on which data."""
+    found = dict(CATALOGUE[identifier].alike)
+    for name, effect in CATALOGUE.items():
+        if identifier in effect.alike:
+            found[name] = effect.alike[identifier]
+    return found
+
+
 def flexibility_effects() -> dict[str, str]:
     """Return the effect behind each key of a cell's compliance section: axial, radial."""
     return {e.flexibility: name for name, e in CATALOGUE.items() if e.flexibility}
@@ -128,4 +137,5 @@ __all__ = [
     "effect_named",
     "flexibility_effects",
     "settling",
+    "ties_of",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
 from gapbridge.core.kernels.interpolation import played, stretches
@@ -34,6 +34,11 @@ class DeadBand(JointEffect):
     by_approach = True
     channels = ("tracking",)
     motion = "the joint moved both ways, or poses reached from both sides"
+    alike: ClassVar = {
+        "latency": "motion at one speed each way",
+        "tracking_lag": "motion at one speed each way",
+    }
+    instead = "in the controller's settings, or a second, limited joint behind each servo"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the half width w."""

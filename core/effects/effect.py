@@ -11,6 +11,7 @@ prediction.
 from __future__ import annotations
 
 from abc import ABC
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -83,6 +84,7 @@ class Effect(ABC):
     channels: ClassVar[tuple[str, ...]]
     needs: ClassVar[tuple[str, ...]] = ()  # log columns beyond those of its channel
     motion: ClassVar[str] = ""  # what a log must contain so that the effect shows
+    alike: ClassVar[Mapping[str, str]] = {}  # another effect: the data on which it looks the same
     instead: ClassVar[str] = ""  # what people do where a simulator's model cannot hold it
 
     # how people read it

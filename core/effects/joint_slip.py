@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term, rows_after
 from gapbridge.core.effects.simulator import Kind, SimulatorChange
@@ -33,6 +33,7 @@ class JointSlip(JointEffect):
     at_moment = True
     channels = ("position",)
     motion = "poses before and after the moment, that differ in the other joints"
+    alike: ClassVar = {"joint_offset": "no pose before the moment"}
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the step, and when it happened."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -33,8 +33,11 @@ class LinkCog(JointEffect):
     order = 22
     carried = True
     felt_by_all = True
+    together = True
     channels = ("torque",)
     motion = "poses that turn the link against gravity, or its accelerations"
+    alike: ClassVar = {"link_inertia": "poses at which the link pulls in one direction"}
+    instead = "move the link's centre of mass by the first moment over its mass"
 
     def sites(self, arm: Arm) -> tuple[Site, ...]:
         """Return the links that have a mass."""

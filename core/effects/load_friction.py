@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -32,6 +32,8 @@ class LoadFriction(JointEffect):
     order = 53
     channels = ("torque",)
     motion = "the joint moved both ways under loads that change"
+    alike: ClassVar = {"coulomb_friction": "motion under one load"}
+    instead = "friction by load in the control loop, or the simulator's actuator"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the share of the load."""

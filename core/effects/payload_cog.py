@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -39,6 +39,10 @@ class PayloadCog(Effect):
     corrects = "payload"
     channels = ("position", "wrench", "torque")
     motion = "a payload, and poses that turn the flange against gravity"
+    alike: ClassVar = {
+        "link_cog": "one constant load: the last link's first moment is the load's mass times it"
+    }
+    instead = "move the centre of mass of the body that models the load"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the shift in flange axes."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term, typical_moment
 from gapbridge.core.effects.simulator import Kind, SimulatorChange
@@ -32,6 +32,7 @@ class ServoDroop(JointEffect):
     order = 60
     channels = ("tracking",)
     motion = "poses, payloads or pulls that change the torque that the joint holds"
+    alike: ClassVar = {"dead_band": "one torque at each joint, reached from one side"}
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the droop per torque."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -33,6 +33,8 @@ class StribeckFriction(JointEffect):
     order = 54
     channels = ("torque",)
     motion = "the joint moved both ways, slowly and fast"
+    alike: ClassVar = {"coulomb_friction": "motion at one low speed"}
+    instead = "friction by speed in the control loop, or the simulator's actuator"
     shapes = tuple(float(v) for v in np.geomspace(4e-3, 0.6, 9))
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -34,6 +34,11 @@ class TargetSlip(Effect):
     at_moment = True
     channels = ("position",)
     motion = "poses before and after the moment, that differ in the orientation of the flange"
+    alike: ClassVar = {
+        "tool_frame": "no pose before the moment",
+        "joint_slip": "one orientation of the flange after the moment",
+    }
+    instead = "none needed: a simulated target does not move"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the shift in flange axes, and when it happened."""

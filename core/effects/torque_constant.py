@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
 
@@ -28,6 +28,7 @@ class TorqueConstant(JointEffect):
     felt_by_all = True
     channels = ("torque",)
     motion = "a joint that carries torque, the more changing the better"
+    alike: ClassVar = {"link_inertia": "a joint that carries one link alone"}
     instead = "scale the measured torque by 1 / (1 + value) before it is compared"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:

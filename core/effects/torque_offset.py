@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from gapbridge.core.effects.coulomb_friction import joint_scale
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
@@ -31,6 +31,11 @@ class TorqueOffset(JointEffect):
     order = 95
     channels = ("torque",)
     motion = "the joint moved both ways, at poses that change its weight"
+    alike: ClassVar = {
+        "coulomb_friction": "motion of the joint one way only",
+        "link_cog": "a joint whose weight never changes",
+    }
+    instead = "subtract the offset from the measured torque before it is compared"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the offset."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -30,6 +30,7 @@ class ViscousFriction(JointEffect):
     order = 51
     channels = ("torque",)
     motion = "the joint moved at several speeds"
+    alike: ClassVar = {"coulomb_friction": "motion at one speed"}
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the coefficient."""

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from test_equilibrium import SEVEN
 
-from gapbridge.core.arm import arm_from_dh, builtin_rows
+from gapbridge.core.arm import arm_from_dh, builtin_arm, builtin_rows
 from gapbridge.core.dynamics import predict_torque, predict_tracking, predict_wrench, with_pieces
-from gapbridge.core.effects import CATALOGUE, CHANNELS, Site, Term, effect_named
+from gapbridge.core.effects import CATALOGUE, CHANNELS, Effect, Site, Term, effect_named, ties_of
 from gapbridge.core.errors import InputError
 from gapbridge.core.loads import Loads
 from gapbridge.core.log.log import Log
@@ -124,3 +124,35 @@ def test_every_member_changes_every_channel_that_it_declares(name, channel):
         values = tuple(p.scale for p in member.parameters(arm, place))
         moved = _predicted(channel, model, [Term(name, place, values)])
         assert np.abs(moved - plain).max() > 1e-8, (name, channel, site.joint)
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_ties_are_mutual_declared_once_and_shown_in_a_common_channel(name):
+    for other, data in ties_of(name).items():
+        assert data
+        assert ties_of(other)[name] == data
+        assert not (name in CATALOGUE[other].alike and other in CATALOGUE[name].alike)
+        assert {*CATALOGUE[name].channels} & {*CATALOGUE[other].channels}
+
+
+def test_the_last_links_first_moment_and_the_loads_centre_are_the_same_under_one_load():
+    arm, rng = builtin_arm("ur10e"), np.random.default_rng(1)
+    q = rng.uniform(-2, 2, (40, arm.n))
+    log = Log("poses.csv", {"actual_q": q}, arm.n)
+    model = Model(arm, payload_mass=2.0, payload_cog=np.array([0.0, 0.0, 0.05]))
+    motion = with_pieces(model, motion_of(log))
+    nominal = predict_torque(model, motion)
+    shift = np.array([0.02, -0.01, 0.0])  # flange axes: those of the last row's frame
+    by_load = predict_torque(model, motion, [Term("payload_cog", Site(), tuple(shift))])
+    moment = tuple(2.0 * shift)
+    by_link = predict_torque(model, motion, [Term("link_cog", Site(arm.n), moment)])
+    assert np.abs(by_load - nominal).max() > 0.1
+    assert np.allclose(by_load, by_link, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_what_no_simulator_holds_says_what_to_do_instead(name):
+    effect = CATALOGUE[name]
+    in_chain = type(effect).shape is not Effect.shape
+    asked = type(effect).simulator is not Effect.simulator
+    assert in_chain or asked or effect.instead

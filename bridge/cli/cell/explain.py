@@ -7,7 +7,7 @@ import inspect
 import click
 
 from gapbridge.core.arm import builtin_arm
-from gapbridge.core.effects import CATALOGUE, CHANNELS, Effect, effect_named
+from gapbridge.core.effects import CATALOGUE, CHANNELS, Effect, effect_named, ties_of
 
 
 @click.command()
@@ -36,6 +36,8 @@ def explanation(effect: Effect) -> str:
     lines = [effect.identifier, "", inspect.getdoc(effect) or "", "", f"shows in: {channels}"]
     if effect.motion:
         lines.append(f"needs motion: {effect.motion}")
+    for other, data in ties_of(effect.identifier).items():
+        lines.append(f"looks the same as {other} on: {data}")
     if effect.needs:
         lines.append(f"needs columns: {', '.join(effect.needs)}")
     lines.append("sits at: " + ("one joint each" if sites[0].joint else "the whole arm"))

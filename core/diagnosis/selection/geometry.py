@@ -1,6 +1,9 @@
-"""The geometry of all links as one cause: many small numbers, none of which stands out alone.
+"""All links as one cause: many small numbers, none of which stands out alone.
 
-Its numbers have a prior (a normal one of an engineer's size), so that what the data do not show
+The geometry of the links in positions; their first moments in torques, of which only combinations
+show (base parameters; Gautier, Khalil, IEEE Trans. Robotics and Automation 6 (1990) 368).
+
+The numbers have a prior (a normal one of an engineer's size), so that what the data do not show
 stays nominal. To a search it is then one more source of correlated noise: the sample space is
 whitened by it, and log det of what it adds is the price that it pays (marginal likelihood).
 """
@@ -13,7 +16,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.diagnosis.criteria import ANGLE, GEOMETRIC, LENGTH, MARGIN, SHARES
+from gapbridge.core.diagnosis.criteria import (
+    ANGLE,
+    FEW_LINKS,
+    GEOMETRIC,
+    LENGTH,
+    MARGIN,
+    SHARES,
+)
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.problem import Found, Space
 from gapbridge.core.diagnosis.selection.search import screened_search
@@ -29,7 +39,8 @@ def members(space: Space) -> tuple[int, ...]:
 
 def prior(candidate: Candidate, share: float = 1.0) -> Array:
     """Return 1 sigma (d,) of each number of a link; ``share`` is that of an engineer's size."""
-    return np.array([share * (LENGTH if p.unit == "m" else ANGLE) for p in candidate.parameters])
+    usual = {"m": LENGTH, "rad": ANGLE}
+    return np.array([share * usual.get(p.unit, p.scale) for p in candidate.parameters])
 
 
 @dataclass(frozen=True)
@@ -79,7 +90,8 @@ def with_links(
     beside that set, or where it holds several geometric causes.
     """
     block = members(space)
-    if len(block) < 2:
+    moments = [c for c in best.chosen if c in block and _of_mass(space.candidates[c])]
+    if len(block) < 2 or (_of_mass(space.candidates[block[0]]) and len(moments) < FEW_LINKS):
         return space, best, {}
     tried = []
     for share in SHARES:
@@ -103,6 +115,11 @@ def with_links(
 def _geometric(candidate: Candidate) -> bool:
     """Return whether this is a link's geometry or the zero of a joint."""
     return candidate.effect.together or (candidate.turns_its_joint and not candidate.periodic)
+
+
+def _of_mass(candidate: Candidate) -> bool:
+    """Return whether a link's numbers are first moments: one link can well be off alone."""
+    return any(p.unit == "kg m" for p in candidate.parameters)
 
 
 def _beside_set(space: Space, best: Found, links: Links, block: Sequence[int]) -> float:

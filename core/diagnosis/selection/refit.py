@@ -74,9 +74,10 @@ def refit(
         nuisance = flat(observation.nuisance, work)
         A = np.hstack([*blocks, extra, nuisance])
         b = flat(gap[..., None], work)[:, 0]
-        size = np.sqrt(np.einsum("ij,ij->j", A, A))
-        unit = np.where(size > 1e-150, 1 / np.maximum(size, 1e-150), 0.0)  # 0: moves nothing
         pull, towards = _pull(usual, x, A.shape[1], remainder, nuisance.shape[1])
+        # with the pull: what the data do not show is as large as its prior, and hides no other
+        size = np.sqrt(np.einsum("ij,ij->j", A, A) + np.einsum("ij,ij->j", pull, pull))
+        unit = np.where(size > 1e-150, 1 / np.maximum(size, 1e-150), 0.0)  # 0: moves nothing
         step = _step(np.vstack([A, pull]), np.concatenate([b, towards]), unit, freed, index, x)
         sizes = [len(v) for v in x]
         cuts = np.cumsum([*sizes, extra.shape[1]])

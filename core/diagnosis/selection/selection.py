@@ -31,7 +31,7 @@ from gapbridge.core.diagnosis.selection.geometry import (
     prior,
     with_links,
 )
-from gapbridge.core.diagnosis.selection.local_search import pruned
+from gapbridge.core.diagnosis.selection.local_search import grown, pruned
 from gapbridge.core.diagnosis.selection.moments import step_candidates
 from gapbridge.core.diagnosis.selection.noise import Noise, estimate_noise
 from gapbridge.core.diagnosis.selection.outliers import (
@@ -51,6 +51,7 @@ from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 ROUNDS = 8
+NOTHING = 1e-4  # worth of a value: a thirtieth of its sigma
 FORBIDDEN = 1e9  # a price that no fit is worth
 
 
@@ -228,22 +229,29 @@ def select(
         used = sum(len(v) for v in best.values) + (links_of(space, links).used if links else 0)
         free = 1 - used / space.freedom
         changed = look_again(work, _less_smooth(work, space, best, smooth, residual), free)
-        if same and not changed:
-            single = [p for p, c in enumerate(index) if c not in links]
-            share = [worth(terms[p], covariance[p]) for p in single]
-            # beside an unnamed function a value is not yet what it comes to without
-            if min(share, default=1.0) >= 1 or len(best.chosen) > len(single):
-                break
+        single = [p for p, c in enumerate(index) if c not in links]
+        share = [worth(terms[p], covariance[p]) for p in single]
+        settled = same and not changed
+        # beside an unnamed function a value is not yet what it comes to without; but what shows
+        # nothing by itself (the scale of a torque that is not there) keeps the place of what does
+        least = 1.0 if settled and len(best.chosen) <= len(single) else NOTHING
+        if min(share, default=1.0) < least:
             weakest = single[int(np.argmin(share))]
             none.add((terms[weakest].effect, terms[weakest].site))
             terms = terms[:weakest] + terms[weakest + 1 :]
+        elif settled:
+            break
         base = terms
     assert space is not None and near is not None and found is not None
     if len(space.y) >= LARGE and any(not space.candidates[c].named for c in found.chosen):
         work.kept, work.noise = counted.copy(), whitened_by
         # what goes into a model has to predict without the unnamed function beside it
-        alone = fit(near, [c for c in found.chosen if space.candidates[c].named])
+        named = [c for c in found.chosen if space.candidates[c].named]
+        # nor may it stand where a named cause would without it: friction of the same joint
+        alone = fit(near, named)
+        alone = pruned(near, grown(near, alone, named_only=True))
         terms, index, covariance, residual = refit(work, space, alone, links)
+        found = fit(near, (*alone.chosen, *(c for c in found.chosen if c not in named)))
     return Selection(
         work.observation, space, found, terms, index, covariance, counted, whitened_by,
         residual, base, raw, links,

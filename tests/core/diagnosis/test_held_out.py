@@ -126,3 +126,18 @@ def test_two_conditions_are_needed(selection):
         ),
     )
     assert not HeldOut(one).possible
+
+
+def test_a_number_that_moves_nothing_takes_nothing_from_the_others(selection):
+    """Of a link kept near nominal that the samples do not show only its prior is there."""
+    chosen = list(selection.found.chosen)
+    dead = next(c for c in range(len(selection.space.candidates)) if c not in chosen)
+    own = selection.space.column_indices([dead])
+    X, taken = selection.space.X.copy(), selection.raw.taken.copy()
+    X[:, own] = taken[:, own] = 0.0
+    blind = replace(
+        selection, space=replace(selection.space, X=X), raw=replace(selection.raw, taken=taken),
+        prior={dead: np.full(len(own), 1e-3)},
+    )  # fmt: skip
+    held = HeldOut(blind)
+    assert held.rms([*chosen, dead]) == pytest.approx(held.rms(chosen), rel=1e-6)

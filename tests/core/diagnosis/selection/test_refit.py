@@ -112,3 +112,32 @@ def test_what_cannot_be_negative_stays_on_its_bound():
     behind = small.turned(2, lambda s, q: -2e-4 * s.approach[:, 1])
     _, (term,), _, _ = refitted(exact(behind), [("backlash", 2)])
     assert term.values[0] == pytest.approx(4e-4, abs=1e-8)
+
+
+def test_a_number_that_moves_nothing_hides_no_other():
+    """A term whose column is rounding alone (a torque scaled that is not there) stays vague."""
+    wanted = [("joint_offset", 2), ("axial_compliance", 3)]
+    metrology = Metrology(registered=True, sigma=small.SIGMA)
+    seen = observe(MODEL, small.log_of(SESSION, exact(offset(2, 0.01))), metrology)
+    assert isinstance(seen, Observation)
+
+    nominal = seen.predict(())
+
+    def predict(terms):
+        dead = sum(t.values[0] for t in terms if t.effect == "axial_compliance")
+        others = [t for t in terms if t.effect != "axial_compliance"]
+        return seen.predict(others) - nominal + 1e-15 * dead / 1e-5
+
+    deaf = replace(seen, measured=seen.measured - nominal, predict=predict)
+    candidates = [c for c in named_candidates(MODEL.arm, "position", turns=[1.0] * 3)
+                  if (c.family, c.site.joint) in wanted]  # fmt: skip
+    kept = np.ones(len(seen.rows), dtype=bool)
+    noise = estimate_noise(deaf, np.full(deaf.measured.shape, small.FLOOR), kept)
+    work = Work(deaf, MODEL.arm, candidates, noise, kept)
+    columns = [named_columns(deaf, c, ()) for c in candidates]
+    space, *_ = sample_space(work, columns, (), [])
+    alone = [c.family for c in candidates].index("joint_offset")
+    _, _, (expected,), _ = refit(work, space, fit(space, (alone,)))
+    terms, _, covariance, _ = refit(work, space, fit(space, (0, 1)))
+    assert terms[alone].values[0] == pytest.approx(0.01, abs=1e-6)
+    assert covariance[alone][0, 0] == pytest.approx(expected[0, 0], rel=0.05)

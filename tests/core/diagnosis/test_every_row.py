@@ -1,0 +1,57 @@
+"""All rows of a long log decide on what a search on some of them left open."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import small_arm as small
+
+from gapbridge.core.diagnosis.every_row import on_every_row, still_accused, with_vague
+from gapbridge.core.diagnosis.held_out import HeldOut
+from gapbridge.core.diagnosis.judgement import VAGUE, judge
+
+
+@pytest.fixture(scope="module")
+def searched():
+    selection = small.diagnosed("backlash").channels[0].selection
+    return selection, judge(selection, HeldOut(selection))
+
+
+def on_all(selection, judgement):
+    """Return the selection on all rows, and its held-out figures."""
+    whole = on_every_row(selection, judgement, selection.observation, small.model_of())
+    return whole, HeldOut(whole)
+
+
+def withdrawn_as_vague(judgement, position):
+    rest = tuple(p for p in judgement.accused if p != position)
+    return replace(judgement, accused=rest, withdrawn=(*judgement.withdrawn, (position, VAGUE)))
+
+
+def test_what_was_too_vague_on_some_rows_is_accused_where_all_rows_are_sure(searched):
+    selection, judgement = searched
+    position = judgement.accused[0]
+    asked = with_vague(withdrawn_as_vague(judgement, position))
+    assert asked.vague == (position,)
+    whole, held = on_all(selection, asked)
+    _, decided = still_accused(whole, asked, held, small.model_of())
+    assert position in decided.accused
+    assert position not in dict(decided.withdrawn)
+
+
+def test_what_is_vague_on_all_rows_too_is_withdrawn(searched):
+    selection, judgement = searched
+    position = judgement.accused[0]
+    asked = with_vague(withdrawn_as_vague(judgement, position))
+    whole, held = on_all(selection, asked)
+    covariance = list(whole.covariance)
+    value = np.array(whole.terms[position].values[: len(covariance[position])])
+    covariance[position] = np.diag((value / 4.0) ** 2)  # enough for a word, not for an accusation
+    unsure = replace(whole, covariance=tuple(covariance))
+    _, decided = still_accused(unsure, asked, held, small.model_of())
+    assert position not in decided.accused
+    assert dict(decided.withdrawn)[position] == VAGUE
+    _, kept = still_accused(unsure, judgement, held, small.model_of())
+    assert position in kept.accused  # what some rows were sure of is not asked again
