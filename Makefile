@@ -5,7 +5,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: help demo test check coverage bench faults simulate clean
+.PHONY: help demo test check coverage bench faults simulate mutants clean
 
 help:
 	@echo "make demo      the whole job on a simulated cell; results in out/demo"
@@ -14,6 +14,7 @@ help:
 	@echo "make coverage  all tests, and which lines of core and drivers they reach"
 	@echo "make bench     speed beside peers, in one run; figures in out/speed.json, out/fleet.json"
 	@echo "make faults    every fault on the real wire, and random ones; fills docs/reliability.md"
+	@echo "make mutants   small mistakes put into the product one at a time, and which go unnoticed"
 	@echo "make simulate  whole runs with faults in simulated time; SEEDS=100000, FIRST=0"
 	@echo "make clean     remove .venv and everything that was made"
 
@@ -53,6 +54,9 @@ MINUTES ?= 120
 faults: .venv/.test
 	$(BIN)/python -m benchmarks.faults --repeat $(REPEAT) --sequences $(SEQUENCES) \
 		--minutes $(MINUTES) --page
+
+mutants: .venv/.test
+	$(BIN)/python -m benchmarks.mutants --out out/mutants.jsonl
 
 # SEEDS: how many runs. One of them again: .venv/bin/python -m benchmarks.simulation --seed N
 SEEDS ?= 2000

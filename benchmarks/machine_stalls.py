@@ -12,7 +12,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Collection, Sequence
-from types import TracebackType
 from typing import Self
 
 PRIORITY = 90  # SCHED_FIFO: before every loop, controller and interrupt thread
@@ -50,12 +49,7 @@ class MachineStalls:
             )
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         found: list[Span] = []
         allowed = True
         for watcher in self._watchers:

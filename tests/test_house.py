@@ -160,3 +160,22 @@ def test_what_the_package_states_is_there_and_nothing_else_is_imported_for_it() 
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120
     )
     assert done.stdout.split() == ["set()", "set()"], done.stdout + done.stderr
+
+
+PRIVATE = {"told", "tell", "words", "wild", "calm", "raw", "foresight", "lacking", "leftover"}
+"""What no engineer of the field would call a thing."""
+IN_THE_FIELDS_WORDS = ("bridge/document", "bridge/report", "bridge/calibration/report",
+                       "bridge/fleet/report", "bridge/web")  # fmt: skip
+FOREIGN_NAMES = {"label_words"}  # an attribute of effects
+
+
+@pytest.mark.parametrize("folder", IN_THE_FIELDS_WORDS)
+def test_identifiers_are_in_the_fields_words(folder: str) -> None:
+    for file in (ROOT / folder).rglob("*.py"):
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        names = {n.id for n in ast.walk(tree) if isinstance(n, ast.Name)}
+        names |= {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
+        names |= {n.arg for n in ast.walk(tree) if isinstance(n, ast.arg)}
+        names |= {n.name for n in ast.walk(tree) if isinstance(n, (ast.FunctionDef, ast.ClassDef))}
+        found = {n for n in names - FOREIGN_NAMES if set(n.lower().split("_")) & PRIVATE}
+        assert not found, (str(file), found)

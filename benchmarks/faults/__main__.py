@@ -13,7 +13,7 @@ from benchmarks.faults import matrix as matrix_module
 from benchmarks.faults import sequences as sequences_module
 from benchmarks.faults.links import LINKS
 from benchmarks.faults.matrix import read_results, run_matrix
-from benchmarks.faults.report import PAGE, fill, matrix
+from benchmarks.faults.report import PAGE, fill, fill_matrix
 from benchmarks.faults.sequences import Tally, read_tally, run_sequences
 from benchmarks.faults.table import ROWS
 
@@ -26,7 +26,9 @@ from benchmarks.faults.table import ROWS
 @click.option("--sequences", default=0, show_default=True, help="Random sequences, over all links.")
 @click.option("--seed", default=1, show_default=True, help="Of the random sequences.")
 @click.option("--minutes", default=120.0, show_default=True, help="No fault is begun after them.")
-@click.option("--page", is_flag=True, help="Write the tables of docs/reliability.md.")
+@click.option(
+    "--page", is_flag=True, help="Write the tables of docs/reliability.md and evidence/faults.md."
+)
 @click.option(
     "--from", "kept", multiple=True, type=click.Path(exists=True, path_type=Path),
     help="Make nothing: write the tables from the folders (--out) of former runs.",
@@ -49,7 +51,7 @@ def main(
         wrong += sum(bool(result.wrong) for result in results)
         click.echo(f"{len(results)} faults, {wrong} not as expected")
         if page:
-            fill(PAGE, "matrix", matrix(ROWS, results))
+            fill_matrix(ROWS, results)
     if sequences:
         left = 60.0 * minutes - (time.monotonic() - begun)
         tally = run_sequences(chosen, sequences, seed, folder, rate, click.echo, left)
@@ -64,7 +66,7 @@ def _write_kept(folders: tuple[Path, ...]) -> None:
     """Write the tables of the page from what runs have kept."""
     results = [r for f in folders if (f / matrix_module.KEPT).exists() for r in read_results(f)]
     if results:
-        fill(PAGE, "matrix", matrix(ROWS, results))
+        fill_matrix(ROWS, results)
     tally = Tally()
     for folder in folders:
         if (folder / sequences_module.KEPT).exists():

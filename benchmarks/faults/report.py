@@ -1,4 +1,7 @@
-"""The results as tables in docs/reliability.md, between marks; nothing else of the page changes."""
+"""The results as tables, between the marks of their pages; nothing else of a page changes.
+
+docs/reliability.md has a line a fault, docs/evidence/faults.md a line a fault and link.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,9 @@ from pathlib import Path
 
 from benchmarks.faults.row import Result, Row
 
-PAGE = Path(__file__).parents[2] / "docs" / "reliability.md"
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE, EVERY_LINK = DOCS / "reliability.md", DOCS / "evidence" / "faults.md"
+NOTHING = "nothing to detect"
 
 
 def fill(page: Path, mark: str, text: str) -> None:
@@ -22,7 +27,41 @@ def fill(page: Path, mark: str, text: str) -> None:
     page.write_text(f"{before}{begin}\n{text}\n{end}{after}", encoding="utf-8")
 
 
+def fill_matrix(rows: Sequence[Row], results: Sequence[Result]) -> None:
+    """Put the matrix of faults into both pages."""
+    fill(PAGE, "matrix", matrix(rows, results))
+    fill(EVERY_LINK, "matrix", matrix_by_link(rows, results))
+
+
 def matrix(rows: Iterable[Row], results: Sequence[Result]) -> str:
+    """Return the matrix of faults, a line for each row: the worst over its links."""
+    lines = [
+        "| fault: how it is made | links | times | detected after, at worst, cycles (ms) "
+        "| largest step / a cycle's allowance | not as expected |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    for row in rows:
+        found = [r for r in results if r.row == row.key]
+        if found:
+            lines.append(_worst_line(row, found))
+    return "\n".join([*lines, "", _counted(results)])
+
+
+def _worst_line(row: Row, found: Sequence[Result]) -> str:
+    seen = [r for r in found if r.cycles is not None and row.sign != "none"]
+    detected = NOTHING if row.sign == "none" else "-"
+    if seen:
+        cycles = max(r.cycles or 0.0 for r in seen)
+        detected = f"{cycles:.1f} ({1e3 * max(r.detected or 0.0 for r in seen):.0f})"
+    step = max(r.largest_step / r.step_allowed for r in found if r.step_allowed)
+    wrong = sum(bool(r.wrong) for r in found)
+    return (
+        f"| {row.fault}: {row.how} | {len({r.link for r in found})} | {len(found)} | {detected} | "
+        f"{step:.1f} | {wrong or 'none'} |"
+    )
+
+
+def matrix_by_link(rows: Iterable[Row], results: Sequence[Result]) -> str:
     """Return the matrix of faults, a line for each row and link."""
     by_case: dict[tuple[str, str], list[Result]] = defaultdict(list)
     for result in results:
@@ -36,19 +75,21 @@ def matrix(rows: Iterable[Row], results: Sequence[Result]) -> str:
         for (key, link), found in by_case.items():
             if key == row.key:
                 lines.append(_line(row, link, found))
+    return "\n".join([*lines, "", _counted(results)])
+
+
+def _counted(results: Sequence[Result]) -> str:
     again, wrong = sum(r.again for r in results), sum(bool(r.wrong) for r in results)
     broken = sum(r.violated for r in results)
-    lines += [
-        "",
+    return (
         f"{len(results)} faults made, {wrong} not as expected, {broken} with an invariant broken; "
-        f"{again} made again because the machine missed deadlines by itself.",
-    ]
-    return "\n".join(lines)
+        f"{again} made again because the machine missed deadlines by itself."
+    )
 
 
 def _line(row: Row, link: str, found: Sequence[Result]) -> str:
     cycles = [r.cycles for r in found if r.cycles is not None and row.sign != "none"]
-    detected = "not to be detected: tolerated" if row.sign == "none" else "-"
+    detected = NOTHING if row.sign == "none" else "-"
     if cycles:
         worst = max(r.detected or 0.0 for r in found)
         detected = f"{statistics.median(cycles):.1f}, {max(cycles):.1f} ({1e3 * worst:.0f})"

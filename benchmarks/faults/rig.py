@@ -6,7 +6,6 @@ import contextlib
 import sys
 import time
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from benchmarks.faults.controller_process import ControllerProcess
@@ -77,12 +76,7 @@ class Rig:
             raise
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         try:
             if self.run.alive:
                 self.controller.go_on()

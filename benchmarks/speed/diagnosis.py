@@ -22,7 +22,7 @@ SHARES = {
     "least squares (lstsq, svd, qr, solve)": ("numpy/linalg", ("lstsq", "svd", "qr", "solve")),
     "torques (recursive Newton-Euler)": ("core/dynamics.py", ()),
     "derivatives of signals": ("core/derivatives.py", ("differentiate",)),
-    "splines": ("core/interpolation.py", ("interpolate",)),
+    "splines": ("core/kernels/interpolation.py", ("interpolate",)),
 }
 
 

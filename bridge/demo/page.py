@@ -9,13 +9,16 @@ import numpy as np
 
 from gapbridge.bridge.demo.picture import arm_drawing, bars_drawing, coloured
 from gapbridge.bridge.demo.result import Result
+from gapbridge.bridge.demo.terminal import truth_rows
 from gapbridge.bridge.document.axes import Chart, logarithmic, named, scale
 from gapbridge.bridge.document.blocks import (
     Block,
     Bullets,
+    Cell,
     Columns,
     Document,
     Heading,
+    Named,
     Pairs,
     Paragraph,
     Part,
@@ -41,18 +44,20 @@ def page(result: Result, diagnosis: str, origin: Mapping[str, Any] | None = None
 
 def document(result: Result, diagnosis: str, origin: Mapping[str, Any]) -> Document:
     """Return the report as blocks."""
+    truth = _truth(result)
     parts: list[tuple[str, str, list[Block]]] = [
         ("result", "The result", _result(result)),
+        *([("truth", "The hidden truth, and what was found", truth)] if truth else []),
         ("visits", "Every visit", [Pictures((_errors(result),))]),
         ("flexibilities", "What was found of the arm", _flexibilities(result)),
-        ("diagnosis", "What the diagnosis says", _diagnosis(diagnosis)),
+        ("diagnosis", "What the diagnosis says of what the fit leaves", _diagnosis(diagnosis)),
         ("figures", "How it was done", [_figures(result), *origin_blocks(origin)]),
     ]
     software = origin_line(origin)
     return Document(
         f"The whole job on a simulated {result.model.arm.name}",
         f"Link {result.link}, seed {result.seed} · {software}",
-        tuple(Part(key, title, "", tuple(blocks)) for key, title, blocks in parts),
+        tuple(Part(key, title, "", tuple(blocks)) for key, title, blocks in parts if blocks),
         f"Demo of {software}, seed {result.seed}",
     )
 
@@ -70,6 +75,21 @@ def _result(result: Result) -> list[Block]:
     return [
         Paragraph(lead, "lead"), Heading("What to do now"), Bullets(NEXT_STEPS),
         Pictures((arm_drawing(result), bars_drawing(result))),
+    ]  # fmt: skip
+
+
+def _truth(result: Result) -> list[Block]:
+    """Return what was hidden beside what was found; nothing where nothing was hidden."""
+    if result.hidden is None:
+        return []
+    fitted = result.summary()["tcp_error_mm"]["fitted"]["rms"]
+    rows: list[list[Cell]] = [
+        [Named("", code=name), truly, found or "not found"]
+        for name, truly, found in truth_rows(result)
+    ]
+    return [
+        Paragraph(f"The fitted flexibilities alone left {fitted:.3f} mm: {result.hidden.about}."),
+        Table(("parameter", "truly", "found"), rows),
     ]  # fmt: skip
 
 

@@ -66,18 +66,25 @@ def truth_lines(result: Result) -> list[str]:
     if result.hidden is None:
         return []
     fitted = result.summary()["tcp_error_mm"]["fitted"]["rms"]
+    lines = [f"the fitted flexibilities alone left {fitted:.3f} mm: {result.hidden.about}"]
+    return lines + [
+        f"  {name}: truly {true}, {f'found {found}' if found else 'not found'}"
+        for name, true, found in truth_rows(result)
+    ]
+
+
+def truth_rows(result: Result) -> list[tuple[str, str, str]]:
+    """Return parameter, truth and what was found of it (empty: nothing) of all that was hidden."""
     found = {
         name: (value, std, unit) for c in result.accused for name, value, std, unit in c.parameters
     }
-    lines = [f"the fitted flexibilities alone left {fitted:.3f} mm: {result.hidden.about}"]
-    for name, true in result.hidden.truth.items():
+    rows = []
+    for name, true in ({} if result.hidden is None else result.hidden.truth).items():
         if name not in found:
-            lines.append(f"  {name}: truly {true:+.3g}, not found")
+            rows.append((name, f"{true:+.3g}", ""))
             continue
         value, std, unit = found[name]
         times, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
-        lines.append(
-            f"  {name}: truly {true * times:+.3g} {unit}, found {value * times:+.3g} "
-            f"± {std * times:.1g} {unit}"
-        )
-    return lines
+        deviation = f"{value * times:+.3g} ± {std * times:.1g} {unit}"
+        rows.append((name, f"{true * times:+.3g} {unit}", deviation))
+    return rows

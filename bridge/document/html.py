@@ -145,9 +145,9 @@ def _view(block: View) -> str:
 
 
 def _figure(body: str, caption: str, kind: str = "") -> str:
-    words = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
+    text = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
     css = f' class="{kind}"' if kind else ""
-    return f"<figure{css}>{body}{words}</figure>"
+    return f"<figure{css}>{body}{text}</figure>"
 
 
 def _table(block: Table) -> str:

@@ -48,8 +48,8 @@ def require_writable(path: Path, *inputs: Path) -> Path:
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[IO[str]]:
     """Give a text file that takes the place of ``path`` when the block ends without an error."""
-    with replacing_bytes(path) as raw:
-        file = io.TextIOWrapper(raw, "utf-8", newline="\n")
+    with replacing_bytes(path) as binary:
+        file = io.TextIOWrapper(binary, "utf-8", newline="\n")
         try:
             yield file
         finally:
@@ -121,8 +121,8 @@ def write_table(path: Path, columns: Sequence[str], table: NDArray[np.float64]) 
         from pyarrow import parquet
 
         frame = pyarrow.table({name: table[:, k] for k, name in enumerate(columns)})
-        with replacing_bytes(path) as raw:
-            parquet.write_table(frame, raw)
+        with replacing_bytes(path) as binary:
+            parquet.write_table(frame, binary)
         return
     with replacing(path) as file:
         file.write(",".join(columns) + "\n")

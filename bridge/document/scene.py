@@ -97,7 +97,7 @@ class Scene:
 def base(reach: float) -> tuple[Path, ...]:
     """Return the floor around the base (z = 0) and the base's axes, for an arm of that reach, m."""
     step = 0.1 if reach < 0.7 else 0.25
-    count = max(int(np.ceil(0.75 * reach / step)), 2)
+    count = max(int(np.ceil(0.5 * reach / step)), 2)
     side = np.arange(-count, count + 1) * step
     edge = count * step
     lines = [np.array([[x, -edge, 0.0], [x, edge, 0.0]]) for x in side]

@@ -1,28 +1,28 @@
-"""The base of the report's sections."""
+"""A section of a report: what it is called, what it is for, and who makes its blocks."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from typing import ClassVar, Generic, TypeVar
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from gapbridge.bridge.document.blocks import Block, Part
 
 M = TypeVar("M")
 
 
-class Section(ABC, Generic[M]):
-    """One section: what it is called, what it is for, and the blocks that it makes of M."""
+@dataclass(frozen=True)
+class Section(Generic[M]):
+    """One section; ``blocks`` makes its blocks of M: none where there is nothing to show."""
 
-    key: ClassVar[str]
-    title: ClassVar[str]
-    about: ClassVar[str] = ""
-    folded: ClassVar[bool] = False  # True: the page shows it only when asked to
+    key: str
+    title: str
+    blocks: Callable[[M], list[Block]]
+    about: str = ""
+    folded: bool = False  # True: the page shows it only when asked to
 
-    @abstractmethod
-    def blocks(self, material: M) -> list[Block]:
-        """Return the section's blocks; none where there is nothing to show."""
 
-    def part(self, material: M) -> Part | None:
-        """Return the section as a part of a document; None where there is nothing to show."""
-        blocks = tuple(self.blocks(material))
-        return Part(self.key, self.title, self.about, blocks, self.folded) if blocks else None
+def parts(sections: Sequence[Section[M]], material: M) -> tuple[Part, ...]:
+    """Return the sections that have something to show as parts of a document."""
+    made = [(s, tuple(s.blocks(material))) for s in sections]
+    return tuple(Part(s.key, s.title, s.about, b, s.folded) for s, b in made if b)

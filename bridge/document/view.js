@@ -83,7 +83,7 @@ export class View {
     const pen = canvas.getContext('2d');
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     pen.lineJoin = pen.lineCap = 'round';
-    const size = 1.45 * this.zoom * Math.min(width, height) / this.span;
+    const size = 1.3 * this.zoom * Math.min(width, height) / this.span;
     const [ca, sa] = [Math.cos(this.azimuth), Math.sin(this.azimuth)];
     const [ce, se] = [Math.cos(this.elevation), Math.sin(this.elevation)];
     const at = (point) => {

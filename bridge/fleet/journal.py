@@ -6,7 +6,6 @@ import fcntl
 import os
 import time
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from pydantic_core import from_json, to_json
@@ -42,12 +41,7 @@ class Journal:
         """Use it."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close it; what was added is on the disk."""
         os.fsync(self._file.fileno())
         self._file.close()

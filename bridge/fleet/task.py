@@ -12,7 +12,7 @@ from typing import Any
 
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.cell.opened_log import open_log
-from gapbridge.core.errors import GapbridgeError
+from gapbridge.core.errors import ArmError, CellError, GapbridgeError, LogError
 from gapbridge.core.log.log import Log
 
 Work = Callable[[Cell, Log, Mapping[str, Any]], dict[str, Any]]
@@ -91,15 +91,19 @@ def _performed(task: Task) -> tuple[str, dict[str, Any]]:
             load_cell(task.cell)
         )  # fmt: skip
         return DONE, {"result": task.work(cell, open_log(task.log, cell), task.options)}
+    except (ArmError, CellError, LogError) as error:  # they name their file
+        return BAD, {"error": _line(error)}
     except GapbridgeError as error:
-        text = " ".join(str(error).split())
-        return BAD, {"error": text if str(task.log) in text else f"{task.log}: {text}"}
+        return BAD, {"error": f"{task.log}: {_line(error)}"}
     except Exception as error:
-        text = " ".join(str(error).split()) or "no message"
         return CRASHED, {
-            "error": f"{task.log}: {type(error).__name__}: {text}",
+            "error": f"{task.log}: {type(error).__name__}: {_line(error) or 'no message'}",
             "details": traceback.format_exc(),
         }
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())
 
 
 @functools.lru_cache(maxsize=64)

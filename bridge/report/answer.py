@@ -14,7 +14,6 @@ from gapbridge.bridge.document.blocks import (
     Pictures,
     Verdict,
 )
-from gapbridge.bridge.document.section import Section
 from gapbridge.bridge.report.answer_picture import CAPTION, picture
 from gapbridge.bridge.report.labels import (
     CHANNELS,
@@ -34,26 +33,21 @@ from gapbridge.core.diagnosis.result import Cause
 KINDS = {"no_gap": GOOD, "explained": GOOD, "partly_explained": DOUBTFUL, "unexplained": BAD}
 
 
-class Answer(Section[Material]):
-    """Verdict, three sentences, what to do now, one picture."""
-
-    key, title = "answer", "The answer"
-
-    def blocks(self, material: Material) -> list[Block]:
-        """Return the blocks; further channels have a line each."""
-        diagnosis = material.diagnosis
-        main = chosen_channel(diagnosis)
-        verdict = Badge(VERDICTS[diagnosis.verdict], KINDS[diagnosis.verdict])
-        others = [
-            Paragraph(f"{CHANNELS[c.channel]}: {one_line(c)}")
-            for c in diagnosis.channels
-            if c is not main
-        ]
-        return [
-            Verdict(verdict, " ".join(sentences(main))), *others,
-            Heading("What to do now"), Bullets(tuple(next_steps(diagnosis))),
-            Pictures(tuple(picture(c) for c in diagnosis.channels), CAPTION),
-        ]  # fmt: skip
+def answer(material: Material) -> list[Block]:
+    """Return the blocks; further channels have a line each."""
+    diagnosis = material.diagnosis
+    main = chosen_channel(diagnosis)
+    verdict = Badge(VERDICTS[diagnosis.verdict], KINDS[diagnosis.verdict])
+    others = [
+        Paragraph(f"{CHANNELS[c.channel]}: {one_line(c)}")
+        for c in diagnosis.channels
+        if c is not main
+    ]
+    return [
+        Verdict(verdict, " ".join(sentences(main))), *others,
+        Heading("What to do now"), Bullets(tuple(next_steps(diagnosis))),
+        Pictures(tuple(picture(c) for c in diagnosis.channels), CAPTION),
+    ]  # fmt: skip
 
 
 def next_steps(diagnosis: Diagnosis) -> list[str]:
@@ -132,7 +126,7 @@ def _causes(channel: ChannelDiagnosis) -> str:
             "No known effect explains it: something is going on that is not in the catalogue, "
             "and no known effect is blamed for it."
         )
-    words = listed([cause_title(c) for c in channel.causes])
+    causes = listed([cause_title(c) for c in channel.causes])
     fall = 1 - after(channel) / max(channel.gap_rms, 1e-300)
     sure = likelihood(min(c.probability for c in channel.causes))
     many = len(channel.causes) > 1
@@ -143,7 +137,7 @@ def _causes(channel: ChannelDiagnosis) -> str:
         else (f"the gap does not fall (it is {left})")
     )
     return (
-        f"Cause{'s' if many else ''}: {words}; with {'them' if many else 'it'} in the model "
+        f"Cause{'s' if many else ''}: {causes}; with {'them' if many else 'it'} in the model "
         f"{change} on measurements that the fit did not see ({sure} sure).{elsewhere(channel)}"
     )
 

@@ -9,7 +9,7 @@ import inspect
 import sys
 from pathlib import Path
 
-from gapbridge.bridge.report.labels import CHANNELS as CHANNEL_WORDS
+from gapbridge.bridge.report.labels import CHANNELS as CHANNEL_TITLES
 from gapbridge.bridge.report.labels import effect_title
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.effects import CATALOGUE, CHANNELS, Effect
@@ -29,7 +29,7 @@ def catalogue_page() -> str:
     """Return the page as Markdown: a table of all effects by channel, then one part each."""
     parts = [HEAD]
     for channel, unit in CHANNELS.items():
-        parts += [f"## {CHANNEL_WORDS[channel]} (`{channel}`, {unit})", "", _table(channel), ""]
+        parts += [f"## {CHANNEL_TITLES[channel]} (`{channel}`, {unit})", "", _table(channel), ""]
     parts += ["## Effect by effect", ""]
     parts += [_effect(effect) for effect in CATALOGUE.values()]
     return "\n".join(parts).rstrip() + "\n"

@@ -6,7 +6,6 @@ import numpy as np
 
 from gapbridge.bridge.document.blocks import Block, Bullets, Heading, Paragraph, Table
 from gapbridge.bridge.document.provenance import origin_blocks
-from gapbridge.bridge.document.section import Section
 from gapbridge.bridge.report.labels import CHANNELS, with_unit
 from gapbridge.bridge.report.material import Material, own_coordinates, per_sample
 from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
@@ -15,40 +14,34 @@ from gapbridge.core.log.log import Log
 LISTED = 20  # outliers listed a channel
 
 
-class DataQuality(Section[Material]):
-    """What the result stands on."""
-
-    key, title = "data_quality", "Data quality"
-    about = "What was used, what was excluded, what could not be seen."
-
-    def blocks(self, material: Material) -> list[Block]:
-        """Return rows used, findings, outliers, channels that the log does not show, origin."""
-        diagnosis = material.diagnosis
-        rows = [
-            [CHANNELS[c.channel], str(len(material.log)), str(c.samples),
-             str(int((~c.selection.kept).sum())),
-             str(len(np.unique(c.selection.observation.groups)))]
-            for c in diagnosis.channels
-        ]  # fmt: skip
-        heads = ("channel", "rows in the log", "samples used", "excluded as outliers",
-                 "different poses or stretches of time")  # fmt: skip
-        blocks: list[Block] = [Table(heads, rows), Heading("Findings")]
-        blocks.append(
-            Bullets(diagnosis.findings) if diagnosis.findings
-            else Paragraph("No check of the log found anything odd.")
-        )  # fmt: skip
-        for channel in diagnosis.channels:
-            blocks += _outliers(channel, material.log)
-        if diagnosis.not_observable:
-            hidden = [
-                [CHANNELS.get(h.channel, h.channel), ", ".join(h.needs)]
-                for h in diagnosis.not_observable
-            ]
-            blocks += [
-                Heading("What this log cannot show"),
-                Table(("channel", "columns it would need"), hidden),
-            ]
-        return blocks + origin_blocks(material.origin)
+def data_quality(material: Material) -> list[Block]:
+    """Return rows used, findings, outliers, channels that the log does not show, origin."""
+    diagnosis = material.diagnosis
+    rows = [
+        [CHANNELS[c.channel], str(len(material.log)), str(c.samples),
+         str(int((~c.selection.kept).sum())),
+         str(len(np.unique(c.selection.observation.groups)))]
+        for c in diagnosis.channels
+    ]  # fmt: skip
+    heads = ("channel", "rows in the log", "samples used", "excluded as outliers",
+             "different poses or stretches of time")  # fmt: skip
+    blocks: list[Block] = [Table(heads, rows), Heading("Findings")]
+    blocks.append(
+        Bullets(diagnosis.findings) if diagnosis.findings
+        else Paragraph("No check of the log found anything odd.")
+    )  # fmt: skip
+    for channel in diagnosis.channels:
+        blocks += _outliers(channel, material.log)
+    if diagnosis.not_observable:
+        hidden = [
+            [CHANNELS.get(h.channel, h.channel), ", ".join(h.needs)]
+            for h in diagnosis.not_observable
+        ]
+        blocks += [
+            Heading("What this log cannot show"),
+            Table(("channel", "columns it would need"), hidden),
+        ]
+    return blocks + origin_blocks(material.origin)
 
 
 def _outliers(channel: ChannelDiagnosis, log: Log) -> list[Block]:

@@ -7,7 +7,6 @@ import numpy as np
 from gapbridge.bridge.document.axes import Chart, distribution, scale
 from gapbridge.bridge.document.blocks import Bar, Block, Cell, Paragraph, Pictures, Table
 from gapbridge.bridge.document.drawing import BAD_DOT, EDGE, LIMIT, Drawing
-from gapbridge.bridge.document.section import Section
 from gapbridge.bridge.report.labels import CHANNELS, effect_title, percent, unit_of, with_unit
 from gapbridge.bridge.report.material import (
     Array,
@@ -22,20 +21,14 @@ from gapbridge.bridge.report.material import (
 from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
 
 
-class HowFar(Section[Material]):
-    """How much smaller the gap becomes."""
-
-    key, title = "how_far", "How far it shrinks"
-    about = "Judged only on measurements that the fit did not see."
-
-    def blocks(self, material: Material) -> list[Block]:
-        """Return the shares, and before and after for every channel."""
-        diagnosis = material.diagnosis
-        blocks: list[Block] = [_shares(diagnosis.channels)]
-        for channel in diagnosis.channels:
-            blocks += channel_heading(diagnosis, channel)
-            blocks += _channel(channel) + _sessions(channel, diagnosis.sessions)
-        return blocks
+def how_far(material: Material) -> list[Block]:
+    """Return the shares, and before and after for every channel."""
+    diagnosis = material.diagnosis
+    blocks: list[Block] = [_shares(diagnosis.channels)]
+    for channel in diagnosis.channels:
+        blocks += channel_heading(diagnosis, channel)
+        blocks += _channel(channel) + _sessions(channel, diagnosis.sessions)
+    return blocks
 
 
 def _shares(channels: tuple[ChannelDiagnosis, ...]) -> Table:

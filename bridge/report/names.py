@@ -50,7 +50,7 @@ def parameter_title(name: str) -> str:
 def with_titles(text: str) -> str:
     """Return a text with public names of parameters and effects in words instead."""
     names = "|".join(sorted((*CATALOGUE, *OF_SESSIONS), key=len, reverse=True))
-    return re.sub(rf"\b(?:{names})(?:_[A-Za-z0-9_.]*\w)?\b", _in_words, text)
+    return re.sub(rf"\b(?:{names})(?:_[A-Za-z0-9_.]*\w)?\b", _as_title, text)
 
 
 def sentence(text: str) -> str:
@@ -60,6 +60,6 @@ def sentence(text: str) -> str:
     return text[:1].upper() + text[1:] + end
 
 
-def _in_words(match: re.Match[str]) -> str:
+def _as_title(match: re.Match[str]) -> str:
     # words of the language are names too ("payload", "backlash"): only what has a _ is a name
     return parameter_title(match[0]) if "_" in match[0] else match[0]

@@ -10,6 +10,7 @@ from gapbridge.bridge.document.blocks import Document
 from gapbridge.bridge.document.html import html
 from gapbridge.bridge.document.output_file import write_text
 from gapbridge.bridge.document.provenance import origin_line
+from gapbridge.bridge.document.section import parts
 from gapbridge.bridge.report.material import Material
 from gapbridge.bridge.report.sections import SECTIONS
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
@@ -36,13 +37,12 @@ def write_report(
 def document(material: Material) -> Document:
     """Return the report as blocks."""
     name, arm = _cell_title(material.cell_name), material.model.arm
-    parts = [section.part(material) for section in SECTIONS]
     kind = "Arm of DH rows" if arm.name == "dh" else f"Arm {arm.name}"
     log = f"log {Path(material.log.path).name}, {len(material.log)} rows"
     return Document(
         f"{name}: the robot against its model",
         f"{kind}, {arm.n} joints · {log} · {origin_line(material.origin)}",
-        tuple(part for part in parts if part is not None),
+        parts(SECTIONS, material),
         f"Gap between model and robot, {name} · {origin_line(material.origin)}",
     )
 

@@ -13,7 +13,6 @@ from gapbridge.bridge.document.blocks import (
     Paragraph,
     Table,
 )
-from gapbridge.bridge.document.section import Section
 from gapbridge.bridge.report.labels import effect_title, joint_list, listed, number, unit_of
 from gapbridge.bridge.report.material import Material
 from gapbridge.core.diagnosis.result import Cause
@@ -24,19 +23,13 @@ SIDE = 1.96  # standard deviations of a 95 % interval
 SHOWN = 12
 
 
-class Parameters(Section[Material]):
-    """What goes into the model."""
-
-    key, title = "parameters", "Parameters and next measurements"
-    about = "What goes into the model, how surely, and what would settle the open questions."
-
-    def blocks(self, material: Material) -> list[Block]:
-        """Return the parameters, the ties and the next measurements."""
-        causes = [c for channel in material.diagnosis.channels for c in channel.causes]
-        return [
-            *_parameters(causes), *_ties(causes), Heading("What to measure next"),
-            *_next(material.diagnosis.next_measurements),
-        ]  # fmt: skip
+def parameters(material: Material) -> list[Block]:
+    """Return the parameters, the ties and the next measurements."""
+    causes = [c for channel in material.diagnosis.channels for c in channel.causes]
+    return [
+        *_parameters(causes), *_ties(causes), Heading("What to measure next"),
+        *_next(material.diagnosis.next_measurements),
+    ]  # fmt: skip
 
 
 def _parameters(causes: list[Cause]) -> list[Block]:

@@ -7,7 +7,6 @@ import numpy as np
 from gapbridge.bridge.document.axes import Chart, scale
 from gapbridge.bridge.document.blocks import Bar, Beside, Block, Cell, Gallery, Table
 from gapbridge.bridge.document.drawing import Drawing
-from gapbridge.bridge.document.section import Section
 from gapbridge.bridge.report.arm_view import arm_view
 from gapbridge.bridge.report.labels import percent, quantity_title, quantity_unit, unit_of
 from gapbridge.bridge.report.material import (
@@ -27,22 +26,16 @@ STATED = 0.02  # share below which a dependence is not worth a line
 POINTS = 600  # of a drawing among many
 
 
-class Where(Section[Material]):
-    """What the gap comes from and follows."""
-
-    key, title = "where", "Where the gap lies"
-    about = "Which joints and axes it comes from, and what it follows."
-
-    def blocks(self, material: Material) -> list[Block]:
-        """Return shares by joint and axis, the gap against quantities, and the arm in space."""
-        blocks: list[Block] = []
-        for channel in material.diagnosis.channels:
-            blocks += channel_heading(material.diagnosis, channel)
-            blocks += [Beside((_joints(channel), _axes(channel), _depends(channel)))]
-            blocks.append(_against(channel))
-            if channel.channel == "position":
-                blocks.append(arm_view(channel, material))
-        return blocks
+def where(material: Material) -> list[Block]:
+    """Return shares by joint and axis, the gap against quantities, and the arm in space."""
+    blocks: list[Block] = []
+    for channel in material.diagnosis.channels:
+        blocks += channel_heading(material.diagnosis, channel)
+        blocks += [Beside((_joints(channel), _axes(channel), _depends(channel)))]
+        blocks.append(_against(channel))
+        if channel.channel == "position":
+            blocks.append(arm_view(channel, material))
+    return blocks
 
 
 def _joints(channel: ChannelDiagnosis) -> Table:

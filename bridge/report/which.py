@@ -15,7 +15,6 @@ from gapbridge.bridge.document.blocks import (
     Table,
 )
 from gapbridge.bridge.document.drawing import EDGE
-from gapbridge.bridge.document.section import Section
 from gapbridge.bridge.report.labels import effect_title, joint_list, likelihood, listed, percent
 from gapbridge.bridge.report.material import Material, channel_heading
 from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
@@ -29,18 +28,12 @@ NOTE = (
 )
 
 
-class Which(Section[Material]):
-    """Every effect that was tried."""
-
-    key, title = "which", "Which effect causes it"
-    about = "Every effect that was tried, with the evidence for and against."
-
-    def blocks(self, material: Material) -> list[Block]:
-        """Return one table per channel."""
-        blocks: list[Block] = [Paragraph(NOTE, "note")]
-        for channel in material.diagnosis.channels:
-            blocks += [*channel_heading(material.diagnosis, channel), _table(channel)]
-        return blocks
+def which(material: Material) -> list[Block]:
+    """Return one table per channel."""
+    blocks: list[Block] = [Paragraph(NOTE, "note")]
+    for channel in material.diagnosis.channels:
+        blocks += [*channel_heading(material.diagnosis, channel), _table(channel)]
+    return blocks
 
 
 def _table(channel: ChannelDiagnosis) -> Table:

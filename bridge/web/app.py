@@ -23,7 +23,7 @@ from gapbridge.bridge.web.watched import Watched, encoded
 FILES = {
     "index.html": "text/html", "style.css": "text/css", "page.js": "text/javascript",
     "drawing.js": "text/javascript", "view.js": "text/javascript",
-    "words.js": "text/javascript", "icon.svg": "image/svg+xml",
+    "messages.js": "text/javascript", "icon.svg": "image/svg+xml",
 }  # fmt: skip
 MOST_POINTS = 2000
 LARGEST_FORM = 4096  # bytes

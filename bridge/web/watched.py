@@ -119,8 +119,8 @@ class Watched:
             times = np.concatenate([self._times, received])
             self._times = times[times > times[-1] - RATE_SPAN]
             self._timing.add(received, rows[:, s["duration"].start], age)
-            raw = rows[:, s["ft_raw_wrench"]]
-            self._sensor = "actual_TCP_force" if np.isnan(raw).all() else "ft_raw_wrench"
+            wrench = rows[:, s["ft_raw_wrench"]]
+            self._sensor = "actual_TCP_force" if np.isnan(wrench).all() else "ft_raw_wrench"
             cycles[:, 0], cycles[:, 1] = received + wall, rows[:, s["state"].start]
             cycles[:, 2:8] = rows[:, s["offset"]]
             cycles[:, 8:14] = rows[:, s[self._sensor]]

@@ -16,7 +16,13 @@ from gapbridge.core.diagnosis.channels.simulation import joined, predicted_by
 from gapbridge.core.diagnosis.every_row import on_every_row, still_accused
 from gapbridge.core.diagnosis.generalisation import NOWHERE, Generalisation, generalisation
 from gapbridge.core.diagnosis.held_out import HeldOut
-from gapbridge.core.diagnosis.judgement import Judgement, judge, with_stand_ins
+from gapbridge.core.diagnosis.judgement import (
+    Judgement,
+    judge,
+    judge_geometry,
+    still_sure,
+    with_stand_ins,
+)
 from gapbridge.core.diagnosis.location import Where, locate
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units, findings
 from gapbridge.core.diagnosis.noise_floor import Floor, noise_floor, own_coordinates, whiteness
@@ -260,10 +266,11 @@ def _channel(
     progress: Callable[[str], None] | None,
 ) -> ChannelDiagnosis:  # fmt: skip
     searched = select(seen, model, withhold, progress)
+    searched, verdict = judge_geometry(searched, judge(searched, HeldOut(searched)), model.arm)
     held = HeldOut(searched)
-    verdict = with_stand_ins(searched, judge(searched, held))
+    verdict = with_stand_ins(searched, verdict)
     stood_in = _stood_in(searched, verdict, held, model)
-    searched = standing(searched, model.arm, verdict.accused, verdict.beside)
+    searched, verdict = still_sure(searched, verdict, model.arm)
     considered = considered_of(searched, verdict, held, model.arm, withhold)
     chosen = [searched.term_index[p] for p in verdict.accused]
     where = locate(searched, gaps(searched, chosen)[0][searched.kept], chosen)
@@ -271,7 +278,7 @@ def _channel(
     if whole is not seen:
         if progress:
             progress(f"{seen.channel}: all {len(whole.rows)} rows")
-        selection = on_every_row(searched, verdict.accused, whole, model)
+        selection = on_every_row(searched, verdict, whole, model)
         held = HeldOut(selection)
         selection, verdict = still_accused(selection, verdict, held, model)
         chosen = [selection.term_index[p] for p in verdict.accused]

@@ -16,6 +16,7 @@ from gapbridge.core.diagnosis.criteria import TIE
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import Judgement
 from gapbridge.core.diagnosis.observation import Observation
+from gapbridge.core.diagnosis.regions import regions
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.following import exact_columns
 from gapbridge.core.diagnosis.selection.geometry import links_of
@@ -23,7 +24,7 @@ from gapbridge.core.diagnosis.selection.local_search import rivals
 from gapbridge.core.diagnosis.selection.noise import carried_to
 from gapbridge.core.diagnosis.selection.outliers import inliers
 from gapbridge.core.diagnosis.selection.problem import fit
-from gapbridge.core.diagnosis.selection.refit import refit
+from gapbridge.core.diagnosis.selection.refit import Remainder, refit
 from gapbridge.core.diagnosis.selection.selection import Selection, standing
 from gapbridge.core.diagnosis.selection.state import Work, sample_space
 from gapbridge.core.effects import Term
@@ -34,12 +35,14 @@ MOST_RIVALS = 12  # of all causes together
 
 
 def on_every_row(
-    selection: Selection, accused: Sequence[int], whole: Observation, model: Model
+    selection: Selection, judgement: Judgement, whole: Observation, model: Model
 ) -> Selection:
-    """Return the selection with its ``accused`` terms (positions) refitted on ``whole``.
+    """Return the selection with its accused terms refitted on ``whole``.
 
-    Its space holds the named terms found, at their positions, and the accused ones' rivals.
+    Its space holds the named terms found, at their positions, and the accused ones' rivals. Where
+    something unknown is left, covariances are those of its scatter among regions.
     """
+    accused = judgement.accused
     candidates = [
         _shaped_as(selection.space.candidates[c], term)
         for c, term in zip(selection.term_index, selection.terms, strict=True)
@@ -56,7 +59,11 @@ def on_every_row(
              if c in selection.prior and p in accused}  # fmt: skip
     near = links_of(space, links).beside(space, links) if links else space
     found = fit(near, tuple(p for p in accused if p not in links))
-    fitted, index, spread, residual = refit(work, space, found, links)
+    remainder = None
+    if judgement.remainder is not None:
+        region = np.repeat(regions(placed, work.kept), placed.measured.shape[1])
+        remainder = Remainder(np.zeros((len(region), 0)), np.zeros(0), region)
+    fitted, index, spread, residual = refit(work, space, found, links, remainder)
     values, covariance = list(selection.terms), list(selection.covariance)
     for c, term, own in zip(index, fitted, spread, strict=True):
         values[c], covariance[c] = term, own

@@ -14,12 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincc
 
+from gapbridge.core.arm import Arm
 from gapbridge.core.diagnosis.bump import bumps
 from gapbridge.core.diagnosis.criteria import (
     ENOUGH_REPEATS,
     GAIN,
     HINT,
     INSTRUMENTS,
+    MINUTE,
     REPEATED,
     STAND_IN_GAIN,
     STATED,
@@ -29,15 +31,27 @@ from gapbridge.core.diagnosis.criteria import (
 )
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.regions import parts
-from gapbridge.core.diagnosis.remainder import links_withstand, withstanding
-from gapbridge.core.diagnosis.residual_structure import dependence, structure_p_value
+from gapbridge.core.diagnosis.remainder import (
+    closes_everywhere,
+    links_withstand,
+    with_the_links,
+    withstanding,
+)
+from gapbridge.core.diagnosis.residual_structure import (
+    basis_of,
+    dependence,
+    structure_p_value,
+)
 from gapbridge.core.diagnosis.selection.bent import not_bent
+from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.local_search import rivals
 from gapbridge.core.diagnosis.selection.problem import Found, Space
-from gapbridge.core.diagnosis.selection.refit import worth
-from gapbridge.core.diagnosis.selection.selection import Selection
+from gapbridge.core.diagnosis.selection.refit import Remainder, worth
+from gapbridge.core.diagnosis.selection.selection import Selection, standing
+from gapbridge.core.errors import InputError
 
 Array = NDArray[np.float64]
+SAME = 1e-4  # of the squares of a cause, left by another that does all that it does
 BESIDE = "it does not keep its value beside the unknown that is left"
 
 
@@ -53,7 +67,7 @@ class Judgement:
     ]  # quantity, held-out share of what is not accounted for
     ties: dict[int, tuple[str, ...]]  # position -> effects that would do as well
     withdrawn: tuple[tuple[int, str], ...]  # position, reason
-    beside: tuple[int, ...] = ()  # unnamed functions that account for what is left
+    remainder: Remainder | None = None  # unnamed functions that account for what is left
     stand_ins: tuple[
         int, ...
     ] = ()  # positions not accused that shrink the gap in regions not fitted
@@ -72,7 +86,8 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
     believed = [
         c for c in selection.term_index if c not in withdrawn and c not in selection.block
     ]  # fmt: skip
-    stays, beside = withstanding(selection, believed)
+    stays, remainder = withstanding(selection, believed)
+    stays += with_the_links(selection, stays, [c for c in believed if c not in stays])
     withdrawn |= {c: BESIDE for c in believed if c not in stays}
     for c in _without_mass(selection, stays):
         withdrawn[c] = "no load is declared, and none is accused"
@@ -83,7 +98,30 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
         withdrawn[c] = "it does not shrink the gap on samples that its fit did not see"
         stays.remove(c)
     judgement = _told(whole, selection, stays, withdrawn, fallen)
-    return replace(judgement, beside=tuple(beside))
+    unknown = judgement.structured or remainder.columns.shape[1] > 0
+    return replace(judgement, remainder=remainder if unknown else None)
+
+
+def judge_geometry(
+    selection: Selection, judgement: Judgement, arm: Arm
+) -> tuple[Selection, Judgement]:
+    """Return selection and judgement with all links' geometry accused, where no single link is.
+
+    It has to close the gap in every part of the log, each predicted by a fit that did not see it.
+    """
+    own = [selection.space.candidates[selection.term_index[p]] for p in judgement.accused]
+    fallen = [selection.space.candidates[selection.term_index[p]] for p, _ in judgement.withdrawn]
+    if any(c.effect.together for c in own) or not any(c.effect.together for c in fallen):
+        return selection, judgement
+    try:
+        whole = selection.with_all_links(arm)
+    except InputError:  # no arm of such links stands
+        return selection, judgement
+    if whole is None or not closes_everywhere(whole):
+        return selection, judgement
+    again = judge(whole, HeldOut(whole))
+    accused = {whole.term_index[p] for p in again.accused}
+    return (whole, again) if accused & set(whole.block) else (selection, judgement)
 
 
 def _told(
@@ -128,7 +166,35 @@ def _no_value(selection: Selection) -> dict[int, str]:
             found[position] = "its value stands on its bound"
         if worth(term, spread) < 1:
             found[position] = "its value may as well be none"
+        usual = [p.scale for p in candidate.parameters]
+        if candidate.curve is None and all(
+            abs(v) < MINUTE * size for v, size in zip(term.values, usual, strict=False)
+        ):
+            found[position] = "its value is too small to matter"
     return found
+
+
+def still_sure(selection: Selection, judgement: Judgement, arm: Arm) -> tuple[Selection, Judgement]:
+    """Return what is accused refitted as all there is, and its judgement.
+
+    Beside the unknown, and over the regions of the log, a value may be less sure than it was, and a
+    stiffness curve straight.
+    """
+    while True:
+        found = standing(selection, arm, judgement.accused, judgement.remainder)
+        single = [p for p in judgement.accused if found.term_index[p] not in found.block]
+        straight = {p for p in not_bent(found.terms, found.covariance) if judgement.remainder}
+        share = [
+            0.0 if p in straight else worth(found.terms[p], found.covariance[p]) for p in single
+        ]
+        if min(share, default=1.0) >= 1:
+            return found, judgement
+        weakest = single[int(np.argmin(share))]
+        judgement = replace(
+            judgement, accused=tuple(p for p in judgement.accused if p != weakest),
+            withdrawn=(*judgement.withdrawn, (weakest, BESIDE)), structured=True,
+            ties={p: names for p, names in judgement.ties.items() if p != weakest},
+        )  # fmt: skip
 
 
 def _without_mass(selection: Selection, stays: Sequence[int]) -> list[int]:
@@ -233,11 +299,13 @@ def pure_error(left: Array, groups: NDArray[np.int64]) -> tuple[float, int]:
 
 
 def _ties(space: Space, found: Found, accused: Sequence[int]) -> dict[int, tuple[str, ...]]:
+    """Return the effects that would do as well as each accused one, at its place."""
     told: dict[int, tuple[str, ...]] = {}
     for c in accused:
         own = space.candidates[c].family
+        near = [other for _, other in rivals(space, found, c, TIE)]
         names: list[str] = []
-        for _, other in rivals(space, found, c, TIE):
+        for other in [*near, *holding(space, found, c)]:
             family = space.candidates[other].family
             if not space.candidates[other].named or family in (own, *names):
                 continue
@@ -245,3 +313,29 @@ def _ties(space: Space, found: Found, accused: Sequence[int]) -> dict[int, tuple
                 names.append(family)
         told[c] = tuple(names)
     return told
+
+
+def holding(space: Space, found: Found, c: int) -> list[int]:
+    """Return the named effects that do all that a candidate does, and more: nothing decides.
+
+    The zero of the last joint is a shift of the tool; it is the simpler guess, and no surer.
+    """
+    if not _geometric(space.candidates[c]):
+        return []
+    rest = basis_of(space.columns([o for o in found.chosen if o != c]))
+    x = space.columns([c])
+    x = x - rest @ (rest.T @ x)
+    whole = float(np.sum(x**2))
+    told = []
+    for other, k in enumerate(space.candidates):
+        if other == c or other in found.chosen or not _geometric(k):
+            continue
+        U = space.columns([other])
+        U = basis_of(U - rest @ (rest.T @ U))
+        if whole > 0 and float(np.sum((x - U @ (U.T @ x)) ** 2)) < SAME * whole:
+            told.append(other)
+    return told
+
+
+def _geometric(candidate: Candidate) -> bool:
+    return candidate.named and (candidate.effect.beside_links or candidate.effect.together)

@@ -17,19 +17,26 @@ def parts(observation: Observation, kept: NDArray[np.bool_]) -> NDArray[np.int64
     One region left out makes the rest extrapolate; scattered ones do so less, and still no
     neighbour of a judged pose is in its fit.
     """
+    region = regions(observation, kept)
+    if observation.order_in_time:
+        return np.asarray(region % PARTS)
+    order = np.random.default_rng(0).permutation(int(region.max()) + 1)
+    return np.asarray(order[region] % PARTS)
+
+
+def regions(observation: Observation, kept: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the region of joint space, or stretch of time, (n,) of each kept sample."""
     if observation.order_in_time:
         t = observation.quantities["timestamp"][kept]
         share = (t - t.min()) / max(float(np.ptp(t)), 1e-9)
-        return np.asarray(np.minimum((share * REGIONS).astype(np.int64), REGIONS - 1) % PARTS)
+        return np.asarray(np.minimum((share * REGIONS).astype(np.int64), REGIONS - 1))
     conditions = np.unique(observation.groups[kept], return_inverse=True)[1].reshape(-1)
     names = [q for q in observation.quantities if q.startswith(("actual_q_", "target_q_"))]
     if not names:
-        return np.asarray(conditions % PARTS)
+        return np.asarray(conditions)
     from scipy.cluster.vq import kmeans2
 
     poses = np.stack([observation.quantities[q][kept] for q in names], axis=1)
     count = min(REGIONS, max(4, (int(conditions.max()) + 1) // 3))
     found = kmeans2(poses, count, minit="++", seed=0, iter=30)[1]
-    region = np.unique(found, return_inverse=True)[1].reshape(-1)
-    order = np.random.default_rng(0).permutation(int(region.max()) + 1)
-    return np.asarray(order[region] % PARTS)
+    return np.asarray(np.unique(found, return_inverse=True)[1].reshape(-1))

@@ -13,13 +13,21 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.diagnosis.criteria import DRIFT, SIBLING, SIGMAS, STAND_IN_GAIN, UNKNOWNS
+from gapbridge.core.diagnosis.criteria import (
+    CLOSED,
+    DRIFT,
+    SIBLING,
+    SIGMAS,
+    STAND_IN_GAIN,
+    UNKNOWNS,
+)
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.observation import Observation
-from gapbridge.core.diagnosis.regions import parts
+from gapbridge.core.diagnosis.regions import parts, regions
 from gapbridge.core.diagnosis.residual_structure import basis_of
 from gapbridge.core.diagnosis.selection.candidate import Candidate, carrying
 from gapbridge.core.diagnosis.selection.problem import gains
+from gapbridge.core.diagnosis.selection.refit import Remainder
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.smooth import targets
 
@@ -32,9 +40,9 @@ LARGE = 900  # rows of the sample space from which several accusations go at a t
 HOPELESS = 0.6  # strength below which they do
 
 
-def withstanding(selection: Selection, believed: Sequence[int]) -> tuple[list[int], list[int]]:
+def withstanding(selection: Selection, believed: Sequence[int]) -> tuple[list[int], Remainder]:
     """Return the candidates, of those believed, that withstand, and the unnamed beside them."""
-    remainder = _Remainder(selection)
+    remainder = _Beside(selection)
     accused = list(believed)
     while accused:
         strength = remainder.strengths(accused)
@@ -45,7 +53,7 @@ def withstanding(selection: Selection, believed: Sequence[int]) -> tuple[list[in
             worst = np.argsort(strength)[: max(1, len(accused) // 8)]
             out |= {int(i) for i in worst if strength[i] < HOPELESS}
         accused = [c for i, c in enumerate(accused) if i not in out]
-    return accused, remainder.beside
+    return accused, remainder.beside_refit(accused)
 
 
 def links_withstand(selection: Selection) -> bool:
@@ -62,12 +70,43 @@ def links_withstand(selection: Selection) -> bool:
     return held.shrink(links, named).interval[0] > STAND_IN_GAIN
 
 
-class _Remainder:
+def with_the_links(selection: Selection, stays: Sequence[int], fallen: Sequence[int]) -> list[int]:
+    """Return the joints' zeros and tool points, of those fallen, that stand with the links.
+
+    Where all links are a cause these are numbers of the same geometry: none is sure beside unnamed
+    functions, so they are judged by what they do together in regions that their fit did not see.
+    """
+    space = selection.space
+    own = [c for c in fallen if space.candidates[c].effect.beside_links]
+    if not (selection.block and own):
+        return []
+    held = HeldOut(selection, parts=parts(selection.observation, selection.kept))
+    rest = [*stays, *selection.block]
+    gains = held.possible and held.shrink([*rest, *own], rest).interval[0] > STAND_IN_GAIN
+    return own if gains else []
+
+
+def closes_everywhere(selection: Selection) -> bool:
+    """Return whether the geometry of all links closes the gap in every part of the log.
+
+    Each part is predicted by a fit that did not see it. What is no geometry at all reaches that in
+    some part by chance, never in all.
+    """
+    part = parts(selection.observation, selection.kept)
+    held = HeldOut(selection, parts=part)
+    if not held.possible:
+        return False
+    count = np.bincount(part)
+    left, gap = (np.bincount(part, held.squares(c)) for c in (list(selection.block), ()))
+    alive = count > 0
+    return bool(np.all(left[alive] < CLOSED**2 * gap[alive]))
+
+
+class _Beside:
     """The unnamed functions of a selection, asked for anew as accusations go."""
 
     def __init__(self, selection: Selection) -> None:
-        self.space = selection.working
-        joints = selection.observation.joint_columns is not None
+        self._selection, self.space = selection, selection.working
         unnamed = [
             c for c, k in enumerate(self.space.candidates) if _unnamed(k, selection.observation)
         ]
@@ -77,11 +116,13 @@ class _Remainder:
         self._asked = [c for c in selection.found.chosen if c in set(unnamed)]
         self._first = self._asked  # beside which the accused were found
         self.beside = self._asked  # those of the last question
-        # a constant is part of any function that moves a joint; of a sensor's axis it is a bias
-        moved = targets(selection.observation) if joints else {}
-        self._constant = {name: selection.rows_of(d) for name, d in moved.items()}
-        part_of = parts(selection.observation, selection.kept)
-        self._part = np.repeat(part_of, selection.observation.measured.shape[1])
+        # a constant is part of any function that moves a joint; of a sensor's axis it is a bias,
+        # and no more of it is the function's than the function is large
+        self._moved = targets(selection.observation)
+        self._constant = {name: selection.rows_of(d) for name, d in self._moved.items()}
+        self._sensed = selection.observation.joint_columns is None
+        self._rows = selection.observation.measured.shape[1]  # of each sample
+        self._part = np.repeat(parts(selection.observation, selection.kept), self._rows)
 
     def strengths(self, accused: list[int]) -> Array:
         """Return of each accusation how far it is over what it takes to stay (1: just)."""
@@ -90,10 +131,9 @@ class _Remainder:
         asked = self.beside = self.asked_for(accused, 1 if large else UNKNOWNS)
         if len(self.space.y) > LARGE:
             self._asked = asked
-        beside = self._beyond(accused, asked)
-        value, spread, shown = self._values(accused, beside)
-        found = np.hstack([self._unit(accused), self.space.columns(self._first)])
-        alone = np.linalg.lstsq(found, self.space.y, rcond=1e-9)[0]
+        value, spread, shown = self._values(accused, *self._beyond(accused, asked))
+        found = [self._unit(accused), self.space.columns(self._first), self._zero(accused)]
+        alone = np.linalg.lstsq(np.hstack(found), self.space.y, rcond=1e-9)[0]
         begin = 0
         sigmas: list[float] = []
         steady: list[float] = []
@@ -116,7 +156,8 @@ class _Remainder:
         """Return the unnamed functions that the residual asks for, at the price of chance alone."""
         space, asked = self.space, list(self._asked)
         for _ in range(most if len(self._index) else 0):
-            basis = basis_of(np.hstack([space.columns(accused), self._beside(asked)]))
+            zero = self._zero(accused)
+            basis = basis_of(np.hstack([space.columns(accused), self._beside(asked), zero]))
             left = space.y - basis @ (basis.T @ space.y)
             freedom = max(space.freedom - basis.shape[1], 1.0)
             variance = max(float(left @ left) / freedom, space.floor)
@@ -127,17 +168,61 @@ class _Remainder:
             asked.append(int(self._index[np.argmax(gain)]))
         return asked
 
+    def _zero(self, accused: Sequence[int]) -> Array:
+        """Return a sensor's constants (m, a) that no accused effect holds: its zero is not sure.
+
+        A constant that is not accused, but there, would be asked for as functions.
+        """
+        if not self._sensed:
+            return np.zeros((len(self.space.y), 0))
+        C = np.hstack(list(self._constant.values()))
+        V = basis_of(self._unit(accused))
+        left = np.linalg.norm(C - V @ (V.T @ C), axis=0) / np.linalg.norm(C, axis=0)
+        return np.asarray(C[:, left > 1e-6])
+
     def _beside(self, asked: Sequence[int]) -> Array:
-        moved = dict.fromkeys(self.space.candidates[c].target for c in asked)
-        constants = [self._constant[t] for t in moved if t in self._constant]
+        """Return the unnamed columns, and last the constants of what they move."""
+        constants = [self._constant[t] for t in self._targets(asked)]
         return np.hstack([self.space.columns(asked), *constants])
 
-    def _beyond(self, accused: Sequence[int], asked: Sequence[int]) -> Array:
+    def _targets(self, asked: Sequence[int]) -> list[str]:
+        moved = dict.fromkeys(self.space.candidates[c].target for c in asked)
+        return [t for t in moved if t in self._constant]
+
+    def _sigma(self, accused: Sequence[int], asked: Sequence[int]) -> Array:
+        """Return the prior 1 sigma of each constant; inf where it is wholly the function's.
+
+        Of a sensor's axis it is as large as all unnamed functions of that axis together; in units
+        in which the rows scatter by one.
+        """
+        targets_, space = self._targets(asked), self.space
+        if not self._sensed:
+            width = sum(self._constant[t].shape[1] for t in targets_)
+            return np.full(width, np.inf)
+        beside = self._beside(asked)
+        A = np.hstack([self._unit(accused), beside])
+        solution = np.linalg.lstsq(A, space.y, rcond=1e-9)[0]
+        rss = float(np.sum((space.y - A @ solution) ** 2))
+        scatter = np.sqrt(max(rss / max(space.freedom - A.shape[1], 1.0), space.floor))
+        x = solution[A.shape[1] - beside.shape[1] :]
+        begin, made = 0, {t: np.zeros(len(space.y)) for t in targets_}
+        for c in asked:
+            own = slice(begin, begin + int(space.start[c + 1] - space.start[c]))
+            begin = own.stop
+            target = space.candidates[c].target
+            if target in made:
+                made[target] += space.columns([c]) @ x[own]
+        size = [scatter * np.linalg.norm(self._constant[t]) for t in targets_]
+        return np.array([np.linalg.norm(made[t]) / n for t, n in zip(targets_, size, strict=True)])
+
+    def _beyond(self, accused: Sequence[int], asked: Sequence[int]) -> tuple[Array, Array]:
         """Return the unnamed columns, of those that hold an accused effect what they do beyond it.
 
-        A pull in any direction holds every weight; one that points nearly down is a weight.
+        With the prior 1 sigma of each. A pull in any direction holds every weight; one that points
+        nearly down is a weight.
         """
         space, X, beside = self.space, self._unit(accused), self._beside(asked)
+        constants = self._sigma(accused, asked)
         for c in asked:
             if not space.candidates[c].of_no_quantity:
                 continue
@@ -151,35 +236,56 @@ class _Remainder:
             if np.sum((own.T @ space.y) ** 2) < MOSTLY * np.sum((whole.T @ space.y) ** 2):
                 continue
             V = basis_of(X[:, inside])
-            beside = np.hstack([others, U - V @ (V.T @ U)])
-        return beside
+            beside = np.hstack([U - V @ (V.T @ U), others])
+        free = np.full(beside.shape[1] - len(constants), np.inf)
+        return beside, np.concatenate([free, constants])
 
     def _unit(self, accused: Sequence[int]) -> Array:
         X = self.space.columns(accused)
         return np.asarray(X / (np.sqrt(np.einsum("ij,ij->j", X, X)) + 1e-300))
 
-    def _values(self, accused: list[int], beside: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def _values(
+        self, accused: list[int], beside: Array, sigma: Array
+    ) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Return values of unit columns, their covariance with scatter, and which are shown.
 
         The scatter is a jackknife over parts of the log: what only imitates differs among them.
         """
-        space, X = self.space, self._unit(accused)
+        known = np.isfinite(sigma)
+        prior = np.diag(1 / np.maximum(sigma, 1e-300))[known]  # rows that every part holds
+        X, y = self._unit(accused), self.space.y
+        X, y = (
+            np.vstack([X, np.zeros((len(prior), X.shape[1]))]),
+            np.append(y, np.zeros(len(prior))),
+        )
+        beside = np.vstack([beside, prior])
+        part = np.append(self._part, np.full(len(prior), -1))
 
         def solved(rows: NDArray[np.bool_]) -> tuple[Array, Array, Array, float]:
-            A, y, U = X[rows], space.y[rows], basis_of(beside[rows])
-            A, y = A - U @ (U.T @ A), y - U @ (U.T @ y)
+            A, b, U = X[rows], y[rows], basis_of(beside[rows])
+            A, b = A - U @ (U.T @ A), b - U @ (U.T @ b)
             size, V = np.linalg.eigh(A.T @ A)
             open_ = size > TAKEN
             inverse = (V * np.where(open_, 1 / np.maximum(size, TAKEN), 0)) @ V.T
-            x = inverse @ (A.T @ y)
-            return x, inverse, (V**2) @ ~open_, float(np.sum((y - A @ x) ** 2))
+            x = inverse @ (A.T @ b)
+            return x, inverse, (V**2) @ ~open_, float(np.sum((b - A @ x) ** 2))
 
-        value, inverse, taken, rss = solved(np.ones(len(self._part), dtype=bool))
-        freedom = max(space.freedom - X.shape[1] - beside.shape[1], 1.0)
-        without = np.array([solved(self._part != p)[0] for p in np.unique(self._part)])
+        value, inverse, taken, rss = solved(np.ones(len(part), dtype=bool))
+        freedom = max(self.space.freedom - X.shape[1] - beside.shape[1], 1.0)
+        without = np.array([solved(part != p)[0] for p in np.unique(self._part)])
         away = without - without.mean(axis=0)
         scatter = (len(without) - 1) / len(without) * away.T @ away
-        return value, inverse * max(rss / freedom, space.floor) + scatter, taken < SHOWN
+        return value, inverse * max(rss / freedom, self.space.floor) + scatter, taken < SHOWN
+
+    def beside_refit(self, accused: Sequence[int]) -> Remainder:
+        """Return what stands beside the accused in their last refit."""
+        asked, selection = self.beside, self._selection
+        constants = [selection.plain_rows_of(self._moved[t]) for t in self._targets(asked)]
+        columns = np.hstack([selection.space.columns(asked), *constants])
+        sigma = self._sigma(accused, asked)
+        free = np.full(columns.shape[1] - len(sigma), np.inf)
+        region = np.repeat(regions(selection.observation, selection.kept), self._rows)
+        return Remainder(columns, np.concatenate([free, sigma]), region)
 
     def _with_siblings(self, accused: list[int], sigmas: Array, steady: Array) -> Array:
         """Return strengths: less is asked at further joints of an effect; of lines as much."""

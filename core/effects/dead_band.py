@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
-from gapbridge.core.interpolation import played, stretches
+from gapbridge.core.kernels.interpolation import played, stretches
 
 if TYPE_CHECKING:
     import numpy as np

@@ -32,6 +32,7 @@ class JointOffset(JointEffect):
     label_words = "zero of joint {joint}"
     calibrated = 2
     moved = "the zero of joint {joint} moved by {size}"
+    beside_links = True
     channels = ("position",)
     motion = "poses that differ in the other joints"
 

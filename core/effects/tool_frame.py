@@ -28,6 +28,7 @@ class ToolFrame(Effect):
     calibrated = 1
     corrects = "tool"
     moved = "the tool moved by {size}: run the short session for the tool"
+    beside_links = True
     channels = ("position",)
     motion = "poses that differ in the orientation of the flange"
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
 from gapbridge.core.effects.simulator import Kind, SimulatorChange
-from gapbridge.core.interpolation import lagged, stretches
+from gapbridge.core.kernels.interpolation import lagged, stretches
 
 if TYPE_CHECKING:
     import numpy as np

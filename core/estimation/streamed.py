@@ -1,8 +1,8 @@
 """Identification from logs of any length: read once, then passed over in blocks of rows.
 
 The same least squares, weights and choice as identification.py, begun at the fit to a sample of the
-rows. Held-out figures leave out every fifth row by chance, not whole poses: among many thousands of
-rows, poses are not separated.
+rows. Held-out figures leave out every fifth stretch of rows, not whole poses: among many thousands
+of rows, poses are not separated. They are judged on the sample's rows, some twenty thousand.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.effects.effect import typical_moment
 from gapbridge.core.estimation import base_parameters, compliance_fit
 from gapbridge.core.estimation.compliance_fit import (
-    RANK,
+    CONVERGED,
+    ROUNDS,
     Data,
     Fit,
+    Linear,
     Mask,
     flexibilities,
-    moved,
     residual,
     solve,
     stepped,
     weights_at,
 )
 from gapbridge.core.estimation.identification import (
-    FOLDS,
     Identification,
     data_of,
     notes_of,
@@ -38,14 +38,15 @@ from gapbridge.core.estimation.identification import (
 )
 from gapbridge.core.estimation.row_store import RowStore
 from gapbridge.core.estimation.streamed_fit import (
+    FOLDS,
     NONE,
-    FitState,
     Piece,
     Stream,
     factors,
-    fit_flexibilities,
-    fit_nuisances,
     joined,
+    placed,
+    scale_of,
+    stretches,
 )
 from gapbridge.core.loads import Loads
 from gapbridge.core.log.log import Log
@@ -56,6 +57,7 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 SAMPLE = 20_000  # rows kept at most, for the first guess and the look whether anything bends
 MANY_OUTLIERS = 100_000  # rows that are named at most
+ENOUGH = 1e-4  # relative step at which a fit of more rows than the sample has converged
 INLIER = 1e-6  # weight below which a row counts as an outlier
 
 
@@ -65,56 +67,69 @@ class _Task:
     scale: float
     nonnegative: bool
 
-    def on_sample(self, before: FitState, sample: Data) -> FitState:
+    def on_sample(self, before: Fit, sample: Data) -> Fit:
         """Fit everything on the rows of the sample: where the passes over all rows begin."""
-        centre = self.prior[0]
+        everything = np.ones(len(self.prior[0]), dtype=bool)
         fit = compliance_fit.fit_flexibilities(
-            before.fit, sample, np.ones(len(centre), dtype=bool), self.prior,
-            nonnegative=self.nonnegative,
-        )  # fmt: skip
-        return FitState(Fit(fit.model, fit.frame, NONE), before.scale)
-
-    def run(self, begin: FitState, stream: Stream) -> tuple[FitState, base_parameters.Shown]:
-        """Fit everything, choose what the data show, fit that alone."""
-        centre = self.prior[0]
-        everything = np.ones(len(centre), dtype=bool)
-        look = fit_flexibilities(
-            begin, stream, everything, self.prior, nonnegative=self.nonnegative, rounds=1
+            before, sample, everything, self.prior, nonnegative=self.nonnegative
         )
-        assert look.fit.linear is not None
-        kept = self.choose(look.fit)
-        values, n = np.where(kept, look.fit.flexibility, centre), len(centre) // 2
-        model = look.fit.model.with_compliance(values[:n], values[n:])
-        begin = FitState(Fit(model, look.fit.frame, NONE), look.scale)
-        found = fit_flexibilities(begin, stream, kept, self.prior, nonnegative=self.nonnegative)
-        assert found.fit.linear is not None
-        return found, base_parameters.what_is_shown(found.fit.linear, kept, self.scale)
+        return Fit(fit.model, fit.frame, NONE)
 
-    def choose(self, look: Fit) -> Mask:
-        """Return which flexibilities (2n,) the data show, by the linear form of a fit of all."""
-        assert look.linear is not None
-        return base_parameters.choose(look.linear, (self.prior[0], self.scale), self.nonnegative)
+    def run(self, begin: Fit, stream: Stream) -> _Found:
+        """Choose what all rows show, and fit that alone.
 
-    def without(self, after: Fit, R: Array, nuisances: int) -> Fit:
-        """Return the fit to some of the rows, one step from the fit to all: choice, then values.
+        A step that is small leaves an error of some percent of itself, by the weights: the steps
+        need not become smaller than what so many rows determine anyway.
+        """
+        now, enough = begin, CONVERGED if stream.count <= SAMPLE else ENOUGH
+        kept: Mask | None = None
+        for _ in range(ROUNDS):
+            noise = scale_of(now, stream.sample)
+            parts = factors(now, noise, stream)
+            found, kept, linear = self.step(now, joined(parts), stream.nuisances, kept)
+            change = np.abs(found.flexibility - now.flexibility).max()
+            base, now = now, found
+            if change < enough * max(np.abs(now.flexibility).max(), 1e-12):
+                break
+        shown = base_parameters.what_is_shown(linear, kept, self.scale)
+        return _Found(now, noise, base, parts, shown)
 
-        ``R`` is those rows' factor at the shape of ``after``.
+    def step(
+        self, at: Fit, R: Array, nuisances: int, kept: Mask | None = None
+    ) -> tuple[Fit, Mask, Linear]:
+        """Return the fit one step from ``at``, what is kept (where not given) and the problem.
+
+        ``R`` is the factor of the rows that are fitted, at the shape of ``at``.
         """
         F, A, b = R[:, :nuisances], R[:, nuisances:-1], R[:, -1]
-        centre, n = self.prior[0], after.model.arm.n
+        centre, n = self.prior[0], at.model.arm.n
         look = stepped(
-            after, (F, A, b), NONE, np.ones(len(centre), dtype=bool), self.prior,
+            at, (F, A, b), NONE, np.ones(len(centre), dtype=bool), self.prior,
             nonnegative=self.nonnegative,
         )  # fmt: skip
-        assert look.linear is not None
-        kept = self.choose(look)
-        begin = np.where(kept, after.flexibility, centre)
-        found = solve(look.linear, kept, begin, self.prior, self.nonnegative)
-        model, frame = after.model, after.frame
-        if nuisances:
-            left = b - A @ (found - after.flexibility)
-            model, frame = moved(model, frame, np.linalg.lstsq(F, left, rcond=RANK)[0])
-        return Fit(model.with_compliance(found[:n], found[n:]), frame, NONE)
+        linear = look.linear
+        assert linear is not None
+        if kept is None:
+            kept = base_parameters.choose(linear, (centre, self.scale), self.nonnegative)
+        begin = np.where(kept, at.flexibility, centre)
+        found = solve(linear, kept, begin, self.prior, self.nonnegative)
+        moved = placed(at, b - A @ (found - at.flexibility), F)
+        return (
+            Fit(moved.model.with_compliance(found[:n], found[n:]), moved.frame, NONE),
+            kept,
+            linear,
+        )
+
+
+@dataclass(frozen=True)
+class _Found:
+    """The fit of all rows, and what it was made of."""
+
+    fit: Fit
+    noise: Array  # (2,) m, rad
+    base: Fit  # one step before
+    parts: Array  # (FOLDS, k, k) R factors of each fold's rows at its shape
+    shown: base_parameters.Shown
 
 
 def identify_streamed(
@@ -142,13 +157,19 @@ def identify_streamed(
     scale = prior_std if np.isfinite(prior_std) else usual
     task = _Task((flexibilities(model), prior_std), scale, nonnegative)
     emit("fitting")
-    before = fit_nuisances(model, stream)
-    after, shown = task.run(task.on_sample(before, stream.sample), stream)
+    before = _nuisances_alone(model, stream.sample)
+    found = task.run(task.on_sample(before, stream.sample), stream)
     unseen = (float("nan"), float("nan"))
     if held_out:
         emit("checking on held-out rows")
-        unseen = _held_out(stream, task, before, after)
-    return _result(model, stream, (before, after), shown, unseen)
+        unseen = _held_out(model, stream, task, found)
+    return _result(model, stream, before, found, unseen)
+
+
+def _nuisances_alone(model: Model, rows: Data) -> Fit:
+    """Return the frame and tool point that fit best, the model's flexibilities left alone."""
+    found = compliance_fit.fit_nuisances(model, rows)
+    return Fit(found.model, found.frame, NONE)
 
 
 def _stream(log: Iterable[Log], metrology: Metrology, by_approach: bool) -> Stream:
@@ -164,17 +185,25 @@ def _stream(log: Iterable[Log], metrology: Metrology, by_approach: bool) -> Stre
             empty = data
         first += len(part)
     every = max(store.count // SAMPLE, 1)
-    kept = [data.part(rows % every == 0) for data, rows in store]
+    kept, folds = [], []
+    for number, (data, rows) in enumerate(store):
+        fold = np.empty(len(rows), dtype=np.int64)
+        for k, part in stretches(number, len(rows)):
+            fold[part] = k
+        taken = rows % every == 0
+        kept.append(data.part(taken))
+        folds.append(fold[taken])
     if not kept:  # no row at all: the usual way says so
         assert empty is not None
-        kept = [empty]
+        kept, folds = [empty], [np.zeros(0, dtype=np.int64)]
     sample = _joined(kept)
     width = 3 if sample.rotation is None else 6
 
     def pieces() -> Iterator[Piece]:
         return (Piece(data, rows) for data, rows in store)
 
-    return Stream(pieces, sample, store.count, width, sample.nuisances)
+    fold = np.concatenate(folds)
+    return Stream(pieces, sample, fold, store.count, width, sample.nuisances)
 
 
 def _joined(parts: list[Data]) -> Data:
@@ -197,56 +226,40 @@ def _joined(parts: list[Data]) -> Data:
     )
 
 
-def fold_of(rows: Rows) -> Rows:
-    """Return the fold (k,) that leaves out each row: by chance, the same at every pass."""
-    x = rows.astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)
-    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
-        x = (x ^ (x >> np.uint64(shift))) * np.uint64(factor)  # splitmix64 (Steele et al. 2014)
-    return ((x ^ (x >> np.uint64(31))) % np.uint64(FOLDS)).astype(np.int64)
+def _held_out(model: Model, stream: Stream, task: _Task, found: _Found) -> tuple[float, float]:
+    """Return the rms before and after over the sample's inliers that each fit did not see.
 
-
-def _held_out(
-    stream: Stream, task: _Task, before: FitState, after: FitState
-) -> tuple[float, float]:
-    """Return the rms before and after over inliers that each fit did not see.
-
-    Fits without a fold are one step from the fits to all rows, whose shape and weights they share.
+    Fits without a fold are one step from the fit to all rows, whose shape and weights they share.
     """
-    parts = [factors(one, stream, fold_of, FOLDS) for one in (before, after)]
-    m, fits = stream.nuisances, []
+    sums, cells = np.zeros(2), 0
+    gap = residual(found.fit.model, stream.sample, found.fit.frame)[0]
+    inlier = weights_at(gap, found.noise) > INLIER
     for k in range(FOLDS):
-        rest = [joined(np.delete(R, k, axis=0)) for R in parts]
-        first = before.fit
-        if m:
-            step = np.linalg.lstsq(rest[0][:, :m], rest[0][:, -1], rcond=RANK)[0]
-            first = Fit(*moved(first.model, first.frame, step), NONE)
-        fits.append((first, task.without(after.fit, rest[1], m)))
-    sums, count = np.zeros(2), 0
-    for piece in stream.pieces():
-        fold, inlier = fold_of(piece.rows), _inliers(after, piece.data)
-        for k in range(FOLDS):
-            unseen = piece.data.part((fold == k) & inlier)
-            gaps = [residual(fit.model, unseen, fit.frame)[0][:, :3] for fit in fits[k]]
-            sums += [float(np.sum(gap**2)) for gap in gaps]
-            count += gaps[0].size
-    before_rms, after_rms = np.sqrt(sums / max(count, 1))
+        rest, unseen = stream.fold != k, (stream.fold == k) & inlier
+        if not rest.any() or not unseen.any():
+            continue
+        others = joined(np.delete(found.parts, k, axis=0))
+        fits = (
+            _nuisances_alone(model, stream.sample.part(rest)),
+            task.step(found.base, others, stream.nuisances)[0],
+        )
+        judged = stream.sample.part(unseen)
+        gaps = [residual(fit.model, judged, fit.frame)[0][:, :3] for fit in fits]
+        sums += [float(np.sum(gap**2)) for gap in gaps]
+        cells += gaps[0].size
+    before_rms, after_rms = np.sqrt(sums / max(cells, 1))
     return float(before_rms), float(after_rms)
 
 
-def _inliers(settled: FitState, data: Data) -> Mask:
-    gap = residual(settled.fit.model, data, settled.fit.frame)[0]
-    return np.asarray(weights_at(gap, settled.scale) > INLIER)
-
-
 def _result(
-    model: Model, stream: Stream, fits: tuple[FitState, FitState], shown: base_parameters.Shown,
-    held_out: tuple[float, float],
-) -> Identification:  # fmt: skip
-    n, kept, after = model.arm.n, shown.kept, fits[1].fit
+    model: Model, stream: Stream, before: Fit, found: _Found, held_out: tuple[float, float]
+) -> Identification:
+    n, shown, after = model.arm.n, found.shown, found.fit
+    kept = shown.kept
     sums, inlier_cells, outliers = np.zeros(2), 0, list[Rows]()
     for piece in stream.pieces():
-        gaps = [residual(one.fit.model, piece.data, one.fit.frame)[0] for one in fits]
-        inlier = weights_at(gaps[1], fits[1].scale) > INLIER
+        gaps = [residual(one.model, piece.data, one.frame)[0] for one in (before, after)]
+        inlier = weights_at(gaps[1], found.noise) > INLIER
         sums += [float(np.sum(gap[inlier, :3] ** 2)) for gap in gaps]
         inlier_cells += 3 * int(inlier.sum())
         outliers.append(piece.rows[~inlier])

@@ -1,9 +1,8 @@
 """The least squares of core.estimation.compliance_fit over rows that pass by in pieces.
 
-Each step of Gauss and Newton passes twice over the rows: once for the gap, whose median says what
-is noise and what is an outlier, once for the R factor of all weighed columns, into which every
-block of
-rows is folded (core.kernels). What is kept does not grow with the rows; the gaps wait in a file.
+Each step of Gauss and Newton passes once over the rows: the gap of every block weighs it, and the
+block is folded into the R factor of all weighed columns (core.kernels), a factor for each fold.
+What is noise and what an outlier the sample says, whose median stands for that of all rows.
 """
 
 from __future__ import annotations
@@ -14,30 +13,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.estimation import compliance_fit
 from gapbridge.core.estimation.compliance_fit import (
-    CONVERGED,
-    NUISANCE_ROUNDS,
     RANK,
-    ROUNDS,
     Data,
     Fit,
-    Mask,
     moved,
     noise_scale,
     nuisance_columns,
     per_cell_of,
     residual,
-    stepped,
     weights_at,
 )
-from gapbridge.core.estimation.registration import IDENTITY
-from gapbridge.core.estimation.spool import Spool
 from gapbridge.core.kernels.factor import factor_blocks
 from gapbridge.core.kernels.threads import in_ranges
 from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
+FOLDS = 5
 NONE = np.zeros(0)  # weights of a fit whose rows nobody keeps
 
 
@@ -55,90 +47,48 @@ class Stream:
 
     pieces: Callable[[], Iterator[Piece]]
     sample: Data  # rows from all over the log, few enough to be kept
+    fold: NDArray[np.int64]  # (S,) of the sample's rows
     count: int  # rows with measured poses
     width: int  # numbers per row: 3, or 6 with rotations
     nuisances: int
 
 
-@dataclass(frozen=True)
-class FitState:
-    """A fit, and the noise by which its rows were weighed."""
-
-    fit: Fit
-    scale: Array  # (2,) m, rad
-
-
-def fit_nuisances(model: Model, stream: Stream) -> FitState:
-    """Return the frame and tool point that fit best, the model's flexibilities left alone."""
-    if not stream.nuisances:
-        fit = Fit(model, IDENTITY, NONE)
-        with _gaps(fit, stream) as gaps:
-            return FitState(fit, _scale(gaps))
-    begin = compliance_fit.fit_nuisances(model, stream.sample)
-    fit = Fit(begin.model, begin.frame, NONE)
-    for _ in range(NUISANCE_ROUNDS):
-        scale, R = weighed(fit, stream)
-        step = np.linalg.lstsq(R[:, :9], R[:, -1], rcond=RANK)[0]
-        fit = Fit(*moved(fit.model, fit.frame, step), NONE)
-        if np.abs(step).max() < CONVERGED:
-            break
-    return FitState(fit, scale)
+def stretches(number: int, rows: int) -> Iterator[tuple[int, slice]]:
+    """Yield each fold's rows of a piece, by its number: neighbours go together."""
+    edges = np.linspace(0, rows, FOLDS + 1).astype(int)
+    for k in range(FOLDS):
+        if edges[k + 1] > edges[k]:
+            yield (number + k) % FOLDS, slice(int(edges[k]), int(edges[k + 1]))
 
 
-def fit_flexibilities(
-    begin: FitState, stream: Stream, kept: Mask, prior: tuple[Array, float], *,
-    nonnegative: bool, rounds: int = ROUNDS,
-) -> FitState:  # fmt: skip
-    """Return the fit of the ``kept`` flexibilities, as ``compliance_fit.fit_flexibilities``."""
-    now = begin
-    for _ in range(rounds):
-        before = now.fit.flexibility
-        scale, R = weighed(now.fit, stream)
-        m = stream.nuisances
-        problem = (R[:, :m], R[:, m:-1], R[:, -1])
-        fit = stepped(now.fit, problem, NONE, kept, prior, nonnegative=nonnegative)
-        now = FitState(fit, scale)
-        if np.abs(fit.flexibility - before).max() < CONVERGED * max(np.abs(before).max(), 1e-12):
-            break
-    return now
+def scale_of(fit: Fit, sample: Data) -> Array:
+    """Return the noise (2,), m and rad, by the gaps of the sample."""
+    gap = np.abs(residual(fit.model, sample, fit.frame)[0])
+    turned = float(np.median(gap[:, 3:])) if gap.shape[1] > 3 else None
+    return noise_scale(float(np.median(gap[:, :3])), turned)
 
 
-def weighed(fit: Fit, stream: Stream) -> tuple[Array, Array]:
-    """Return the noise (2,) and the R factor (k, k) of [nuisances | flexibilities | gap]."""
-    k = stream.nuisances + 2 * fit.model.arm.n + 1
-    R = np.zeros((k, k))
-    with _gaps(fit, stream) as gaps:
-        scale = _scale(gaps)
-        gaps.rewind()
-        for piece in stream.pieces():
-            gap = gaps.read(len(piece.rows))
-            cells = per_cell_of(weights_at(gap, scale), scale, stream.width)
-            add_rows(fit.model, piece.data, gap, cells, R)
-    return scale, R
+def factors(fit: Fit, scale: Array, stream: Stream) -> Array:
+    """Return the R factors (FOLDS, k, k) of [nuisances | flexibilities | gap] of each fold's rows.
 
-
-def factors(
-    settled: FitState,
-    stream: Stream,
-    part_of: Callable[[NDArray[np.int64]], NDArray[np.int64]],
-    parts: int,
-) -> Array:
-    """Return the R factors (parts, k, k) of the rows of each part, at a fit's shape and weights.
-
-    ``part_of`` returns the part, from 0, of rows by their numbers.
+    Columns at the shape of ``fit``, rows weighed by the noise ``scale`` (2,).
     """
-    fit, scale = settled.fit, settled.scale
     k = stream.nuisances + 2 * fit.model.arm.n + 1
-    found = np.zeros((parts, k, k))
-    for piece in stream.pieces():
+    found = np.zeros((FOLDS, k, k))
+    for number, piece in enumerate(stream.pieces()):
         gap, _ = residual(fit.model, piece.data, fit.frame)
         cells = per_cell_of(weights_at(gap, scale), scale, stream.width)
-        part = part_of(piece.rows)
-        for p in range(parts):
-            own = np.flatnonzero(part == p)
-            if len(own):
-                add_rows(fit.model, piece.data.part(own), gap[own], cells[own], found[p])
+        for fold, rows in stretches(number, len(gap)):
+            add_rows(fit.model, piece.data.part(rows), gap[rows], cells[rows], found[fold])
     return found
+
+
+def placed(fit: Fit, left: Array, F: Array) -> Fit:
+    """Return the fit with its nuisances moved so that F @ step takes up what is ``left``."""
+    if not F.shape[1]:
+        return fit
+    step = np.linalg.lstsq(F, left, rcond=RANK)[0]
+    return Fit(*moved(fit.model, fit.frame, step), NONE)
 
 
 def joined(factors: Array) -> Array:
@@ -177,15 +127,3 @@ def _fold(R: Array, *parts: Array) -> None:
     folded = np.linalg.qr(np.vstack([R, *parts]), mode="r")
     R[:] = 0.0
     R[: len(folded)] = folded
-
-
-def _gaps(fit: Fit, stream: Stream) -> Spool:
-    gaps = Spool(stream.width)
-    for piece in stream.pieces():
-        gaps.append(residual(fit.model, piece.data, fit.frame)[0])
-    return gaps
-
-
-def _scale(gaps: Spool) -> Array:
-    turned = gaps.median_size(3, 6) if gaps.width > 3 else None
-    return noise_scale(gaps.median_size(0, 3), turned)

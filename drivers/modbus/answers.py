@@ -6,7 +6,13 @@ from typing import Any
 
 from gapbridge.core.errors import InvalidStateError
 from gapbridge.drivers.modbus.registers import wire_of
-from gapbridge.drivers.modbus.tcp_requests import refusal
+
+EXCEPTIONS = {
+    1: "illegal function", 2: "illegal address", 3: "illegal value", 4: "device failure",
+    5: "acknowledge", 6: "device busy", 10: "no path to the device",
+    11: "the device does not answer",
+}  # fmt: skip
+"""Exception codes (MODBUS Application Protocol Specification V1.1b3, 7)."""
 
 
 def check_answer(answer: Any, function: int, count: int, where: str) -> bytes:
@@ -25,18 +31,22 @@ def check_answer(answer: Any, function: int, count: int, where: str) -> bytes:
     return wire_of(found)
 
 
-def check_written(answer: Any, function: int, address: int, where: str) -> None:
-    """Refuse an answer that does not confirm a write. Raises InvalidStateError."""
+def check_written(answer: Any, function: int, address: int, count: int, where: str) -> None:
+    """Refuse an answer that does not confirm a write of ``count``. Raises InvalidStateError."""
     _check_function(answer, function, where)
     if answer.address != address:
         raise InvalidStateError(f"{where}: found address {answer.address}, expected {address}")
+    if function in (15, 16) and answer.count != count:
+        raise InvalidStateError(f"{where}: found {answer.count} written, expected {count}")
 
 
 def _check_function(answer: Any, function: int, where: str) -> None:
     if answer is None:
         raise InvalidStateError(f"{where}: found no answer")
     if answer.isError():
-        raise InvalidStateError(f"{where}: {refusal(getattr(answer, 'exception_code', 0))}")
+        code = getattr(answer, "exception_code", 0)
+        words = EXCEPTIONS.get(code, f"exception {code}")
+        raise InvalidStateError(f"{where}: the controller refuses: {words}")
     if answer.function_code != function:
         raise InvalidStateError(
             f"{where}: found an answer to function {answer.function_code}, expected {function}"

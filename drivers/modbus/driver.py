@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -70,15 +73,16 @@ class ModbusDriver(Driver):
         self.transport.open()
         try:
             found = [self.transport.read(block) for block in self.map.identity]
-            check_identity(self.profile, self.map, found)
+            with self._named():
+                check_identity(self.profile, self.map, found)
             self._slow_at = 0.0
-            sample = self._decoder.decode(self._read_blocks())
-            self._check_limits(sample.vectors["position"])
+            blocks = self._read_blocks()
+            with self._named():
+                sample = self._decoder.decode(blocks)
+                self._check_limits(sample.vectors["position"])
         except InvalidStateError as error:
             self.transport.close()
-            name = self.transport.name
-            problem = str(error).removeprefix(f"{name}: ")
-            raise LinkError(f"{name}: {problem}") from None
+            raise LinkError(str(error)) from None
         except LinkError:
             self.transport.close()
             raise
@@ -86,6 +90,14 @@ class ModbusDriver(Driver):
         self._freshness.restart()
         self._connected = True
         self._due = self._fresh_at = self._now()
+
+    @contextlib.contextmanager
+    def _named(self) -> Iterator[None]:
+        """Name the link in what a check finds; errors of the transport have its name already."""
+        try:
+            yield
+        except InvalidStateError as error:
+            raise InvalidStateError(f"{self.transport.name}: {error}") from None
 
     def _check_limits(self, q: Vector) -> None:
         """Refuse joints where the arm cannot be: units, word order or signs are wrong."""

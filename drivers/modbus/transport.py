@@ -2,7 +2,6 @@
 
 The library takes an answer of another function or with too few registers for good, and raises its
 own errors as well as the operating system's; here an answer is what was asked for, or a LinkError.
-Over TCP the requests of every cycle go round the library (drivers/modbus/tcp_requests.py).
 """
 
 from __future__ import annotations
@@ -17,15 +16,17 @@ from pymodbus.exceptions import ModbusException, ModbusIOException
 from pymodbus.pdu import ModbusPDU
 
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
-from gapbridge.drivers.modbus import tcp_requests
 from gapbridge.drivers.modbus.answers import check_answer, check_written
 from gapbridge.drivers.modbus.map import Block, RegisterMap
-from gapbridge.drivers.modbus.registers import BIT_TABLES, Table
+from gapbridge.drivers.modbus.registers import Table
 from gapbridge.drivers.modbus.settings import ModbusSettings
-from gapbridge.drivers.modbus.tcp_requests import TcpRequests
 from gapbridge.drivers.modbus.tls import CheckedContext, checked_context
 
 READ_FUNCTIONS: dict[Table, int] = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
+WRITE_FUNCTIONS: dict[tuple[Table, bool], int] = {
+    ("coil", True): 5, ("coil", False): 15, ("holding", True): 6, ("holding", False): 16,
+}  # fmt: skip
+"""Table and whether one value goes in a request of its own -> function."""
 
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # reported by our own errors instead
 
@@ -38,7 +39,6 @@ class Transport:
         self._writable: frozenset[tuple[Table, int]] = frozenset()
         self._allowed: set[tuple[Table, int, int]] = set()  # runs that were looked up before
         self._client: Any = None
-        self._tcp: TcpRequests | None = None
         self._calls: dict[Table, Any] = {}  # the client's methods that read
 
     def allow(self, compiled: RegisterMap) -> None:
@@ -72,7 +72,6 @@ class Transport:
             raise LinkError(f"{self.name}: cannot be reached: {why or 'no answer or refused'}")
         if settings_are_tcp(self._settings) and client.socket is not None:
             client.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._tcp = TcpRequests(client, self._device, self._settings.timeout)
         self._calls = {
             "coil": client.read_coils, "discrete": client.read_discrete_inputs,
             "holding": client.read_holding_registers, "input": client.read_input_registers,
@@ -101,7 +100,7 @@ class Transport:
 
     def close(self) -> None:
         """Close the socket, which the library leaves open after some errors; may be repeated."""
-        client, self._client, self._tcp = self._client, None, None
+        client, self._client = self._client, None
         if client is not None:
             client.close()
 
@@ -114,9 +113,6 @@ class Transport:
         """
         table = block.table
         function = READ_FUNCTIONS[table]
-        if self._tcp is not None and table not in BIT_TABLES:
-            answer = self._ask_tcp(tcp_requests.read_request(function, block.first, block.count))
-            return self._registers(answer, function, block.count, table)
         self._opened()
         found = self._ask(
             self._calls[table], block.first, count=block.count, device_id=self._device
@@ -126,20 +122,11 @@ class Transport:
     def exchange(self, block: Block, address: int, values: Sequence[int]) -> bytes:
         """Write holding registers, then read a block of them, in one request (function 23)."""
         self._check_allowed("holding", address, values)
-        if self._tcp is not None:
-            request = tcp_requests.exchange_request(block.first, block.count, address, values)
-            return self._registers(self._ask_tcp(request), 23, block.count, "holding")
         answer = self._ask(
             self._opened().readwrite_registers, read_address=block.first, read_count=block.count,
             write_address=address, values=list(values), device_id=self._device,
         )  # fmt: skip
         return check_answer(answer, 23, block.count, f"{self.name}: holding")
-
-    def _registers(self, answer: bytes, function: int, count: int, table: Table) -> bytes:
-        try:
-            return tcp_requests.read_registers(answer, function, count)
-        except InvalidStateError as error:
-            raise InvalidStateError(f"{self.name}: {table}: {error}") from None
 
     # -- writing ----------------------------------------------------------------------------------
 
@@ -154,37 +141,18 @@ class Transport:
         client = self._opened()
         one = single or len(values) == 1
         try:
-            if table == "holding" and not one:
-                self._write_registers(client, address, values)
-                return
             for start, chunk in _chunks(address, values, one):
                 if table == "coil":
                     call = client.write_coil if one else client.write_coils
                 else:
-                    call = client.write_register
+                    call = client.write_register if one else client.write_registers
                 sent: Any = chunk[0] if one else chunk
                 sent = bool(sent) if table == "coil" and one else sent
-                function = {("coil", True): 5, ("coil", False): 15}.get((table, one), 6)
-                check_written(
-                    self._ask(call, start, sent, device_id=self._device),
-                    function,
-                    start,
-                    f"{self.name}: {table}",
-                )
+                function = WRITE_FUNCTIONS[table, one]
+                answer = self._ask(call, start, sent, device_id=self._device)
+                check_written(answer, function, start, len(chunk), f"{self.name}: {table}")
         except InvalidStateError as error:
             raise WriteError(str(error)) from None
-
-    def _write_registers(self, client: Any, address: int, values: Sequence[int]) -> None:
-        """Write holding registers in one request. Raises InvalidStateError, LinkError."""
-        if self._tcp is None:
-            found = self._ask(client.write_registers, address, list(values), device_id=self._device)
-            check_written(found, 16, address, f"{self.name}: holding")
-            return
-        answer = self._ask_tcp(tcp_requests.write_request(address, values))
-        try:
-            tcp_requests.check_written(answer, address, len(values))
-        except InvalidStateError as error:
-            raise InvalidStateError(f"{self.name}: holding: {error}") from None
 
     def _check_allowed(self, table: Table, address: int, values: Sequence[int]) -> None:
         run = (table, address, len(values))
@@ -204,18 +172,6 @@ class Transport:
         if self._client is None:
             raise LinkError(f"{self.name}: found no connection, expected connect() first")
         return self._client
-
-    def _ask_tcp(self, request: bytes) -> bytes:
-        """Return the PDU that answers one. Raises LinkError; the socket is closed then."""
-        assert self._tcp is not None
-        try:
-            return self._tcp.ask(request)
-        except TimeoutError:
-            self._give_up(StaleStateError(self._silence()))
-        except InvalidStateError as error:
-            self._give_up(InvalidStateError(f"{self.name}: {error}"))
-        except OSError as error:
-            self._give_up(LinkError(f"{self.name}: no answer: {_words(error)}"))
 
     def _ask(self, call: Any, *arguments: Any, **keys: Any) -> ModbusPDU:
         """Return the library's answer. Raises LinkError; the socket is closed then."""

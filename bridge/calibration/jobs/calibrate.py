@@ -142,10 +142,10 @@ class WholeJob(Job):
         from gapbridge.bridge.calibration.jobs.facts import (
             session_facts,  # pictures take their time
         )
-        from gapbridge.bridge.calibration.report import write_report
+        from gapbridge.bridge.calibration.report import Material, write_report
 
         facts = session_facts(self.cell, options, self.session)
-        for file in write_report(found, self.session.plan, facts, folder):
+        for file in write_report(Material(found, self.session.plan, facts), folder):
             prompt.say(f"{file}: written")
         if not found.complete:
             prompt.warn(f"not complete: {found.remaining}")

@@ -22,7 +22,9 @@ from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell, save_cell
 from gapbridge.bridge.document.output_file import require_writable, write_text
 from gapbridge.bridge.document.provenance import provenance
+from gapbridge.core.calibration.payload_session import PayloadCalibration
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
+from gapbridge.core.calibration.tool_session import ToolCalibration
 from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
@@ -68,6 +70,26 @@ class Job(ABC):
     @abstractmethod
     def finish(self) -> None:
         """Work out what the readings determine, report it, and apply it where a person says so."""
+
+    def report_short(
+        self, found: PayloadCalibration | ToolCalibration, lines: Sequence[str],
+        instrument: tuple[str, str],
+    ) -> None:  # fmt: skip
+        """Say what a short session found, a line an estimate, and write its report.
+
+        ``instrument``: name and kind of what was measured with.
+        """
+        from gapbridge.bridge.calibration.jobs.facts import session_facts
+        from gapbridge.bridge.calibration.report import ShortMaterial, write_report
+
+        prompt = self.prompt
+        prompt.say()
+        prompt.say(found.verdict, "bold")
+        for line in (*lines, *(f"  note: {note}" for note in found.notes)):
+            prompt.say(line)
+        facts = session_facts(self.cell, self.options, self.session, instrument)
+        for file in write_report(ShortMaterial(found, facts, self.cell.model), self.folder):
+            prompt.say(f"{file}: written")
 
     def hand_over(
         self, model: Model, what: str, sections: dict[str, Any] | None = None

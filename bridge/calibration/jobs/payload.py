@@ -71,28 +71,16 @@ class PayloadJob(Job):
 
     def finish(self) -> None:
         """Report mass, centre of gravity and bias, and write them into a new cell after a yes."""
-        prompt, taken = self.prompt, self.session.taken
+        taken = self.session.taken
         q = np.array([t.q for t in taken])
         wrench = np.array([t.raw_wrench for t in taken])
         found = calibrate_payload(self.cell.model, q, wrench)
-        prompt.say()
-        prompt.say(found.verdict, "bold")
-        for e in found.estimates:
-            low, high = e.interval
-            prompt.say(
-                f"  {e.name:<14} {figure(e.value)} {e.unit}  "
-                f"(95 %: {figure(low)} to {figure(high)})"
-            )
-        for note in found.notes:
-            prompt.say(f"  note: {note}")
-        from gapbridge.bridge.calibration.jobs.facts import session_facts
-        from gapbridge.bridge.calibration.report import write_payload
-
-        facts = session_facts(
-            self.cell, self.options, self.session, ("the force sensor of the flange", "wrench")
-        )
-        for file in write_payload(found, facts, self.folder, self.cell.model):
-            prompt.say(f"{file}: written")
+        lines = [
+            f"  {e.name:<14} {figure(e.value)} {e.unit}  "
+            f"(95 %: {figure(e.interval[0])} to {figure(e.interval[1])})"
+            for e in found.estimates
+        ]
+        self.report_short(found, lines, ("the force sensor of the flange", "wrench"))
         payload = {"mass": found.mass, "cog": [float(v) for v in found.cog]}
         self.hand_over(
             found.applied(self.cell.model), "the cell with this load", {"payload": payload}

@@ -69,27 +69,15 @@ class ToolJob(Job):
 
     def finish(self) -> None:
         """Report where the tip is, and write it into a new cell after a yes."""
-        prompt, model = self.prompt, self.cell.model
+        model = self.cell.model
         readings = self.session.readings("point")
         found = calibrate_tool(model, readings.q, readings.loads)
-        prompt.say()
-        prompt.say(found.verdict, "bold")
-        for e in found.estimates:
-            low, high = e.interval
-            prompt.say(
-                f"  {e.name:<11} {millimetres(e.value)}  "
-                f"(95 %: {millimetres(low)} to {millimetres(high)})"
-            )
-        for note in found.notes:
-            prompt.say(f"  note: {note}")
-        from gapbridge.bridge.calibration.jobs.facts import session_facts
-        from gapbridge.bridge.calibration.report import write_tool
-
-        facts = session_facts(
-            self.cell, self.options, self.session, ("tip on a fixed point", "touch")
-        )
-        for file in write_tool(found, facts, self.folder, model):
-            prompt.say(f"{file}: written")
+        lines = [
+            f"  {e.name:<11} {millimetres(e.value)}  "
+            f"(95 %: {millimetres(e.interval[0])} to {millimetres(e.interval[1])})"
+            for e in found.estimates
+        ]
+        self.report_short(found, lines, ("tip on a fixed point", "touch"))
         applied = found.applied(model)
         tcp = {
             "xyz": [float(v) for v in applied.tool_in_flange[:3, 3]],

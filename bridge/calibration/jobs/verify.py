@@ -103,10 +103,10 @@ class VerifyJob(Job):
         self._tell(found)
         write_log(readings, metrology.registered, folder / "readings.csv")
         from gapbridge.bridge.calibration.jobs.facts import session_facts
-        from gapbridge.bridge.calibration.report import write_verification
+        from gapbridge.bridge.calibration.report import VerificationMaterial, write_report
 
         facts = session_facts(self.cell, options, self.session)
-        for file in write_verification(found, facts, folder, readings):
+        for file in write_report(VerificationMaterial(found, facts, readings), folder):
             prompt.say(f"{file}: written")
         self.session.add("ended", holds=found.holds)
 

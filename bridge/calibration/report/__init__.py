@@ -1,18 +1,16 @@
 """Reports of calibration sessions, for customers: one HTML file and a PDF."""
 
 from gapbridge.bridge.calibration.report.facts import InstrumentFacts, SessionFacts
-from gapbridge.bridge.calibration.report.report import (
-    write_payload,
-    write_report,
-    write_tool,
-    write_verification,
-)
+from gapbridge.bridge.calibration.report.material import Material
+from gapbridge.bridge.calibration.report.report import write_report
+from gapbridge.bridge.calibration.report.sections.short_sections import ShortMaterial
+from gapbridge.bridge.calibration.report.sections.verification_sections import VerificationMaterial
 
 __all__ = [
     "InstrumentFacts",
+    "Material",
     "SessionFacts",
-    "write_payload",
+    "ShortMaterial",
+    "VerificationMaterial",
     "write_report",
-    "write_tool",
-    "write_verification",
 ]

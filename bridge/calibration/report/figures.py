@@ -23,7 +23,7 @@ def fine(length: float) -> str:
     return f"{fixed(length * 1e3, 4)} mm" if math.isfinite(length) else "unknown"
 
 
-def load_words(mass: float, name: str = "") -> str:
+def load_title(mass: float, name: str = "") -> str:
     """Return "8 kg" or "1 kg (gripper)"; a name that only says the mass is left out."""
     weight = f"{plain(mass)} kg"
     return f"{weight} ({name})" if name and name != weight else weight
@@ -51,7 +51,7 @@ def decimals_of(spread: float) -> int:
     return min(max(1 - math.floor(math.log10(spread)), 0), 9)
 
 
-def estimate_words(e: Estimate) -> tuple[str, str, str, str]:
+def estimate_texts(e: Estimate) -> tuple[str, str, str, str]:
     """Return value, interval, 1 sigma and unit of an estimate, all to the digits of its sigma."""
     unit, factor = unit_of(e.unit)
     digits = decimals_of(e.std * factor)

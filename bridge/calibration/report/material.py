@@ -51,10 +51,10 @@ class Material:
         return _joined(c.before, c.held_out_before), _joined(c.after, c.held_out_after)
 
     @cached_property
-    def calm(self) -> tuple[Errors, Errors]:
+    def inliers(self) -> tuple[Errors, Errors]:
         """Return the errors before and after of all readings but the outliers."""
         before, after = self.both
-        kept = np.array([int(r) not in self.wild for r in before.rows], dtype=bool)
+        kept = np.array([int(r) not in self.outlier_rows for r in before.rows], dtype=bool)
         return (
             Errors(before.vector[kept], before.rows[kept]),
             Errors(after.vector[kept], after.rows[kept]),
@@ -66,7 +66,7 @@ class Material:
         return pose_accuracies(self.calibration)
 
     @cached_property
-    def wild(self) -> frozenset[int]:
+    def outlier_rows(self) -> frozenset[int]:
         """Return the rows of readings that are blunders."""
         return frozenset(int(r) for r in outlier_readings(self.calibration))
 
@@ -82,7 +82,7 @@ class Material:
         return bool(len(self.calibration.held_out_before.vector))
 
     @property
-    def judged_words(self) -> str:
+    def judged_on(self) -> str:
         """Return which poses the errors are judged on."""
         if self.held_out:
             return "poses that the fit never saw"
@@ -111,7 +111,7 @@ class Material:
         return self.calibration.readings.kind in KINDS
 
     @property
-    def error_words(self) -> str:
+    def error_meaning(self) -> str:
         """Return what an error is, for this kind of reading."""
         return ERRORS.get(self.calibration.readings.kind, ERRORS["position"])
 

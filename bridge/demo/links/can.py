@@ -36,7 +36,7 @@ class CanLink(PeerLink):
     ports = (SOCKETCAND_PORT, BENCH_PORT)
     scene = Scene(
         workspace=Workspace(
-            lower=(-0.6, 1.0, -2.0, -0.6, 0.1, -0.8), upper=(0.6, 2.3, -0.6, 0.6, 1.1, 0.8),
+            lower=(-0.6, 1.0, -2.0, -1.0, 0.0, -1.6), upper=(0.6, 2.3, -0.6, 1.0, 1.1, 1.6),
             lowest=0.05, nearest=0.22, far=0.35, regular=0.02,
         ),
         calibration_loads=(

@@ -1,5 +1,5 @@
-// The page: takes the daemon's messages, fills in words and figures, draws.
-import { MEANING, clock, count, duration, inWords, number } from './words.js';
+// The page: takes the daemon's messages, fills in texts and figures, draws.
+import { MEANING, clock, count, duration, describe, number } from './messages.js';
 import { Lines, colour, drawHistogram, forgetColours } from './drawing.js';
 import { View } from './view.js';
 
@@ -91,10 +91,10 @@ function tick(data) {
   showGauges();
 }
 
-// -- words and figures ---------------------------------------------------------------------------
+// -- texts and figures ---------------------------------------------------------------------------
 
-function text(element, words) {
-  if (element.textContent !== words) element.textContent = words;
+function text(element, message) {
+  if (element.textContent !== message) element.textContent = message;
 }
 
 function showAbout() {
@@ -210,9 +210,9 @@ function showArm(arm) {
   );
   $('joints').replaceChildren(...arm.q.map((angle, i) => {
     const line = document.createElement('tr'), warm = arm.temperature[i];
-    const words = [`${i + 1}`, `${(angle * 180 / Math.PI).toFixed(2)}°`,
+    const texts = [`${i + 1}`, `${(angle * 180 / Math.PI).toFixed(2)}°`,
       warm === null ? '–' : `${warm.toFixed(1)} °C`];
-    line.append(...words.map((word) => {
+    line.append(...texts.map((word) => {
       const cell = document.createElement('td');
       cell.textContent = word;
       return cell;
@@ -272,11 +272,11 @@ function showTiming() {
   ], [{ at: 1 / seen.about.rate, name: 'one cycle' }]);
   $('timing-numbers').replaceChildren(...[
     ['duration', 'work of a cycle'], ['age', 'age of the state behind it'],
-  ].map(([name, words]) => {
+  ].map(([name, message]) => {
     const line = document.createElement('tr'), first = document.createElement('td');
     const swatch = document.createElement('i');
     swatch.className = `swatch-${name}`;
-    first.append(swatch, words);
+    first.append(swatch, message);
     line.append(first, ...['p50', 'p99', 'max'].map((figure) => {
       const cell = document.createElement('td');
       cell.textContent = duration(timing[name][figure]);
@@ -288,7 +288,7 @@ function showTiming() {
 
 function showEvents() {
   const list = seen.events.slice(-100).reverse().map((event) => {
-    const { title, text: words, look } = inWords(event);
+    const { title, text: message, look } = describe(event);
     const item = document.createElement('li');
     item.className = look;
     const time = document.createElement('time');
@@ -297,7 +297,7 @@ function showEvents() {
     kind.className = 'kind';
     kind.textContent = title;
     rest.className = 'text';
-    rest.textContent = words;
+    rest.textContent = message;
     item.append(time, kind, rest);
     return item;
   });
@@ -329,9 +329,9 @@ function draw(at) {
 
 // -- connection ----------------------------------------------------------------------------------
 
-function connection(kind, words) {
+function connection(kind, message) {
   document.body.dataset.connection = kind;
-  text($('connection').lastElementChild, words);
+  text($('connection').lastElementChild, message);
 }
 
 function connect() {
@@ -418,10 +418,10 @@ addEventListener('resize', () => { if (seen.about) showTiming(); });
 for (const legend of document.querySelectorAll('.legend')) {
   const parts = AXES.map((axis) => [axis, axis]);
   if (legend.dataset.for === 'force') parts.push(['dashed', 'dashed: predicted']);
-  for (const [look, words] of parts) {
+  for (const [look, message] of parts) {
     const line = document.createElement('i'), label = document.createElement('span');
     line.className = look;
-    label.append(line, words);
+    label.append(line, message);
     legend.append(label);
   }
 }

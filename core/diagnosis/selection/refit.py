@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri, stdtrit
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.diagnosis.criteria import OWN_SIGMAS
@@ -23,12 +24,33 @@ NO_PRIOR: Mapping[int, Array] = {}
 WEAK = 100.0  # usual sizes of a parameter: how far the data may take it against nothing
 
 
+@dataclass(frozen=True)
+class Remainder:
+    """Unnamed functions that stand beside the causes, and the regions that scatter is judged by."""
+
+    columns: Array  # (m, d) rows of the sample space
+    sigma: Array  # (d,) prior 1 sigma of each value over the scatter of the rows; inf: free
+    region: NDArray[np.int64]  # (m,) region or stretch of each row
+
+    def rows(self) -> Array:
+        """Return the prior as rows (f, d) of a regression whose right-hand side is zero."""
+        known = np.isfinite(self.sigma)
+        return np.asarray(np.diag(1 / np.maximum(self.sigma, 1e-300))[known])
+
+    def scatter_alone(self) -> Remainder:
+        """Return the same without functions: the scatter among regions stays."""
+        return replace(self, columns=self.columns[:, :0], sigma=self.sigma[:0])
+
+
 def refit(
-    work: Work, space: Space, found: Found, links: Mapping[int, Array] = NO_PRIOR
-) -> tuple[tuple[Term, ...], tuple[int, ...], tuple[Array, ...], Array]:
+    work: Work, space: Space, found: Found, links: Mapping[int, Array] = NO_PRIOR,
+    remainder: Remainder | None = None,
+) -> tuple[tuple[Term, ...], tuple[int, ...], tuple[Array, ...], Array]:  # fmt: skip
     """Refit the named terms exactly, smooth ones kept linear; moves the frame along.
 
     ``links`` are further candidates, with 1 sigma of each number: these are kept near nominal.
+    Beside a ``remainder`` covariances are those of regions left out in turn (jackknife), where
+    these are wider than those of white noise: what is unknown is not the same everywhere.
     """
     index = (*(c for c in found.chosen if space.candidates[c].named), *links)
     freed = {c: _freed(work.arm, space.candidates[c]) for c in index}
@@ -40,7 +62,8 @@ def refit(
     ] + [np.zeros(len(space.candidates[c].parameters)) for c in links]
     usual = [links[c] if c in links else _wide(freed[c]) for c in index]
     extra = space.columns(smooth)
-    covariance: list[Array] = []
+    if remainder is not None:
+        extra = np.hstack([extra, remainder.columns])
     for _ in range(REFITS):
         observation = work.observation
         terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
@@ -54,7 +77,7 @@ def refit(
         b = flat(gap[..., None], work)[:, 0]
         size = np.sqrt(np.einsum("ij,ij->j", A, A))
         unit = np.where(size > 1e-150, 1 / np.maximum(size, 1e-150), 0.0)  # 0: moves nothing
-        pull, towards = _pull(usual, x, A.shape[1])
+        pull, towards = _pull(usual, x, A.shape[1], remainder, nuisance.shape[1])
         step = _step(np.vstack([A, pull]), np.concatenate([b, towards]), unit, freed, index, x)
         sizes = [len(v) for v in x]
         cuts = np.cumsum([*sizes, extra.shape[1]])
@@ -68,21 +91,50 @@ def refit(
             moved_terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
             left = observation.measured - observation.predict(moved_terms)
             work.observation = observation.rebase(_along(extra, nuisance, left, work))
-        residual_ss = float(np.sum((b - A @ step) ** 2))
-        variance = max(residual_ss / max(len(b) - A.shape[1], 1), space.floor)
-        whole = np.vstack([A, pull]) * unit
-        inverse = np.linalg.pinv(whole.T @ whole, rcond=1e-13, hermitian=True)
-        spread = inverse * np.outer(unit, unit) * variance
-        begin = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
-        covariance = [spread[i:j, i:j] for i, j in itertools.pairwise(begin)]
         if moved < 1e-6:
             break
+    residual_ss = float(np.sum((b - A @ step) ** 2))
+    variance = max(residual_ss / max(len(b) - A.shape[1], 1), space.floor)
+    whole = np.vstack([A, pull]) * unit
+    inverse = np.linalg.pinv(whole.T @ whole, rcond=1e-13, hermitian=True)
+    spread = inverse * np.outer(unit, unit) * variance
+    if remainder is not None and len(index):
+        right = np.concatenate([b, towards])
+        spread = _widened(spread, whole, right, unit, remainder.region)
+    begin = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
+    covariance = [spread[i:j, i:j] for i, j in itertools.pairwise(begin)]
     terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
     gap = work.observation.measured - work.observation.predict(terms)
     nuisance = work.observation.nuisance
     if nuisance.shape[2]:
         gap = gap - nuisance @ _along(extra, flat(nuisance, work), gap, work)
     return terms, index, tuple(covariance), gap
+
+
+def _widened(
+    white: Array, A: Array, b: Array, unit: Array, region: NDArray[np.int64]
+) -> Array:  # fmt: skip
+    """Return the covariance (p, p) by leaving out regions, nowhere narrower than ``white``.
+
+    ``A`` (m, p) are the rows of the regression times ``unit``; those after ``region`` always stay.
+    The jackknife over clusters: Cameron, Miller, "A Practitioner's Guide to Cluster-Robust
+    Inference" (2015), CV3.
+    """
+    G, g = A.T @ A, A.T @ b
+    names = np.unique(region)
+    without = np.empty((len(names), len(unit)))
+    for k, name in enumerate(names):
+        out = np.flatnonzero(region == name)
+        rest = G - A[out].T @ A[out]
+        inverse = np.linalg.pinv(rest, rcond=1e-12, hermitian=True)
+        without[k] = unit * (inverse @ (g - A[out].T @ b[out]))
+    away = without - without.mean(axis=0)
+    # few regions: as wide as a normal distribution of the same 95 % interval
+    few = float(stdtrit(max(len(names) - 1, 1), 0.975) / ndtri(0.975))
+    scatter = few**2 * (len(names) - 1) / len(names) * away.T @ away
+    wide, narrow = np.sqrt(np.diag(scatter)), np.sqrt(np.maximum(np.diag(white), 0.0))
+    share = np.maximum(narrow / np.maximum(wide, 1e-300), 1.0)
+    return np.asarray(scatter * np.outer(share, share))
 
 
 def worth(term: Term, spread: Array) -> float:
@@ -123,16 +175,26 @@ def _along(extra: Array, nuisance: Array, gap: Array, work: Work) -> Array:
     return np.asarray(solution[extra.shape[1] :])
 
 
-def _pull(usual: list[Array], x: list[Array], width: int) -> tuple[Array, Array]:
+def _pull(
+    usual: list[Array], x: list[Array], width: int, remainder: Remainder | None, nuisance: int
+) -> tuple[Array, Array]:
     """Return rows (k, width) and targets that pull parameters ``x`` towards nominal.
 
     ``usual`` is how far each may be from there. Where that is many usual sizes only combinations
-    without any trace in the data feel it: lengths along parallel axes, which run off else.
+    without any trace in the data feel it: lengths along parallel axes, which run off else. What
+    the ``remainder`` knows of its own numbers, before the last ``nuisance`` columns, comes with it.
     """
     size = np.concatenate([*usual, np.zeros(0)])
     rows = np.zeros((len(size), width))
     rows[np.arange(len(size)), np.arange(len(size))] = 1 / size
-    return rows, -np.concatenate([*x, np.zeros(0)]) / size
+    towards = -np.concatenate([*x, np.zeros(0)]) / size
+    if remainder is None:
+        return rows, towards
+    known = remainder.rows()
+    end = width - nuisance
+    more = np.zeros((len(known), width))
+    more[:, end - known.shape[1] : end] = known
+    return np.vstack([rows, more]), np.concatenate([towards, np.zeros(len(known))])
 
 
 def _wide(candidate: Candidate) -> Array:

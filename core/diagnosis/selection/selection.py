@@ -24,7 +24,13 @@ from gapbridge.core.diagnosis.selection.candidate import (
     with_what_it_needs,
 )
 from gapbridge.core.diagnosis.selection.following import exact_columns, one_delay
-from gapbridge.core.diagnosis.selection.geometry import Links, links_of, with_links
+from gapbridge.core.diagnosis.selection.geometry import (
+    Links,
+    links_of,
+    members,
+    prior,
+    with_links,
+)
 from gapbridge.core.diagnosis.selection.local_search import pruned
 from gapbridge.core.diagnosis.selection.moments import step_candidates
 from gapbridge.core.diagnosis.selection.noise import Noise, estimate_noise
@@ -34,7 +40,7 @@ from gapbridge.core.diagnosis.selection.outliers import (
     with_wild_explained,
 )
 from gapbridge.core.diagnosis.selection.problem import Found, Space, fit
-from gapbridge.core.diagnosis.selection.refit import refit, worth
+from gapbridge.core.diagnosis.selection.refit import Remainder, refit, worth
 from gapbridge.core.diagnosis.selection.search import LARGE, screened_search
 from gapbridge.core.diagnosis.selection.smooth import smooth_candidates
 from gapbridge.core.diagnosis.selection.state import Raw, Work, flat, locate, sample_space
@@ -88,10 +94,14 @@ class Selection:
 
     def rows_of(self, columns: Array) -> Array:
         """Return columns (N, k, d) as rows (m, d) of the working space."""
+        rows = self.plain_rows_of(columns)
+        return rows if self.links is None else self.links.whitened(rows)
+
+    def plain_rows_of(self, columns: Array) -> Array:
+        """Return columns (N, k, d) as rows (m, d) of the space in which the links are no noise."""
         kept, B = self.kept, self.nuisance_basis
         rows = (self.noise.whitener[kept] @ columns[kept]).reshape(len(B), -1)
-        rows = rows - B @ (B.T @ rows)
-        return np.asarray(rows if self.links is None else self.links.whitened(rows))
+        return np.asarray(rows - B @ (B.T @ rows))
 
     def pull(self, chosen: Sequence[int]) -> Array:
         """Return one over the prior sigma of each number of a set of candidates; 0: none."""
@@ -117,6 +127,25 @@ class Selection:
             terms=tuple(self.terms[p] for p in index),
             term_index=tuple(self.term_index[p] for p in index),
             covariance=tuple(self.covariance[p] for p in index),
+        )  # fmt: skip
+
+    def with_all_links(self, arm: Arm) -> Selection | None:
+        """Return the selection with the links' geometry as a whole in the place of single links.
+
+        What else was found stays as far as it pays beside them; None where the arm has no links.
+        """
+        space, block = self.space, members(self.space)
+        if len(block) < 2:
+            return None
+        sigma = {c: prior(space.candidates[c]) for c in block}
+        near = links_of(space, sigma).beside(space, block)
+        chosen = [c for c in self.found.chosen if c not in block]
+        found = pruned(near, fit(near, chosen))
+        work = Work(self.observation, arm, [], self.noise, self.kept)
+        terms, index, covariance, residual = refit(work, space, found, sigma)
+        return replace(
+            self, observation=work.observation, prior=sigma, found=found, terms=terms,
+            term_index=index, covariance=covariance, residual=residual,
         )  # fmt: skip
 
     @property
@@ -259,25 +288,24 @@ def _less_smooth(
 
 
 def standing(
-    selection: Selection, arm: Arm, accused: Sequence[int], beside: Sequence[int] = ()
+    selection: Selection, arm: Arm, accused: Sequence[int], remainder: Remainder | None = None
 ) -> Selection:
     """Return the selection with some of its terms (positions) refitted as all there is.
 
-    Values that were fitted beside a withdrawn term are not those that stand without it. ``beside``
-    are unnamed functions that account for what is left: in a short log it would bias the values; a
-    long one averages over it, and its model has to predict without them.
+    Values that were fitted beside a withdrawn term are not those that stand without it. The
+    ``remainder`` accounts for what is left: in a short log it would bias the values; a long one
+    averages over it, and its model has to predict without it.
     """
-    short = len(selection.space.y) < LARGE
-    if not accused or (len(accused) == len(selection.terms) and not (short and beside)):
+    if not accused or (len(accused) == len(selection.terms) and remainder is None):
         return selection
+    if remainder is not None and len(selection.space.y) >= LARGE:
+        remainder = remainder.scatter_alone()
     work = Work(selection.observation, arm, [], selection.noise, selection.kept)
     chosen = [selection.term_index[p] for p in accused]
     links = selection.prior if set(chosen) & set(selection.prior) else {}
     space = selection.working if links else selection.space
-    if short:
-        chosen += beside
     alone = fit(space, [c for c in chosen if c not in links])
-    fitted, index, spread, residual = refit(work, selection.space, alone, links)
+    fitted, index, spread, residual = refit(work, selection.space, alone, links, remainder)
     terms, covariance = list(selection.terms), list(selection.covariance)
     for c, term, own in zip(index, fitted, spread, strict=True):
         position = selection.term_index.index(c)

@@ -12,7 +12,6 @@ import selectors
 import socket
 import threading
 import time
-from types import TracebackType
 from typing import Self
 
 from gapbridge.drivers.addresses import is_loopback
@@ -100,12 +99,7 @@ class Hub:
         self.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _poke(self) -> None:

@@ -11,7 +11,6 @@ import tempfile
 import threading
 import time
 from dataclasses import dataclass
-from types import TracebackType
 from typing import IO, Self
 
 from gapbridge.core.errors import LinkError
@@ -111,12 +110,7 @@ class SimulatedController:
         self.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     def _process(self) -> subprocess.Popen[str]:

@@ -292,9 +292,9 @@ def test_three_rounds_of_visits_and_the_truth_are_shown(
     said = capsys.readouterr().out
     assert "fit and diagnosis" in said
     assert "tool_frame_x: truly +1 mm, found +1 ± 0.003 mm" in said
-    drawn = picture(whole)
-    assert all(colour in drawn for colour in ("#d64545", "#d9902f", "#2f9e5b"))
+    drawn = svg_file(picture(whole))
+    assert all(f'fill="var(--{c})"' in drawn for c in ("bad-dot", "before", "limit"))
     html = page(whole, "")
-    assert "truly +1 mm" in html
+    assert "+1 ± 0.003 mm" in html
     assert whole.summary()["tcp_error_mm"]["fitted"]["rms"] > 0
     assert whole.summary()["hidden"]["tool_frame_x"] == 1e-3

@@ -17,7 +17,8 @@ from gapbridge.bridge.served.protocol import HEADER_TIME, LARGEST_HEAD, MOST_CON
 from gapbridge.core.errors import CellError, InputError
 
 TOKEN = "7d1f0c3a9b8e4f62a5d07c1e93b8462f"
-PATHS = ("", "status", "history", "events", "page.js", "style.css", "words.js", "drawing.js",
+PATHS = ("", "status", "history", "events", "page.js", "style.css", "messages.js", "view.js",
+         "drawing.js",
          "icon.svg", "metrics", "nothing")  # fmt: skip
 
 

@@ -128,6 +128,18 @@ def test_a_tie_names_the_other_and_leaves_the_strangers_out():
         assert channel_of(clear).causes[0].indistinguishable_from == ()
 
 
+@pytest.mark.parametrize(("joint", "tie"), [(3, ("tool_frame",)), (2, ())])
+def test_the_last_joints_zero_is_a_tie_with_the_tool(joint, tie):
+    """Both move the TCP about the last axis, by the same in all poses."""
+    session = small.session_of(0)
+    real = small.turned(joint, lambda s, q: np.full(len(q), 8e-4))
+    log = small.log_of(session, small.readings(real, session))
+    found = diagnose(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
+    (cause,) = found.channels[0].causes
+    assert (cause.effect, cause.joints) == ("joint_offset", (joint,))
+    assert cause.indistinguishable_from == tie
+
+
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 999), sigma=st.floats(1e-6, 1e-2), pairs=st.integers(30, 60))
 def test_repeats_show_the_noise_whatever_the_poses_are_off_by(seed, sigma, pairs):

@@ -12,10 +12,11 @@ from pyarrow import parquet
 
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import ExcitationError, LogError
+from gapbridge.core.estimation import streamed
 from gapbridge.core.estimation.identification import data_of, identify_compliance
 from gapbridge.core.estimation.row_store import RowStore
-from gapbridge.core.estimation.spool import Spool
-from gapbridge.core.estimation.streamed import fold_of, identify_streamed
+from gapbridge.core.estimation.streamed import identify_streamed
+from gapbridge.core.estimation.streamed_fit import stretches
 from gapbridge.core.log.log import Log, read_log
 from gapbridge.core.log.pieces import LogPieces
 from gapbridge.core.metrology import Metrology
@@ -145,22 +146,27 @@ def test_a_cell_that_is_no_number_is_named_in_a_later_piece(tmp_path):
         list(LogPieces(path, 6, 100))
 
 
-def test_the_median_of_a_spool_is_numpys():
-    rng = np.random.default_rng(0)
-    for count in (1, 2, 999, 1000):
-        rows = rng.normal(0, 10.0 ** rng.integers(-8, 3, (count, 1)), (count, 6))
-        with Spool(6) as spool:
-            spool.append(rows[: count // 2])
-            spool.append(rows[count // 2 :])
-            assert spool.median_size(0, 3) == np.median(np.abs(rows[:, :3]))
-            assert spool.median_size(3, 6) == np.median(np.abs(rows[:, 3:]))
+def test_each_row_is_in_one_fold_and_folds_are_alike_in_size():
+    counts, seen = np.zeros(5, dtype=int), []
+    for number, rows in enumerate((1000, 1000, 3, 777)):
+        for fold, part in stretches(number, rows):
+            counts[fold] += part.stop - part.start
+            seen += [(number, row) for row in range(part.start, part.stop)]
+    assert len(seen) == len(set(seen)) == counts.sum() == 2780
+    assert counts.min() > 0.97 * 2780 / 5
 
 
-def test_folds_are_alike_in_size_and_the_same_at_every_pass():
-    rows = np.arange(100_000)
-    folds = fold_of(rows)
-    assert np.bincount(folds).min() > 0.97 * len(rows) / 5
-    np.testing.assert_array_equal(fold_of(rows[777:1000]), folds[777:1000])
+def test_more_rows_than_the_sample_give_what_all_of_them_give(monkeypatch):
+    monkeypatch.setattr(streamed, "SAMPLE", 300)
+    log = measured_log(False, True, outlier=20)
+    whole = identify_compliance(nominal(), log)
+    found = identify_streamed(nominal(), pieces_of(log))
+    np.testing.assert_array_equal(found.identifiable, whole.identifiable)
+    spread = np.maximum(whole.std_axial, 1e-12)
+    assert (np.abs(found.axial - whole.axial) < 0.02 * spread).all()
+    np.testing.assert_array_equal(found.outliers, whole.outliers)
+    assert found.remaining_rms == pytest.approx(whole.remaining_rms, rel=1e-3)
+    assert found.remaining_rms_held_out == pytest.approx(whole.remaining_rms_held_out, rel=0.1)
 
 
 def test_rows_that_wait_in_a_file_are_those_that_came():

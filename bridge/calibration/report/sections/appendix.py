@@ -8,32 +8,26 @@ from numpy.typing import NDArray
 from gapbridge.bridge.calibration.report.figures import degrees, fixed
 from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.document.blocks import Block, Cell, Table
-from gapbridge.bridge.document.section import Section
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 
-class Appendix(Section[Material]):
-    """The list of all readings with their errors."""
-
-    key, title = "readings", "All readings"
-    about = "In the order in which they were taken; errors in mm."
-    folded = True
-
-    def blocks(self, material: Material) -> list[Block]:
-        """Return one long table."""
-        readings = material.calibration.readings
-        before, after = (_by_row(e.rows, e.norm, len(readings)) for e in material.both)
-        rows: list[list[Cell]] = []
-        for i in range(len(readings)):
-            used = "wild" if i in material.wild else "check" if readings.held_out[i] else "fit"
-            rows.append([
-                str(i + 1), str(int(readings.pose[i]) + 1), str(int(readings.load[i]) + 1),
-                degrees(readings.q[i]), used, _told(before[i]), _told(after[i]),
-            ])  # fmt: skip
-        heads = ("no.", "pose", "load", "joint angles, degrees", "used for", "before", "after")
-        return [Table(heads, rows, (0.5, 0.6, 0.6, 4, 0.8, 0.8, 0.8), (5, 6))]
+def all_readings(material: Material) -> list[Block]:
+    """Return one long table."""
+    readings = material.calibration.readings
+    before, after = (_by_row(e.rows, e.norm, len(readings)) for e in material.both)
+    rows: list[list[Cell]] = []
+    for i in range(len(readings)):
+        used = (
+            "outlier" if i in material.outlier_rows else "check" if readings.held_out[i] else "fit"
+        )
+        rows.append([
+            str(i + 1), str(int(readings.pose[i]) + 1), str(int(readings.load[i]) + 1),
+            degrees(readings.q[i]), used, _in_mm(before[i]), _in_mm(after[i]),
+        ])  # fmt: skip
+    heads = ("no.", "pose", "load", "joint angles, degrees", "used for", "before", "after")
+    return [Table(heads, rows, (0.5, 0.6, 0.6, 4, 0.8, 0.8, 0.8), (5, 6))]
 
 
 def _by_row(rows: Index, norm: Array, count: int) -> Array:
@@ -42,5 +36,5 @@ def _by_row(rows: Index, norm: Array, count: int) -> Array:
     return found
 
 
-def _told(value: float) -> str:
+def _in_mm(value: float) -> str:
     return fixed(value, 3) if np.isfinite(value) else "–"

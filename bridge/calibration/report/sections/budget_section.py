@@ -16,7 +16,6 @@ from gapbridge.bridge.document.blocks import (
     Strong,
     Table,
 )
-from gapbridge.bridge.document.section import Section
 from gapbridge.bridge.report.labels import number, percent, unit_of, with_unit
 from gapbridge.bridge.report.names import parameter_title
 from gapbridge.core.calibration.budget.budget import Budget, Input
@@ -28,28 +27,19 @@ OUTSIDE = (
 )
 
 
-class BudgetSection(Section[Material]):
-    """How surely the tool is where the model puts it."""
-
-    key, title = "uncertainty", "Uncertainty budget"
-    about = (
-        "In the manner of the GUM: how surely the tool is where the calibrated model puts it, "
-        "along one axis of the base."
-    )
-
-    def blocks(self, material: Material) -> list[Block]:
-        """Return the result, the budget, its check, what stands behind it and what is not in it."""
-        given = material.budget
-        blocks: list[Block] = [Paragraph(_result(given)), _table(given)]
-        blocks.append(Bullets(tuple(f"{i.name}: {i.source}" for i in given.inputs)))
-        blocks.append(Paragraph(_factor(given)))
-        if given.looked_at:
-            blocks += [Heading("Check against the poses kept out of the fit"),
-                       Paragraph(_check(given))]  # fmt: skip
-        if given.parameters is not None:
-            blocks += _behind(given.parameters)
-        missing = tuple(f"{name}: nobody has stated it" for name in given.missing)
-        return [*blocks, Heading("Not in the budget"), Bullets((*missing, *OUTSIDE))]
+def uncertainty_budget(material: Material) -> list[Block]:
+    """Return the result, the budget, its check, what stands behind it and what is not in it."""
+    given = material.budget
+    blocks: list[Block] = [Paragraph(_result(given)), _table(given)]
+    blocks.append(Bullets(tuple(f"{i.name}: {i.source}" for i in given.inputs)))
+    blocks.append(Paragraph(_factor(given)))
+    if given.looked_at:
+        blocks += [Heading("Check against the poses kept out of the fit"),
+                   Paragraph(_check(given))]  # fmt: skip
+    if given.parameters is not None:
+        blocks += _behind(given.parameters)
+    missing = tuple(f"{name}: nobody has stated it" for name in given.missing)
+    return [*blocks, Heading("Not in the budget"), Bullets((*missing, *OUTSIDE))]
 
 
 def _result(given: Budget) -> str:

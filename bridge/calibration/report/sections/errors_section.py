@@ -9,36 +9,30 @@ from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.document.axes import Chart, distribution, named, scale
 from gapbridge.bridge.document.blocks import Block, Paragraph, Pictures, Table
 from gapbridge.bridge.document.drawing import AFTER, BEFORE, Drawing
-from gapbridge.bridge.document.section import Section
 from gapbridge.core.calibration.result import Errors
 
 LEGEND = (("before", BEFORE), ("after", AFTER))
 
 
-class ErrorsSection(Section[Material]):
-    """How large the errors were and are."""
-
-    key, title = "errors", "Before and after"
-
-    def blocks(self, material: Material) -> list[Block]:
-        """Return the table of figures, the distribution and the axes."""
-        pictures = [_distribution(material)]
-        if len(material.axes) > 1:
-            pictures.append(_axes(material))
-        words = material.error_words
-        return [
-            Paragraph(f"{words[:1].upper()}{words[1:]}.", "note"),
-            _table(material),
-            Pictures(tuple(pictures), _caption(material)),
-        ]
+def before_and_after(material: Material) -> list[Block]:
+    """Return the table of figures, the distribution and the axes."""
+    pictures = [_distribution(material)]
+    if len(material.axes) > 1:
+        pictures.append(_axes(material))
+    meaning = material.error_meaning
+    return [
+        Paragraph(f"{meaning[:1].upper()}{meaning[1:]}.", "note"),
+        _table(material),
+        Pictures(tuple(pictures), _caption(material)),
+    ]
 
 
 def _caption(material: Material) -> str:
     text = (
-        f"On {material.judged_words}. Distribution: the share of the readings whose error is at "
+        f"On {material.judged_on}. Distribution: the share of the readings whose error is at "
         "most so large, errors in powers of ten."
     )
-    if material.wild:
+    if material.outlier_rows:
         text += " The table counts outliers too."
     if len(material.axes) > 1:
         c = material.calibration

@@ -5,36 +5,29 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.bridge.calibration.report.figures import load_words, mm
+from gapbridge.bridge.calibration.report.figures import load_title, mm
 from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.document.axes import Chart, logarithmic, named, plain, visible
 from gapbridge.bridge.document.blocks import Block, Pictures, Table
 from gapbridge.bridge.document.drawing import AFTER, BEFORE, Drawing
-from gapbridge.bridge.document.section import Section
 
 Index = NDArray[np.int64]
 
 
-class LoadsSection(Section[Material]):
-    """How the errors go with the load."""
-
-    key, title = "loads", "Over the load"
-    about = "Errors by what hung on the flange; outliers are left out."
-
-    def blocks(self, material: Material) -> list[Block]:
-        """Return a picture and a table, one column and one row a load."""
-        before, _ = material.calm
-        load = material.calibration.readings.load[before.rows]
-        numbers = [int(k) for k in np.unique(load)]
-        return [
-            Pictures((_picture(material, load, numbers),),
-                     "One dot a reading, a line at the mean; powers of ten upwards."),
-            _table(material, load, numbers),
-        ]  # fmt: skip
+def over_the_load(material: Material) -> list[Block]:
+    """Return a picture and a table, one column and one row a load."""
+    before, _ = material.inliers
+    load = material.calibration.readings.load[before.rows]
+    numbers = [int(k) for k in np.unique(load)]
+    return [
+        Pictures((_picture(material, load, numbers),),
+                 "One dot a reading, a line at the mean; powers of ten upwards."),
+        _table(material, load, numbers),
+    ]  # fmt: skip
 
 
 def _picture(material: Material, load: Index, numbers: list[int]) -> Drawing:
-    before, after = material.calm
+    before, after = material.inliers
     labels = [f"{plain(_mass(material, k))} kg" for k in numbers]
     chart = Chart(
         "Error by load", named("load on the flange", labels),
@@ -64,13 +57,13 @@ def _mass(material: Material, number: int) -> float:
 
 
 def _table(material: Material, load: Index, numbers: list[int]) -> Table:
-    before, after = material.calm
+    before, after = material.inliers
     plan, rows = material.plan, []
     for k in numbers:
         old, new = before.norm[load == k], after.norm[load == k]
         name = plan.loads[k].name if plan and k < len(plan.loads) else ""
         rows.append([
-            load_words(_mass(material, k), name), str(len(old)),
+            load_title(_mass(material, k), name), str(len(old)),
             mm(float(old.mean())), mm(float(old.max())), mm(float(new.mean())),
             mm(float(new.max())),
         ])  # fmt: skip

@@ -2,42 +2,35 @@
 
 from __future__ import annotations
 
-from gapbridge.bridge.calibration.report.figures import decimals_of, estimate_words, fixed
+from gapbridge.bridge.calibration.report.figures import decimals_of, estimate_texts, fixed
 from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.document.blocks import Block, Bullets, Cell, Heading, Paragraph, Table
-from gapbridge.bridge.document.section import Section
 from gapbridge.bridge.report.labels import unit_of
 from gapbridge.bridge.report.names import parameter_title, with_titles
 from gapbridge.core.calibration.result import Estimate
 
 
-class ParametersSection(Section[Material]):
-    """What goes into the model, and how surely."""
-
-    key, title = "parameters", "Parameters of the model"
-    about = "What this arm has beyond the model that the cell had; intervals of 95 %."
-
-    def blocks(self, material: Material) -> list[Block]:
-        """Return the table and what the readings do not determine."""
-        c = material.calibration
-        shown = [e for e in c.estimates if e.shown]
-        hidden = [parameter_title(e.name) for e in c.estimates if not e.shown]
-        planned = any(e.expected_std is not None for e in shown)
-        blocks: list[Block] = [estimates_table(shown, planned=planned)]
-        if any(e.on_bound for e in shown):
-            text = "* stands on the bound of what is physically possible."
-            blocks.append(Paragraph(text, "note"))
-        if c.combinations or hidden:
-            blocks.append(Heading("What these readings cannot determine"))
-            items = [with_titles(text) for text in c.combinations]
-            # the combinations speak of most of them
-            items += [
-                f"{name}: these readings do not show it; it stays near where it stood"
-                for name in hidden
-                if not any(text.startswith(name) for text in items)
-            ]
-            blocks.append(Bullets(tuple(items)))
-        return blocks
+def parameters(material: Material) -> list[Block]:
+    """Return the table and what the readings do not determine."""
+    c = material.calibration
+    shown = [e for e in c.estimates if e.shown]
+    hidden = [parameter_title(e.name) for e in c.estimates if not e.shown]
+    planned = any(e.expected_std is not None for e in shown)
+    blocks: list[Block] = [estimates_table(shown, planned=planned)]
+    if any(e.on_bound for e in shown):
+        text = "* stands on the bound of what is physically possible."
+        blocks.append(Paragraph(text, "note"))
+    if c.combinations or hidden:
+        blocks.append(Heading("What these readings cannot determine"))
+        items = [with_titles(text) for text in c.combinations]
+        # the combinations speak of most of them
+        items += [
+            f"{name}: these readings do not show it; it stays near where it stood"
+            for name in hidden
+            if not any(text.startswith(name) for text in items)
+        ]
+        blocks.append(Bullets(tuple(items)))
+    return blocks
 
 
 def estimates_table(shown: list[Estimate], *, planned: bool) -> Table:
@@ -52,7 +45,7 @@ def estimates_table(shown: list[Estimate], *, planned: bool) -> Table:
 
 
 def _row(e: Estimate) -> list[Cell]:
-    value, interval, std, unit = estimate_words(e)
+    value, interval, std, unit = estimate_texts(e)
     return [parameter_title(e.name) + (" *" if e.on_bound else ""), value, interval, std, unit]
 
 

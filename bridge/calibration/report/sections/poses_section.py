@@ -9,7 +9,6 @@ from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.document.axes import Chart, scale
 from gapbridge.bridge.document.blocks import Block, Paragraph, Pictures
 from gapbridge.bridge.document.drawing import AFTER, EDGE, INK, LIMIT, Circle, Drawing
-from gapbridge.bridge.document.section import Section
 from gapbridge.bridge.document.skeleton import skeleton
 from gapbridge.core.calibration.plan import Plan
 
@@ -17,20 +16,14 @@ VIEWS = (("The poses, from above", 0, 1), ("The poses, from the side", 0, 2))
 AXES = ("x, m", "y, m", "z, m")
 
 
-class PosesSection(Section[Material]):
-    """Where the arm stood, and what that was expected to contribute."""
-
-    key, title = "poses", "Poses"
-    about = "Chosen so that they determine the parameters best; those kept out of the fit judge it."
-
-    def blocks(self, material: Material) -> list[Block]:
-        """Return the arm in its poses, and the plan's expectation beside what was reached."""
-        drawings = [_view(material, *view) for view in VIEWS]
-        caption = "The arm in the poses of the fit (grey) and those kept out of it (green)."
-        blocks: list[Block] = [Pictures(tuple(drawings), caption)]
-        if material.plan is not None:
-            blocks += _planned(material, material.plan)
-        return blocks
+def poses(material: Material) -> list[Block]:
+    """Return the arm in its poses, and the plan's expectation beside what was reached."""
+    drawings = [_view(material, *view) for view in VIEWS]
+    caption = "The arm in the poses of the fit (grey) and those kept out of it (green)."
+    blocks: list[Block] = [Pictures(tuple(drawings), caption)]
+    if material.plan is not None:
+        blocks += _planned(material, material.plan)
+    return blocks
 
 
 def _view(material: Material, title: str, i: int, j: int) -> Drawing:

@@ -9,31 +9,24 @@ from gapbridge.bridge.calibration.report.figures import counted, fixed, mm, mrad
 from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.document.axes import plain
 from gapbridge.bridge.document.blocks import Block, Paragraph, Table
-from gapbridge.bridge.document.section import Section
 from gapbridge.core.calibration.budget.pose_accuracy import PoseAccuracy
 
 ASKED = 30  # visits that the standard asks for
 
 
-class RepeatsSection(Section[Material]):
-    """AP and RP of the poses that were visited more than once."""
-
-    key, title = "repeats", "Pose accuracy and repeatability"
-    about = "In the terms of ISO 9283: AP and RP of every pose that was visited more than once."
-
-    def blocks(self, material: Material) -> list[Block]:
-        """Return the table, and how far these visits are what the standard asks for."""
-        found = material.accuracies
-        if not found:
-            return [Paragraph(_none(material))]
-        worst = max(found, key=lambda p: p.repeatability)
-        before, after = (max(p.accuracy[k] for p in found) for k in (0, 1))
-        lead = (
-            f"The largest pose accuracy AP is {mm(before)} before and {mm(after)} after the "
-            f"calibration; the largest pose repeatability RP is {mm(worst.repeatability)} "
-            f"(pose {worst.pose + 1})."
-        )
-        return [Paragraph(lead), _table(found), Paragraph(_note(found), "note")]
+def pose_accuracy(material: Material) -> list[Block]:
+    """Return the table, and how far these visits are what the standard asks for."""
+    found = material.accuracies
+    if not found:
+        return [Paragraph(_none(material))]
+    worst = max(found, key=lambda p: p.repeatability)
+    before, after = (max(p.accuracy[k] for p in found) for k in (0, 1))
+    lead = (
+        f"The largest pose accuracy AP is {mm(before)} before and {mm(after)} after the "
+        f"calibration; the largest pose repeatability RP is {mm(worst.repeatability)} "
+        f"(pose {worst.pose + 1})."
+    )
+    return [Paragraph(lead), _table(found), Paragraph(_note(found), "note")]
 
 
 def _none(material: Material) -> str:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gapbridge.bridge.calibration.report.facts import SessionFacts
-from gapbridge.bridge.calibration.report.figures import load_words, mm
+from gapbridge.bridge.calibration.report.figures import load_title, mm
 from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.document.axes import plain
 from gapbridge.bridge.document.blocks import Block, Bullets, Columns, Heading, Pairs
-from gapbridge.bridge.document.section import Section
 from gapbridge.bridge.report.names import sentence
 
 KINDS = {
@@ -24,21 +23,16 @@ KINDS = {
 }
 
 
-class SessionSection(Section[Material]):
-    """Who, where, when, with what."""
-
-    key, title = "session", "Session and instrument"
-
-    def blocks(self, material: Material) -> list[Block]:
-        """Return the facts as on the front of a certificate."""
-        c, facts = material.calibration, material.session
-        counts = [
-            ("poses", _poses_words(material)),
-            ("readings", _readings_words(material)),
-            ("loads", _loads_words(material)),
-        ]
-        notes = (*c.notes, *(material.plan.notes if material.plan else ()))
-        return facts_blocks(facts, counts, len(c.stations), notes)
+def session_and_instrument(material: Material) -> list[Block]:
+    """Return the facts as on the front of a certificate."""
+    c, facts = material.calibration, material.session
+    counts = [
+        ("poses", _poses_text(material)),
+        ("readings", _readings_text(material)),
+        ("loads", _loads_text(material)),
+    ]
+    notes = (*c.notes, *(material.plan.notes if material.plan else ()))
+    return facts_blocks(facts, counts, len(c.stations), notes)
 
 
 def facts_blocks(
@@ -102,25 +96,25 @@ def _instrument(facts: SessionFacts, stations: int) -> list[tuple[str, str]]:
     return [(name, text) for name, text in given if text]
 
 
-def _poses_words(material: Material) -> str:
+def _poses_text(material: Material) -> str:
     readings = material.calibration.readings
     held = len(set(readings.pose[readings.held_out].tolist()))
     fitted = len(set(readings.pose[~readings.held_out].tolist()))
     return f"{fitted} to fit, {held} kept out of the fit to check it"
 
 
-def _readings_words(material: Material) -> str:
-    facts, wild = material.session, len(material.calibration.outliers)
+def _readings_text(material: Material) -> str:
+    facts, outliers = material.session, len(material.calibration.outliers)
     text = f"{facts.readings}"
     if facts.undone:
         text += f"; {facts.undone} were taken back"
-    if wild:
-        text += f"; {wild} {'was' if wild == 1 else 'were'} outlying and down-weighted"
+    if outliers:
+        text += f"; {outliers} {'was' if outliers == 1 else 'were'} outlying and down-weighted"
     return text
 
 
-def _loads_words(material: Material) -> str:
+def _loads_text(material: Material) -> str:
     plan = material.plan
     if plan is None:
         return str(len(set(material.calibration.readings.load.tolist())))
-    return "; ".join(load_words(p.mass, p.name) for p in plan.loads)
+    return "; ".join(load_title(p.mass, p.name) for p in plan.loads)

@@ -17,50 +17,44 @@ from gapbridge.bridge.document.blocks import (
     Tiles,
     Verdict,
 )
-from gapbridge.bridge.document.section import Section
 from gapbridge.bridge.report.labels import listed
 from gapbridge.bridge.report.names import sentence
 
 FEWEST_HELD_OUT = 8  # poses kept out of the fit by which an accuracy can be decided
 
 
-class Summary(Section[Material]):
-    """What came out, on half a page."""
-
-    key, title = "result", "Result"
-
-    def blocks(self, material: Material) -> list[Block]:
-        """Return the verdict and the large figures."""
-        c = material.calibration
-        before, after = material.judged
-        badge = Badge("Complete", GOOD) if c.complete else Badge("Not complete", DOUBTFUL)
-        if not after.mean < before.mean:
-            badge = Badge("No improvement", BAD)
-        tiles = [
-            Tile("mean error before", mm(before.mean), f"at most {mm(before.max)}"),
-            Tile("mean error after", mm(after.mean), f"at most {mm(after.max)}"),
-            Tile("smaller by", _times(before.mean, after.mean), f"over {len(after.norm)} readings"),
-            Tile("expanded uncertainty (k = 2)", f"± {mm(material.budget.expanded)}",
-                 "of one coordinate of the tool"),
-        ]  # fmt: skip
-        text = f"Errors are those of {material.judged_words}: {material.error_words}."
-        if not material.shows_places:
-            text += (
-                " Such readings show a part of where the tool is: how well its place is known "
-                "stands in the uncertainty, not in these errors."
-            )
-        wild = [r for r in material.judged[1].rows if r in material.wild]
-        if wild and material.held_out:
-            rows = listed([str(int(r) + 1) for r in wild])
-            text += (
-                f" Among them {'is reading' if len(wild) == 1 else 'are readings'} {rows}, far "
-                "beyond all others: to be measured again. The uncertainty does not count it."
-            )
-        asked = [] if material.session.accuracy is None else [_asked(material)]
-        return [
-            Verdict(badge, sentence(c.verdict)), *asked, Tiles(tuple(tiles)),
-            Paragraph(text, "note"),
-        ]  # fmt: skip
+def summary(material: Material) -> list[Block]:
+    """Return the verdict and the large figures."""
+    c = material.calibration
+    before, after = material.judged
+    badge = Badge("Complete", GOOD) if c.complete else Badge("Not complete", DOUBTFUL)
+    if not after.mean < before.mean:
+        badge = Badge("No improvement", BAD)
+    tiles = [
+        Tile("mean error before", mm(before.mean), f"at most {mm(before.max)}"),
+        Tile("mean error after", mm(after.mean), f"at most {mm(after.max)}"),
+        Tile("smaller by", _times(before.mean, after.mean), f"over {len(after.norm)} readings"),
+        Tile("expanded uncertainty (k = 2)", f"± {mm(material.budget.expanded)}",
+             "of one coordinate of the tool"),
+    ]  # fmt: skip
+    text = f"Errors are those of {material.judged_on}: {material.error_meaning}."
+    if not material.shows_places:
+        text += (
+            " Such readings show a part of where the tool is: how well its place is known "
+            "stands in the uncertainty, not in these errors."
+        )
+    outliers = [r for r in material.judged[1].rows if r in material.outlier_rows]
+    if outliers and material.held_out:
+        rows = listed([str(int(r) + 1) for r in outliers])
+        text += (
+            f" Among them {'is reading' if len(outliers) == 1 else 'are readings'} {rows}, far "
+            "beyond all others: to be measured again. The uncertainty does not count it."
+        )
+    asked = [] if material.session.accuracy is None else [_asked(material)]
+    return [
+        Verdict(badge, sentence(c.verdict)), *asked, Tiles(tuple(tiles)),
+        Paragraph(text, "note"),
+    ]  # fmt: skip
 
 
 def _asked(material: Material) -> Verdict:

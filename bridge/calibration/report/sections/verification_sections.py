@@ -33,7 +33,7 @@ from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.verify import Suspect, Verification
 from gapbridge.core.effects import CATALOGUE
 
-TWICE = 2.0  # promised deviations that an error hardly exceeds
+TWICE = 2.0  # predicted sigmas that an error hardly exceeds
 
 
 @dataclass(frozen=True)
@@ -42,67 +42,51 @@ class VerificationMaterial:
 
     verification: Verification
     session: SessionFacts
-    readings: Readings | None
+    readings: Readings | None = None
 
 
-class Holds(Section[VerificationMaterial]):
-    """The answer."""
-
-    key, title = "result", "Result"
-
-    def blocks(self, material: VerificationMaterial) -> list[Block]:
-        """Return the verdict, the large figures and how it was judged."""
-        v = material.verification
-        badge = Badge("Still holds", GOOD) if v.holds else Badge("No longer holds", BAD)
-        promised = float(np.sqrt(np.mean(v.promised**2)))
-        tiles = Tiles((
-            Tile("error now, rms", mm(v.errors.rms), f"at most {mm(v.errors.max)}"),
-            Tile("promised, rms", mm(promised), "uncertainty, arm and instrument"),
-            Tile("error over promise", f"{v.ratio:.2f}", "about 1 is as promised"),
-            Tile("chance", likelihood(v.chance), "of so much, if it still holds"),
-        ))  # fmt: skip
-        text = (
-            "A few poses were measured again and compared with what the calibration said they "
-            "would be. It counts as broken where so large an error would come by chance less than "
-            "once in a thousand."
-        )
-        return [Verdict(badge, sentence(v.verdict)), tiles, Paragraph(text, "note")]
+def holds(material: VerificationMaterial) -> list[Block]:
+    """Return the verdict, the large figures and how it was judged."""
+    v = material.verification
+    badge = Badge("Still holds", GOOD) if v.holds else Badge("No longer holds", BAD)
+    predicted = float(np.sqrt(np.mean(v.promised**2)))
+    tiles = Tiles((
+        Tile("error now, rms", mm(v.errors.rms), f"at most {mm(v.errors.max)}"),
+        Tile("predicted, rms", mm(predicted), "uncertainty, arm and instrument"),
+        Tile("error over prediction", f"{v.ratio:.2f}", "about 1 is as predicted"),
+        Tile("chance", likelihood(v.chance), "of so much, if it still holds"),
+    ))  # fmt: skip
+    text = (
+        "A few poses were measured again and compared with what the calibration said they "
+        "would be. It counts as broken where so large an error would come by chance less than "
+        "once in a thousand."
+    )
+    return [Verdict(badge, sentence(v.verdict)), tiles, Paragraph(text, "note")]
 
 
-class Facts(Section[VerificationMaterial]):
-    """Who, where, when, with what."""
-
-    key, title = "session", "Session and instrument"
-
-    def blocks(self, material: VerificationMaterial) -> list[Block]:
-        """Return the facts."""
-        v, facts = material.verification, material.session
-        counts = [("readings", str(len(v.errors.rows)))]
-        return facts_blocks(facts, counts, len(v.stations), v.notes)
+def facts(material: VerificationMaterial) -> list[Block]:
+    """Return the facts."""
+    v = material.verification
+    counts = [("readings", str(len(v.errors.rows)))]
+    return facts_blocks(material.session, counts, len(v.stations), v.notes)
 
 
-class Poses(Section[VerificationMaterial]):
-    """Every reading against its promise."""
-
-    key, title = "poses", "Every reading"
-    about = "Error of each reading, and twice what the calibration promised of it."
-
-    def blocks(self, material: VerificationMaterial) -> list[Block]:
-        """Return a picture and a table."""
-        v, readings = material.verification, material.readings
-        rows: list[list[Cell]] = []
-        for i, row in enumerate(v.errors.rows):
-            q = "–" if readings is None else degrees(readings.q[row])
-            within = v.errors.norm[i] <= TWICE * v.promised[i]
-            rows.append([
-                str(int(row) + 1), q, ",  ".join(fixed(x * 1e3, 3) for x in v.errors.vector[i]),
-                mm(float(v.errors.norm[i])), mm(float(v.promised[i])),
-                Badge("within", GOOD) if within else Badge("beyond", BAD),
-            ])  # fmt: skip
-        heads = ("no.", "joint angles, degrees", "error along the axes, mm", "error",
-                 "promised, 1 sigma", "twice the promise")  # fmt: skip
-        table = Table(heads, rows, (0.4, 3, 1.9, 0.9, 1, 1), (2, 3, 4))
-        return [Pictures((_picture(v),)), table]
+def poses(material: VerificationMaterial) -> list[Block]:
+    """Return a picture and a table."""
+    v, readings = material.verification, material.readings
+    rows: list[list[Cell]] = []
+    for i, row in enumerate(v.errors.rows):
+        q = "–" if readings is None else degrees(readings.q[row])
+        within = v.errors.norm[i] <= TWICE * v.promised[i]
+        rows.append([
+            str(int(row) + 1), q, ",  ".join(fixed(x * 1e3, 3) for x in v.errors.vector[i]),
+            mm(float(v.errors.norm[i])), mm(float(v.promised[i])),
+            Badge("within", GOOD) if within else Badge("beyond", BAD),
+        ])  # fmt: skip
+    heads = ("no.", "joint angles, degrees", "error along the axes, mm", "error",
+             "predicted, 1 sigma", "twice the prediction")  # fmt: skip
+    table = Table(heads, rows, (0.4, 3, 1.9, 0.9, 1, 1), (2, 3, 4))
+    return [Pictures((_picture(v),)), table]
 
 
 def _picture(v: Verification) -> Drawing:
@@ -110,44 +94,39 @@ def _picture(v: Verification) -> Drawing:
     step = max(1, len(labels) // 20)
     labels = [name if i % step == 0 else "" for i, name in enumerate(labels)]
     values = [*v.errors.norm * 1e3, *TWICE * v.promised * 1e3]
-    chart = Chart("Error and promise", named("reading", labels), scale("mm", values), width=560)
-    for i, (error, promised) in enumerate(zip(v.errors.norm, v.promised, strict=True)):
+    chart = Chart("Error and prediction", named("reading", labels), scale("mm", values), width=560)
+    for i, (error, predicted) in enumerate(zip(v.errors.norm, v.promised, strict=True)):
         chart.column(i, float(error) * 1e3, AFTER, 0.55)
-        most = TWICE * float(promised) * 1e3
+        most = TWICE * float(predicted) * 1e3
         chart.line([i - 0.4, i + 0.4], [most, most], EDGE, width=2.2)
-    chart.legend((("error", AFTER), ("twice the promise", EDGE)))
+    chart.legend((("error", AFTER), ("twice the prediction", EDGE)))
     return chart.drawing
 
 
-class Moved(Section[VerificationMaterial]):
-    """What explains the change."""
-
-    key, title = "moved", "What may have moved"
-
-    def blocks(self, material: VerificationMaterial) -> list[Block]:
-        """Return the suspects; nothing where the calibration holds."""
-        v = material.verification
-        if v.holds:
-            return []
-        if v.moved is None:
-            return [Paragraph(
-                "No single change (tool, load, one joint's zero, instrument, one bad reading) "
-                "explains the errors. Calibrate anew."
-            )]  # fmt: skip
-        blocks: list[Block] = [Paragraph(f"What explains it best: {suspect_words(v.moved)}.")]
-        if v.moved.estimates:
-            blocks.append(estimates_table(list(v.moved.estimates), planned=False))
-        if v.suspects:
-            rows = [[suspect_words(s), likelihood(s.chance)] for s in v.suspects]
-            blocks += [
-                Heading("What explains it nearly as well"),
-                Table(("change", "chance of what is left"), rows, (3, 1), (1,)),
-            ]
-        return blocks
+def moved(material: VerificationMaterial) -> list[Block]:
+    """Return the suspects; nothing where the calibration holds."""
+    v = material.verification
+    if v.holds:
+        return []
+    if v.moved is None:
+        return [Paragraph(
+            "No single change (tool, load, one joint's zero, instrument, one bad reading) "
+            "explains the errors. Calibrate anew."
+        )]  # fmt: skip
+    blocks: list[Block] = [Paragraph(f"What explains it best: {suspect_title(v.moved)}.")]
+    if v.moved.estimates:
+        blocks.append(estimates_table(list(v.moved.estimates), planned=False))
+    if v.suspects:
+        rows = [[suspect_title(s), likelihood(s.chance)] for s in v.suspects]
+        blocks += [
+            Heading("What explains it nearly as well"),
+            Table(("change", "chance of what is left"), rows, (3, 1), (1,)),
+        ]
+    return blocks
 
 
-def suspect_words(suspect: Suspect) -> str:
-    """Return what may have moved, in words."""
+def suspect_title(suspect: Suspect) -> str:
+    """Return what may have moved, for people."""
     kind, _, number = suspect.name.rpartition("_")
     if kind == "reading":
         return f"reading {number} alone is wrong"
@@ -158,4 +137,10 @@ def suspect_words(suspect: Suspect) -> str:
     return f"another {parameter_title(suspect.name)}"
 
 
-VERIFICATION: tuple[Section[VerificationMaterial], ...] = (Holds(), Facts(), Poses(), Moved())
+VERIFICATION: tuple[Section[VerificationMaterial], ...] = (
+    Section("result", "Result", holds),
+    Section("session", "Session and instrument", facts),
+    Section("poses", "Every reading", poses,
+            "Error of each reading, and twice the calibration's prediction of it."),
+    Section("moved", "What may have moved", moved),
+)  # fmt: skip

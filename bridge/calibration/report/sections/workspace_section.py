@@ -10,7 +10,6 @@ from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.document.axes import Chart, scale
 from gapbridge.bridge.document.blocks import Block, Paragraph, Pictures, Table
 from gapbridge.bridge.document.drawing import AFTER, BEFORE, EDGE, INK, Circle, Drawing
-from gapbridge.bridge.document.section import Section
 from gapbridge.bridge.document.skeleton import round_factor
 from gapbridge.core.calibration.result import Errors
 
@@ -19,36 +18,31 @@ LONGEST = 0.16  # of the workspace's size: how long a large error is drawn
 VIEWS = {"from above": (("x, m", 0), ("y, m", 1)), "from the side": (("x, m", 0), ("z, m", 2))}
 
 
-class WorkspaceSection(Section[Material]):
-    """Where in the workspace the errors are."""
-
-    key, title = "workspace", "Over the workspace"
-
-    def blocks(self, material: Material) -> list[Block]:
-        """Return the errors as arrows, from two sides, and a table of zones."""
-        before, after = material.calm
-        tip = material.tip[before.rows]
-        zones = _zones(tip, before, after)
-        if not material.shows_places:
-            return [zones]
-        about = "Each line begins where the tool was meant to be and shows which way it was off."
-        size = float(np.ptp(tip, axis=0).max())
-        drawings, factors = [], []
-        for name, errors, colour in (("Before", before, BEFORE), ("After", after, AFTER)):
-            factor = _factor(errors, size)
-            factors.append(factor)
-            for view, axes in VIEWS.items():
-                title = f"{name}, {view}"
-                drawings.append(_view(title, axes, tip, errors.vector * factor, colour))
-        caption = (
-            f"{_all(material)} Errors before are drawn {factors[0]:,.0f} times as long as they are,"
-            f" errors after {factors[1]:,.0f} times. Axes of the base; the square is the base."
-        )
-        return [Paragraph(about, "note"), Pictures(tuple(drawings), caption), zones]
+def over_the_workspace(material: Material) -> list[Block]:
+    """Return the errors as arrows, from two sides, and a table of zones."""
+    before, after = material.inliers
+    tip = material.tip[before.rows]
+    zones = _zones(tip, before, after)
+    if not material.shows_places:
+        return [zones]
+    about = "Each line begins where the tool was meant to be and shows which way it was off."
+    size = float(np.ptp(tip, axis=0).max())
+    drawings, factors = [], []
+    for name, errors, colour in (("Before", before, BEFORE), ("After", after, AFTER)):
+        factor = _factor(errors, size)
+        factors.append(factor)
+        for view, axes in VIEWS.items():
+            title = f"{name}, {view}"
+            drawings.append(_view(title, axes, tip, errors.vector * factor, colour))
+    caption = (
+        f"{_all(material)} Errors before are drawn {factors[0]:,.0f} times as long as they are,"
+        f" errors after {factors[1]:,.0f} times. Axes of the base; the square is the base."
+    )
+    return [Paragraph(about, "note"), Pictures(tuple(drawings), caption), zones]
 
 
 def _all(material: Material) -> str:
-    return "All readings but the outliers." if material.wild else "All readings."
+    return "All readings but the outliers." if material.outlier_rows else "All readings."
 
 
 def _factor(errors: Errors, size: float) -> float:

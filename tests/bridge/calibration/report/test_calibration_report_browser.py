@@ -7,21 +7,22 @@ from calibration_report_cases import calibration, plan, session
 from short_session_cases import payload, tool, verification
 
 from gapbridge.bridge.calibration.report import (
-    write_payload,
+    Material,
+    ShortMaterial,
+    VerificationMaterial,
     write_report,
-    write_tool,
-    write_verification,
 )
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 WRITERS = {
-    "calibration": lambda out: write_report(calibration(), plan(), session(), out),
-    "verification": lambda out: write_verification(
-        *verification(moved=True)[:1], session(), out, verification(moved=True)[1]
+    "calibration": lambda out: write_report(Material(calibration(), plan(), session()), out),
+    "verification": lambda out: write_report(
+        VerificationMaterial(verification(moved=True)[0], session(), verification(moved=True)[1]),
+        out,
     ),
-    "payload": lambda out: write_payload(*payload()[:1], session(), out, payload()[1]),
-    "tool": lambda out: write_tool(*tool()[:1], session(), out, tool()[1]),
+    "payload": lambda out: write_report(ShortMaterial(payload()[0], session(), payload()[1]), out),
+    "tool": lambda out: write_report(ShortMaterial(tool()[0], session(), tool()[1]), out),
 }
 # texts of a drawing that reach beyond its edge
 CUT = """[...document.querySelectorAll('svg')].flatMap(svg => {

@@ -6,9 +6,9 @@ import pytest
 
 from gapbridge.bridge.calibration.report.figures import (
     decimals_of,
-    estimate_words,
+    estimate_texts,
     fixed,
-    load_words,
+    load_title,
     mm,
 )
 from gapbridge.bridge.report.names import parameter_title, sentence, with_titles
@@ -52,7 +52,7 @@ def test_lengths_are_told_to_the_micrometre(length, text):
 
 def test_a_value_has_the_digits_of_its_deviation():
     e = Estimate("joint_offset_2", 7.99412e-4, 1.26e-5, "rad")
-    assert estimate_words(e) == ("0.799", "0.775 to 0.824", "0.013", "mrad")
+    assert estimate_texts(e) == ("0.799", "0.775 to 0.824", "0.013", "mrad")
     assert decimals_of(0.0) == decimals_of(math.inf) == 3
 
 
@@ -62,5 +62,5 @@ def test_nothing_is_never_minus_nothing():
 
 
 def test_a_loads_name_that_only_says_its_mass_is_left_out():
-    assert load_words(8.0, "8 kg") == "8 kg"
-    assert load_words(1.25, "gripper") == "1.25 kg (gripper)"
+    assert load_title(8.0, "8 kg") == "8 kg"
+    assert load_title(1.25, "gripper") == "1.25 kg (gripper)"

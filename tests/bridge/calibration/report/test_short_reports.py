@@ -7,11 +7,11 @@ from short_session_cases import payload, tool, verification
 
 from gapbridge.bridge.calibration.report import (
     InstrumentFacts,
-    write_payload,
-    write_tool,
-    write_verification,
+    ShortMaterial,
+    VerificationMaterial,
+    write_report,
 )
-from gapbridge.bridge.calibration.report.figures import estimate_words, mm
+from gapbridge.bridge.calibration.report.figures import estimate_texts, mm
 
 
 def read(paths):
@@ -23,7 +23,7 @@ def read(paths):
 
 def test_a_calibration_that_holds_says_so_and_accuses_nothing(tmp_path):
     found, readings = verification(moved=False)
-    html, phrase = read(write_verification(found, session(), tmp_path, readings))
+    html, phrase = read(write_report(VerificationMaterial(found, session(), readings), tmp_path))
     for text in (html, phrase):
         assert "Still holds" in text
         assert "What may have moved" not in text
@@ -33,7 +33,7 @@ def test_a_calibration_that_holds_says_so_and_accuses_nothing(tmp_path):
 
 def test_a_calibration_that_no_longer_holds_names_what_moved(tmp_path):
     found, readings = verification(moved=True)
-    html, phrase = read(write_verification(found, session(), tmp_path, readings))
+    html, phrase = read(write_report(VerificationMaterial(found, session(), readings), tmp_path))
     for text in (html, phrase):
         assert "No longer holds" in text
         assert "another zero of joint 3" in text
@@ -42,7 +42,7 @@ def test_a_calibration_that_no_longer_holds_names_what_moved(tmp_path):
 
 def test_a_verification_without_its_readings_leaves_only_the_angles_out(tmp_path):
     found, _ = verification(moved=True)
-    html, _ = read(write_verification(found, session(), tmp_path))
+    html, _ = read(write_report(VerificationMaterial(found, session()), tmp_path))
     assert all(mm(float(e)) in html for e in found.errors.norm)
 
 
@@ -52,14 +52,14 @@ def test_a_short_session_shows_each_number_with_its_interval(kind, unit, tmp_pat
     facts = session(instrument=instrument)
     if kind == "payload":
         found, nominal = payload()
-        paths = write_payload(found, facts, tmp_path, nominal)
+        paths = write_report(ShortMaterial(found, facts, nominal), tmp_path)
     else:
         found, nominal = tool()
-        paths = write_tool(found, facts, tmp_path, nominal)
+        paths = write_report(ShortMaterial(found, facts, nominal), tmp_path)
     html, phrase = read(paths)
 
     for estimate in found.estimates:
-        value, interval, _, _ = estimate_words(estimate)
+        value, interval, _, _ = estimate_texts(estimate)
         assert f"<div>{value}</div>" in html
         assert f"<div>{interval}</div>" in html
         assert interval in phrase
@@ -71,6 +71,6 @@ def test_a_short_session_shows_each_number_with_its_interval(kind, unit, tmp_pat
 def test_a_outlier_reading_of_the_sensor_is_remarked(tmp_path):
     found, nominal = payload()
     assert list(found.outliers) == [5]
-    html, _ = read(write_payload(found, session(), tmp_path, nominal))
+    html, _ = read(write_report(ShortMaterial(found, session(), nominal), tmp_path))
     assert "Found, see remarks" in html
     assert "Down-weighted as outlier: reading 6." in html

@@ -10,7 +10,7 @@ import pypdfium2
 import pytest
 from calibration_report_cases import calibration, plan, session
 
-from gapbridge.bridge.calibration.report import write_report
+from gapbridge.bridge.calibration.report import Material, write_report
 from gapbridge.core.calibration.result import Errors
 
 FACTS = {"number": "GB-20261121-0912-1a2b3c4d", "version": "9.8.7", "cell_sha256": "ab" * 32}
@@ -19,7 +19,7 @@ FACTS = {"number": "GB-20261121-0912-1a2b3c4d", "version": "9.8.7", "cell_sha256
 def page(folder: Path, accuracy: float | None, **changed: object) -> str:
     found = replace(calibration(), **changed)
     facts = session(**FACTS, accuracy=accuracy)
-    return write_report(found, plan(), facts, folder)[0].read_text(encoding="utf-8")
+    return write_report(Material(found, plan(), facts), folder)[0].read_text(encoding="utf-8")
 
 
 def test_number_version_hash_certificate_and_room_to_sign_stand_in_it(tmp_path: Path) -> None:
@@ -62,7 +62,7 @@ def test_what_is_left_is_the_same_statement_in_every_section(tmp_path: Path) -> 
         "remaining": left, "verdict": f"the error falls; not complete: {left}",
     }  # fmt: skip
     text = page(tmp_path, None, **changed)
-    section = text[text.index('id="leftover"') : text.index('id="poses"')]
+    section = text[text.index('id="residual"') : text.index('id="poses"')]
     assert "To be added, with the share" in section
     assert "90 %" in section
     assert "no known effect" not in section.lower()
@@ -70,7 +70,7 @@ def test_what_is_left_is_the_same_statement_in_every_section(tmp_path: Path) -> 
 
 
 def test_every_page_says_how_many_there_are(tmp_path: Path) -> None:
-    _, paper = write_report(calibration(), plan(), session(**FACTS), tmp_path)
+    _, paper = write_report(Material(calibration(), plan(), session(**FACTS)), tmp_path)
     pages = pypdfium2.PdfDocument(str(paper))
     ends = [p.get_textpage().get_text_bounded().strip().split("\n")[-1] for p in pages]
     assert ends == [f"page {i} of {len(pages)}" for i in range(1, len(pages) + 1)]

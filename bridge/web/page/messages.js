@@ -1,4 +1,4 @@
-// What the page says: states and events in sentences, numbers with their units.
+// States and events in sentences, numbers with their units.
 
 export const MEANING = {
   disconnected: 'No link to the robot. The daemon tries again by itself; nothing is written.',
@@ -43,9 +43,9 @@ const KNOWN = new Set(['time', 'monotonic', 'sequence', 'kind', 'from', 'to', 'c
 const SENTENCES = new Set(['failure', 'fault', 'ended', 'reason']);
 
 // a path by its last part: the rest only says where on that machine
-const shorter = (words) => words.replace(/(?:\/[^\s;,:/]+){2,}\/([^\s;,:/]+)/g, '…/$1').slice(0, 600);
+const shorter = (message) => message.replace(/(?:\/[^\s;,:/]+){2,}\/([^\s;,:/]+)/g, '…/$1').slice(0, 600);
 
-export function inWords(event) {
+export function describe(event) {
   const found = { title: event.kind || 'event', text: '', look: '' };
   if (event.to) {
     const to = String(event.to).toLowerCase();
@@ -54,14 +54,14 @@ export function inWords(event) {
     found.text = shorter([event.cause, event.detail].filter(Boolean).join(': '));
     return found;
   }
-  // the detail is a sentence already; what has none is told key by key
-  const told = event.detail ? [event.detail] : [];
+  // the detail is a sentence already; what has none is shown key by key
+  const parts = event.detail ? [event.detail] : [];
   for (const [key, value] of Object.entries(event.detail ? {} : event)) {
     if (KNOWN.has(key) || value === null || value === '') continue;
     const plain = typeof value === 'object' ? JSON.stringify(value) : String(value);
-    told.push(SENTENCES.has(key) ? plain : `${key.replace(/_/g, ' ')} ${plain}`);
+    parts.push(SENTENCES.has(key) ? plain : `${key.replace(/_/g, ' ')} ${plain}`);
   }
-  found.text = shorter(told.join('; '));
+  found.text = shorter(parts.join('; '));
   if (['fault', 'refused'].includes(event.kind) || event.failure || event.fault) found.look = 'bad';
   return found;
 }

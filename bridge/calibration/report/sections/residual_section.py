@@ -1,4 +1,4 @@
-"""The residual: the diagnosis of the remainder, in words."""
+"""The residual: what the diagnosis says of it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from gapbridge.bridge.document.blocks import (
     Table,
     Verdict,
 )
-from gapbridge.bridge.document.section import Section
 from gapbridge.bridge.report.answer import one_line, sentences
 from gapbridge.bridge.report.labels import CHANNELS, effect_title, listed
 from gapbridge.bridge.report.material import chosen_channel
@@ -29,30 +28,22 @@ from gapbridge.core.diagnosis.diagnosis import Diagnosis
 SHOWN = 8  # measurements proposed
 
 
-class LeftoverSection(Section[Material]):
-    """Whether the calibration is complete."""
-
-    key, title = "leftover", "The residual"
-    about = (
-        "What the calibrated model still misses is examined again: does any further effect show?"
-    )
-
-    def blocks(self, material: Material) -> list[Block]:
-        """Return the verdict, what was found, and what would settle it."""
-        c = material.calibration
-        if c.diagnosis is None:
-            text = "These readings do not allow to examine the residual."
-            return [Verdict(Badge("Not examined", QUIET), text)]
-        badge = Badge("Complete", GOOD) if c.complete else Badge("Not complete", DOUBTFUL)
-        main = chosen_channel(c.diagnosis)
-        blocks: list[Block] = [Verdict(badge, sentence(c.remaining))]
-        if not c.missing_effects and (c.complete or c.diagnosis.verdict != "no_gap"):
-            blocks.append(Paragraph(" ".join(sentences(main))))
-        others = [ch for ch in c.diagnosis.channels if ch is not main]
-        blocks += [Paragraph(f"{CHANNELS[ch.channel]}: {one_line(ch)}") for ch in others]
-        if c.diagnosis.findings:
-            blocks.append(Bullets(tuple(_finding(f) for f in c.diagnosis.findings)))
-        return [*blocks, *([] if c.complete else _next(c.diagnosis))]
+def residual(material: Material) -> list[Block]:
+    """Return the verdict, what was found, and what would settle it."""
+    c = material.calibration
+    if c.diagnosis is None:
+        text = "These readings do not allow to examine the residual."
+        return [Verdict(Badge("Not examined", QUIET), text)]
+    badge = Badge("Complete", GOOD) if c.complete else Badge("Not complete", DOUBTFUL)
+    main = chosen_channel(c.diagnosis)
+    blocks: list[Block] = [Verdict(badge, sentence(c.remaining))]
+    if not c.missing_effects and (c.complete or c.diagnosis.verdict != "no_gap"):
+        blocks.append(Paragraph(" ".join(sentences(main))))
+    others = [ch for ch in c.diagnosis.channels if ch is not main]
+    blocks += [Paragraph(f"{CHANNELS[ch.channel]}: {one_line(ch)}") for ch in others]
+    if c.diagnosis.findings:
+        blocks.append(Bullets(tuple(_finding(f) for f in c.diagnosis.findings)))
+    return [*blocks, *([] if c.complete else _next(c.diagnosis))]
 
 
 def _finding(text: str) -> str:

@@ -1,0 +1,194 @@
+"""The short reports: a session with the flange sensor, and one for the tool."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapbridge.bridge.calibration.report.facts import SessionFacts
+from gapbridge.bridge.calibration.report.figures import fixed, mm
+from gapbridge.bridge.calibration.report.sections.parameters_section import estimates_table
+from gapbridge.bridge.calibration.report.sections.session_section import facts_blocks
+from gapbridge.bridge.document.axes import Chart, named, scale
+from gapbridge.bridge.document.blocks import (
+    DOUBTFUL,
+    GOOD,
+    Badge,
+    Block,
+    Paragraph,
+    Pictures,
+    Table,
+    Tile,
+    Tiles,
+    Verdict,
+)
+from gapbridge.bridge.document.drawing import AFTER, BAD_DOT, BEFORE, Drawing
+from gapbridge.bridge.document.section import Section
+from gapbridge.bridge.report.names import sentence
+from gapbridge.core.calibration.payload_session import PayloadCalibration
+from gapbridge.core.calibration.tool_session import ToolCalibration
+from gapbridge.core.model import Model
+
+Array = NDArray[np.float64]
+F = TypeVar("F", bound=PayloadCalibration | ToolCalibration)
+
+
+@dataclass(frozen=True)
+class ShortMaterial(Generic[F]):
+    """What a short session found; ``nominal`` is the model as the cell had it."""
+
+    found: F
+    session: SessionFacts
+    nominal: Model | None = None
+
+
+def _result(
+    found: PayloadCalibration | ToolCalibration, tiles: tuple[Tile, ...], before: str
+) -> list[Block]:
+    """Return the verdict, the large figures, and what the cell had."""
+    badge = Badge("Found, see remarks", DOUBTFUL) if found.notes else Badge("Found", GOOD)
+    return [
+        Verdict(badge, sentence(found.verdict)), Tiles(tiles),
+        *([Paragraph(before)] if before else []),
+    ]  # fmt: skip
+
+
+def _point(values: Sequence[float] | Array, factor: float = 1e3, decimals: int = 1) -> str:
+    return ", ".join(fixed(float(v) * factor, decimals) for v in np.asarray(values))
+
+
+def _bars(
+    title: str, names: str, unit: str, series: Sequence[tuple[Array, str]],
+    outliers: Collection[int],
+) -> Chart:  # fmt: skip
+    """Return a chart of magnitudes, one group of columns an entry; the last series' outliers red.
+
+    ``series`` are magnitudes in ``unit`` with their colours.
+    """
+    count = len(series[0][0])
+    every = [float(v) for values, _ in series for v in values]
+    labels = [str(i + 1) for i in range(count)]
+    chart = Chart(
+        title, named(names, labels), scale(unit, every), width=340 + 80 * (len(series) - 1)
+    )
+    width = 0.72 / len(series)
+    for k, (values, colour) in enumerate(series):
+        shift = (k - (len(series) - 1) / 2) * (width + 0.04)
+        for i, value in enumerate(values):
+            marked = k == len(series) - 1 and i in outliers
+            chart.column(i + shift, float(value), BAD_DOT if marked else colour, width)
+    return chart
+
+
+def payload_result(material: ShortMaterial[PayloadCalibration]) -> list[Block]:
+    """Return mass, centre of gravity and the sensor's zero."""
+    found, nominal = material.found, material.nominal
+    mass, *cog = (e for e in found.estimates[:4])
+    wide = max((e.interval[1] - e.interval[0]) / 2 for e in cog)
+    tiles = (
+        Tile("mass", f"{fixed(mass.value, 3)} kg",
+             f"± {fixed((mass.interval[1] - mass.interval[0]) / 2, 3)} kg (95 %)"),
+        Tile("centre of gravity x, y, z, mm", _point(found.cog),
+             f"± {fixed(wide * 1e3, 1)} mm (95 %, the widest)"),
+        Tile("sensor zero of force, N", _point(found.bias[:3], 1.0, 2), "along x, y, z"),
+        Tile("sensor zero of torque, Nm", _point(found.bias[3:], 1.0, 3), "about x, y, z"),
+    )  # fmt: skip
+    before = "" if nominal is None else (
+        f"The cell had {fixed(nominal.payload_mass, 3)} kg at "
+        f"{_point(nominal.payload_cog)} mm from the flange."
+    )  # fmt: skip
+    return _result(found, tiles, before)
+
+
+def payload_facts(material: ShortMaterial[PayloadCalibration]) -> list[Block]:
+    """Return who, where, when, with what."""
+    counts = [("orientations", str(len(material.found.residual)))]
+    return facts_blocks(material.session, counts, 1, material.found.notes)
+
+
+def payload_parameters(material: ShortMaterial[PayloadCalibration]) -> list[Block]:
+    """Return all ten numbers."""
+    return [estimates_table([e for e in material.found.estimates if e.shown], planned=False)]
+
+
+def payload_residual(material: ShortMaterial[PayloadCalibration]) -> list[Block]:
+    """Return what the sensor read beyond load and zero, against the noise that was found."""
+    found = material.found
+    drawings = [
+        _bars(title, "orientation", unit,
+              [(np.linalg.norm(found.residual[:, part], axis=1), AFTER)], found.outliers).drawing
+        for title, unit, part in (("Residual force", "N", slice(0, 3)),
+                                  ("Residual torque", "Nm", slice(3, 6)))
+    ]  # fmt: skip
+    force, torque = found.noise
+    rows = [["force", f"{fixed(force, 3)} N"], ["torque", f"{fixed(torque, 4)} Nm"]]
+    caption = "Length of the residual; red: down-weighted as outlier."
+    return [Pictures(tuple(drawings), caption),
+            Table(("noise of one axis, 1 sigma", "found"), rows, (2, 1), (1,))]  # fmt: skip
+
+
+def tool_result(material: ShortMaterial[ToolCalibration]) -> list[Block]:
+    """Return where the tip is."""
+    found, nominal = material.found, material.nominal
+    wide = max((e.interval[1] - e.interval[0]) / 2 for e in found.estimates)
+    tiles = (
+        Tile("tool centre x, y, z, mm", _point(found.tcp, decimals=2),
+             f"± {mm(wide)} (95 %, the widest)"),
+        Tile("tips apart before", mm(_rms(found.nominal_residual)), "rms, cell's tool"),
+        Tile("tips apart after", mm(_rms(found.residual)), "rms, tool found"),
+        Tile("noise of one touch", mm(found.noise), "1 sigma of one coordinate"),
+    )  # fmt: skip
+    before = "" if nominal is None else (
+        f"The cell had the tool at {_point(nominal.chain().tool_position, decimals=2)} mm, in the "
+        "axes of the flange."
+    )  # fmt: skip
+    return _result(found, tiles, before)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.asarray(values) ** 2)))
+
+
+def tool_facts(material: ShortMaterial[ToolCalibration]) -> list[Block]:
+    """Return who, where, when, with what."""
+    counts = [("touches", str(len(material.found.residual)))]
+    return facts_blocks(material.session, counts, 1, material.found.notes)
+
+
+def tool_parameters(material: ShortMaterial[ToolCalibration]) -> list[Block]:
+    """Return the tool centre with its intervals, and the touches."""
+    found = material.found
+    place = f"The fixed place is at {_point(found.point, decimals=2)} mm in the axes of the base."
+    caption = (
+        "How far each touch is from the fixed place: with the tool that the cell had, and with "
+        "the one that was found. Red: down-weighted as outlier."
+    )
+    return [
+        estimates_table(list(found.estimates), planned=False), Paragraph(place),
+        Pictures((_touches(found),), caption),
+    ]  # fmt: skip
+
+
+def _touches(found: ToolCalibration) -> Drawing:
+    before, after = (np.abs(r) * 1e3 for r in (found.nominal_residual, found.residual))
+    chart = _bars("Every touch", "touch", "mm", [(before, BEFORE), (after, AFTER)], found.outliers)
+    chart.legend((("before", BEFORE), ("after", AFTER)))
+    return chart.drawing
+
+
+PAYLOAD: tuple[Section[ShortMaterial[PayloadCalibration]], ...] = (
+    Section("result", "Result", payload_result),
+    Section("session", "Session and instrument", payload_facts),
+    Section("parameters", "What was found", payload_parameters, "Flange axes; intervals of 95 %."),
+    Section("residual", "The residual", payload_residual,
+            "Reading minus load and sensor zero, orientation by orientation."),
+)  # fmt: skip
+TOOL: tuple[Section[ShortMaterial[ToolCalibration]], ...] = (
+    Section("result", "Result", tool_result),
+    Section("session", "Session and instrument", tool_facts),
+    Section("parameters", "What was found", tool_parameters, "Flange axes; intervals of 95 %."),
+)

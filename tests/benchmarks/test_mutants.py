@@ -1,0 +1,45 @@
+"""The list of mistakes: each stands in a file of the product as it is, and is told from it."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from benchmarks.mutants.__main__ import table
+from benchmarks.mutants.mutant import Mutant, read_mutants
+from benchmarks.mutants.trial import Verdict
+from gapbridge.core.errors import InputError
+
+ROOT = Path(__file__).resolve().parents[2]
+MUTANTS = read_mutants()
+
+
+@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda m: m.what)
+def test_each_mistake_can_be_made_and_names_tests_that_are_there(mutant: Mutant) -> None:
+    text = mutant.text(ROOT)
+    ast.parse(text)
+    assert text != (ROOT / mutant.file).read_text(encoding="utf-8")
+    for test in mutant.tests:
+        path, _, name = test.partition("::")
+        assert (ROOT / path).exists(), test
+        assert not name or f"def {name}" in (ROOT / path).read_text(encoding="utf-8"), test
+
+
+def test_no_mistake_stands_in_the_list_twice() -> None:
+    seen = {(m.file, m.find, m.replace) for m in MUTANTS}
+    assert len(seen) == len(MUTANTS)
+
+
+def test_a_text_that_is_not_there_once_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.py").write_text("x = 1\nx = 1\n")
+    with pytest.raises(InputError, match="2 times, expected once"):
+        Mutant("twice", "a.py", "x = 1", "x = 2", ("tests",)).text(tmp_path)
+
+
+def test_the_table_counts_by_folder() -> None:
+    one, other = (Mutant("m", f"{name}/a.py", "x", "y", ("tests",)) for name in ("core", "bridge"))
+    lines = table([Verdict(one, True, ""), Verdict(one, False, ""), Verdict(other, True, "")])
+    assert "| core | 2 | 1 (50 %) |" in lines
+    assert lines[-1] == "| all | 3 | 2 (67 %) |"

@@ -1,0 +1,244 @@
+"""Beside something unknown: what is accused, what is not, and how far values are believed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import moving_truth as truth
+import numpy as np
+import pytest
+import small_arm as small
+
+from benchmarks.blind.session import Plan
+from gapbridge.core.diagnosis.channels.position import observe as observe_position
+from gapbridge.core.diagnosis.channels.wrench import observe
+from gapbridge.core.diagnosis.criteria import MINUTE
+from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.held_out import HeldOut
+from gapbridge.core.diagnosis.judgement import Judgement, judge, judge_geometry, still_sure
+from gapbridge.core.diagnosis.remainder import closes_everywhere, with_the_links
+from gapbridge.core.diagnosis.selection import selection
+from gapbridge.core.diagnosis.selection.candidate import named_candidates, with_what_it_needs
+from gapbridge.core.diagnosis.selection.refit import Remainder, _widened, worth
+from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.metrology import Metrology
+
+N, ROWS = 6, 70
+NOISE = np.repeat([0.1, 0.001], 3)
+WAY = np.array([2.0, -3.0, 1.0, 0.05, 0.02, -0.03])
+STRETCHED = tuple(
+    replace(row, a=row.a + da, d=row.d + dd, alpha=row.alpha + turn)
+    for row, da, dd, turn in zip(
+        small.NOMINAL.rows, (6e-4, -7e-4, 0.0), (5e-4, 4e-4, 0.0), (7e-4, -6e-4, 0.0), strict=True
+    )
+)
+
+
+@pytest.fixture(scope="module")
+def plant(tmp_path_factory):
+    return truth.plant(tmp_path_factory.mktemp("arm"), N, 1)
+
+
+def wrench_log(plant, error, mass=2.0, declared=True):
+    """Return a log of poses whose sensor reads an ``error(q)`` (N, 6) too much."""
+    q = truth.poses(N, ROWS, 5)
+    load, still = np.full(ROWS, mass), np.zeros((ROWS, 6))
+    wrench = plant.dynamics(q, 0 * q, 0 * q, still, load)[1] + error(q)
+    wrench += np.random.default_rng(3).normal(0, 1, wrench.shape) * NOISE
+    more = {"payload": load, "payload_cog": np.tile(truth.COG, (ROWS, 1))} if declared else {}
+    return truth.log_of(
+        N, timestamp=np.arange(ROWS) * 20.0, actual_q=q, ft_raw_wrench=wrench, **more
+    )
+
+
+def hose(q):
+    """Return the pull of a hose that a wrist joint winds up from some angle on."""
+    return np.maximum(q[:, 4] - np.quantile(q[:, 4], 0.35), 0.0)[:, None] * WAY
+
+
+def accused_of(plant, error):
+    found = diagnose(plant.model(2.0), wrench_log(plant, error))
+    channel = next(c for c in found.channels if c.channel == "wrench")
+    return {c.effect for c in channel.causes}, channel
+
+
+def test_the_mean_of_an_unknown_wrench_is_no_bias_of_the_sensor(plant):
+    accused, channel = accused_of(plant, hose)
+    assert accused == set()
+    assert channel.structured
+    assert "actual_q_4" in [name for name, _ in channel.depends_on[:3]]
+
+
+def test_a_bias_that_the_unknown_cannot_be_is_accused_beside_it(plant):
+    accused, channel = accused_of(plant, lambda q: hose(q) + 12 * WAY)
+    assert accused == {"ft_bias"}
+    (cause,) = channel.causes
+    # where the hose is slack it is zero, which nobody knows: its mean may be either's
+    off = np.array([p.value for p in cause.parameters]) - 12 * WAY
+    assert np.all(np.abs(off) < 3 * np.array([p.std for p in cause.parameters]))
+
+
+def test_gain_and_turn_and_centre_wait_for_a_load(plant):
+    """A sensor that reads nothing has nothing to scale or to turn."""
+
+    def beside(mass, effect):
+        log = wrench_log(plant, hose, declared=mass > 0)
+        model = plant.model(mass)
+        seen = observe(model, log, Metrology())
+        (own,) = [c for c in named_candidates(model.arm, "wrench") if c.family == effect]
+        return with_what_it_needs(seen, own).beside
+
+    for effect in ("ft_gain", "ft_misalignment", "payload_cog"):
+        assert (beside(0.0, effect), beside(2.0, effect)) == ("payload", "")
+    for effect in ("ft_bias", "ft_drift", "payload"):
+        assert beside(0.0, effect) == ""
+
+
+def test_no_gain_and_no_turn_is_accused_of_a_load_that_is_not(plant):
+    bare = replace(plant.model(0.0), payload_cog=np.zeros(3))
+    log = wrench_log(plant, lambda q: 0 * hose(q), declared=False)
+    channel = next(
+        c for c in diagnose(bare, log, withhold=("payload",)).channels if c.channel == "wrench"
+    )
+    assert not {"ft_gain", "ft_misalignment", "payload_cog"} & {c.effect for c in channel.causes}
+
+
+def linear(seed, shift):
+    """Return white covariance, rows, right side, regions of two columns with cluster effects."""
+    rng = np.random.default_rng(seed)
+    region = np.repeat(np.arange(24), 10)
+    A = np.column_stack([np.ones(240), rng.normal(size=240)])
+    b = A @ [1.0, 2.0] + rng.normal(size=240) + shift * rng.normal(size=24)[region]
+    left = b - A @ np.linalg.lstsq(A, b, rcond=None)[0]
+    white = np.linalg.inv(A.T @ A) * float(left @ left) / 238
+    return white, A, b, region
+
+
+def test_intervals_hold_where_regions_differ():
+    """What shifts whole regions makes a mean less sure than that many rows would be."""
+    off = []
+    for seed in range(150):
+        white, A, b, region = linear(seed, 1.0)
+        spread = np.sqrt(np.diag(_widened(white, A, b, np.ones(2), region)))
+        off.append((np.linalg.lstsq(A, b, rcond=None)[0] - [1.0, 2.0]) / spread)
+        assert np.all(spread >= np.sqrt(np.diag(white)) * (1 - 1e-9))
+    inside = np.mean(np.abs(off) < 1.96, axis=0)
+    assert np.all(inside > 0.9)
+    naive = [
+        (np.linalg.lstsq(A, b, rcond=None)[0][0] - 1.0) / np.sqrt(white[0, 0])
+        for white, A, b, _ in (linear(seed, 1.0) for seed in range(150))
+    ]
+    assert np.mean(np.abs(naive) < 1.96) < 0.8
+
+
+def test_rows_after_the_regions_are_a_prior_that_always_stays():
+    white, A, b, region = linear(0, 0.0)
+    held = np.vstack([A, [1e6, 0.0]])
+    spread = _widened(white * 0, held, np.append(b, 1e6), np.ones(2), region)
+    assert spread[0, 0] < 1e-9
+
+
+@pytest.fixture(scope="module")
+def links():
+    """Return the selection of an arm whose links are all a little off."""
+    session = small.session_of(0)
+    real = replace(small.NOMINAL, rows=STRETCHED)
+    log = small.log_of(session, small.readings(real, session))
+    found = diagnose(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
+    return found.channels[0].selection
+
+
+def fallen(found, family="link_geometry"):
+    """Return a judgement that took everything back, one link among it."""
+    arm = small.model_of().arm
+    whole = found if found.block else found.with_all_links(arm)
+    own = [p for p, c in enumerate(whole.term_index)
+           if whole.space.candidates[c].family == family]  # fmt: skip
+    return whole, Judgement((), True, 0.0, (), {}, tuple((p, "") for p in own))
+
+
+def test_all_links_are_accused_where_they_close_the_gap_everywhere(links):
+    whole, judgement = fallen(links)
+    found, again = judge_geometry(replace(whole, prior={}), judgement, small.model_of().arm)
+    assert found.block
+    assert {found.terms[p].effect for p in again.accused} >= {"link_geometry"}
+    joints = [found.terms[p].site.joint for p in again.accused
+              if found.terms[p].effect == "link_geometry"]  # fmt: skip
+    assert sorted(joints) == [1, 2]
+
+
+@pytest.mark.parametrize("effect", ["cross_coupling", "backlash"])
+def test_links_that_close_no_gap_are_not_accused(effect):
+    whole, judgement = fallen(small.diagnosed(effect).channels[0].selection)
+    assert not closes_everywhere(replace(whole, found=replace(whole.found, chosen=())))
+    found, again = judge_geometry(replace(whole, prior={}), judgement, small.model_of().arm)
+    assert again is judgement
+    assert not found.block
+
+
+def test_a_joint_zero_goes_with_the_links_where_it_helps_elsewhere(links):
+    whole, _ = fallen(links)
+    zero = [c for c, k in enumerate(whole.space.candidates) if k.family == "joint_offset"]
+    lines = [c for c, k in enumerate(whole.space.candidates) if k.periodic][:1]
+    assert with_the_links(whole, (), zero) == []  # there is none
+    session = small.session_of(0)
+    real = replace(small.REAL["joint_offset"], rows=STRETCHED)
+    log = small.log_of(session, small.readings(real, session))
+    seen = diagnose(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
+    both, _ = fallen(seen.channels[0].selection)
+    second = [c for c in zero if both.space.candidates[c].site.joint == 2]
+    assert with_the_links(both, (), [*second, *lines]) == second
+    assert with_the_links(replace(both, prior={}), (), second) == []  # no links are a cause
+
+
+def test_a_value_far_below_its_usual_size_is_no_accusation():
+    found = small.diagnosed("backlash").channels[0].selection
+    (term,), (c,) = found.terms, found.term_index
+    usual = found.space.candidates[c].parameters[0].scale
+    for size, stays in ((0.5 * MINUTE * usual, False), (2 * MINUTE * usual, True)):
+        small_one = replace(
+            found, terms=(term.with_values(np.array([size])),),
+            covariance=(np.array([[(size / 50) ** 2]]),),
+        )  # fmt: skip
+        judged = judge(small_one, HeldOut(found))
+        assert (len(judged.accused) == 1) is stays
+        assert stays or judged.withdrawn == ((0, "its value is too small to matter"),)
+
+
+def test_what_is_no_longer_sure_beside_the_unknown_is_taken_back():
+    found = small.diagnosed("backlash").channels[0].selection
+    judgement = judge(found, HeldOut(found))
+    arm = small.model_of().arm
+    assert still_sure(found, judgement, arm)[1] is judgement
+    rows = len(found.space.y)
+    # an unnamed function that does the very same as the accused
+    twin = found.space.columns(found.term_index)
+    unknown = Remainder(twin, np.full(twin.shape[1], np.inf), np.arange(rows) // 3 % 20)
+    _, judged = still_sure(found, replace(judgement, remainder=unknown), arm)
+    assert judged.accused == ()
+    assert judged.structured
+    assert [p for p, _ in judged.withdrawn] == [0]
+
+
+def test_every_member_that_waits_for_another_names_one_of_its_channel():
+    for effect in CATALOGUE.values():
+        if effect.shown_by is not None:
+            other = CATALOGUE[effect.shown_by.effect]
+            assert set(effect.channels) & set(other.channels)
+
+
+def test_what_the_exact_refit_takes_back_gives_its_place_to_another(monkeypatch):
+    """Without reversals play is an offset: where the one has no value, the other is found."""
+    one_sided = small.session_of(3, Plan(poses=60, both_sides=False))
+    real = small.turned(2, lambda s, q: np.full(len(q), -4.5e-4))
+    log = small.log_of(one_sided, small.readings(real, one_sided, 3))
+    seen = observe_position(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
+    (first,) = selection.select(seen, small.model_of()).terms
+
+    def worthless(term, spread):
+        return 0.0 if term.effect == first.effect else worth(term, spread)
+
+    monkeypatch.setattr(selection, "worth", worthless)
+    (instead,) = selection.select(seen, small.model_of()).terms
+    assert {first.effect, instead.effect} == {"joint_offset", "backlash"}
+    assert instead.site.joint == 2
