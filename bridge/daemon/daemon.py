@@ -38,8 +38,8 @@ from gapbridge.bridge.loop.loop import LONGEST_STOP, Exit
 from gapbridge.bridge.loop.setpoint_stream import longest_withdrawal
 from gapbridge.bridge.loop.supervisor import Cause, State
 from gapbridge.bridge.recording.folder import LOOP_LOG, new_session, require_folder
-from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import InputError, LinkError
+from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.controller_address import address_of
 
 __all__ = ["Daemon", "Say", "settings_of"]

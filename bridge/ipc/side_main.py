@@ -19,7 +19,7 @@ from typing import Any
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc.shared_memory import FollowedPage, SharedMemory
-from gapbridge.core.clock import SYSTEM
+from gapbridge.drivers.clock import SYSTEM
 
 FAREWELL = 5.0  # s that a side process may take to end after the daemon
 NICENESS = 5  # the loop comes first
