@@ -5,8 +5,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, cast
 
-from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import LinkError
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 if TYPE_CHECKING:
     from gapbridge.core.model import Model

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import WriteError
 from gapbridge.core.model import Model
 from gapbridge.core.setpoint import Setpoint
 from gapbridge.core.state import RobotState
+from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.controller_facts import ControllerFacts, Difference, differences
 from gapbridge.drivers.gate import Gate
 

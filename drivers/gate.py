@@ -14,11 +14,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from gapbridge.core.clock import SYSTEM
 from gapbridge.core.errors import GateError
 from gapbridge.core.kernels.reference import JIT
 from gapbridge.core.model import Model
 from gapbridge.core.setpoint import Setpoint
+from gapbridge.drivers.clock import SYSTEM
 
 Vector = NDArray[np.float64]
 GAP = 5.0  # cycles: no step is larger than this many cycles' allowance

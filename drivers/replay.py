@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import LinkError, LogError
 from gapbridge.core.setpoint import Setpoint
 from gapbridge.core.state import RobotState
+from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.driver import Driver, DriverSettings
 
 if TYPE_CHECKING:

@@ -6,6 +6,10 @@ import math
 import struct
 from typing import Any
 
+from pymodbus.client.mixin import ModbusClientMixin
+from pymodbus.exceptions import ModbusIOException
+from pymodbus.pdu import DecodePDU, ModbusPDU
+
 from benchmarks.simulation.links import SimulatedLink
 from benchmarks.simulation.world import Process
 from gapbridge.core.errors import InvalidStateError, LinkError
@@ -21,10 +25,6 @@ from gapbridge.drivers.simulated.modbus.server import ModbusServer
 ADDRESS_MISSING = 2  # exception code
 
 
-class _Closable:
-    def close(self) -> None: ...
-
-
 class _Transport(Transport):
     """The product's, whose connection is the link's wires."""
 
@@ -37,12 +37,37 @@ class _Transport(Transport):
         if not self.link.reachable:
             raise LinkError(f"{self.name}: cannot be reached: refused")
         self.link.reconnected()
-        self._client = _Closable()
-        self._tcp = _Requests(self.link, self._settings.timeout)  # type: ignore[assignment]
+        self._client = client = _Client(self.link, self._settings.timeout)
+        self._calls = {"holding": client.read_holding_registers}
+
+
+class _Client(ModbusClientMixin[ModbusPDU]):
+    """The library's client, whose bytes go over the link's wires."""
+
+    def __init__(self, link: ModbusLink, timeout: float) -> None:
+        super().__init__()
+        self._requests, self._decoder = _Requests(link, timeout), DecodePDU(False)
+
+    def execute(self, no_response_expected: bool, request: ModbusPDU) -> ModbusPDU:
+        """Send a request, and return what answers it."""
+        try:
+            data = self._requests.ask(bytes([request.function_code]) + request.encode())
+        except TimeoutError:
+            raise ModbusIOException("No response received after 0 retries") from None
+        except InvalidStateError:
+            raise ModbusIOException("request asks for id=1 but received id=2") from None
+        found = self._decoder.decode(data)
+        if found is None:
+            raise ModbusIOException("Unable to decode request")
+        found.dev_id, found.transaction_id = request.dev_id, request.transaction_id
+        return found
+
+    def close(self) -> None:
+        """Do nothing: the link's wires stay."""
 
 
 class _Requests:
-    """Asks one question after the other, as TcpRequests does."""
+    """Asks one question after the other."""
 
     def __init__(self, link: ModbusLink, timeout: float) -> None:
         self._link, self._timeout, self._number = link, timeout, 0

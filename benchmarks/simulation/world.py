@@ -16,7 +16,7 @@ from typing import Any
 
 from greenlet import getcurrent, greenlet
 
-from gapbridge.core.clock import Clock
+from gapbridge.drivers.clock import Clock
 
 BEGIN = 1000.0  # s: no moment is zero by accident
 EPOCH = 1.7e9  # s between the monotonic clock and the calendar

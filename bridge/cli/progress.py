@@ -6,8 +6,8 @@ import contextlib
 import sys
 from collections.abc import Callable, Iterator
 
-from gapbridge.core.clock import SYSTEM
 from gapbridge.core.kernels.compiling import ABOUT
+from gapbridge.drivers.clock import SYSTEM
 
 AGAIN = 10.0  # s between two words on compiling
 

@@ -9,7 +9,7 @@ from gapbridge.bridge.ipc.control_socket import Peer, refusal
 from gapbridge.bridge.ipc.events import Event
 from gapbridge.bridge.ipc.shared_memory import Phase
 from gapbridge.bridge.loop.supervisor import Cause, State
-from gapbridge.core.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 LONGEST_ARMING = 25.0  # s: uploads a program to the robot
 LONGEST_RAMP = 20.0  # s

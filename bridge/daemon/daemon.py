@@ -38,8 +38,8 @@ from gapbridge.bridge.loop.loop import LONGEST_STOP, Exit
 from gapbridge.bridge.loop.setpoint_stream import longest_withdrawal
 from gapbridge.bridge.loop.supervisor import Cause, State
 from gapbridge.bridge.recording.folder import LOOP_LOG, new_session, require_folder
-from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import InputError, LinkError
+from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.controller_address import address_of
 
 __all__ = ["Daemon", "Say", "settings_of"]
@@ -217,9 +217,10 @@ class Daemon:
     def disarm(self, by: str = PROGRAM) -> int:
         """Ask the loop, this or the next one, to ramp out and observe; in a fault, acknowledge it.
 
-        Returns the request's number: it counts once ``taken`` has come to it.
+        A fault that comes meanwhile is not: nobody has seen it. Returns the request's number: it
+        counts once ``taken`` has come to it.
         """
-        return self._request(Command.DISARM, by)
+        return self._request(Command.DISARM if self.latched else Command.RAMP_OUT, by)
 
     def _request(self, command: Command, by: str) -> int:
         with self._request_lock:
@@ -234,9 +235,10 @@ class Daemon:
         """
         while not self._requests.empty():
             number, command, by = self._requests.get()
-            words = f"{command.name.lower()} asked for by {by}"
+            name = "arm" if command == Command.ARM else "disarm"
+            words = f"{name} asked for by {by}"
             self.event_log.add(
-                {"kind": "request", "command": command.name.lower(), "number": number, "by": by,
+                {"kind": "request", "command": name, "number": number, "by": by,
                  "detail": words}
             )  # fmt: skip
             self._commands.ask(command, number)
@@ -377,8 +379,9 @@ class Daemon:
             "may_write": self.may_write, "number": self._loops, "latched": self._status.latched,
             "after": after,
         }  # fmt: skip
-        if self._commands.last_of(Command.DISARM) > self.page.taken:
-            self._commands.ask(Command.DISARM)
+        for command in (Command.DISARM, Command.RAMP_OUT):
+            if self._commands.last_of(command) > self.page.taken:
+                self._commands.ask(command)
         if armed_by and self.may_write:
             self._request(Command.ARM, armed_by)
             self._pass_on()

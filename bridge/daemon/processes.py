@@ -18,7 +18,7 @@ from gapbridge.bridge.ipc.sealed_memory import sealed_bytes
 from gapbridge.bridge.ipc.shared_memory import Phase, RunPage
 from gapbridge.bridge.ipc.side_process import environment
 from gapbridge.bridge.loop.loop import Exit
-from gapbridge.core.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 STARTING_LIMIT = 180.0  # s: imports and, the first time, compilation
 ENDING_LIMIT = 2.0  # s

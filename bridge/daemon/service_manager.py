@@ -9,7 +9,7 @@ import contextlib
 import os
 import socket
 
-from gapbridge.core.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 
 class ServiceManager:

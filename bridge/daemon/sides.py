@@ -8,7 +8,7 @@ from typing import IO, Any
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
-from gapbridge.core.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 SIDES: dict[str, tuple[str, Callable[[DaemonSettings], bool]]] = {
     "recorder": ("gapbridge.bridge.recording.main", lambda s: s.recording.folder is not None),

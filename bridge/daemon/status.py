@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gapbridge.bridge.ipc.events import Event
 from gapbridge.bridge.loop.checks import NOTHING, UNSOLVED
 from gapbridge.bridge.loop.supervisor import HEALED_BY_RECONNECTING, Cause, State
-from gapbridge.core.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 RATE_SPAN = 2.0  # s that the rate is taken over
 

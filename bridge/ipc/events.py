@@ -6,7 +6,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any
 
-from gapbridge.core.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 KEPT = 500
 Event = dict[str, Any]

@@ -28,7 +28,7 @@ from gapbridge.bridge.ipc.sealed_memory import (
     map_as_writer,
     seal,
 )
-from gapbridge.core.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 Array = NDArray[np.float64]
 WORDS = 128

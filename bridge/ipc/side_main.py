@@ -20,8 +20,8 @@ from typing import Any
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc.shared_memory import FollowedPage, SharedMemory
-from gapbridge.core.clock import SYSTEM
 from gapbridge.core.errors import GapbridgeError
+from gapbridge.drivers.clock import SYSTEM
 
 FAREWELL = 5.0  # s that a side process may take to end after the daemon
 NICENESS = 5  # the loop comes first

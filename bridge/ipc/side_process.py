@@ -17,7 +17,7 @@ from typing import IO, Any
 
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_main import EventLines, EventWriter
-from gapbridge.core.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 BACKOFF = (0.2, 10.0)  # s before a restart: first, most
 HEALTHY = 10.0  # s after which a restart counts as the first again

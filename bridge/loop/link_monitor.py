@@ -12,9 +12,9 @@ from gapbridge.bridge.ipc.counts import Count
 from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.supervisor import Cause, Supervisor
 from gapbridge.core.arm import Arm
-from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
 from gapbridge.core.state import RobotState
+from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.state_check import FASTEST, LARGEST, JointCheck
 

@@ -34,13 +34,13 @@ from gapbridge.bridge.loop.replay import ReplayedLoop
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream, gate_bounds
 from gapbridge.bridge.setpoint_source import make_source
 from gapbridge.bridge.setpoint_source.source import Source
-from gapbridge.core.clock import SYSTEM
 from gapbridge.core.errors import GapbridgeError, InputError
 from gapbridge.core.files import read_only_from
 from gapbridge.core.kernels import compiling
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.drivers import make_driver
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.ft_sensor.joined import DriverWithSensor
 from gapbridge.drivers.replay import ReplayDriver

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from gapbridge.bridge.cell.sections import LimitSettings
 from gapbridge.bridge.loop.offset_in_force import InForce
 from gapbridge.core.arm import Arm
-from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.compensation import Compensator, Correction
 from gapbridge.core.errors import StaleStateError
 from gapbridge.core.kernels.reference import JIT
@@ -20,6 +19,7 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.setpoint import Setpoint
 from gapbridge.core.state import RobotState
+from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.gate import GateBounds
 
 Vector = NDArray[np.float64]

@@ -15,7 +15,7 @@ from typing import Any
 from gapbridge.bridge.ipc.side_main import Order, take_order
 from gapbridge.bridge.recording.recorder import Recorder
 from gapbridge.bridge.recording.redaction import redacted
-from gapbridge.core.clock import SYSTEM
+from gapbridge.drivers.clock import SYSTEM
 
 LOOK_EVERY = 0.1  # s
 QUIET = 0.6  # s without a heartbeat of the loop after which a lost daemon's run is over

@@ -23,9 +23,9 @@ from gapbridge.bridge.recording.event_text import LEVELS, level_of, text_of
 from gapbridge.bridge.recording.finishing import finish, unfinished
 from gapbridge.bridge.recording.folder import next_path, number_after, prune, segments
 from gapbridge.bridge.recording.segment import Segment
-from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.mcap_schema import CONFIGURATION, EVENTS, LOG, STATUS
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 FLUSH_EVERY = 0.4  # s
 RETRY_EVERY = 2.0  # s after which a disk that refused is tried again

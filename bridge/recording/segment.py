@@ -20,7 +20,6 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from gapbridge.bridge.document.output_file import MODE, sync_folder
-from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.log.mcap_layout import layout_of
 from gapbridge.core.log.mcap_schema import (
     CYCLE_CHANNELS,
@@ -31,6 +30,7 @@ from gapbridge.core.log.mcap_schema import (
     json_name,
     json_schema,
 )
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 Array = NDArray[np.float64]
 LARGEST_CHUNK = 1 << 26  # bytes: chunks end by flush, long before this

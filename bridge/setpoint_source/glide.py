@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.bridge.setpoint_source.source import SourceDryError
-from gapbridge.core.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 Vector = NDArray[np.float64]
 LONGEST_GLIDE = 0.1  # s

@@ -27,8 +27,8 @@ from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.ipc.control_socket import peer_of
 from gapbridge.bridge.setpoint_source.glide import Glide
 from gapbridge.bridge.setpoint_source.source import Source
-from gapbridge.core.clock import SYSTEM
 from gapbridge.core.errors import RunError
+from gapbridge.drivers.clock import SYSTEM
 
 Vector = NDArray[np.float64]
 LONGEST_LINE = 4096  # bytes

@@ -12,8 +12,8 @@ import socket
 
 from gapbridge.bridge.served.credentials import read_token
 from gapbridge.bridge.setpoint_source.planner import Connection, PlannerSource
-from gapbridge.core.clock import SYSTEM
 from gapbridge.core.errors import InputError
+from gapbridge.drivers.clock import SYSTEM
 
 FIRST_LINE = 2.0  # s in which the token has to come
 

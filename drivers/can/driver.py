@@ -7,7 +7,6 @@ import contextlib
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import (
     ForeignCommandError,
     InvalidStateError,
@@ -24,6 +23,7 @@ from gapbridge.drivers.can.reader import FrameReader
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.can.state import StateBuilder
 from gapbridge.drivers.can.writer import FrameWriter
+from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.driver import Driver
 
 Vector = NDArray[np.float64]

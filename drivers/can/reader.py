@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import LinkError
 from gapbridge.drivers.can.assembler import Assembler, Sample
 from gapbridge.drivers.can.profile import CanProfile, Key
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.can_bus.bus import close_bus, first_line, open_bus
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 Vector = NDArray[np.float64]
 LONGEST_WAY, LEAST_WAY = 4.0, 0.03  # cycles, s: what has lain here for longer is not fresh

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import PartialWriteError, WriteError
 from gapbridge.drivers.can.profile import Action, CanProfile, Key, Outgoing
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.can_bus.bus import first_line
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 Vector = NDArray[np.float64]
 Frames = list[tuple[Key, bytes]]

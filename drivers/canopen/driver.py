@@ -8,7 +8,6 @@ import logging
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import (
     InputError,
     InvalidStateError,
@@ -35,6 +34,7 @@ from gapbridge.drivers.canopen.rhythm import Rhythm
 from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.canopen.state import StateBuilder, not_following, positions, states
 from gapbridge.drivers.canopen.sync_set import SyncSet
+from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.driver import Driver
 
 Vector = NDArray[np.float64]

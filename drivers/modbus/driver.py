@@ -8,12 +8,12 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.compensation import wanted_pose
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
 from gapbridge.core.model import Model
 from gapbridge.core.setpoint import Setpoint
 from gapbridge.core.state import RobotState
+from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.modbus.decode import Decoder, Sample, check_identity, check_step
 from gapbridge.drivers.modbus.freshness import Freshness

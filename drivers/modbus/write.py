@@ -12,7 +12,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import (
     ForeignCommandError,
     IneffectiveWriteError,
@@ -21,6 +20,7 @@ from gapbridge.core.errors import (
 )
 from gapbridge.core.setpoint import Setpoint
 from gapbridge.core.state import RobotState
+from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.modbus import encode
 from gapbridge.drivers.modbus.decode import Sample
 from gapbridge.drivers.modbus.registers import UNITS, Table

@@ -12,10 +12,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import WriteError
 from gapbridge.core.setpoint import Setpoint
 from gapbridge.core.state import RobotState
+from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.ur_rtde import registers
 from gapbridge.drivers.ur_rtde.allowed import AllowedControl, AllowedInputs
 from gapbridge.drivers.ur_rtde.no_delay import send_at_once

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.compensation import wanted_pose
 from gapbridge.core.errors import InvalidStateError, LinkError, WriteError
 from gapbridge.core.model import Model
 from gapbridge.core.rotation import one_rotation_matrix
 from gapbridge.core.setpoint import Setpoint
 from gapbridge.core.state import RobotState
+from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.controller_facts import TCP_TURNED, ControllerFacts, Difference, differences
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.offset_inverse import Nominal

@@ -16,10 +16,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
 from gapbridge.core.kernels.reference import JIT
 from gapbridge.core.state import RobotState
+from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.state_check import FASTEST, JITTER, LARGEST
 from gapbridge.drivers.ur_rtde.registers import APPLIED, ECHO, PROGRAM
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings

@@ -72,6 +72,13 @@ def test_the_page_has_the_list() -> None:
     assert as_markdown() in DOCS.read_text(encoding="utf-8")
 
 
+def test_a_disarm_from_before_a_fault_does_not_acknowledge_it() -> None:
+    """Seed 98: the loop stood still, somebody asked for disarming, and then the robot stopped."""
+    assert not run(98).violations
+    plan = [(0.1, "machine stalls"), (0.11, "disarm"), (0.12, "protective stop")]
+    assert not [str(o) for seed in range(12) if (o := run(seed, plan=plan)).violations]
+
+
 # -- each of the list is found where the product is broken -----------------------------------------
 
 

@@ -19,10 +19,10 @@ from gapbridge.bridge.ipc.shared_memory import slices_of
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.recording import finishing
 from gapbridge.bridge.recording.segment import Segment
-from gapbridge.core.clock import Clock
 from gapbridge.core.errors import GapbridgeError
 from gapbridge.core.log.mcap_reading import read_columns
 from gapbridge.core.log.mcap_schema import EVENTS
+from gapbridge.drivers.clock import Clock
 
 Scenario = Callable[[Path, Callable[[], Path]], None]
 N = 6

@@ -25,11 +25,11 @@ from gapbridge.bridge.loop.link_monitor import LinkMonitor, SampleCheck, hold_ti
 from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.supervisor import State, Supervisor
 from gapbridge.core.arm import builtin_arm
-from gapbridge.core.clock import SYSTEM, Clock
 from gapbridge.core.errors import InvalidStateError, StaleStateError
 from gapbridge.core.limits import ENVELOPE, RATE
 from gapbridge.core.model import Model
 from gapbridge.core.state import RobotState
+from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.driver import Driver
 
 ARM = builtin_arm("ur10e")
