@@ -80,7 +80,7 @@ def main() -> None:
         for rows, path in logs.items():
             write_log(path, rows)
         many, tenth, poses = logs.values()
-        commands = {
+        commands: dict[str, list[object]] = {
             f"`fit`, {options.rows:,} rows, Parquet":
                 ["fit", many, "--cell", cell, "--out", fitted],
             f"`predict`, {options.rows:,} rows, Parquet in and out":

@@ -261,8 +261,8 @@ def bent(**shift: float) -> Hidden:
 
 
 def test_a_bent_tool_is_drawn_from_the_seed() -> None:
-    drawn = [Hidden.drawn(seed, ("tool_frame",)) for seed in range(20)]
-    assert drawn[3] == Hidden.drawn(3, ("tool_frame",)) != drawn[4]
+    drawn = [Hidden.drawn(seed, ("bent_tool",)) for seed in range(20)]
+    assert drawn[3] == Hidden.drawn(3, ("bent_tool",)) != drawn[4]
     sizes = [np.linalg.norm(hidden.simulation["tool_shift"]) for hidden in drawn]
     assert 1e-3 <= min(sizes) <= max(sizes) <= 2.5e-3
 
