@@ -129,14 +129,11 @@ def _widest(changes: list[float], sigma: float, filters: list[Array]) -> int:
 def _jumps(
     change: Array, typical: float, sigma: float, h: Array, other: Array
 ) -> NDArray[np.bool_]:
-    """Return where (N,) two windows disagree, and the rows between within reach of the wider one.
-
-    Around a jump the disagreement changes its sign; beyond its ends the windows agree again.
-    """
+    """Return where (N,) two windows disagree, and the rows beside that the wider one mixes in."""
     limit = max(CLEAR * sigma * np.sqrt(_difference(h, other)), COARSE * typical)
-    reach = np.ones(2 * (max(len(h), len(other)) // 2) + 1)
-    within = np.convolve(change > limit, reach, mode="same") > 0.5
-    return np.asarray(np.convolve(~within, reach, mode="same") < 0.5)
+    clear = (change > limit).astype(float)
+    half = max(len(h), len(other)) // 2
+    return np.asarray(np.convolve(clear, np.ones(2 * half + 1), mode="same") > 0.5)
 
 
 def _difference(h: Array, wider: Array) -> float:

@@ -155,20 +155,3 @@ def test_held_samples_do_not_keep_the_windows_short():
     error = (motion.qdd - COURSE.at(t, 2))[motion.valid]
     assert motion.valid.mean() > 0.8
     assert np.sqrt(np.mean(error**2)) < 0.1
-
-
-def test_rows_are_left_out_around_a_jump_and_not_far_beyond_it():
-    t = np.arange(3000) / 500
-    acceleration = np.where(t < 3, 2.0, -2.0)
-    speed = 2.0 * np.minimum(t, 6.0 - t)
-    angle = np.where(t < 3, t**2, 18.0 - (6.0 - t) ** 2)
-    noisy = speed + np.random.default_rng(0).normal(0, 2e-3, t.shape)
-    q = np.round(angle / ENCODER) * ENCODER
-    log = truth.log_of(1, timestamp=t, actual_q=q[:, None], actual_qd=noisy[:, None])
-    motion = motion_of(log)
-    inner = np.flatnonzero(~motion.valid[200:-200]) + 200
-    error = np.abs(motion.qdd[:, 0] - acceleration)
-    assert error[motion.valid].max() < 1.0
-    wrong = np.flatnonzero(error[200:-200] > 0.2) + 200
-    assert inner.min() < 1500 < inner.max()
-    assert np.ptp(inner) < 1.7 * np.ptp(wrong)
