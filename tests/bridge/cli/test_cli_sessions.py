@@ -76,7 +76,7 @@ def test_two_logs_are_one_diagnosis(answered) -> None:
     for arguments in ("new region of joint space", "in a new session 0.0", "carries"):
         assert arguments in answer.out
     report = (folder / "out" / "report.html").read_text(encoding="utf-8")
-    for arguments in ("in a new region", "in a new session", "left under a fit of the others"):
+    for arguments in ("in a new region", "in a new session", "residual under a fit of the others"):
         assert arguments in report
 
 
@@ -119,7 +119,7 @@ def test_rows_outside_what_was_fitted_are_warned_of(answered) -> None:
         for word in (
             "warning: ",
             "turned.csv",
-            "actual_q_5: 5 of 5 rows",
+            "joint 6 (actual_q_5): 5 of 5 rows",
             "outside what was fitted",
         ):
             assert word in line
