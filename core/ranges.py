@@ -46,13 +46,12 @@ def outside(log: Log, fitted: Range) -> list[str]:
         if name not in fitted:
             continue
         low, high = fitted[name]
-        margin = _margin(name, low, high)
-        beyond = np.flatnonzero((values < low - margin) | (values > high + margin))
-        if len(beyond):
-            worst = beyond[np.argmax(np.abs(values[beyond] - (low + high) / 2))]
+        rows = np.flatnonzero(beyond(name, values, fitted))
+        if len(rows):
+            worst = rows[np.argmax(np.abs(values[rows] - (low + high) / 2))]
             reported.append(
-                f"{label(name)}: {len(beyond)} of {len(values)} rows lie outside what was fitted, "
-                f"{low:.4g} to {high:.4g} {UNITS[_stem(name)]} (row {log.line(worst)}: "
+                f"{label(name)}: {len(rows)} of {len(values)} rows lie outside what was fitted, "
+                f"{low:.4g} to {high:.4g} {UNITS[stem_of(name)]} (row {log.line(worst)}: "
                 f"{values[worst]:.4g})"
             )
     return reported
@@ -63,10 +62,15 @@ def outside_rows(log: Log, fitted: Range) -> NDArray[np.bool_]:
     out = np.zeros(len(log), dtype=bool)
     for name, values in _columns(log).items():
         if name in fitted:
-            low, high = fitted[name]
-            margin = _margin(name, low, high)
-            out |= (values < low - margin) | (values > high + margin)
+            out |= beyond(name, values, fitted)
     return out
+
+
+def beyond(name: str, values: Array, fitted: Range) -> NDArray[np.bool_]:
+    """Return which values (N,) of a column lie outside what was fitted; NaN does not."""
+    low, high = fitted[name]
+    margin = _margin(name, low, high)
+    return np.asarray((values < low - margin) | (values > high + margin))
 
 
 def outside_findings(log: Log) -> list[str]:
@@ -89,18 +93,17 @@ def _beyond(log: Log, fitted: Range) -> dict[str, float]:
     found = {}
     for name, values in _columns(log).items():
         if name in fitted:
-            low, high = fitted[name]
-            margin = _margin(name, low, high)
-            found[name] = float(np.mean((values < low - margin) | (values > high + margin)))
+            found[name] = float(np.mean(beyond(name, values, fitted)))
     return found
 
 
-def _stem(name: str) -> str:
+def stem_of(name: str) -> str:
+    """Return a column's name without its index."""
     return name if name in UNITS else name.rpartition("_")[0]
 
 
 def _margin(name: str, low: float, high: float) -> float:
-    return max(MARGIN * (high - low), LEAST[_stem(name)])
+    return max(MARGIN * (high - low), LEAST[stem_of(name)])
 
 
 def _columns(log: Log) -> dict[str, Array]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -17,6 +17,7 @@ from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.served.credentials import check_credentials, read_token
 from gapbridge.core.errors import CellError, InputError
 from gapbridge.core.files import read_bytes, recorded
+from gapbridge.core.ranges import Range
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,7 @@ class Configuration:
     n: int  # joints
     text: str
     files: Mapping[str, bytes]  # all that was read for it, by absolute path
+    fitted: Range = field(default_factory=dict)  # what the model was fitted on, by log column
 
     @property
     def hash(self) -> str:
@@ -39,7 +41,7 @@ def configuration_for(settings: DaemonSettings) -> Configuration:
     with recorded() as files:
         cell = load_cell(settings.cell)
         _read_named(settings)
-    return Configuration(settings, cell.arm.n, cell.document.text, files)
+    return Configuration(settings, cell.arm.n, cell.document.text, files, cell.fitted_range)
 
 
 def read_configuration(path: Path) -> Configuration:
@@ -48,7 +50,7 @@ def read_configuration(path: Path) -> Configuration:
         cell = load_cell(path)
         settings = settings_of(cell)
         _read_named(settings)
-    return Configuration(settings, cell.arm.n, cell.document.text, files)
+    return Configuration(settings, cell.arm.n, cell.document.text, files, cell.fitted_range)
 
 
 def _read_named(settings: DaemonSettings) -> None:

@@ -20,6 +20,7 @@ from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.run_settings import Configuration, configuration_for, settings_of
 from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
 from gapbridge.bridge.daemon.control import Control
+from gapbridge.bridge.daemon.fitted_watch import FittedWatch
 from gapbridge.bridge.daemon.host import OwnerLock
 from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.daemon.reload import Reload
@@ -88,6 +89,7 @@ class Daemon:
         self.manager = ServiceManager(clock)
         self.session = ""
         self._status = DaemonStatus(self.page.slices, clock)
+        self._fitted = FittedWatch(given.fitted, self.page.slices)
         self._status_at = 0.0
         self._reload = Reload(self.manager, self.event_log)
         self.control = Control(self, clock)
@@ -253,6 +255,7 @@ class Daemon:
                 self._run_loop((by or PROGRAM) if arm else "", duration)
                 swap = self._reload.swap()
                 self.configuration = swap.configuration or self.configuration
+                self._fitted = FittedWatch(self.configuration.fitted, self.page.slices)
                 arm = swap.rearms  # else only a person starts the writing again
                 by = "the cell file" if arm else ""
                 if not self._stopping.is_set() and not swap.in_order:
@@ -403,6 +406,8 @@ class Daemon:
         self._status.take(rows)
         for event in events:
             self.event_log.add(event)
+        for words in self._fitted.take(rows, self._clock.monotonic()):
+            self.event_log.add({"kind": "warning", "what": "outside_fitted", "detail": words})
 
     def _on_event(self, event: Event) -> None:
         """Act on an event, and report it to the person at the terminal."""

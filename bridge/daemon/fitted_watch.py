@@ -1,0 +1,59 @@
+"""Watching for what was never fitted: a run whose joints, loads or temperatures lie beyond it.
+
+A model fitted at other poses or loads is a guess there; nothing is held back for it, a person is
+warned once for as long as it lasts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapbridge.core.log.columns import label
+from gapbridge.core.ranges import UNITS, Range, beyond, stem_of
+
+Array = NDArray[np.float64]
+WATCHED = ("actual_q", "payload", "joint_temperatures", "actual_TCP_force")
+CALM = 5.0  # s within what was fitted, after which leaving it again is reported again
+
+
+class FittedWatch:
+    """Compares the cycles of a run with what the cell's model was fitted on.
+
+    ``slices``: where each field stands in a cycle's row (SharedMemory.slices).
+    """
+
+    def __init__(self, fitted: Range, slices: Mapping[str, slice]) -> None:
+        self._places: list[tuple[str, int]] = []
+        for field in WATCHED:
+            part = slices[field]
+            for i, place in enumerate(range(part.start, part.stop)):
+                name = field if part.stop - part.start == 1 else f"{field}_{i}"
+                if name in fitted:
+                    self._places.append((name, place))
+        self._fitted = fitted
+        self._outside: dict[str, float] = {}  # column -> s, when it last lay outside
+
+    def take(self, rows: Array, now: float) -> list[str]:
+        """Return one sentence for each quantity that has just left what was fitted.
+
+        ``rows`` (k, width): cycles of the loop; ``now``: s, monotonic.
+        """
+        reported = []
+        for name, place in self._places:
+            values = rows[:, place]
+            out = beyond(name, values, self._fitted)
+            if not out.any():
+                if name in self._outside and now - self._outside[name] > CALM:
+                    del self._outside[name]
+                continue
+            if name not in self._outside:
+                low, high = self._fitted[name]
+                reported.append(
+                    f"{label(name)}: found {values[out][0]:.4g} {UNITS[stem_of(name)]}, outside "
+                    f"what was fitted, {low:.4g} to {high:.4g}: the correction is a guess there"
+                )
+            self._outside[name] = now
+        return reported
