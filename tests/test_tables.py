@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from pathlib import Path
 
 import pytest
 
@@ -20,7 +21,6 @@ NAMED = [
     *JOBS.values(),
     *SIMULATORS.values(),
     *(name for name, _ in COMMANDS.values()),
-    *(f"{module}:main" for module, _ in SIDES.values()),
     *SOURCES.values(),
     *DRIVERS.values(),
     *FT_SENSORS.values(),
@@ -31,3 +31,10 @@ NAMED = [
 def test_a_named_member_is_where_its_table_says(name: str) -> None:
     module, member = name.split(":")
     assert callable(getattr(importlib.import_module(module), member))
+
+
+@pytest.mark.parametrize("name", [module for module, _ in SIDES.values()])
+def test_a_side_process_is_a_module_that_can_be_run(name: str) -> None:
+    file = importlib.import_module(name).__file__
+    assert file is not None
+    assert 'if __name__ == "__main__":\n' in Path(file).read_text(encoding="utf-8")

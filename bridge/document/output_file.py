@@ -131,9 +131,9 @@ def write_table(path: Path, columns: Sequence[str], table: NDArray[np.float64]) 
 
         frame = pyarrow.table([table[:, k] for k in range(table.shape[1])], list(columns))
         plain = csv.WriteOptions(include_header=False, quoting_style="none")
-        with replacing_bytes(path) as raw:
-            raw.write((",".join(columns) + "\n").encode())
-            csv.write_csv(frame, raw, plain)
+        with replacing_bytes(path) as binary:
+            binary.write((",".join(columns) + "\n").encode())
+            csv.write_csv(frame, binary, plain)
         return
     with replacing(path) as file:
         file.write(",".join(columns) + "\n")

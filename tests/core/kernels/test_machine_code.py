@@ -41,7 +41,8 @@ class Package:
         (self.core / "kernels").mkdir(parents=True)
         (self.core.parent / "__init__.py").write_text("")
         (self.core / "__init__.py").write_text("")
-        shutil.copy(CORE / "kernels" / "machine_code.py", self.core / "kernels")
+        for name in ("compiling.py", "machine_code.py"):
+            shutil.copy(CORE / "kernels" / name, self.core / "kernels")
         (self.core / "correction.py").write_text(CORRECTION)
         self.change(2.0)
 
@@ -115,8 +116,8 @@ def test_compiled_functions_stand_only_where_they_are_looked_for() -> None:
 
 def test_each_compiled_function_of_ours_is_kept_so() -> None:
     from gapbridge.bridge.loop import setpoint_stream
-    from gapbridge.core import interpolation, limits
-    from gapbridge.core.kernels import single
+    from gapbridge.core import limits
+    from gapbridge.core.kernels import interpolation, single
 
     compiled = (single.correct, limits._limit, interpolation._follow, setpoint_stream._followed)
     for function in compiled:
