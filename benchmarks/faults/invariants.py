@@ -93,6 +93,7 @@ class Doubt:
     earliest: float
     time: float
     state: int
+    values: Numbers = ()
 
 
 class Checker:
@@ -141,7 +142,10 @@ class Checker:
         for doubt in doubts:
             if not any(a - SURE <= doubt.time and doubt.earliest <= b + SURE for a, b in spans):
                 late = min((doubt.earliest - b for _, b in spans if b < doubt.time), default=0.0)
-                self.found.add(f"write in state {doubt.state}, {late:.3f} s after the last allowed")
+                self.found.add(
+                    f"write of {[round(v, 6) for v in doubt.values]} in state {doubt.state}, "
+                    f"{late:.3f} s after the last allowed"
+                )
 
     def _end_stream(self, time: float) -> None:
         """Nothing is being written: the next stream begins without an offset, wherever it is."""
@@ -193,6 +197,9 @@ class Checker:
         That is part of arming, which may have been refused by the time that the tap sees it.
         """
         b, left = self.bounds, self._in_force(write.time)
+        seen = self._fresh  # after a stop, or another's zero, the program has none before its time
+        if seen is not None and seen.bare and seen.time - self._written_at > b.fresh:
+            left = ZEROS
         bare = math.hypot(*left[:3]) <= b.offset_rate * b.cycle + 2.0 * b.grain
         bare = bare and math.hypot(*left[3:]) <= b.rotation_rate * b.cycle + 2.0 * b.grain_rotation
         return bare and not any(write.values) and write.state in (OBSERVING, ARMED)
@@ -226,7 +233,7 @@ class Checker:
 
     def _check_state(self, write: Write) -> None:
         if write.state not in WRITING:
-            self.doubts.append(Doubt(write.early, write.time, write.state))
+            self.doubts.append(Doubt(write.early, write.time, write.state, write.values))
         since, b = self._unsafe_since, self.bounds
         if since is not None and write.early - since > max(b.fresh, GRACE + b.cycle):
             self.found.add(

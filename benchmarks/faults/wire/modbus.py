@@ -13,6 +13,7 @@ from benchmarks.faults.wire.seen import Change, Decoder, Fresh, Write
 READS, WRITES = (3, 4), (5, 6, 15, 16, 22, 23)
 MAILBOX, WORDS = 234, 11  # sequence, six counts, heartbeat, two rates, checksum
 COUNT = 1e-6  # m and rad
+ECHO = range(248, 254)  # the offset that the robot's program applies
 GOOD = {258: 7, 260: 1, 261: 0, 262: 0}  # mode running, power on, no stop, no emergency
 
 
@@ -61,7 +62,8 @@ class ModbusDecoder(Decoder):
         q = tuple(get(270 + i, 0) * 1e-3 + 2 * math.pi * turns[i] for i in range(6))
         known = all(register in self._registers for register in GOOD)
         safe = all(get(register) == value for register, value in GOOD.items())
-        return [Fresh(time, math.nan, q, None, safe, known, state)]
+        bare = all(get(register) == 0 for register in ECHO)
+        return [Fresh(time, math.nan, q, None, safe, known, state, bare=bare)]
 
     def patch(self, message: bytes, what: str, change: Change) -> bytes:
         """See Decoder.patch: whole milliradians, of one turn; there is no clock."""

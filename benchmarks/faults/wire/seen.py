@@ -28,6 +28,7 @@ class Fresh:
     safe_known: bool
     state: int
     earliest: float = math.nan
+    bare: bool = False
 
     @property
     def early(self) -> float:
