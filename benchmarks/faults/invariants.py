@@ -142,9 +142,9 @@ class Checker:
         for doubt in doubts:
             if not any(a - SURE <= doubt.time and doubt.earliest <= b + SURE for a, b in spans):
                 late = min((doubt.earliest - b for _, b in spans if b < doubt.time), default=0.0)
+                values = [round(v, 6) for v in doubt.values]
                 self.found.add(
-                    f"write of {[round(v, 6) for v in doubt.values]} in state {doubt.state}, "
-                    f"{late:.3f} s after the last allowed"
+                    f"write in state {doubt.state}, {late:.3f} s after the last allowed: {values}"
                 )
 
     def _end_stream(self, time: float) -> None:
