@@ -139,6 +139,8 @@ def test_whoever_is_killed_is_withdrawn_at_the_rates_of_the_cell(
     rows = np.array(out["seen"])
     assert rows[0, 1] > 1.5e-4
     assert rows[-1, 1] < rows[0, 1]
+    early = rows[rows[:, 0] < rows[0, 0] + 0.1, 1]
+    assert (np.diff(early) >= 0.0).all()  # no zero was sent: the program waits out the silence
     gaps = np.diff(rows[:, 0])
     assert (-np.diff(rows[:, 1]) <= 0.0005 * gaps * 1.001 + 1e-12).all()
     assert (-np.diff(rows[:, 4]) <= 0.001 * gaps * 1.001 + 1e-12).all()
