@@ -11,7 +11,7 @@ from pathlib import Path
 
 from benchmarks.simulation.sequence import LINKS, Outcome, run
 
-TELL_EVERY = 60.0  # s
+REPORT_EVERY = 60.0  # s
 
 
 def main() -> int:
@@ -32,7 +32,7 @@ def main() -> int:
 
 def many(first: int, count: int, limit: float, out: Path | None) -> int:
     """Run many seeds, and print what they came to."""
-    begun, told = time.monotonic(), time.monotonic()
+    begun, reported = time.monotonic(), time.monotonic()
     done: Counter[str] = Counter()
     faults = writes = violated = 0
     oldest, simulated = dict.fromkeys(LINKS, 0.0), 0.0
@@ -47,9 +47,11 @@ def many(first: int, count: int, limit: float, out: Path | None) -> int:
         if outcome.violations:
             violated += 1
             print(f"{outcome}\n  again: python -m benchmarks.simulation --seed {seed}", flush=True)
-        if time.monotonic() - told > TELL_EVERY:
-            told = time.monotonic()
-            print(f"{done.total()} seeds, {violated} violated, {told - begun:.0f} s", flush=True)
+        if time.monotonic() - reported > REPORT_EVERY:
+            reported = time.monotonic()
+            print(
+                f"{done.total()} seeds, {violated} violated, {reported - begun:.0f} s", flush=True
+            )
     figures = {
         "first": first, "seeds": done.total(), "by_link": dict(done), "faults": faults,
         "setpoints": writes, "violated": violated, "oldest_state_s": oldest,

@@ -2,7 +2,7 @@
 
     python -m benchmarks.speed.commands [--rows 1000000] [--repeats 3]
 
-A simulated UR10e at random poses under three payloads, measured to 30 um, one reading of 500 wild.
+A simulated UR10e at random poses under three payloads, measured to 30 um, one of 500 an outlier.
 Prints a table: the least of the repeats' CPU times, the largest memory. Numerics on one thread.
 """
 
@@ -41,8 +41,8 @@ def write_log(path: Path, rows: int) -> None:
     q, mass = rng.uniform(-2, 2, (rows, 6)), rng.choice([0.0, 3.0, 6.0], rows)
     cog = np.tile([0.0, 0.0, 0.1], (rows, 1))
     position = model.predict(q, Loads(mass, cog)).position + rng.normal(0, 3e-5, (rows, 3))
-    wild = rng.random(rows) < 0.002
-    position[wild] += rng.normal(0, 5e-3, (wild.sum(), 3))
+    outlier = rng.random(rows) < 0.002
+    position[outlier] += rng.normal(0, 5e-3, (outlier.sum(), 3))
     columns = {f"actual_q_{i}": q[:, i] for i in range(6)} | {"payload": mass}
     columns |= {f"payload_cog_{i}": cog[:, i] for i in range(3)}
     columns |= {f"measured_position_{i}": position[:, i] for i in range(3)}

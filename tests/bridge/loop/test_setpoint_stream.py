@@ -110,6 +110,21 @@ def test_numbers_that_are_not_finite_never_leave() -> None:
     assert after.q == pytest.approx(before.q, abs=1e-9)
 
 
+@pytest.mark.parametrize("part", ["q", "offset_in_base"])
+def test_a_correction_that_is_no_number_is_known_as_such(
+    part: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stream = Run().stream
+    fine = stream.correct(Q, LIGHT)
+    assert stream.finite
+    spoilt = getattr(fine, part).copy()
+    spoilt[1] = np.nan
+    compensator = stream._compensator
+    monkeypatch.setattr(compensator, "correct", lambda *_: fine._replace(**{part: spoilt}))
+    stream.correct(Q, LIGHT)
+    assert not stream.finite
+
+
 def test_a_jump_of_the_source_is_refused() -> None:
     run = Run()
     run.cycles(400)
