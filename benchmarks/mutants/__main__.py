@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tempfile
 import time
 from collections import defaultdict
@@ -18,15 +19,17 @@ from gapbridge.core.errors import InputError
 
 @click.command()
 @click.option("--only", default="", help="Those whose file, text or list has this in it.")
+@click.option("--part", default="1/1", help="K/N: every N-th from the K-th, for N runs beside.")
 @click.option("--out", type=click.Path(path_type=Path), help="JSON lines, one a mutant.")
-def main(only: str, out: Path | None) -> None:
+def main(only: str, part: str, out: Path | None) -> None:
     """Make each listed mistake in a copy of the checkout and run the tests that must notice it.
 
     A test counts only where it passes without the mistake. Exit 1 where one goes unnoticed.
     """
     mutants = [m for m in read_mutants() if only in m.file or only in m.what]
+    mutants = mutants[_part(part)]
     if not mutants:
-        raise InputError(f"--only: found no mutant with {only!r}")
+        raise InputError(f"--only, --part: found no mutant with {only!r} in part {part}")
     begun, verdicts = time.monotonic(), []
     with tempfile.TemporaryDirectory() as folder:
         trial = Trial(Path(folder))
@@ -42,6 +45,14 @@ def main(only: str, out: Path | None) -> None:
     click.echo("\n".join(["", *table(verdicts), f"{time.monotonic() - begun:.0f} s"]))
     if not all(v.killed for v in verdicts):
         raise SystemExit(1)
+
+
+def _part(given: str) -> slice:
+    """Return which of a list belong to part "K/N"."""
+    match = re.fullmatch(r"(\d+)/(\d+)", given)
+    if match is None or not 1 <= (first := int(match[1])) <= (every := int(match[2])):
+        raise InputError(f"--part: found {given!r}, expected K/N with K from 1 to N")
+    return slice(first - 1, None, every)
 
 
 def table(verdicts: list[Verdict]) -> list[str]:
