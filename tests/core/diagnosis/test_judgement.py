@@ -78,8 +78,8 @@ def test_more_left_than_the_stated_noise_is_structure():
 def test_what_does_not_shrink_the_gap_of_unseen_samples_is_withdrawn():
     selection = channel_of("backlash").selection
     rng = np.random.default_rng(0)
-    drawn = rng.normal(size=len(selection.raw.target))
-    noise = replace(selection, raw=replace(selection.raw, target=drawn))
+    drawn = rng.normal(size=len(selection.unprojected.target))
+    noise = replace(selection, unprojected=replace(selection.unprojected, target=drawn))
     kept = judge(selection, HeldOut(selection))
     assert len(kept.accused) == 1
     left = judge(selection, HeldOut(noise))
