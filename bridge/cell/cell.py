@@ -134,6 +134,12 @@ class Cell:
         return Spread(tuple(origin.parameters), np.array(origin.covariance, dtype=float))
 
     @property
+    def intervals(self) -> dict[str, tuple[float, float]]:
+        """Return the 95 % interval of each number that was applied, by name, SI."""
+        origin = self.file.provenance
+        return {} if origin is None else dict(origin.intervals)
+
+    @property
     def simulation(self) -> Simulation:
         """Return section ``simulation``."""
         return self.file.simulation

@@ -106,7 +106,7 @@ def measured_log(folder: Path, order: tuple[int, ...] = (0, 1, 2, 3, 4, 5)) -> P
     ("robot", "order", "phrase"),
     [
         (CRAIG, (0, 1, 2, 3, 4, 5), "robot.dh looks like modified DH rows (Craig)"),
-        ("robot: {model: ur10e}\n", (2, 1, 0, 3, 4, 5), "joints 1 and 3 look swapped (a UR's elbow"),
+        ("robot: {model: ur10e}\n", (2, 1, 0, 3, 4, 5), "joints 1 and 3 look swapped (a UR's"),
         ("robot: {model: ur10e}\n", (0, 1, 2, 5, 3, 4), "the joints look out of order: joint 4 is"),
         ("robot: {model: ur3e}\n", (0, 1, 2, 3, 4, 5), "is it the right arm, tool and order"),
     ],
