@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -230,9 +231,12 @@ def _placed(document: Document, text: str) -> str:
 
 def _paths(keys: tuple[str | int, ...], value: object) -> Iterator[tuple[str | int, ...]]:
     """Yield the path of every key and entry."""
-    inside = value.items() if isinstance(value, dict) else ()
-    inside = enumerate(value) if isinstance(value, list) else inside
-    for key, own in inside:
+    entries: Iterable[tuple[Any, object]] = ()
+    if isinstance(value, dict):
+        entries = value.items()
+    elif isinstance(value, list):
+        entries = enumerate(value)
+    for key, own in entries:
         yield (*keys, key)
         yield from _paths((*keys, key), own)
 

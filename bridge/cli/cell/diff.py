@@ -97,7 +97,7 @@ def _words(part: Part, one: Cell, other: Cell) -> str:
     """Return what differs in a part, in units that people read."""
     old, new = one.model, other.model
     if part.name == "tool":
-        apart = np.linalg.solve(old.tool_in_flange, new.tool_in_flange)
+        apart = np.asarray(np.linalg.solve(old.tool_in_flange, new.tool_in_flange), dtype=float)
         turned = 1e3 * float(np.linalg.norm(rotation_vector(apart[:3, :3])))
         return (
             f"TCP: {_mm(old.tool_in_flange[:3, 3])} -> {_mm(new.tool_in_flange[:3, 3])} in the "
