@@ -16,7 +16,7 @@ poses in the shares of a joint. It is reported as what it is, and kept out of th
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -385,7 +385,9 @@ class SlipWatch:
             for length in range(SUFFIXES[0], SUFFIXES[-1] + 1)
         }
         known = {length: found for length, found in tried.items() if found is not None}
-        length = max(known, key=lambda one: float(known[one][0].max()))  # the likeliest moment
+        ahead = max(known.values(), key=lambda found: float(found[0].max()))
+        left, count = self._left(int(np.argmax(ahead[0]))), len(self._rests)
+        length = min(known, key=lambda one: left(count - one))  # the likeliest moment
         gains, values, stds, _ = known[length]
         order = np.argsort(-gains)
         joints = tuple(int(j) + 1 for j in order if gains[j] > gains[order[0]] - BESIDE)
@@ -421,30 +423,38 @@ class SlipWatch:
 
         A sensor that was zeroed anew two rests before a moment looks like much at that moment.
         """
+        count = len(self._rests)
+        free = self._left(None)
+        return min(map(free, range(2, count - 1))) - self._left(joint)(count - length)
+
+    def _left(self, joint: int | None) -> Callable[[int], float]:
+        """Return what gives chi-square of all rests for a step of what is free at a moment.
+
+        Each pose's own mean is fitted too, and where one is given the slip of a joint (from 0). A
+        moment is the number of the first rest after it.
+        """
         rests = list(self._rests)
         number = np.array([rest.place for rest in rests])
         readings = np.array([rest.readings for rest in rests])
         seen = np.isfinite(readings).all(axis=0)
         assert self._sigma is not None
         scale = 1.0 / self._sigma[seen]
-        b = readings[:, seen] * scale
-        places = self._places
-        free = np.array([places[p].free[seen] * scale[:, None] for p in number])
-        slip = np.array([places[p].slip[seen, joint] * scale for p in number])[:, :, None]
+        places = [self._places[p] for p in number]
+        columns = np.array([place.free[seen] * scale[:, None] for place in places])
+        if joint is not None:
+            slip = np.array([place.slip[seen, joint] * scale for place in places])
+            columns = np.concatenate([columns, slip[:, :, None]], axis=2)
         same = (number[:, None] == number).astype(float)
         same /= same.sum(axis=1, keepdims=True)
+        b = readings[:, seen] * scale
+        b = (b - same @ b).ravel()
 
-        def left(columns: Array, moment: int) -> float:
-            """Return chi-square, each pose's own mean and ``columns`` from a moment on fitted."""
+        def left(moment: int) -> float:
             stepped = np.where(np.arange(len(rests))[:, None, None] >= moment, columns, 0.0)
-            A = stepped - np.einsum("ij,jkl->ikl", same, stepped)
-            rest = (b - same @ b).ravel()
-            A = A.reshape(len(rest), -1)
-            found = np.linalg.lstsq(A, rest, rcond=1e-6)[0]
-            return float(np.sum((rest - A @ found) ** 2))
+            A = (stepped - np.einsum("ij,jkl->ikl", same, stepped)).reshape(len(b), -1)
+            return float(np.sum((b - A @ np.linalg.lstsq(A, b, rcond=1e-6)[0]) ** 2))
 
-        slipped = left(np.concatenate([free, slip], axis=2), len(rests) - length)
-        return min(left(free, moment) for moment in range(2, len(rests) - 1)) - slipped
+        return left
 
     def _changes(self, length: int) -> list[_Change]:
         """Return how the last rests differ from those before, pose by pose.
