@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -121,18 +121,28 @@ class _Change(NamedTuple):
     free: Array  # (k, f)
 
 
-@dataclass
 class _Standing:
-    """The arm since it came to a stop."""
+    """The arm since it came to a stop at ``q`` (n,) rad, ``since`` s: means of short windows."""
 
-    q: Array  # (n,) rad
-    since: float  # s
-    sums: Array = field(default_factory=lambda: np.zeros(0))
-    count: int = 0
-    begun: float = 0.0  # s, of the window
-    windows: list[Array] = field(default_factory=list)
-    last: Array | None = None  # window
-    touched: bool = False
+    def __init__(self, q: Array, since: float) -> None:
+        self.q, self.since = q, since
+        self.windows: list[Array] = []
+        self._last: Array | None = None  # window
+        self._sum: Array | float = 0.0
+        self._count, self._begun = 0, 0.0  # rows of the window, and s of the first
+
+    def take(self, rows: Array, begun: float, ended: float) -> tuple[Array, Array] | None:
+        """Return a window that has ended, and how it differs from the one before it, if any."""
+        self._begun = self._begun if self._count else begun
+        self._sum, self._count = self._sum + rows.sum(axis=0), self._count + len(rows)
+        if ended - self._begun < WINDOW:
+            return None
+        mean = np.asarray(self._sum / self._count)
+        self._sum, self._count = 0.0, 0
+        before, self._last = self._last, mean
+        if len(self.windows) < WINDOWS:
+            self.windows.append(mean)
+        return None if before is None else (mean, mean - before)
 
 
 class SlipWatch:
@@ -163,6 +173,7 @@ class SlipWatch:
         self._places: list[_Place] = []
         self._rests: deque[_Rest] = deque(maxlen=KEPT)
         self._standing: _Standing | None = None
+        self._touched = False  # a force has come or gone during this rest
         self._before: Array | None = None  # (n,) rad: the rest before this one
         self._odd: list[_Rest] = []  # rests in a row under a force
         self._sigma: Array | None = None  # (m,) of one rest
@@ -194,37 +205,22 @@ class SlipWatch:
             or not standing.since <= t[-1]  # a new clock
         ):
             found += self._end_rest()
-            self._standing = _Standing(q[-1].copy(), float(t[-1]))
-            return found
-        if t[0] < standing.since + SETTLING:
-            return found
-        if not standing.count:
-            standing.sums, standing.begun = np.zeros(len(self._taken)), float(t[0])
-        standing.sums = standing.sums + rows[:, self._taken].sum(axis=0)
-        standing.count += len(rows)
-        if t[-1] - standing.begun >= WINDOW:
-            found += self._window(standing, float(t[-1]))
+            self._standing, self._touched = _Standing(q[-1].copy(), float(t[-1])), False
+        elif t[0] >= standing.since + SETTLING:
+            window = standing.take(rows[:, self._taken], float(t[0]), float(t[-1]))
+            found += [] if window is None else self._jump(*window, float(t[-1]))
         return found
 
     # -- one rest ---------------------------------------------------------------------------------
 
-    def _window(self, standing: _Standing, now: float) -> list[Slip | Force]:
-        """Close a window; a force that comes or goes while the arm stands is nobody's zero."""
-        mean = standing.sums / standing.count
-        standing.count = 0
-        before, standing.last = standing.last, mean
-        if len(standing.windows) < WINDOWS:
-            standing.windows.append(mean)
-        if before is None or standing.touched or self._sigma is None:
+    def _jump(self, mean: Array, change: Array, now: float) -> list[Slip | Force]:
+        """Report a force that comes or goes while the arm stands: nobody's zero, once a rest."""
+        if self._touched or self._sigma is None:
             return []
         n = self._n
-        change = mean - before
-        jump = _first_finite(change[n : n + 3], change[n + 6 : n + 9])
-        size = float(np.linalg.norm(jump))
-        if not size > self._most(LARGEST_SLIP * 9.81 * self._payload(mean)[0]):
-            return []
-        standing.touched = True
-        return [_force(size, now, "came or went while the arm stood still")]
+        size = float(np.linalg.norm(_first_finite(change[n : n + 3], change[n + 6 : n + 9])))
+        self._touched = size > self._most(LARGEST_SLIP * 9.81 * self._payload(mean)[0])
+        return [_force(size, now, "came or went while the arm stood still")] * self._touched
 
     def _most(self, slip: float) -> float:
         """Return the force, N, above which a change is more than noise and a slip's ``slip``, N."""
