@@ -115,6 +115,11 @@ def settling(terms: Iterable[Term]) -> list[Term]:
     return [t for t in acting(terms, "tracking") if type(CATALOGUE[t.effect]).settle is not own]
 
 
+def by_approach(terms: Iterable[Term]) -> bool:
+    """Return whether terms ask for the joints' last motions."""
+    return any(CATALOGUE[term.effect].by_approach for term in terms)
+
+
 def effect_named(identifier: str) -> Effect:
     """Return a member of the catalogue; raises InputError naming the nearest known one."""
     if identifier in CATALOGUE:
@@ -133,6 +138,7 @@ __all__ = [
     "Site",
     "Term",
     "acting",
+    "by_approach",
     "correcting",
     "effect_named",
     "flexibility_effects",

@@ -14,7 +14,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.effects import by_approach
 from gapbridge.core.effects.effect import typical_moment
 from gapbridge.core.estimation import base_parameters, compliance_fit
 from gapbridge.core.estimation.compliance_fit import (
@@ -159,7 +159,7 @@ def identify_streamed(
     metrology = metrology or Metrology()
     emit = progress or (lambda text: None)
     emit("reading")
-    stream = _stream(log, metrology, by_approach(model))
+    stream = _stream(log, metrology, by_approach(model.terms))
     usual = 1e-2 / typical_moment(model.arm)
     prior_std = usual if prior_std is None else prior_std
     require_excitation(model, stream.sample, metrology, min(prior_std, usual))
@@ -179,11 +179,6 @@ def _nuisances_alone(model: Model, rows: Data) -> Fit:
     """Return the frame and tool point that fit best, the model's flexibilities left alone."""
     found = compliance_fit.fit_nuisances(model, rows)
     return Fit(found.model, found.frame, NONE)
-
-
-def by_approach(model: Model) -> bool:
-    """Return whether the model's effects ask for the joints' last motions."""
-    return any(CATALOGUE[term.effect].by_approach for term in model.terms)
 
 
 def _stream(log: Iterable[Log], metrology: Metrology, motions: bool) -> Stream:
