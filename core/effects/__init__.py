@@ -120,6 +120,11 @@ def by_approach(terms: Iterable[Term]) -> bool:
     return any(CATALOGUE[term.effect].by_approach for term in terms)
 
 
+def at_moment(terms: Iterable[Term]) -> bool:
+    """Return whether a term steps once, so that it matters when a row was taken."""
+    return any(CATALOGUE[term.effect].at_moment for term in terms)
+
+
 def effect_named(identifier: str) -> Effect:
     """Return a member of the catalogue; raises InputError naming the nearest known one."""
     if identifier in CATALOGUE:
@@ -138,6 +143,7 @@ __all__ = [
     "Site",
     "Term",
     "acting",
+    "at_moment",
     "by_approach",
     "correcting",
     "effect_named",

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import pyarrow
 
 Array = NDArray[np.float64]
-BUFFER = 1 << 20  # bytes of each column that are read ahead
+BUFFER = 1 << 18  # bytes of each column that are read ahead
 
 
 def parquet_tables(path: Path, rows: int | None = None) -> Iterator[tuple[list[str], Array]]:
@@ -32,11 +32,16 @@ def parquet_tables(path: Path, rows: int | None = None) -> Iterator[tuple[list[s
 
     try:
         given = pyarrow.BufferReader(read_bytes(path)) if is_given() else path
-        file = ParquetFile(given, buffer_size=BUFFER)
+        # not ahead of what is asked for: whole columns would be
+        file = ParquetFile(given, buffer_size=BUFFER, pre_buffer=False)
         names = list(file.schema_arrow.names)
         wanted = [names[i] for i in wanted_of(names)]
         _check_types(path, file.schema_arrow, wanted)
-        parts = [file.read(wanted)] if rows is None else file.iter_batches(rows, columns=wanted)
+        parts = (
+            [file.read(wanted)]
+            if rows is None
+            else file.iter_batches(rows, columns=wanted, use_threads=False)
+        )
         for part in parts:
             table = np.empty((part.num_rows, len(wanted)), order="F")
             for k, name in enumerate(wanted):
@@ -44,6 +49,7 @@ def parquet_tables(path: Path, rows: int | None = None) -> Iterator[tuple[list[s
                     part.column(name).cast(pyarrow.float64()).to_numpy(zero_copy_only=False)
                 )
             yield names, table
+        pyarrow.default_memory_pool().release_unused()
     except (pyarrow.ArrowException, OSError) as error:
         raise LogError(f"{path}: found no readable Parquet file ({error})") from None
 

@@ -11,7 +11,6 @@ from gapbridge.bridge.cell.opened_log import check_log, open_log
 from gapbridge.core.effects import by_approach
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.log import Log
-from gapbridge.core.log.mcap_reading import files_of
 from gapbridge.core.log.pieces import PARQUET, LogPieces
 from gapbridge.core.log.sources import source_of
 from gapbridge.core.log.sources.recording import Recording
@@ -30,7 +29,11 @@ class LargeLog:
 
     def __iter__(self) -> Iterator[Log]:
         """Yield the pieces. Raises LogError, as ``open_log`` does."""
-        files = files_of(self.path) if not self.path.is_file() else [self.path]
+        files = [self.path]
+        if not self.path.is_file():
+            from gapbridge.core.log.mcap_reading import files_of  # brings protobuf
+
+            files = files_of(self.path)
         for file in files:
             for piece in LogPieces(file, self.cell.arm.n, motions=self.motions):
                 check_log(piece, self.cell)
