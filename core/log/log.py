@@ -218,13 +218,10 @@ def csv_table(
     wanted = wanted_of(names)
     for number, line in zip(numbers, lines, strict=True):
         if line.count(delimiter) != len(names) - 1:
-            raise LogError(
-                f"{path}: row {number}: found {line.count(delimiter) + 1} cells, "
-                f"expected {len(names)} as in the header"
-            )
+            raise cell_count(path, number, line.count(delimiter) + 1, len(names))
     if not wanted:
         return np.empty((len(lines), 0))
-    rows = lines if delimiter == "," else [line.replace(",", ".") for line in lines]
+    rows = [line.replace(",", ".") for line in lines] if delimiter == ";" else lines
     try:
         return np.loadtxt(rows, delimiter=delimiter, usecols=wanted, ndmin=2, comments=None)
     except ValueError:
@@ -243,6 +240,14 @@ def is_comment(line: str) -> bool:
 def delimiter_of(header: str) -> str:
     """Return what stands between the cells of a CSV file."""
     return ";" if header.count(";") > header.count(",") else ","
+
+
+def cell_count(path: Path, row: int, found: int, expected: int) -> LogError:
+    """Return the error of a row with another number of cells than the header."""
+    more = " (decimal commas? then ; between the cells)" if found > expected else ""
+    return LogError(
+        f"{path}: row {row}: found {found} cells, expected {expected} as in the header{more}"
+    )
 
 
 def cell_number(path: Path, row: int, name: str, cell: str, delimiter: str) -> float:
