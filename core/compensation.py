@@ -185,7 +185,8 @@ class Compensator:
         self._view = view_row(self._row, n)
         self._conditions = model.conditions()
         self._settling = settling(model.terms)
-        self._stiff_links = not chain.flexibility.any()
+        # one compiled call does it all: links are stiff, and no effect looks at the joint angles
+        self._plain = not (chain.flexibility.any() or self._conditions or self._settling)
         self._pose = np.zeros(12)
         # what acts where nothing is given
         self._mass, self._wrench = np.array([float(model.payload_mass)]), np.zeros((1, 6))
@@ -201,7 +202,7 @@ class Compensator:
         n, loads = self._n, loads or NOTHING
         found, nominal = np.empty(n + 6), np.ascontiguousarray(nominal_q, dtype=float)
         q, moved = found[:n], found[n:]
-        if self._stiff_links and not self._conditions and not self._settling:
+        if self._plain:
             mass, cog, wrench = loads.payload_mass, loads.payload_cog, loads.wrench
             best, steps = single.correct(
                 self._block, nominal, self._mass if mass is None else mass,
@@ -217,6 +218,27 @@ class Compensator:
             _want(rigid, self._rigid_row, self._rigid_shape, q, self._pose)
             _moved(self._wanted, self._pose, q - nominal, moved)
         return Correction(q, moved, best, steps)
+
+    def correct_rows(self, nominal_q: Array, loads: Loads) -> Correction:
+        """Return the corrected setpoints for ``nominal_q`` (N, n): ``correct``, row after row."""
+        n, count = self._n, len(nominal_q)
+        nominal = np.ascontiguousarray(nominal_q, dtype=float)
+        found, residual = np.empty((count, n + 6)), np.empty(count)
+        steps = np.empty(count, dtype=np.int64)
+        if self._plain:
+            given = (loads.payload_mass, loads.payload_cog, loads.wrench)
+            own = (self._mass, self._cog, self._wrench)
+            acting = [
+                o if g is None else np.ascontiguousarray(g, dtype=float)
+                for g, o in zip(given, own, strict=True)
+            ]
+            single.correct_rows(self._block, nominal, *acting, found, residual, steps)
+        else:
+            for r in range(count):
+                one = self.correct(nominal[r], loads[r : r + 1])
+                found[r, :n], found[r, n:] = one.q, one.offset_in_base
+                residual[r], steps[r] = one.residual, one.steps
+        return Correction(found[:, :n], found[:, n:], residual, steps)
 
     def forget(self) -> None:
         """Begin the next correction from nothing, whatever was solved last."""
@@ -268,14 +290,7 @@ def correct(model: Model, nominal_q: Array, loads: Loads | None = None) -> Corre
     """Return the corrected setpoints of many rows (N, n): ``Compensator.correct`` row by row."""
     q = np.atleast_2d(np.asarray(nominal_q, dtype=float))
     # what slipped once has slipped: setpoints are for what comes
-    loads, live = replace(loads or Loads(), time=None), Compensator(model)
-    results = [live.correct(q[r], loads[r : r + 1]) for r in range(len(q))]
-    return Correction(
-        np.array([c.q for c in results]).reshape(q.shape),
-        np.array([c.offset_in_base for c in results]).reshape(len(q), 6),
-        np.array([c.residual for c in results]),
-        np.array([c.steps for c in results]),
-    )
+    return Compensator(model).correct_rows(q, replace(loads or Loads(), time=None))
 
 
 def wanted_pose(model: Model, nominal_q: Array) -> Poses:

@@ -7,6 +7,7 @@
     │   ├── ArmError          an arm table, URDF or DH list
     │   ├── CellError         a cell file
     │   ├── LogError          a log or a trajectory
+    │   ├── EquilibriumError  a load under which the model's arm would buckle
     │   ├── ExcitationError   the data cannot speak about what was asked of it
     │   └── PlanError         no poses can be planned for what was asked
     └── RunError              something failed while running: exit 1, one clear line
@@ -46,6 +47,16 @@ class CellError(InputError):
 
 class LogError(InputError):
     """A log or a trajectory file cannot be used."""
+
+
+class EquilibriumError(InputError):
+    """The arm finds no equilibrium under its load in one row of several."""
+
+    text = "the arm finds no equilibrium under its load; expected smaller flexibilities or loads"
+
+    def __init__(self, row: int) -> None:
+        super().__init__(f"row {row + 1}: {self.text}")
+        self.row = row  # from 0
 
 
 class ExcitationError(InputError):

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from gapbridge.core.arm import Arm
 from gapbridge.core.effects import CATALOGUE, Site, Term, flexibility_effects, settling
 from gapbridge.core.effects.effect import Effect
-from gapbridge.core.errors import InputError
+from gapbridge.core.errors import EquilibriumError, InputError
 from gapbridge.core.kernels import many
 from gapbridge.core.kernels.reference import Chain, Rows
+from gapbridge.core.kernels.turns import rotation_vectors
 from gapbridge.core.loads import Loads
-from gapbridge.core.rotation import rotation_vector
 
 Array = NDArray[np.float64]
 SETTLING = 10  # times that servos are looked at where they have given way
@@ -33,7 +33,9 @@ class Poses:
     @property
     def rotation_vector(self) -> Array:
         """Return the rotations as rotation vectors (N, 3), rad."""
-        return rotation_vector(self.rotation)
+        vectors = np.empty((len(self.rotation), 3))
+        rotation_vectors(np.ascontiguousarray(self.rotation), vectors)
+        return vectors
 
 
 @dataclass(frozen=True)
@@ -196,7 +198,4 @@ class Model:
 
 def _require_equilibrium(bad: int) -> None:
     if bad >= 0:
-        raise InputError(
-            f"row {bad + 1}: the arm finds no equilibrium under its load; expected "
-            "smaller flexibilities or loads"
-        )
+        raise EquilibriumError(bad)

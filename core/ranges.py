@@ -39,22 +39,47 @@ def merged(ranges: Iterable[Range]) -> dict[str, tuple[float, float]]:
     return whole
 
 
+class Outside:
+    """How far a log, given in pieces, lies outside what was fitted."""
+
+    def __init__(self, fitted: Range) -> None:
+        self._fitted = fitted
+        self._rows = 0
+        self._count: dict[str, int] = {}
+        self._worst: dict[str, tuple[float, int, float]] = {}  # from the middle, line, value
+
+    def add(self, log: Log) -> None:
+        """Look at one more piece."""
+        self._rows += len(log)
+        for name, values in _columns(log).items():
+            if name not in self._fitted:
+                continue
+            rows = np.flatnonzero(beyond(name, values, self._fitted))
+            if not len(rows):
+                continue
+            away = np.abs(values[rows] - sum(self._fitted[name]) / 2)
+            worst = int(np.argmax(away))
+            found = float(away[worst]), log.line(rows[worst]), float(values[rows[worst]])
+            self._count[name] = self._count.get(name, 0) + len(rows)
+            self._worst[name] = max(self._worst.get(name, found), found, key=lambda one: one[0])
+
+    def sentences(self) -> list[str]:
+        """Return one sentence for each quantity that lies outside."""
+        reported = []
+        for name, count in self._count.items():
+            (low, high), (_, line, value) = self._fitted[name], self._worst[name]
+            reported.append(
+                f"{label(name)}: {count} of {self._rows} rows lie outside what was fitted, "
+                f"{low:.4g} to {high:.4g} {UNITS[stem_of(name)]} (row {line}: {value:.4g})"
+            )
+        return reported
+
+
 def outside(log: Log, fitted: Range) -> list[str]:
     """Return one sentence for each quantity of a log that lies outside what was fitted."""
-    reported = []
-    for name, values in _columns(log).items():
-        if name not in fitted:
-            continue
-        low, high = fitted[name]
-        rows = np.flatnonzero(beyond(name, values, fitted))
-        if len(rows):
-            worst = rows[np.argmax(np.abs(values[rows] - (low + high) / 2))]
-            reported.append(
-                f"{label(name)}: {len(rows)} of {len(values)} rows lie outside what was fitted, "
-                f"{low:.4g} to {high:.4g} {UNITS[stem_of(name)]} (row {log.line(worst)}: "
-                f"{values[worst]:.4g})"
-            )
-    return reported
+    found = Outside(fitted)
+    found.add(log)
+    return found.sentences()
 
 
 def outside_rows(log: Log, fitted: Range) -> NDArray[np.bool_]:

@@ -16,7 +16,8 @@ from gapbridge.bridge.cell.opened_log import open_log
 from gapbridge.bridge.document.provenance import fitted, provenance
 from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.compensation import correct
-from gapbridge.core.errors import InputError, LogError
+from gapbridge.core.effects import by_approach
+from gapbridge.core.errors import EquilibriumError, InputError
 from gapbridge.core.log.log import Log
 from gapbridge.core.predicted_channels import predicted_channels
 from gapbridge.core.ranges import outside_rows, range_of
@@ -38,27 +39,28 @@ def predict(cell: Cell, log: Log, *, channels: bool = False) -> Predicted:
     give way. The standard deviation comes from the covariance of what was fitted, where the cell
     has it. ``channels``: torque, wrench and tracking are predicted too.
     """
-    q, loads = log.require("actual_q", "target_q"), log.loads()
+    q, loads = log.require("actual_q", "target_q"), log.loads(by_approach(cell.model.terms))
+    spread, ranges, std = cell.spread, cell.fitted_range, None
     try:
         if not log.has("actual_q"):
             q = cell.model.settled(q, loads)
-        poses = cell.model.predict(q, loads)
-    except LogError:
-        raise
-    except InputError as error:
-        raise InputError(f"{log.path}: data {error}") from None
+        if spread.names:
+            poses, std = spread.poses_and_std(cell.model, q, loads)
+        else:
+            poses = cell.model.predict(q, loads)
+    except EquilibriumError as error:
+        raise InputError(f"{log.path}: row {log.line(error.row)}: {error.text}") from None
     further, lacking = predicted_channels(cell.model, log) if channels else ({}, {})
-    spread, ranges = cell.spread, cell.fitted_range
     return Predicted(
-        poses.position, poses.rotation_vector,
-        spread.position_std(cell.model, q, loads) if spread.names else None,
+        poses.position, poses.rotation_vector, std,
         outside_rows(log, ranges) if ranges else None, further, lacking,
     )  # fmt: skip
 
 
 def compensate(cell: Cell, log: Log) -> Corrected:
     """Return the setpoint of every row whose predicted real pose is the rigid arm's at it."""
-    found = correct(cell.model, log.require("target_q", "actual_q"), log.loads())
+    loads = log.loads(by_approach(cell.model.terms))
+    found = correct(cell.model, log.require("target_q", "actual_q"), loads)
     return Corrected(found.q, found.residual)  # type: ignore[arg-type]  # of N rows: an array
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import click
@@ -10,7 +10,7 @@ import click
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.cell.opened_log import open_log
 from gapbridge.core.log.log import Log
-from gapbridge.core.ranges import outside
+from gapbridge.core.ranges import Outside
 from gapbridge.core.sessions import join_sessions
 
 log_argument = click.argument("log", type=click.Path(path_type=Path))
@@ -52,5 +52,16 @@ def warn_outside(log: Log, cell: Cell) -> None:
 
     What was fitted stands in the cell's ``provenance``; cells without one give no warning.
     """
-    for text in outside(log, cell.fitted_range):
-        click.echo(f"warning: {log.path}: {text}", err=True)
+    for _ in looked_over([log], cell):
+        pass
+
+
+def looked_over(pieces: Iterable[Log], cell: Cell) -> Iterator[Log]:
+    """Yield the pieces of a log, then print what ``warn_outside`` does of all of them."""
+    found, path = Outside(cell.fitted_range), ""
+    for piece in pieces:
+        found.add(piece)
+        path = piece.path
+        yield piece
+    for text in found.sentences():
+        click.echo(f"warning: {path}: {text}", err=True)

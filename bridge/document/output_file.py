@@ -12,7 +12,7 @@ import contextlib
 import io
 import os
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.errors import InputError, RunError
 
+Array = NDArray[np.float64]
 PARQUET = (".parquet", ".pq")
 LONG = 50_000  # numbers from which a library writes a table as text: ten times as fast
 MODE = 0o640  # of a new file
@@ -112,29 +113,58 @@ def write_text(path: Path, text: str) -> None:
         file.write(text)
 
 
-def write_table(path: Path, columns: Sequence[str], table: NDArray[np.float64]) -> None:
+def write_table(path: Path, columns: Sequence[str], table: Array) -> None:
     """Write rows (N, k) under k column names, as Parquet where the path's suffix says so, or CSV.
 
     Every number reads back exactly.
     """
-    if path.suffix.lower() in PARQUET:
-        import pyarrow
-        from pyarrow import parquet
+    with writing_table(path) as append:
+        append(columns, table)
 
-        frame = pyarrow.table({name: table[:, k] for k, name in enumerate(columns)})
-        with replacing_bytes(path) as binary:
-            parquet.write_table(frame, binary)
-        return
-    if table.size > LONG:
+
+@contextlib.contextmanager
+def writing_table(path: Path) -> Iterator[Callable[[Sequence[str], Array], None]]:
+    """Give a function that appends rows (N, k) to what ``write_table`` would write at once.
+
+    It takes the same column names each time.
+    """
+    with replacing_bytes(path) as binary, contextlib.ExitStack() as opened:
+        if path.suffix.lower() in PARQUET:
+            yield _parquet_to(binary, opened)
+        else:
+            yield _text_to(binary)
+
+
+def _parquet_to(
+    binary: IO[bytes], opened: contextlib.ExitStack
+) -> Callable[[Sequence[str], Array], None]:
+    import pyarrow
+    from pyarrow.parquet import ParquetWriter
+
+    writers: list[ParquetWriter] = []
+
+    def append(columns: Sequence[str], table: Array) -> None:
+        frame = pyarrow.table([table[:, k] for k in range(table.shape[1])], list(columns))
+        if not writers:
+            # numbers that hardly repeat: a dictionary of them is work for nothing
+            writer = ParquetWriter(binary, frame.schema, use_dictionary=False)
+            writers.append(opened.enter_context(writer))
+        writers[0].write_table(frame)
+
+    return append
+
+
+def _text_to(binary: IO[bytes]) -> Callable[[Sequence[str], Array], None]:
+    def append(columns: Sequence[str], table: Array) -> None:
+        if not binary.tell():
+            binary.write((",".join(columns) + "\n").encode())
+        if table.size <= LONG:
+            np.savetxt(binary, table, fmt="%.17g", delimiter=",")
+            return
         import pyarrow
         from pyarrow import csv
 
         frame = pyarrow.table([table[:, k] for k in range(table.shape[1])], list(columns))
-        plain = csv.WriteOptions(include_header=False, quoting_style="none")
-        with replacing_bytes(path) as binary:
-            binary.write((",".join(columns) + "\n").encode())
-            csv.write_csv(frame, binary, plain)
-        return
-    with replacing(path) as file:
-        file.write(",".join(columns) + "\n")
-        np.savetxt(file, table, fmt="%.17g", delimiter=",")
+        csv.write_csv(frame, binary, csv.WriteOptions(include_header=False, quoting_style="none"))
+
+    return append

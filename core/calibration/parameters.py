@@ -126,6 +126,18 @@ class Parameters:
         new = [term.with_values(np.array(v)) for term, v in added.values() if any(v)]
         return replace(self.nominal, terms=(*terms, *new))
 
+    def model_with_all(self, values: Array) -> tuple[Model, list[tuple[int, int]]]:
+        """Return ``model(values)`` with the terms of zeros, which have slopes nevertheless.
+
+        And where each parameter (p) stands in it: number of the term, number of the value.
+        """
+        model = self.model(values)
+        present = {(term.effect, term.site) for term in model.terms}
+        model = model.with_terms([t for t in self.terms if (t.effect, t.site) not in present])
+        numbers = {(term.effect, term.site): i for i, term in enumerate(model.terms)}
+        places = [(self.terms[t], k) for t, k in self.place]
+        return model, [(numbers[term.effect, term.site], k) for term, k in places]
+
     @property
     def prior(self) -> Array:
         """Return 1 sigma (p,) that weakly holds each at the nominal model: ten usual sizes."""

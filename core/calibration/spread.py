@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.redundancy import Redundancy
 from gapbridge.core.effects import CATALOGUE, Term
-from gapbridge.core.errors import InputError
+from gapbridge.core.errors import EquilibriumError, InputError
+from gapbridge.core.estimation.pose_jacobian import pose_columns
 from gapbridge.core.loads import Loads
-from gapbridge.core.model import Model
+from gapbridge.core.model import Model, Poses
 
 Array = NDArray[np.float64]
-STEP = 1e-3  # share of a parameter's usual size, for derivatives of the predicted TCP
-
+STEP = 1e-3  # share of a parameter's usual size, where a derivative of the TCP is a difference
+CONVERGED = 1e-7  # m/rad: a standard deviation need not be known better
 BLOCK = 20_000  # rows at a time, so that memory does not grow with them
 
 
@@ -77,26 +78,31 @@ class Spread:
         q = np.atleast_2d(q)
         if not self.names:
             return np.full((len(q), 3), np.nan)
+        return self.poses_and_std(model, q, loads)[1]
+
+    def poses_and_std(self, model: Model, q: Array, loads: Loads | None) -> tuple[Poses, Array]:
+        """Return what ``model.predict`` does, and ``position_std`` (N, 3); one parameter at least.
+
+        Raises InputError where a parameter is none of the model's arm, or a row has no equilibrium.
+        """
         parameters = parameters_named(model, self.names, "provenance")
-        out = np.empty((len(q), 3))
+        here, chosen = parameters.model_with_all(np.zeros(len(parameters)))
+        position, rotation = np.empty((len(q), 3)), np.empty((len(q), 3, 3))
+        std = np.empty((len(q), 3))
         for begin in range(0, len(q), BLOCK):
             rows = slice(begin, begin + BLOCK)
-            here = None if loads is None else loads[rows]
-            J = _columns(parameters, model, q[rows], here)
-            square = np.einsum("nki,ij,nkj->nk", J, self.covariance, J, optimize=True)
-            out[rows] = np.sqrt(np.maximum(square, 0.0))
-        return out
-
-
-def _columns(parameters: Parameters, model: Model, q: Array, loads: Loads | None) -> Array:
-    """Return d TCP position / d parameters (N, 3, p), base axes."""
-    middle = model.predict(q, loads).position
-    J = np.empty((len(q), 3, len(parameters)))
-    for i, scale in enumerate(parameters.scales):
-        step = np.zeros(len(parameters))
-        step[i] = STEP * scale
-        J[:, :, i] = (parameters.model(step).predict(q, loads).position - middle) / step[i]
-    return J
+            try:
+                found = pose_columns(
+                    here, q[rows], None if loads is None else loads[rows], chosen,
+                    STEP * parameters.scales, coordinates=3, converged=CONVERGED,
+                )  # fmt: skip
+            except EquilibriumError as error:
+                raise EquilibriumError(begin + error.row) from None
+            position[rows], rotation[rows] = found.poses.position, found.poses.rotation
+            for k, J in enumerate(found.jacobian):
+                square = np.sum(J * (self.covariance @ J), axis=0)
+                std[rows, k] = np.sqrt(np.maximum(square, 0.0))
+        return Poses(position, rotation), std
 
 
 def parameters_named(model: Model, names: Sequence[str], where: str) -> Parameters:

@@ -115,6 +115,16 @@ def settling(terms: Iterable[Term]) -> list[Term]:
     return [t for t in acting(terms, "tracking") if type(CATALOGUE[t.effect]).settle is not own]
 
 
+def by_approach(terms: Iterable[Term]) -> bool:
+    """Return whether terms ask for the joints' last motions."""
+    return any(CATALOGUE[term.effect].by_approach for term in terms)
+
+
+def at_moment(terms: Iterable[Term]) -> bool:
+    """Return whether a term steps once, so that it matters when a row was taken."""
+    return any(CATALOGUE[term.effect].at_moment for term in terms)
+
+
 def effect_named(identifier: str) -> Effect:
     """Return a member of the catalogue; raises InputError naming the nearest known one."""
     if identifier in CATALOGUE:
@@ -133,6 +143,8 @@ __all__ = [
     "Site",
     "Term",
     "acting",
+    "at_moment",
+    "by_approach",
     "correcting",
     "effect_named",
     "flexibility_effects",

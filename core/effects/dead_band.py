@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
-from gapbridge.core.kernels.interpolation import played, stretches
 
 if TYPE_CHECKING:
     import numpy as np
@@ -52,6 +51,8 @@ class DeadBand(JointEffect):
             return super().track(term, arm, q, motion)
         assert term.site.joint is not None
         i, width = term.site.joint - 1, term.values[0]
+        from gapbridge.core.kernels.interpolation import played, stretches  # brings numba
+
         result = q.copy()
         for part in stretches(motion):
             result[part, i] = played(q[part, i], width, float(motion.q[part.start, i]))

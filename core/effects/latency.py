@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
 from gapbridge.core.effects.simulator import Kind, SimulatorChange
-from gapbridge.core.kernels.interpolation import interpolate, stretches
 
 if TYPE_CHECKING:
     import numpy as np
@@ -53,6 +52,8 @@ class Latency(JointEffect):
         if not motion.moving:
             return q
         i = term.site.joint - 1
+        from gapbridge.core.kernels.interpolation import interpolate, stretches  # brings numba
+
         result = q.copy()
         for part in stretches(motion):
             time = motion.t[part]

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
 from gapbridge.core.effects.simulator import Kind, SimulatorChange
-from gapbridge.core.kernels.interpolation import lagged, stretches
 
 if TYPE_CHECKING:
     import numpy as np
@@ -51,6 +50,8 @@ class TrackingLag(JointEffect):
         if not motion.moving:
             return q
         i, constant = term.site.joint - 1, term.values[0]
+        from gapbridge.core.kernels.interpolation import lagged, stretches  # brings numba
+
         result = q.copy()
         for part in stretches(motion):
             command = q[part, i]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.effects.effect import Effect
+from gapbridge.core.kernels.adjoint import CONVERGED
 from gapbridge.core.kernels.pose_jacobian import jacobian_blocks
 from gapbridge.core.kernels.rates import chain_rate, of_rows, slots
 from gapbridge.core.kernels.reference import Chain, Rows
@@ -35,27 +36,32 @@ class PoseColumns:
     """TCP poses of N rows, and how they change with p parameters, base axes."""
 
     poses: Poses
-    jacobian: Array  # (6, p, N) m and rad per unit: position, then turn
+    jacobian: Array  # (6 or 3, p, N) m and rad per unit: position, then turn
 
 
 def pose_columns(
-    model: Model, q: Array, loads: Loads | None, values: Sequence[Value], steps: Array
-) -> PoseColumns:
+    model: Model, q: Array, loads: Loads | None, values: Sequence[Value], steps: Array, *,
+    coordinates: int = 6, converged: float = CONVERGED,
+) -> PoseColumns:  # fmt: skip
     """Return poses and columns for encoder angles ``q`` (N, n) and some values in the model.
 
-    ``steps`` (p,): what a value is moved by where a difference is taken. Raises InputError where a
-    row has no equilibrium.
+    ``steps`` (p,): what a value is moved by where a difference is taken. ``coordinates``: 3 for
+    positions alone; ``converged``: how much the last round may change a derivative by a bending,
+    m/rad. Raises InputError where a row has no equilibrium.
     """
     loads = loads or Loads()
-    jacobian = np.empty((6, len(values), len(q)))
+    jacobian = np.empty((coordinates, len(values), len(q)))
     chain, rows = model.chain(), model.rows(q, loads)
     rates, known = _chain_rates(model, chain, values)
     varying, first_order_ok = _row_rates(model, q, loads, values, steps)
-    poses = _swept(chain, rows, _entries(rates), varying, jacobian)
+    poses = None
+    if not _steps_once(model, loads):
+        poses = _swept(chain, rows, (_entries(rates), varying), jacobian, converged)
     if poses is None:
         poses, known = model.predict(q, loads), np.zeros(len(values), dtype=bool)
     for c in np.flatnonzero(~(known & first_order_ok)).tolist():
-        jacobian[:, c] = _difference(model, q, loads, values[c], float(steps[c]))
+        change = _difference(model, q, loads, values[c], float(steps[c]))
+        jacobian[:, c] = change[:coordinates]
     return PoseColumns(poses, jacobian)
 
 
@@ -108,10 +114,17 @@ def _row_rates(
     return (np.array(starts), np.array(found_slots, dtype=np.int64), rates), first_order_ok
 
 
+def _steps_once(model: Model, loads: Loads) -> bool:
+    """Return whether rows before a moment have a pose that the chain alone does not give."""
+    own = Effect.before
+    steps = any(type(CATALOGUE[t.effect]).before is not own for t in model.terms)
+    return steps and loads.time is not None
+
+
 def _swept(
-    chain: Chain, rows: Rows, rates: Entries, varying: Entries, jacobian: Array
+    chain: Chain, rows: Rows, entries: tuple[Entries, Entries], jacobian: Array, converged: float
 ) -> Poses | None:
-    """Write the slopes (6, p, N) and return the poses; None where the sweep cannot."""
+    """Write the slopes (3 or 6, p, N) and return the poses; None where the sweep cannot."""
     if bool(chain.flexibility.any()) or bool(getattr(config, "DISABLE_JIT", 0)):
         return None
     count = len(rows.q)
@@ -119,7 +132,9 @@ def _swept(
 
     def work(first: int, last: int) -> int:
         return int(
-            jacobian_blocks(chain, rows, rates, varying, first, last, position, rotation, jacobian)
+            jacobian_blocks(
+                chain, rows, *entries, first, last, position, rotation, jacobian, converged
+            )
         )
 
     if any(bad >= 0 for bad in in_ranges(work, count)):

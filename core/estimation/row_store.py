@@ -43,6 +43,10 @@ class RowStore:
         return iter(self._blocks)
 
     def _kept(self, values: NDArray[Any]) -> NDArray[Any]:
+        if (
+            len(values) and (values == values[0]).all()
+        ):  # one payload's centre: a row counts for all
+            return np.broadcast_to(values[:1].copy(), values.shape)
         if values.nbytes <= self._free:
             self._free -= values.nbytes
             return values

@@ -8,13 +8,13 @@ of rows, poses are not separated. They are judged on the sample's rows, some twe
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.effects import at_moment, by_approach
 from gapbridge.core.effects.effect import typical_moment
 from gapbridge.core.estimation import base_parameters, compliance_fit
 from gapbridge.core.estimation.compliance_fit import (
@@ -159,7 +159,7 @@ def identify_streamed(
     metrology = metrology or Metrology()
     emit = progress or (lambda text: None)
     emit("reading")
-    stream = _stream(log, metrology, by_approach(model))
+    stream = _stream(log, metrology, model)
     usual = 1e-2 / typical_moment(model.arm)
     prior_std = usual if prior_std is None else prior_std
     require_excitation(model, stream.sample, metrology, min(prior_std, usual))
@@ -181,16 +181,14 @@ def _nuisances_alone(model: Model, rows: Data) -> Fit:
     return Fit(found.model, found.frame, NONE)
 
 
-def by_approach(model: Model) -> bool:
-    """Return whether the model's effects ask for the joints' last motions."""
-    return any(CATALOGUE[term.effect].by_approach for term in model.terms)
-
-
-def _stream(log: Iterable[Log], metrology: Metrology, motions: bool) -> Stream:
+def _stream(log: Iterable[Log], metrology: Metrology, model: Model) -> Stream:
     """Return the rows with measured poses; passes once over the log."""
     store, first, empty = RowStore(), 0, None
+    motions, timed = by_approach(model.terms), at_moment(model.terms)
     for part in log:
         data, used = data_of(part, metrology, motions)
+        if not timed:  # nothing asks for it, and it is as long as the log
+            data = replace(data, loads=replace(data.loads, time=None))
         if len(used):
             store.append(data, used + first)
         else:
@@ -226,7 +224,7 @@ def _joined(parts: list[Data]) -> Data:
     loads = Loads(
         *(
             stacked([getattr(part.loads, name) for part in parts])
-            for name in ("payload_mass", "payload_cog", "wrench", "temperature", "approach")
+            for name in ("payload_mass", "payload_cog", "wrench", "temperature", "approach", "time")
         )
     )
     return Data(

@@ -257,7 +257,7 @@ def _pulled(w, u, s, record):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
-def solve(w, v, u, s, n, axis, turning, deflected):  # type: ignore[no-untyped-def]
+def solve(w, v, u, s, n, axis, turning, deflected, converged):  # type: ignore[no-untyped-def]
     """Write the derivatives of one coordinate by twists, and the adjoints; whether it settled."""
     for record in range(n + 2):
         a = record * OWN * _L
@@ -280,7 +280,7 @@ def solve(w, v, u, s, n, axis, turning, deflected):  # type: ignore[no-untyped-d
         change = 0.0
         for k in range(_L):
             change = max(change, s[CHANGED * _L + k])
-        if change < CONVERGED:
+        if change < converged:
             return True
     return not deflected
 

@@ -182,28 +182,47 @@ def _of_payload(w, v, B, push, turned, n, g, gravity):  # type: ignore[no-untype
 
 
 @njit(**JIT)
-def _slopes(chain, w, v, u, B, push, turned, axis, turning):  # type: ignore[no-untyped-def]
-    """Write all slots of one coordinate."""
+def _slopes(chain, w, v, u, B, push, turned, axis, turning, links, loads):  # type: ignore[no-untyped-def]
+    """Write the slots of one coordinate; those of links, and of tool and weights, where wanted."""
     n = chain.mass.shape[0]
     gravity = 6 * (n + 2) + 4 * n
-    for j in range(n + 1):
-        source = (j + 1) * OWN * _L
-        _in_axes(w, u, B, j, source + SHIFT * _L, 6 * j, True)
-        _in_axes(w, u, B, j, source + TWIST * _L, 6 * j + 3, False)
-    B[gravity * _L : (gravity + 3) * _L] = 0.0
-    push[:] = 0.0
-    turned[:] = 0.0
-    _reaction(w, u, push, turned, 0)
+    if links:
+        for j in range(n + 1):
+            source = (j + 1) * OWN * _L
+            _in_axes(w, u, B, j, source + SHIFT * _L, 6 * j, True)
+            _in_axes(w, u, B, j, source + TWIST * _L, 6 * j + 3, False)
     for i in range(n):
-        _reaction(w, u, push, turned, i + 1)
-        _weighed(w, B, push, turned, i + 1, chain.mass[i], chain.cog[i], gravity)
         _of_joint(w, u, B, n, i, chain.position[i + 1], chain.compliance[i, 2])
-    _of_tool(w, v, B, n, 6 * (n + 1), push, axis, turning)
-    _of_payload(w, v, B, push, turned, n, chain.gravity, gravity)
+    if loads:
+        B[gravity * _L : (gravity + 3) * _L] = 0.0
+        push[:] = 0.0
+        turned[:] = 0.0
+        _reaction(w, u, push, turned, 0)
+        for i in range(n):
+            _reaction(w, u, push, turned, i + 1)
+            _weighed(w, B, push, turned, i + 1, chain.mass[i], chain.cog[i], gravity)
+        _of_tool(w, v, B, n, 6 * (n + 1), push, axis, turning)
+        _of_payload(w, v, B, push, turned, n, chain.gravity, gravity)
     for j in range(3):
         for k in range(_L):
             total = w[RECORD * _L + (TOTAL + 3 + j) * _L + k]
             B[(gravity + 3 + j) * _L + k] = u[(PULL + j) * _L + k] * total
+
+
+@njit(**JIT)
+def _linked(used, n):  # type: ignore[no-untyped-def]
+    """Return whether a parameter moves a link's geometry."""
+    return np.any(used < 6 * (n + 1))
+
+
+@njit(**JIT)
+def _loaded(used, n):  # type: ignore[no-untyped-def]
+    """Return whether a parameter moves the tool, gravity or the payload's mass."""
+    tool, gravity = 6 * (n + 1), 6 * (n + 2) + 4 * n
+    for slot in used:
+        if tool <= slot < tool + 6 or gravity <= slot < gravity + 3 or slot == 12 * n + 18:
+            return True
+    return False
 
 
 @njit(**FAST)
@@ -230,13 +249,14 @@ def _columns(B, rates, varying, first, count, J, column):  # type: ignore[no-unt
 
 
 @njit(**JIT)
-def jacobian_blocks(chain, rows, rates, varying, first, last, position, rotation, J):  # type: ignore[no-untyped-def]
+def jacobian_blocks(chain, rows, rates, varying, first, last, position, rotation, J, converged):  # type: ignore[no-untyped-def]
     """Write TCP poses of rows first..last, and their derivatives J (3 or 6, p, N).
 
     Derivatives by p parameters, of the position (m) and of the turn (rad), base axes. ``rates``:
     for parameter c the entries start[c]..start[c+1] of (slot, rate); ``varying`` likewise, with a
-    rate per row (entries, N). Slots: ``rates.ChainRate``. Returns the first row of a block that
-    does not settle at once, or -1. The arm's links must not bend themselves.
+    rate per row (entries, N). Slots: ``rates.ChainRate``. ``converged``: of the adjoints (m/rad),
+    how much a last round may change. Returns the first row of a block that does not settle at once,
+    or -1. The arm's links must not bend themselves.
     """
     n = chain.mass.shape[0]
     w, v = lanes_of(n)
@@ -244,6 +264,7 @@ def jacobian_blocks(chain, rows, rates, varying, first, last, position, rotation
     B, column = np.zeros(slots(n) * _L), np.empty(_L)
     push, turned = np.empty(3 * _L), np.empty(3 * _L)
     deflected = bends(chain)
+    links, loads = _linked(rates[1], n), _loaded(rates[1], n) or _loaded(varying[1], n)
     for r in range(first, last, _L):
         if not (gather(chain, rows, r, w, v) and settle(chain, w, v, deflected)):
             return r
@@ -256,8 +277,8 @@ def jacobian_blocks(chain, rows, rates, varying, first, last, position, rotation
         prepare(chain, w, v, u, s)
         for coordinate in range(J.shape[0]):
             axis, turning = coordinate % 3, coordinate >= 3
-            if not solve(w, v, u, s, n, axis, turning, deflected):
+            if not solve(w, v, u, s, n, axis, turning, deflected, converged):
                 return r
-            _slopes(chain, w, v, u, B, push, turned, axis, turning)
+            _slopes(chain, w, v, u, B, push, turned, axis, turning, links, loads)
             _columns(B, rates, varying, r, count, J[coordinate], column)
     return -1

@@ -187,6 +187,19 @@ def correct(b, nominal, mass, cog, wrench, found):  # type: ignore[no-untyped-de
     return best, steps
 
 
+@njit(**JIT)
+def correct_rows(b, nominal, mass, cog, wrench, found, residual, steps):  # type: ignore[no-untyped-def]
+    """``correct`` row after row: nominal (N, n), found (N, n + 6), residual (N,), steps (N,).
+
+    A load of a single row counts for all.
+    """
+    for r in range(nominal.shape[0]):
+        m, c, w = min(r, len(mass) - 1), min(r, len(cog) - 1), min(r, len(wrench) - 1)
+        residual[r], steps[r] = correct(
+            b, nominal[r], mass[m : m + 1], cog[c : c + 1], wrench[w : w + 1], found[r]
+        )
+
+
 @njit(**FAST)
 def _motion(r, wanted, found, n, moves):  # type: ignore[no-untyped-def]
     """Write the motion (6,) from the wanted pose to the reached one behind it; nothing for none."""

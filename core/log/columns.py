@@ -43,6 +43,11 @@ def is_known(name: str) -> bool:
     return COLUMNS.get(name) == 0 or bool(match and COLUMNS.get(match[1], 0) != 0)
 
 
+def wanted_of(names: Sequence[str]) -> list[int]:
+    """Return where the columns stand that a log may hold."""
+    return [i for i, name in enumerate(names) if is_known(name)]
+
+
 def indices(name: str, n: int) -> list[str]:
     """Return what follows ``name`` in the columns of an arm of n joints: '_0', '_1', ... or ''."""
     count = COLUMNS[name]

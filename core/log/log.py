@@ -17,9 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.errors import LogError
-from gapbridge.core.files import is_file, is_given, read_bytes
+from gapbridge.core.files import is_file, read_bytes
 from gapbridge.core.loads import Loads
-from gapbridge.core.log.columns import COLUMNS, INDEXED, is_known, misspelt, nearest, written
+from gapbridge.core.log.columns import (
+    COLUMNS,
+    INDEXED,
+    is_known,
+    misspelt,
+    nearest,
+    wanted_of,
+    written,
+)
+from gapbridge.core.log.parquet_tables import parquet_tables
 
 Array = NDArray[np.float64]
 GZIP = b"\x1f\x8b"
@@ -151,22 +160,18 @@ def read_log(path: Path | str, n: int) -> Log:
     if not is_file(path):
         raise LogError(f"{path}: file not found, expected a CSV or Parquet log")
     if path.suffix.lower() in (".parquet", ".pq"):
-        names, table = _read_parquet(path)
+        names, table = next(parquet_tables(path))
         lines = None
     else:
         names, table, lines = _read_csv(path)
     if not len(table):
         raise LogError(f"{path}: found no data rows, expected at least one")
-    columns = table_columns(path, [name for name in names if is_known(name)], table, n)
+    columns = table_columns(path, [names[i] for i in wanted_of(names)], table, n)
     if not columns:
         raise LogError(f"{path}: columns: found none that a log may hold{nearest(names)}")
     unknown = tuple(name for name in names if not is_known(name))
     counted = None if lines is None else np.arange(len(table)) + 1
     return Log(str(path), columns, n, unknown=unknown, lines=lines, numbers=counted)
-
-
-def _wanted(names: Sequence[str]) -> list[int]:
-    return [i for i, name in enumerate(names) if is_known(name)]
 
 
 def _text(path: Path) -> str:
@@ -200,25 +205,31 @@ def _read_csv(path: Path) -> tuple[list[str], Array, NDArray[np.int64] | None]:
     names = [name.strip().strip('"') for name in lines[0].split(delimiter)]
     if len(lines) == 1:
         return names, np.empty((0, len(names))), numbers
-    width = lines[0].count(delimiter)
-    for number, line in zip(kept[1:], lines[1:], strict=True):
-        if line.count(delimiter) != width:
-            raise cell_count(path, number, line.count(delimiter) + 1, width + 1)
-    wanted = _wanted(names)
+    return names, csv_table(path, names, kept[1:], lines[1:], delimiter), numbers
+
+
+def csv_table(
+    path: Path, names: Sequence[str], numbers: Sequence[int], lines: Sequence[str], delimiter: str
+) -> Array:
+    """Return the known columns (rows, known columns) of lines, with their ``numbers`` in the file.
+
+    Raises LogError where a line has not as many cells as there are names, or a cell is no number.
+    """
+    wanted = wanted_of(names)
+    for number, line in zip(numbers, lines, strict=True):
+        if line.count(delimiter) != len(names) - 1:
+            raise cell_count(path, number, line.count(delimiter) + 1, len(names))
     if not wanted:
-        return names, np.empty((len(lines) - 1, 0)), numbers
-    rows = lines[1:]
-    if delimiter == ";":
-        rows = [line.replace(",", ".") for line in rows]
+        return np.empty((len(lines), 0))
+    rows = [line.replace(",", ".") for line in lines] if delimiter == ";" else lines
     try:
-        table = np.loadtxt(rows, delimiter=delimiter, usecols=wanted, ndmin=2, comments=None)
+        return np.loadtxt(rows, delimiter=delimiter, usecols=wanted, ndmin=2, comments=None)
     except ValueError:
-        table = np.array([
+        return np.array([
             [cell_number(path, number, names[i], cell, delimiter) for i, cell in
              enumerate(line.split(delimiter)) if i in wanted]
-            for number, line in zip(kept[1:], lines[1:], strict=True)
+            for number, line in zip(numbers, lines, strict=True)
         ])  # fmt: skip
-    return names, table, numbers
 
 
 def is_comment(line: str) -> bool:
@@ -250,31 +261,6 @@ def cell_number(path: Path, row: int, name: str, cell: str, delimiter: str) -> f
         ) from None
 
 
-def _read_parquet(path: Path) -> tuple[list[str], Array]:
-    """Return the names of all columns, and those that are known (rows, known columns)."""
-    import pyarrow
-    from pyarrow import parquet
-
-    try:
-        data = pyarrow.BufferReader(read_bytes(path)) if is_given() else path
-        names = list(parquet.read_schema(data).names)
-        wanted = [names[i] for i in _wanted(names)]
-        frame = parquet.read_table(data, columns=wanted)
-        for name in wanted:
-            kind = frame.schema.field(name).type
-            types = pyarrow.types
-            if not (types.is_floating(kind) or types.is_integer(kind) or types.is_decimal(kind)):
-                what = "text" if pyarrow.types.is_string(kind) else str(kind)
-                raise LogError(f"{path}: column {name}: found {what}, expected numbers")
-        table = [
-            frame[name].cast(pyarrow.float64()).to_numpy(zero_copy_only=False) for name in wanted
-        ]
-    except (pyarrow.ArrowException, OSError) as error:
-        raise LogError(f"{path}: found no readable Parquet file ({error})") from None
-    rows = frame.num_rows
-    return names, np.column_stack(table) if wanted else np.empty((rows, 0))
-
-
 def table_columns(path: Path, names: Sequence[str], table: Array, n: int) -> dict[str, Array]:
     """Return columns (N,) or (N, k) of a table (N, names), grouped by name.
 
@@ -286,7 +272,7 @@ def table_columns(path: Path, names: Sequence[str], table: Array, n: int) -> dic
         if COLUMNS.get(name) == 0:
             if name in columns:
                 raise LogError(f"{path}: column {name}: found twice, expected once")
-            columns[name] = np.ascontiguousarray(table[:, position])
+            columns[name] = table[:, position].copy()  # a view would keep the whole table
             continue
         match = INDEXED.match(name)
         if match and COLUMNS.get(match[1], 0) != 0:

@@ -6,7 +6,7 @@ the rows before (the last motion of a joint) is carried over.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -19,16 +19,18 @@ from gapbridge.core.log.columns import is_known
 from gapbridge.core.log.log import (
     GZIP,
     Log,
-    cell_count,
-    cell_number,
+    csv_table,
     delimiter_of,
     is_comment,
     last_motion,
     read_log,
     table_columns,
 )
+from gapbridge.core.log.parquet_tables import parquet_tables
 
 Array = NDArray[np.float64]
+# names of all columns, values of the known ones (rows, known columns), lines where not in sequence
+Table = tuple[list[str], Array, NDArray[np.int64] | None]
 ROWS = 16_384  # of a piece
 RECORDING = ".mcap"
 PARQUET = (".parquet", ".pq")
@@ -47,13 +49,16 @@ class LogPieces:
         """Yield the pieces in order. Raises LogError, as ``read_log`` does."""
         motion = _Motion()
         first = 2
-        for names, table in _tables(self.path, self.rows):
+        for names, table, lines in _tables(self.path, self.rows):
             known = [name for name in names if is_known(name)]
             columns = table_columns(self.path, known, table, self.n)
             if not columns:
                 read_log(self.path, self.n)  # says what is wrong with it
             unknown = tuple(name for name in names if not is_known(name))
-            piece = Log(str(self.path), columns, self.n, first, unknown=unknown)
+            numbers = np.arange(first - 1, first - 1 + len(table))
+            piece = Log(
+                str(self.path), columns, self.n, first, lines, unknown=unknown, numbers=numbers
+            )
             yield motion.carried(piece) if self.motions else piece
             first += len(table)
 
@@ -88,12 +93,12 @@ class _Motion:
         return replace(piece, columns={**piece.columns, "approach": sign})
 
 
-def _tables(path: Path, rows: int) -> Iterator[tuple[list[str], Array]]:
-    """Yield the names of all columns and the known ones' values (rows, known columns)."""
+def _tables(path: Path, rows: int) -> Iterator[Table]:
+    """Yield the pieces of a file."""
     if not path.is_file():
         raise LogError(f"{path}: file not found, expected a CSV or Parquet log")
     if path.suffix.lower() in PARQUET:
-        return _parquet(path, rows)
+        return ((names, table, None) for names, table in parquet_tables(path, rows))
     if path.suffix.lower() == RECORDING:
         return _recording(path)
     with path.open("rb") as file:
@@ -105,44 +110,33 @@ def _tables(path: Path, rows: int) -> Iterator[tuple[list[str], Array]]:
     return _csv(path, rows)
 
 
-def _parquet(path: Path, rows: int) -> Iterator[tuple[list[str], Array]]:
-    import pyarrow
-    from pyarrow import parquet
-
-    try:
-        file = parquet.ParquetFile(path)
-        names = list(file.schema_arrow.names)
-        wanted = [name for name in names if is_known(name)]
-        for batch in file.iter_batches(batch_size=rows, columns=wanted):
-            table = np.empty((batch.num_rows, len(wanted)))
-            for k, name in enumerate(wanted):
-                values = batch.column(name).cast(pyarrow.float64())
-                table[:, k] = values.to_numpy(zero_copy_only=False)
-            yield names, table
-    except pyarrow.ArrowException as error:
-        raise LogError(f"{path}: found no readable Parquet file of numbers ({error})") from None
-
-
-def _csv(path: Path, rows: int) -> Iterator[tuple[list[str], Array]]:
+def _csv(path: Path, rows: int) -> Iterator[Table]:
     with path.open(encoding="utf-8-sig") as file:
-        kept = ((k, line) for k, line in enumerate(file, start=1) if not is_comment(line))
+        kept = _lines(file)
         header = next(kept, (1, ""))[1]
         delimiter = delimiter_of(header)
         names = [name.strip().strip('"') for name in header.strip().split(delimiter)]
-        wanted = [k for k, name in enumerate(names) if is_known(name)]
-        while lines := list(islice(kept, rows)):
-            table = np.empty((len(lines), len(wanted)))
-            for k, (number, line) in enumerate(lines):
-                cells = line.strip().split(delimiter)
-                if len(cells) != len(names):
-                    raise cell_count(path, number, len(cells), len(names))
-                table[k] = [
-                    cell_number(path, number, names[c], cells[c], delimiter) for c in wanted
-                ]
-            yield names, table
+        while taken := list(islice(kept, rows)):
+            numbers, lines = zip(*taken, strict=True)
+            table = csv_table(
+                path, names, numbers, [line.rstrip("\r\n") for line in lines], delimiter
+            )
+            yield names, table, np.array(numbers, dtype=np.int64)
 
 
-def _recording(path: Path) -> Iterator[tuple[list[str], Array]]:
+def _lines(file: Iterable[str]) -> Iterator[tuple[int, str]]:
+    """Yield the lines of a file with their numbers, without comments and blank ones at the end."""
+    blank = []
+    for number, line in enumerate(file, start=1):
+        if not line.strip():
+            blank.append((number, line))
+        elif not is_comment(line):
+            yield from blank
+            blank.clear()
+            yield number, line
+
+
+def _recording(path: Path) -> Iterator[Table]:
     from gapbridge.core.log.mcap_reading import read_batches
 
     for batch in read_batches(path):
@@ -155,4 +149,4 @@ def _recording(path: Path) -> Iterator[tuple[list[str], Array]]:
                 names += [name + end for end in ends]
                 parts.append(flat)
         if parts:
-            yield names, np.hstack(parts)
+            yield names, np.hstack(parts), None

@@ -166,6 +166,19 @@ def test_rows_at_once_are_the_rows_one_by_one(n):
         np.testing.assert_allclose(together.q[r], alone.q, atol=1e-7)
 
 
+def test_many_rows_are_what_one_compensator_says_row_after_row():
+    model, rng = MODELS[6], np.random.default_rng(8)
+    q = rng.uniform(-2, 2, (40, 6))
+    q[7] = 0.0  # singular, and out of reach
+    for loads in (Loads(), Loads(payload_mass=rng.uniform(0, 9, 40), wrench=np.full((40, 6), 9.0))):
+        live, together = Compensator(model), correct(model, q, loads)
+        for r in range(len(q)):
+            alone = live.correct(q[r], loads[r : r + 1])
+            np.testing.assert_array_equal(together.q[r], alone.q)
+            np.testing.assert_array_equal(together.offset_in_base[r], alone.offset_in_base)
+            assert (together.residual[r], together.steps[r]) == (alone.residual, alone.steps)
+
+
 BAD = {
     "joint": (np.full(6, np.nan), None),
     "wrench": (np.full(6, 0.5), Loads(wrench=np.full((1, 6), np.nan))),

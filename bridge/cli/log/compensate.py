@@ -7,21 +7,21 @@ from pathlib import Path
 import click
 import numpy as np
 
-from gapbridge.bridge.cell.opened_log import open_log
+from gapbridge.bridge.api.functions import compensate as corrected
+from gapbridge.bridge.cli.log.large_log import pieces_of
 from gapbridge.bridge.cli.options import (
     cell_option,
     csv_option,
     log_argument,
+    looked_over,
     open_cell,
-    warn_outside,
 )
 from gapbridge.bridge.cli.progress import progress
-from gapbridge.bridge.document.output_file import require_writable, write_table
-from gapbridge.core.compensation import correct
-from gapbridge.core.errors import InputError
+from gapbridge.bridge.document.output_file import require_writable, writing_table
+from gapbridge.core.errors import EquilibriumError, InputError
+from gapbridge.core.log.log import Log
 from gapbridge.core.model import Array
 
-CHUNK = 500  # rows between two looks of the progress bar
 MISSED = 1e-6  # m: a corrected setpoint that leaves more than this is reported
 
 
@@ -39,36 +39,30 @@ def compensate(log: Path, cell: Path, out: Path) -> None:
     Example: gapbridge compensate log.csv --cell cell.yaml --out corrected.csv
     """
     given = open_cell(cell)
-    rows = open_log(log, given)
-    warn_outside(rows, given)
     require_writable(out, log, cell)
-    nominal = rows.require("target_q", "actual_q")
-    loads = rows.loads()
-    corrected, residual = np.empty(nominal.shape), np.empty(len(nominal))
-    with progress("correcting", len(nominal)) as advance:
-        for start in range(0, len(nominal), CHUNK):
-            part = slice(start, start + CHUNK)
-            result = correct(given.model, nominal[part], loads[part])
-            corrected[part], residual[part] = result.q, result.residual
-            advance(len(result.q))
-    _tell_missed(log, residual, rows.first_row)
-    write_table(out, [f"corrected_q_{i}" for i in range(given.arm.n)], corrected)
-    click.echo(f"{out}: {len(nominal)} corrected setpoints")
-
-
-def _tell_missed(log: Path, residual: Array, first_row: int) -> None:
-    """Refuse rows without an equilibrium; name those whose wanted pose is out of reach."""
-    lost = np.flatnonzero(~np.isfinite(residual))
-    if len(lost):
-        raise InputError(
-            f"{log}: row {lost[0] + first_row}: the arm finds no equilibrium under its load; "
-            "expected smaller flexibilities or loads"
-        )
-    missed = np.flatnonzero(residual > MISSED)
-    if len(missed):
-        worst = missed[np.argmax(residual[missed])]
+    names = [f"corrected_q_{i}" for i in range(given.arm.n)]
+    rows, missed, worst, line = 0, 0, 0.0, 0
+    with writing_table(out) as append, progress("correcting") as advance:
+        for piece in looked_over(pieces_of(log, given), given):
+            found = corrected(given, piece)
+            _require_equilibrium(piece, found.residual)
+            append(names, found.q)
+            missed += int(np.sum(found.residual > MISSED))
+            most = int(found.residual.argmax())
+            if found.residual[most] > worst:
+                worst, line = float(found.residual[most]), piece.line(most)
+            rows += len(piece)
+            advance(len(piece))
+    if missed:
         click.echo(
-            f"warning: {log}: {len(missed)} row(s) cannot reach their wanted pose; row "
-            f"{worst + first_row} misses it most, by {residual[worst] * 1e3:.3g} mm",
+            f"warning: {log}: {missed} row(s) cannot reach their wanted pose; row {line} misses it "
+            f"most, by {worst * 1e3:.3g} mm",
             err=True,
         )
+    click.echo(f"{out}: {rows} corrected setpoints")
+
+
+def _require_equilibrium(log: Log, residual: Array) -> None:
+    lost = np.flatnonzero(~np.isfinite(residual))
+    if len(lost):
+        raise InputError(f"{log.path}: row {log.line(lost[0])}: {EquilibriumError.text}")

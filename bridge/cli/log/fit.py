@@ -25,9 +25,10 @@ from gapbridge.bridge.cli.progress import progress, status
 from gapbridge.bridge.document.output_file import require_writable
 from gapbridge.bridge.document.provenance import fitted, provenance
 from gapbridge.core.calibration.spread import Spread
+from gapbridge.core.effects import by_approach
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.estimation.identification import Identification, identify_compliance
-from gapbridge.core.estimation.streamed import by_approach, identify_streamed
+from gapbridge.core.estimation.streamed import identify_streamed
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.ranges import merged, range_of
@@ -84,7 +85,7 @@ def _identified(
         ranges: list[dict[str, tuple[float, float]]] = []
 
         def read_once() -> Iterator[Log]:
-            for piece in LargeLog(paths[0], cell, by_approach(cell.model)):
+            for piece in LargeLog(paths[0], cell, by_approach(cell.model.terms)):
                 ranges.append(range_of(piece))
                 yield piece
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from gapbridge.bridge.cell import Cell
-from gapbridge.bridge.cell.opened_log import check_log
+from gapbridge.bridge.cell.opened_log import check_log, open_log
+from gapbridge.core.effects import by_approach
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.log import Log
-from gapbridge.core.log.mcap_reading import files_of
 from gapbridge.core.log.pieces import PARQUET, LogPieces
 from gapbridge.core.log.sources import source_of
 from gapbridge.core.log.sources.recording import Recording
@@ -29,11 +29,25 @@ class LargeLog:
 
     def __iter__(self) -> Iterator[Log]:
         """Yield the pieces. Raises LogError, as ``open_log`` does."""
-        files = files_of(self.path) if not self.path.is_file() else [self.path]
+        files = [self.path]
+        if not self.path.is_file():
+            from gapbridge.core.log.mcap_reading import files_of  # brings protobuf
+
+            files = files_of(self.path)
         for file in files:
             for piece in LogPieces(file, self.cell.arm.n, motions=self.motions):
                 check_log(piece, self.cell)
                 yield piece
+
+
+def pieces_of(path: Path, cell: Cell) -> Iterable[Log]:
+    """Return a log for a cell's arm in pieces; what another program wrote, or is small, as one.
+
+    Raises LogError, as ``open_log`` does.
+    """
+    if source_of(path) is None and is_large(path):
+        return LargeLog(path, cell, by_approach(cell.model.terms))
+    return [open_log(path, cell)]
 
 
 def is_large(path: Path) -> bool:

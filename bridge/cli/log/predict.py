@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from operator import itemgetter
 from pathlib import Path
 
 import click
 import numpy as np
+from numpy.typing import NDArray
 
 from gapbridge.bridge.api.functions import predict as predicted
 from gapbridge.bridge.api.records import Predicted
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.opened_log import open_log
+from gapbridge.bridge.cli.log.large_log import pieces_of
 from gapbridge.bridge.cli.options import (
     cell_option,
     csv_option,
     log_argument,
+    looked_over,
     open_cell,
-    warn_outside,
 )
-from gapbridge.bridge.document.output_file import require_writable, write_table
+from gapbridge.bridge.cli.progress import progress
+from gapbridge.bridge.document.output_file import require_writable, writing_table
 from gapbridge.core.log.log import Log
 
+Array = NDArray[np.float64]
 SHOWN = 8  # rows named at most
 
 
@@ -50,34 +55,66 @@ def predict(log: Path, cell: Path, out: Path, channels: bool) -> None:
     Example: gapbridge predict log.csv --cell cell.yaml --out predicted.csv
     """
     given = open_cell(cell)
-    rows = open_log(log, given)
-    warn_outside(rows, given)
     require_writable(out, log, cell)
-    found = predicted(given, rows, channels=channels)
-    names: list[str] = []
-    for name, values in found.columns.items():
-        names += [name] if values.ndim == 1 else [f"{name}_{i}" for i in range(values.shape[1])]
-    write_table(out, names, np.column_stack(list(found.columns.values())))
-    click.echo(f"{out}: {len(rows)} predicted poses")
-    for text in _said(given, rows, found):
+    # channels take derivatives along the whole log
+    pieces = [open_log(log, given)] if channels else pieces_of(log, given)
+    summary = _Summary()
+    with writing_table(out) as append, progress("predicting") as advance:
+        for piece in looked_over(pieces, given):
+            found = predicted(given, piece, channels=channels)
+            append(*_table(found))
+            summary.add(piece, found)
+            advance(len(piece))
+    click.echo(f"{out}: {summary.rows} predicted poses")
+    for text in summary.lines(given):
         click.echo(text)
 
 
-def _said(cell: Cell, log: Log, found: Predicted) -> Iterator[str]:
-    """Yield what is to be known of the predictions: their spread, and what is not there."""
-    if found.position_std is None:
-        yield f"no standard deviation: {cell.path} keeps no covariance of a fit"
-    else:
-        std = 1e3 * np.linalg.norm(found.position_std, axis=1)
-        yield (
-            f"standard deviation of the position (3D, the fit's part): {np.median(std):.4f} mm in "
-            f"the middle, at most {std.max():.4f} mm (row {log.line(int(std.argmax()))})"
-        )
-    if found.outside is not None and found.outside.any():
-        rows = np.flatnonzero(found.outside)
-        some = ", ".join(str(log.line(i)) for i in rows[:SHOWN]) + (
-            ", ..." if len(rows) > SHOWN else ""
-        )
-        yield f"outside what was fitted: {len(rows)} of {len(found.outside)} rows ({some})"
-    for channel, needs in found.lacking.items():
-        yield f"no {channel} predicted: needs {needs}"
+def _table(found: Predicted) -> tuple[list[str], Array]:
+    """Return the names (k) and values (N, k) of all columns."""
+    names: list[str] = []
+    for name, values in found.columns.items():
+        names += [name] if values.ndim == 1 else [f"{name}_{i}" for i in range(values.shape[1])]
+    return names, np.column_stack(list(found.columns.values()))
+
+
+class _Summary:
+    """What is to be known of the predictions of all pieces: their spread, and what is not there."""
+
+    def __init__(self) -> None:
+        self.rows = 0
+        self._std: list[Array] = []  # mm, in space
+        self._worst = (-1.0, 0)  # mm, line
+        self._outside: list[int] = []  # lines of the first
+        self._count = 0
+        self._lacking: dict[str, str] = {}
+
+    def add(self, log: Log, found: Predicted) -> None:
+        self.rows += len(log)
+        if found.position_std is not None:
+            std = 1e3 * np.linalg.norm(found.position_std, axis=1)
+            self._std.append(std)
+            worst = int(std.argmax())
+            self._worst = max(self._worst, (float(std[worst]), log.line(worst)), key=itemgetter(0))
+        if found.outside is not None:
+            rows = np.flatnonzero(found.outside)
+            self._count += len(rows)
+            self._outside += [log.line(i) for i in rows[: SHOWN - len(self._outside)]]
+        self._lacking |= found.lacking
+
+    def lines(self, cell: Cell) -> Iterator[str]:
+        """Yield what a person should know."""
+        if not self._std:
+            yield f"no standard deviation: {cell.path} keeps no covariance of a fit"
+        else:
+            worst, line = self._worst
+            middle = np.median(np.concatenate(self._std))
+            yield (
+                f"standard deviation of the position (3D, the fit's part): {middle:.4f} mm in "
+                f"the middle, at most {worst:.4f} mm (row {line})"
+            )
+        if self._count:
+            some = ", ".join(map(str, self._outside)) + (", ..." if self._count > SHOWN else "")
+            yield f"outside what was fitted: {self._count} of {self.rows} rows ({some})"
+        for channel, needs in self._lacking.items():
+            yield f"no {channel} predicted: needs {needs}"

@@ -19,13 +19,5 @@ SHARE = 0.01  # of a parameter's usual size, as the step of a difference
 
 def moved_poses(parameters: Parameters, values: Array, readings: Readings) -> PoseColumns:
     """Return the TCP poses of the readings at ``values`` (p,), and their slopes (6, p, N)."""
-    model = parameters.model(values)
-    present = {(term.effect, term.site) for term in model.terms}
-    # a model leaves out terms of zeros, which have slopes nevertheless
-    model = model.with_terms([t for t in parameters.terms if (t.effect, t.site) not in present])
-    numbers = {(term.effect, term.site): i for i, term in enumerate(model.terms)}
-    chosen = []
-    for t, k in parameters.place:
-        term = parameters.terms[t]
-        chosen.append((numbers[term.effect, term.site], k))
+    model, chosen = parameters.model_with_all(values)
     return pose_columns(model, readings.q, readings.loads, chosen, SHARE * parameters.scales)

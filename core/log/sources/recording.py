@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gapbridge.core.errors import LogError
-from gapbridge.core.log.mcap_reading import SUFFIX, files_of, read_batches
-from gapbridge.core.log.pieces import LogPieces
+from gapbridge.core.log.pieces import RECORDING, LogPieces
 from gapbridge.core.log.sources.source import Converted, Source, SourceOptions
 
 
@@ -22,7 +21,9 @@ class Recording(Source):
     def holds(self, path: Path) -> bool:
         """Return whether this is one file of a run, or its name."""
         if path.exists():
-            return path.is_file() and path.suffix.lower() == SUFFIX
+            return path.is_file() and path.suffix.lower() == RECORDING
+        from gapbridge.core.log.mcap_reading import files_of  # brings protobuf: not for every log
+
         try:
             return bool(files_of(path))
         except LogError:
@@ -30,6 +31,8 @@ class Recording(Source):
 
     def read(self, path: Path, arm_joints: Sequence[str], options: SourceOptions) -> Converted:
         """Return the log; see ``Source.read``."""
+        from gapbridge.core.log.mcap_reading import files_of
+
         n = len(arm_joints) or _joints(path)
         pieces = [piece for file in files_of(path) for piece in LogPieces(file, n)]
         if not pieces:
@@ -41,5 +44,7 @@ class Recording(Source):
 
 def _joints(path: Path) -> int:
     """Return how many joints the recorded arm has, 0 where nothing was recorded."""
+    from gapbridge.core.log.mcap_reading import read_batches
+
     first = next((batch for batch in read_batches(path) if "actual_q" in batch.columns), None)
     return 0 if first is None else int(first.columns["actual_q"].shape[1])

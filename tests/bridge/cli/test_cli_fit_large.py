@@ -22,6 +22,14 @@ def parquet_in(folder: Path, columns: Columns) -> Path:
     return folder / "log.parquet"
 
 
+def read_table(path: Path) -> Columns:
+    if path.suffix == ".parquet":
+        found = parquet.read_table(path)
+        return {name: found[name].to_numpy() for name in found.column_names}
+    table = np.genfromtxt(path, delimiter=",", names=True)
+    return {name: table[name] for name in table.dtype.names or ()}
+
+
 def session(rows: int) -> Columns:
     q, loads = poses_and_loads(rows)
     return columns_of(q, loads) | measured(bent_model(), q, loads, noise=2e-5)
@@ -40,6 +48,53 @@ def test_a_large_log_gives_what_it_gives_in_one_piece(tmp_path, monkeypatch):
     one, other = (load_cell(tmp_path / f"{name}.yaml").model for name in ("whole", "parts"))
     for a, b in zip(one.compliance(), other.compliance(), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+@pytest.mark.parametrize("command", ["predict", "compensate"])
+def test_a_log_in_pieces_is_predicted_and_compensated_as_one(
+    tmp_path, monkeypatch, command, suffix
+):
+    """The numbers, the rows named and the warnings are those of the whole log."""
+    log, cell = parquet_in(tmp_path, session(900)), cell_in(tmp_path)
+    fitted = tmp_path / "fitted.yaml"
+    assert gapbridge("fit", log, "--cell", cell, "--out", fitted).code == 0
+    wide = session(900)
+    wide["actual_q_1"] = wide["actual_q_1"] + np.where(np.arange(900) % 100 == 50, 2.5, 0.0)
+    log = parquet_in(tmp_path, wide)
+    found = []
+    for name in ("whole", "parts"):
+        out = tmp_path / f"{name}{suffix}"
+        result = gapbridge(command, log, "--cell", fitted, "--out", out)
+        assert result.code == 0, result.err
+        found.append((result.out.replace(name, ""), result.err, read_table(out)))
+        monkeypatch.setattr(large_log, "LARGE", 500)
+        monkeypatch.setattr(
+            large_log, "LogPieces", lambda path, n, motions=True: LogPieces(path, n, 200)
+        )
+    (said, warned, whole), (said_too, warned_too, parts) = found
+    assert (said, warned) == (said_too, warned_too)
+    assert "9 of 900 rows lie outside" in warned
+    assert list(whole) == list(parts)
+    for name, values in whole.items():
+        np.testing.assert_allclose(parts[name], values, rtol=0, atol=1e-7)
+
+
+def test_a_row_without_equilibrium_is_named_by_its_line_in_any_piece(tmp_path, monkeypatch):
+    columns = session(900)
+    log, fitted = parquet_in(tmp_path, columns), tmp_path / "fitted.yaml"
+    assert gapbridge("fit", log, "--cell", cell_in(tmp_path), "--out", fitted).code == 0
+    columns["actual_TCP_force_2"][640] = 1e9
+    log = parquet_in(tmp_path, columns)
+    for _ in ("whole", "pieces"):
+        for command in ("predict", "compensate"):
+            text = refused(command, log, "--cell", fitted, "--out", tmp_path / "new.csv")
+            assert "log.parquet: row 642: the arm finds no equilibrium" in text
+            assert not (tmp_path / "new.csv").exists()
+        monkeypatch.setattr(large_log, "LARGE", 500)
+        monkeypatch.setattr(
+            large_log, "LogPieces", lambda path, n, motions=True: LogPieces(path, n, 200)
+        )
 
 
 def test_a_fault_far_down_a_large_log_names_its_row(tmp_path, monkeypatch):

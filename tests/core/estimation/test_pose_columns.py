@@ -134,3 +134,29 @@ def test_a_load_under_which_the_arm_buckles_is_named():
     soft = model.with_compliance([1e-1] * 6, [1e-1] * 6)
     with pytest.raises(InputError, match="row 1: the arm finds no equilibrium"):
         pose_columns(soft, q, loads, [(0, 0)], np.array([1e-5]))
+
+
+def test_positions_alone_and_coarser_columns_are_the_same_within_what_was_asked():
+    model, (q, loads) = deflected(["joint_offset", "payload"]), situation(COUNT)
+    for effects in (["axial_compliance"], ["joint_offset", "tool_frame", "payload"]):
+        places, scales = every(model, effects)
+        whole = pose_columns(model, q, loads, places, scales)
+        some = pose_columns(model, q, loads, places, scales, coordinates=3, converged=1e-7)
+        assert some.jacobian.shape == (3, len(places), COUNT)
+        scale = np.abs(whole.jacobian[:3]).max(axis=(0, 2))[:, None]
+        assert (np.abs(some.jacobian - whole.jacobian[:3]) / scale).max() < 1e-6
+        np.testing.assert_array_equal(some.poses.position, whole.poses.position)
+
+
+def test_where_the_target_slips_once_rows_before_it_keep_their_poses():
+    (site,) = CATALOGUE["target_slip"].sites(builtin_arm("ur10e"))
+    model, (q, loads) = deflected(["joint_offset"]), situation(8)
+    count = len(CATALOGUE["target_slip"].parameters(model.arm, site)) - 1
+    model = model.with_terms([Term("target_slip", site, (*(2e-3,) * count, 4.5))])
+    loads = replace(loads, time=np.arange(8.0))
+    places, scales = every(model, ["joint_offset"])
+    found = pose_columns(model, q, loads, places, 0.01 * scales)
+    np.testing.assert_array_equal(found.poses.position, model.predict(q, loads).position)
+    for c, (t, k) in enumerate(places):
+        expected = difference(model, q, loads, t, k, 0.05 * scales[c])
+        assert np.abs(found.jacobian[:, c] - expected).max() < 1e-6 * np.abs(expected).max()

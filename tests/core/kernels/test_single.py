@@ -37,7 +37,7 @@ def path(count: int = 60) -> np.ndarray:
 
 def test_each_correction_along_a_path_is_that_of_the_general_way():
     one, other = Compensator(deflected()), Compensator(deflected())
-    other._stiff_links = False
+    other._plain = False
     rng = np.random.default_rng(0)
     for q in path():
         loads = Loads(wrench=rng.normal(0, 30, (1, 6)))
@@ -52,7 +52,7 @@ def test_each_correction_along_a_path_is_that_of_the_general_way():
 )
 def test_singular_poses_and_no_numbers_go_the_same_way(q):
     one, other = Compensator(deflected()), Compensator(deflected())
-    other._stiff_links = False
+    other._plain = False
     quick, general = one.correct(q), other.correct(q)
     np.testing.assert_allclose(quick.q, general.q, rtol=0, atol=1e-9)
     np.testing.assert_allclose(quick.residual, general.residual, rtol=1e-6, atol=1e-9)
