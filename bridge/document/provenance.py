@@ -62,13 +62,19 @@ def _argument(value: Any) -> str:
 
 
 def fitted(
-    origin: dict[str, Any], ranges: Mapping[str, tuple[float, float]], spread: Spread
-) -> dict[str, Any]:
-    """Return the provenance of a cell: with what its model was fitted on, and its covariance."""
+    origin: dict[str, Any], ranges: Mapping[str, tuple[float, float]], spread: Spread,
+    causes: Sequence[Mapping[str, Any]] = (),
+) -> dict[str, Any]:  # fmt: skip
+    """Return the provenance of a cell: with what its model was fitted on, and its covariance.
+
+    ``causes``: what was accused, as the schema of cells has it.
+    """
     listed = {name: [low, high] for name, (low, high) in ranges.items()}
     result = {**origin, "fitted": listed}
     if spread.names:
         result |= {"parameters": list(spread.names), "covariance": spread.covariance.tolist()}
+    if causes:
+        result["causes"] = [dict(cause) for cause in causes]
     return result
 
 

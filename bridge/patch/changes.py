@@ -6,6 +6,7 @@ without; the rest is what each effect says in a simulator's terms. No effect is 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,7 +88,10 @@ class ModelChanges:
 def changes_of(model: Model) -> ModelChanges:
     """Return what the terms of a model change of its nominal arm; stand-ins are left out."""
     stand_ins = tuple(dict.fromkeys(_named(t) for t in model.terms if t.stand_in))
-    model = model.without_terms().with_terms([t for t in model.terms if not t.stand_in])
+    accused = [t for t in model.terms if not t.stand_in]
+    elsewhere = _not_held([t for t in accused if not CATALOGUE[t.effect].of_the_arm], model)
+    kept = [t for t in accused if CATALOGUE[t.effect].of_the_arm]
+    model = model.without_terms().with_terms(kept)
     nominal, real, arm = model.without_terms().chain(), model.chain(), model.arm
     n = arm.n
     steps = [transform(nominal.rotation[i], nominal.position[i]) for i in range(n + 1)]
@@ -113,7 +117,8 @@ def changes_of(model: Model) -> ModelChanges:
     return ModelChanges(
         model, np.array(frames), shift, frames[-1] @ tool,
         np.linalg.inv(tool) @ shift[n] @ real_tool, real.gravity if turned else None, springs,
-        settings, _not_held(model), tuple(f"{name}: a stand-in, not accused" for name in stand_ins),
+        settings, (*_not_held(kept, model), *elsewhere),
+        tuple(f"{name}: a stand-in, not accused" for name in stand_ins),
     )  # fmt: skip
 
 
@@ -121,12 +126,12 @@ def _named(term: Term) -> str:
     return term.effect + ("" if term.site.joint is None else f" of joint {term.site.joint}")
 
 
-def _not_held(model: Model) -> tuple[tuple[str, str], ...]:
+def _not_held(terms: Sequence[Term], model: Model) -> tuple[tuple[str, str], ...]:
     """Return the effects that are neither in the chain nor anything a simulator knows."""
     found: dict[str, str] = {}
-    for term in model.terms:
+    for term in terms:
         effect = CATALOGUE[term.effect]
-        in_chain = type(effect).shape is not Effect.shape
+        in_chain = effect.of_the_arm and type(effect).shape is not Effect.shape
         if not in_chain and not effect.simulator(term, model.arm):
             found[effect.identifier] = effect.instead
     return tuple(found.items())

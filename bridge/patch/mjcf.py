@@ -23,12 +23,16 @@ from gapbridge.bridge.patch.model_format import (
     named_one,
     pick_joints,
 )
+from gapbridge.core.effects.effect import typical_moment
 from gapbridge.core.effects.simulator import Kind
 from gapbridge.core.errors import InputError
 from gapbridge.core.rotation import rotation_matrix, transform
 
 Array = NDArray[np.float64]
 TAKEN_UP = 0.2  # rad/s2: an arm that slows down no faster leaves its play behind it
+GAUSS = (0.5 - 3**0.5 / 6, 0.5 + 3**0.5 / 6)  # of a length: two points of quadrature
+HEAVY = 1.5  # times a joint's usual moment: up to there a stiffening spring has to hold
+LINEAR = 1  # of an actuator's interp
 SMALL = 1e-6  # kg m2 of a point mass: MuJoCo asks for more than none
 
 
@@ -68,6 +72,21 @@ class Mjcf(ModelFormat):
         comment = ["Patched by gapbridge.", *done.changed, *notes,
                    *(f"not in here: {line}" for line in missing)]  # fmt: skip
         return Patched(scene.text(comment, options.folder), tuple(done.changed), tuple(missing))
+
+
+def _stiffening(c: float, softening: float, most: float) -> tuple[float, float, float]:
+    """Return a spring's polynomial for theta = c M / sqrt(1 + softening M^2), up to ``most`` Nm.
+
+    The law's inverse has no end of odd powers, MuJoCo's spring two of them: linear and cubic. Their
+    factors are those with the least squares of the angle's error.
+    """
+    moment = np.linspace(0.0, most, 200)[1:]
+    root = np.sqrt(1 + softening * moment**2)
+    angle, slope = c * moment / root, c / root**3
+    columns = np.column_stack([angle, angle**3]) * slope[:, None]
+    scale = np.linalg.norm(columns, axis=0)
+    linear, cubic = np.linalg.lstsq(columns / scale, moment * slope, rcond=None)[0] / scale
+    return float(linear), 0.0, float(cubic)
 
 
 class _Patch:
@@ -123,14 +142,16 @@ class _Patch:
             return
         if delay:
             drive.delay = delay + (drive.delay if self.options.on_top else 0.0)
+            drive.interp = LINEAR  # a held command would come whole steps late
             drive.nsample = int(np.ceil(drive.delay / self.scene.spec.option.timestep)) + 1
             self.changed.append(f"actuator of {name}: delay {drive.delay:.6g} s")
         if lag:
             filtered = self.scene.mujoco.mjtDyn.mjDYN_FILTEREXACT
             parameters = np.array(drive.dynprm)
             given = parameters[0] if drive.dyntype == filtered and self.options.on_top else 0.0
-            parameters[0] = lag + given
-            drive.dyntype, drive.dynprm = filtered, parameters
+            # sampled, the filter answers half a step earlier than its time constant says
+            parameters[0] = lag + (given or self.scene.spec.option.timestep / 2)
+            drive.dyntype, drive.dynprm, drive.actearly = filtered, parameters, 1
             self.changed.append(f"actuator of {name}: timeconst {parameters[0]:.6g} s")
         if droop:
             self._soften(drive, droop)
@@ -158,8 +179,9 @@ class _Patch:
                 continue
             stiffness: tuple[float, ...] = (1 / c,)
             if k == 2 and softening > 0:
-                # the inverse of theta = c M / sqrt(1 + M^2 s) is M = theta/c (1 + theta^2 s / 2c^2)
-                stiffness = (1 / c, 0.0, softening / (2 * c**3))
+                stiffness = _stiffening(
+                    c, softening, HEAVY * typical_moment(self.changes.model.arm)
+                )
             inertia = self.scene.inertia_about(name, axes[:, k])
             self._behind(name, label, axes[:, k], stiffness=stiffness, inertia=inertia)
             self.changed.append(f"joint {name}_{label}: stiffness {1 / c:.6g} Nm/rad")
@@ -219,26 +241,32 @@ class _Patch:
             self.scene.put_before(first, "base_compliance", hinges)
 
     def links(self) -> None:
-        """Let links bend: two hinges across the link at a third of its length, 4 EI / 3 L each."""
+        """Let links bend: two pairs of hinges across the link, each of 2 EI / L.
+
+        At the two Gauss points of its length, so that shift and slope of its end are those of the
+        cantilever, for a force and for a moment.
+        """
         for i, flexibility in enumerate(self.changes.springs.link[:-1]):
             root, end = self.joint_in_world(i + 1)[:3, 3], self.joint_in_world(i + 2)[:3, 3]
             length = float(np.linalg.norm(end - root))
             if flexibility <= 0 or length == 0:
                 continue
-            along = (end - root) / length
             body = self.scene.body_of(self.names[i + 1])
-            point = root + along * length / 3
-            across = np.linalg.svd(along[None])[2][1:]
-            stiffness = 4 / (3 * length * flexibility)
+            stiffness = 2 / (length * flexibility)
             name = f"{self.names[i]}_link_flexibility"
-            self.scene.put_before(body, name, [
-                Hinge(f"{name}_{k + 1}", self.scene.point_in(body, point),
-                      self.scene.in_body(body, axis), (stiffness,),
-                      self.scene.inertia_about(self.names[i + 1], axis, point))
-                for k, axis in enumerate(across)
-            ])  # fmt: skip
-            self.changed.append(f"joints {name}_1, _2: stiffness {stiffness:.6g} Nm/rad across "
-                                "the link, at a third of its length")  # fmt: skip
+            hinges = []
+            for share in GAUSS:
+                point = root + share * (end - root)
+                for axis in np.linalg.svd((end - root)[None])[2][1:]:
+                    inertia = self.scene.inertia_about(self.names[i + 1], axis, point)
+                    hinges.append(Hinge(
+                        f"{name}_{len(hinges) + 1}", self.scene.point_in(body, point),
+                        self.scene.in_body(body, axis), (stiffness,), inertia,
+                    ))  # fmt: skip
+            self.scene.put_before(body, name, hinges)
+            self.changed.append(
+                f"joints {name}_1 to _4: stiffness {stiffness:.6g} Nm/rad across the link"
+            )
 
     def tool(self) -> None:
         """Move the TCP's site."""
@@ -338,4 +366,5 @@ class _Patch:
             lines.append(
                 f"gravcomp of {', '.join(lifted)} takes out what springs and servos give way"
             )
-        return lines + [f"{name}: {text}" for name, text in self.changes.not_held]
+        lines += [f"{name}: {text}" for name, text in self.changes.not_held]
+        return [*lines, *self.changes.left_out]

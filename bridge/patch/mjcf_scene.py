@@ -41,10 +41,13 @@ class Hinge:
     inertia: float = 0.0  # kg m2 that swings on the spring, for its damping
     half_range: float = 0.0  # rad to each side, 0 where it is not limited
 
-    def element(self) -> ElementTree.Element:
-        """Return the <joint>, every attribute written: a model's classes give others."""
+    def element(self, timestep: float) -> ElementTree.Element:
+        """Return the <joint>, every attribute written: a model's classes give others.
+
+        A spring too stiff for the time step is damped as much as its integration needs.
+        """
         stiffness = self.stiffness or (0.0,)
-        damping = 2 * DAMPING * np.sqrt(self.inertia * stiffness[0])
+        damping = max(2 * DAMPING * np.sqrt(self.inertia * stiffness[0]), timestep * stiffness[0])
         half = self.half_range
         joint = ElementTree.Element(
             "joint", name=self.name, type="hinge", pos=numbers(self.point),
@@ -203,15 +206,16 @@ class Scene:
         self.spec.comment = ""
         self.spec.compile()
         root = ElementTree.fromstring(self.spec.to_xml())
+        timestep = float(self.spec.option.timestep)
         text = "\n".join(comment).replace("--", "- -")
         root.insert(0, ElementTree.Comment(f" {text} "))
         for joint, hinges in self._behind.items():
             body, own = _in_body(root, _named(root, "joint", joint))
             place = list(body).index(own) + 1
             for k, hinge in enumerate(hinges):
-                body.insert(place + k, hinge.element())
+                body.insert(place + k, hinge.element(timestep))
         for name, (wrapper, hinges) in self._before.items():
-            _put_before(root, name, wrapper, hinges)
+            _put_before(root, name, wrapper, [hinge.element(timestep) for hinge in hinges])
         for (tag, name), frame in self._placed.items():
             carrier = self._before[name][0] if tag == "body" and name in self._before else name
             _write_frame(root, tag, carrier, frame)
@@ -269,7 +273,7 @@ def _frame_of(element: ElementTree.Element) -> Array:
 
 
 def _put_before(
-    root: ElementTree.Element, name: str, wrapper: str, hinges: Sequence[Hinge]
+    root: ElementTree.Element, name: str, wrapper: str, hinges: Sequence[ElementTree.Element]
 ) -> None:
     body = _named(root, "body", name)
     parent = next(e for e in root.iter() if body in list(e))
@@ -279,10 +283,10 @@ def _put_before(
             new.set(key, body.attrib[key])
             if key in PLACED:
                 del body.attrib[key]
-    point = np.mean([hinge.point for hinge in hinges], axis=0)
+    point = np.array(hinges[0].attrib["pos"].split(), dtype=float)
     inertial = {"pos": point, "mass": WRAPPER_MASS, "diaginertia": [WRAPPER_MASS] * 3}
     ElementTree.SubElement(new, "inertial", {k: numbers(v) for k, v in inertial.items()})
-    new.extend([hinge.element() for hinge in hinges])
+    new.extend(hinges)
     place = list(parent).index(body)
     parent.remove(body)
     new.append(body)

@@ -31,6 +31,8 @@ INSTEAD = {
     Kind.SERVO_COMPLIANCE: "gain of the servo: in the controller's settings",
     Kind.PLAY: "play: SDF or MJCF with a second, limited joint",
     Kind.PAYLOAD: "load: change the inertial of the link that carries it",
+    Kind.PAYLOAD_COG: "load: move the centre of the inertial of the link that carries it",
+    Kind.SENSOR_TURN: "sensor's frame: turn the fixed joint of its link, or its readings",
 }
 
 
@@ -241,4 +243,5 @@ def _springs(changes: ModelChanges) -> list[str]:
 def _settings(changes: ModelChanges) -> list[str]:
     kinds = {setting.kind for setting in changes.settings}
     own = [text for kind, text in INSTEAD.items() if kind in kinds]
-    return own + [f"{name}: {instead}" for name, instead in changes.not_held]
+    own += [f"{name}: {instead}" for name, instead in changes.not_held]
+    return [*own, *changes.left_out]

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.patch.arms import BASE_AT, BASE_TURN, UR_JOINTS, mjcf
 from gapbridge.core.arm import builtin_arm
-from tests.bridge.patch.arms_written import BASE_AT, BASE_TURN, UR_JOINTS, mjcf
 
 mujoco = pytest.importorskip("mujoco")
 

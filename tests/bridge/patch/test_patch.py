@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.patch.arms import BASE_AT, BASE_TURN, UR_JOINTS, mjcf, urdf
 from gapbridge.bridge.patch import PatchOptions, changes_of, format_of
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import InputError
 from gapbridge.core.model import Model
-from tests.bridge.patch.arms_written import BASE_AT, BASE_TURN, UR_JOINTS, mjcf, urdf
 
 mujoco = pytest.importorskip("mujoco")
 pinocchio = pytest.importorskip("pinocchio")
