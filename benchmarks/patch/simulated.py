@@ -16,8 +16,8 @@ from benchmarks.patch.arms import BASE_AT, BASE_TURN, WrittenArm
 Array = NDArray[np.float64]
 AT_REST = 2e-5  # rad/s
 STEP = 1e-3  # s
-LOGGED = 10  # steps between two rows of a motion
-DURATION = 24.0  # s of a motion
+LOGGED = 20  # steps between two rows of a motion
+DURATION = 14.0  # s of a motion
 AWAY = 0.08  # rad from which a pose is approached
 APPROACH = 2.0  # s that the approach takes
 LOAD_COG = (0.0, 0.0, 0.1)  # m, flange axes

@@ -65,7 +65,7 @@ def predicted_by(channel: str, observe: Observe) -> Observe:
 
 
 def _with_prediction(seen: Observation, values: Array) -> Observation:
-    own, rebase = seen.predict, seen.rebase
+    own, rebase, fewer = seen.predict, seen.rebase, seen.fewer
     nominal = own(())
     base = nominal.copy()
     part = values[seen.rows]
@@ -75,4 +75,5 @@ def _with_prediction(seen: Observation, values: Array) -> Observation:
         return np.asarray(base + (own(terms) - nominal)) if terms else base
 
     moved = None if rebase is None else lambda step: _with_prediction(rebase(step), values)
-    return replace(seen, predict=predict, rebase=moved)
+    thinned = None if fewer is None else lambda take: _with_prediction(fewer(take), values)
+    return replace(seen, predict=predict, rebase=moved, fewer=thinned)
