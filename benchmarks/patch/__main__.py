@@ -9,6 +9,8 @@ from pathlib import Path
 
 from benchmarks.patch.arms import written_arms
 from benchmarks.patch.cases import cases
+from benchmarks.patch.measured import SETS, compared
+from benchmarks.patch.measured import line as line_of_set
 from benchmarks.patch.run import run
 from benchmarks.patch.table import draw, fill_page, line
 
@@ -26,7 +28,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/patch"))
     parser.add_argument("--resume", action="store_true", help="keep results that are there")
     parser.add_argument("--page", action="store_true", help="fill docs/simulators.md, and draw")
+    parser.add_argument(
+        "--urdf", action="store_true", help="instead: measured arms into URDF (../shared/data)"
+    )
     given = parser.parse_args()
+    if given.urdf:
+        for name in SETS:
+            print(line_of_set(compared(name, given.out / "urdf" / name)), flush=True)
+        return
     results = []
     for name in given.arms.split(","):
         for case in cases(arms[name]):

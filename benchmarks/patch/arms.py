@@ -153,8 +153,11 @@ def bent(along: np.ndarray, flexibility: float) -> str:
     return text
 
 
-def urdf(arm: Arm, names: tuple[str, ...], tcp: float = 0.1) -> str:
-    """Return a URDF whose link frames are not the joints' DH frames, with comments in it."""
+def urdf(arm: Arm, names: tuple[str, ...], tcp: float | np.ndarray = 0.1) -> str:
+    """Return a URDF whose link frames are not the joints' DH frames, with comments in it.
+
+    ``tcp``: along z of the flange, or its place there (3,).
+    """
     turns = frame_turns(arm.n)
     turn = Rotation.from_matrix(arm.link_in_link[0][:3, :3])
     at = arm.link_in_link[0][:3, 3]
@@ -177,7 +180,7 @@ def urdf(arm: Arm, names: tuple[str, ...], tcp: float = 0.1) -> str:
         nxt = arm.link_in_link[i + 1]
         at = turns[i].inv().apply(nxt[:3, 3])
         turn = turns[i].inv() * Rotation.from_matrix(nxt[:3, :3])
-    at = at + turn.apply([0, 0, tcp])
+    at = at + turn.apply([0, 0, tcp] if np.ndim(tcp) == 0 else tcp)
     text += (
         f'  <joint name="tool_joint" type="fixed">\n'
         f'    <origin xyz="{numbers(at)}" rpy="{numbers(turn.as_euler("xyz"))}"/>\n'

@@ -27,7 +27,12 @@ def open_log(path: Path, cell: Cell) -> Log:
     if source is None:
         log = read_log(path, cell.arm.n)
     else:
-        converted = source.read(path, joint_names(cell), SourceOptions())
+        try:
+            converted = source.read(path, joint_names(cell), SourceOptions())
+        except LogError as error:
+            if "--" not in str(error):
+                raise
+            raise LogError(f"{error} (options of gapbridge convert)") from None
         for note in converted.notes:
             click.echo(f"note: {path}: {note}", err=True)
         log = converted.log(path, cell.arm.n)
