@@ -2,7 +2,7 @@
 
 The log is diagnosed, what was found is patched into a URDF of the nominal arm, and Pinocchio's
 TCP at every measured pose is held against the product's own prediction. What a URDF cannot hold
-(flexibility) is left out of both.
+(flexibility, a periodic error) is left out of both.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 
 from benchmarks.patch.arms import urdf
 from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.patch import changes_of
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.log.log import read_log
 
@@ -54,7 +55,9 @@ def compared(name: str, folder: Path) -> Compared:
     (folder / "nominal.urdf").write_text(urdf(arm, names, tcp=tool))
     printed = _gapbridge(folder, "patch", "nominal.urdf", "--cell", "found.yaml", "--out",
                          "patched.urdf", "--tcp", "tool")  # fmt: skip
-    terms = [t for t in cell.model.terms if not CATALOGUE[t.effect].softens]
+    elsewhere = {effect for effect, _ in changes_of(cell.model).not_held}
+    terms = [t for t in cell.model.terms
+             if not CATALOGUE[t.effect].softens and t.effect not in elsewhere]  # fmt: skip
     rigid = cell.model.without_terms().with_terms(terms)
     q = read_log(folder / "log.csv", arm.n).require("actual_q")
     robot = pinocchio.buildModelFromUrdf(str(folder / "patched.urdf"))

@@ -18,7 +18,6 @@ from benchmarks.patch.arms import WrittenArm, mjcf
 from benchmarks.patch.cases import APPROACHED, DROOP, KP, MOVING, TORQUE, WRENCH, Case
 from benchmarks.patch.simulated import (
     LOAD_COG,
-    LOGGED,
     Plant,
     at_rest,
     in_motion,
@@ -30,6 +29,7 @@ Array = NDArray[np.float64]
 POSES, LOADS, WRITTEN_LOAD = 36, (0.5, 4.0, 8.0), 1.0  # kg
 NOISE = {"measured_position": 2e-5, "actual_q": 1e-5, "actual_current_as_torque": 0.1,
          "ft_raw_wrench": 0.05}  # fmt: skip
+LOGGED = {MOVING: 5, TORQUE: 20}  # steps between two rows of a motion
 BEGIN = 2.5  # s of a motion that are left out: until it has swelled
 CELL = """\
 robot:
@@ -138,11 +138,12 @@ def _log(arm: WrittenArm, case: Case, plant: Plant, path: Path, noisy: bool = Fa
 
 def _motion(arm: WrittenArm, case: Case, plant: Plant) -> dict[str, Array]:
     t, q = motion(arm, seed=4)
-    found = in_motion(arm, plant, WRITTEN_LOAD, q)
-    keep = t[::LOGGED] >= BEGIN
-    columns = {"timestamp": t[::LOGGED][keep]}
+    logged = LOGGED[case.kind]
+    found = in_motion(arm, plant, WRITTEN_LOAD, q, logged)
+    keep = t[::logged] >= BEGIN
+    columns = {"timestamp": t[::logged][keep]}
     if case.kind == MOVING:
-        return {**columns, "target_q": q[::LOGGED][keep], "actual_q": found["actual_q"][keep]}
+        return {**columns, "target_q": q[::logged][keep], "actual_q": found["actual_q"][keep]}
     load = {"payload": np.full(keep.sum(), WRITTEN_LOAD),
             "payload_cog": np.tile(LOAD_COG, (keep.sum(), 1))}  # fmt: skip
     return {**columns, **{name: values[keep] for name, values in found.items()}, **load}

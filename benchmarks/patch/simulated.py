@@ -16,7 +16,6 @@ from benchmarks.patch.arms import BASE_AT, BASE_TURN, WrittenArm
 Array = NDArray[np.float64]
 AT_REST = 2e-5  # rad/s
 STEP = 1e-3  # s
-LOGGED = 20  # steps between two rows of a motion
 DURATION = 14.0  # s of a motion
 AWAY = 0.08  # rad from which a pose is approached
 APPROACH = 2.0  # s that the approach takes
@@ -105,8 +104,10 @@ def motion(arm: WrittenArm, seed: int) -> tuple[Array, Array]:
     return t, q
 
 
-def in_motion(arm: WrittenArm, plant: Plant, load: float, q: Array) -> dict[str, Array]:
-    """Return the log's columns while the commands q (steps, n) are played."""
+def in_motion(
+    arm: WrittenArm, plant: Plant, load: float, q: Array, logged: int
+) -> dict[str, Array]:
+    """Return the log's columns while the commands q (steps, n) are played, every so many steps."""
     model, data = plant.compiled(load)
     at = [model.joint(name).qposadr[0] for name in arm.joints]
     dof = [model.joint(name).dofadr[0] for name in arm.joints]
@@ -118,7 +119,7 @@ def in_motion(arm: WrittenArm, plant: Plant, load: float, q: Array) -> dict[str,
     steps(plant, model, data, 3000)
     rows: dict[str, list[Array]] = {"actual_q": [], "actual_qd": [], "actual_current_as_torque": []}
     for k in range(len(q)):
-        if k % LOGGED == 0:
+        if k % logged == 0:
             mujoco.mj_forward(model, data)
             rows["actual_q"].append(data.qpos[at].copy())
             rows["actual_qd"].append(data.qvel[dof].copy())
