@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.diagnosis.criteria import SMOOTH_PRICE
+from gapbridge.core.diagnosis.criteria import SMOOTH_PENALTY
 from gapbridge.core.diagnosis.residual_structure import basis_of
 from gapbridge.core.diagnosis.selection.candidate import joint_quantity
 from gapbridge.core.diagnosis.selection.selection import Selection
@@ -33,10 +33,10 @@ def bumps(selection: Selection) -> set[int]:
         rest = basis_of(space.columns([c for c in chosen if c not in group]))
         y = space.y - rest @ (rest.T @ space.y)
         basis = basis_of(space.columns(group) - rest @ (rest.T @ space.columns(group)))
-        told = float(space.misfit(np.array(y @ y - np.sum((basis.T @ y) ** 2))))
+        lines_score = float(space.misfit(np.array(y @ y - np.sum((basis.T @ y) ** 2))))
         bump = float(space.misfit(np.array(_best_bump(selection, i, rest, y))))
-        price = 3 * np.log(space.freedom) + 2 * np.log(len(space.candidates)) + SMOOTH_PRICE
-        if bump + price <= told + float(space.price[group].sum()):
+        penalty = 3 * np.log(space.freedom) + 2 * np.log(len(space.candidates)) + SMOOTH_PENALTY
+        if bump + penalty <= lines_score + float(space.penalty[group].sum()):
             found |= set(group)
     return found
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
-from gapbridge.core.diagnosis.criteria import CHANCE, MATTERS
+from gapbridge.core.diagnosis.criteria import CHANCE, MATERIAL_SHARE
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import CATALOGUE, Reported
@@ -55,8 +55,8 @@ def carried(selection: Selection, chosen: Sequence[int], arm: Arm) -> tuple[Carr
 def _compared(
     selection: Selection, own: list[int], rest: list[int], of_row: NDArray[np.int64], arm: Arm
 ) -> Carried | None:
-    space, raw = selection.space, selection.raw
-    columns = raw.columns(space, own)
+    space, unprojected = selection.space, selection.unprojected
+    columns = unprojected.columns(space, own)
     usual = np.concatenate([[p.scale for p in space.candidates[c].parameters] for c in own])
     shown = [
         int(s) for s in np.unique(of_row)
@@ -66,7 +66,7 @@ def _compared(
         return None
     width = columns.shape[1]
     split = np.hstack([columns * (of_row == s)[:, None] for s in shown])
-    beside = np.hstack([raw.columns(space, rest), raw.nuisance])
+    beside = np.hstack([unprojected.columns(space, rest), unprojected.nuisance])
     A = np.hstack([split, beside])
     size = np.sqrt(np.einsum("ij,ij->j", A, A))
     alive = size > DEAD * np.concatenate(
@@ -74,8 +74,8 @@ def _compared(
          size[split.shape[1] :]]
     )  # fmt: skip
     unit = np.where(alive, 1 / np.where(alive, size, 1.0), 0.0)
-    solution, *_ = np.linalg.lstsq(A * unit, raw.target, rcond=1e-9)
-    left = raw.target - (A * unit) @ solution
+    solution, *_ = np.linalg.lstsq(A * unit, unprojected.target, rcond=1e-9)
+    left = unprojected.target - (A * unit) @ solution
     variance = max(float(left @ left) / max(len(left) - A.shape[1], 1), space.floor)
     inverse = np.linalg.pinv((A * unit).T @ (A * unit), rcond=1e-10, hermitian=True)
     own_part = slice(0, split.shape[1])
@@ -89,12 +89,14 @@ def _compared(
         values[:, everywhere], covariance[np.ix_(compared, compared)],
         columns[:, everywhere], of_row, shown,
     )  # fmt: skip
-    told = []
+    reported = []
     for i, s in enumerate(shown):
         block = slice(i * width, (i + 1) * width)
-        told.append((s, _reported(space.candidates, own, values[i], covariance[block, block], arm)))
+        reported.append(
+            (s, _reported(space.candidates, own, values[i], covariance[block, block], arm))
+        )
     effect = space.candidates[own[0]].family
-    return Carried(effect, not (p_value < CHANCE and matters), p_value, tuple(told))
+    return Carried(effect, not (p_value < CHANCE and matters), p_value, tuple(reported))
 
 
 def _differing(
@@ -114,18 +116,18 @@ def _differing(
         [columns[of_row == s] @ (values[i] - mean) for i, s in enumerate(shown)]
     )
     whole = np.concatenate([columns[of_row == s] @ mean for s in shown])
-    return p_value, bool(change @ change > MATTERS**2 * (whole @ whole))
+    return p_value, bool(change @ change > MATERIAL_SHARE**2 * (whole @ whole))
 
 
 def _reported(
     candidates: Sequence[Candidate], own: list[int], x: Array, covariance: Array, arm: Arm
 ) -> tuple[Reported, ...]:
-    told: list[Reported] = []
+    reported: list[Reported] = []
     at = 0
     for c in own:
         candidate = candidates[c]
         d = len(candidate.parameters)
         part = covariance[at : at + d, at : at + d]
-        told += CATALOGUE[candidate.family].reported(arm, candidate.term(x[at : at + d]), part)
+        reported += CATALOGUE[candidate.family].reported(arm, candidate.term(x[at : at + d]), part)
         at += d
-    return tuple(told)
+    return tuple(reported)

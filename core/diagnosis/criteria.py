@@ -9,15 +9,13 @@ checked it.
 from __future__ import annotations
 
 # An accusation beside the unnamed functions that the residual asks for
-SIGMAS = (
-    6.0  # of its value; 4 gives 11 false of 72 unknown alone, 6 to 8 give 7, 12 loses weak ones
-)
+SIGMAS = 6.0  # of its value; 4 gives 11 false of 72 unknown alone, 6 to 8 7, 12 loses weak ones
 SIBLING = 3.0  # at further joints of an effect that stays at one: 7 of 218 true terms lost without
-DRIFT = 1.5  # times: how far its value may move; 2 gives one false more, 1.3 loses real friction
-UNKNOWNS = 6  # unnamed functions asked for at a time: more span the short logs
+MAX_DRIFT = 1.5  # times, of its value: 2 gives one false more, 1.3 loses real friction
+MAX_UNNAMED = 6  # unnamed functions asked for at a time: more span the short logs
 # An accusation by itself
 OWN_SIGMAS = 3.0  # of at least one of its numbers: what an engineer calls a finding
-MINUTE = 1e-3  # of its parameters' usual sizes: the tail of a servo is a dead band of 5e-9 rad
+NEGLIGIBLE = 1e-3  # of its parameters' usual sizes: the tail of a servo is a dead band of 5e-9 rad
 GAIN = 0.0  # lower end of the held-out gain of a cause
 STAND_IN_GAIN = 0.02  # the same of a stand-in, in regions that its fit did not see
 HEAVIEST = 3.0  # times the largest declared payload (or the rated one): a load is not off by more
@@ -25,47 +23,49 @@ HEAVIEST = 3.0  # times the largest declared payload (or the rated one): a load 
 LENGTH, ANGLE = 5e-4, 1e-3  # m, rad: 1 sigma of machining and assembly
 SHARES = (0.2, 1.0)  # of them: a factory calibration leaves a fifth, a kit arm all of it
 FEW_LINKS = 3  # links whose first moments are off singly, from which all are tried as a whole
-CLOSED = 1 / 3  # of the gap in every part not fitted: the Motoman cube keeps 0.20 to 0.29, unknown
+CLOSED_SHARE = (
+    1 / 3
+)  # of the gap in every part not fitted: the Motoman cube keeps 0.20 to 0.29, unknown
 # causes 0.42 at least in some part, nearly always all of the gap
-GEOMETRIC = 2  # geometric causes from which all links are tried as a whole
+MIN_GEOMETRIC_CAUSES = 2  # geometric causes from which all links are tried as a whole
 # A residual with structure
-SURE = 0.002  # probability below which it is sure, times one more than the causes beside it
-HINT = 0.05  # the same where the search needed an unnamed function or an accusation has fallen
-STATED = 1.5  # times the stated noise: beyond, more than noise is left
-REPEATED = 1.6  # times the scatter of repeated poses
+SURE_P = 0.002  # probability below which it is sure, times one more than the causes beside it
+HINT_P = 0.05  # the same where the search needed an unnamed function or an accusation has fallen
+OVER_STATED_NOISE = 1.5  # times the stated noise: beyond, more than noise is left
+OVER_REPEAT_SCATTER = 1.6  # times the scatter of repeated poses
 ENOUGH_REPEATS = 30  # degrees of freedom from which repeats are a measure of the noise
-USUAL = 1.2e-4  # m, one coordinate: a worse repeatability than that is none
-INSTRUMENTS = 5.0  # times the instrument's sigma, for coarse instruments
+USUAL_REPEATABILITY = 1.2e-4  # m, one coordinate: a worse repeatability than that is none
+OVER_INSTRUMENT_SIGMA = 5.0  # times the instrument's sigma, for coarse instruments
 # Ties
-TIE = 7.0  # score within which another explanation counts as equally good
-BENT = 10.8  # gain in -2 log likelihood of a bent stiffness curve over a straight one
-SAME = 1e-4  # of a cause's squares, left by another that does all it does: equal but for rounding
+TIE_SCORE = 7.0  # score within which another explanation counts as equally good
+CURVATURE_GAIN = 10.8  # in -2 log likelihood, of a nonlinear stiffness over a linear one
+SAME_SPAN = 1e-4  # of a cause's squares left by another that does all it does: rounding
 # The search: what a hypothesis costs. These hold together; the blind tables of docs/evidence.md
 # are what supports them as a whole, none was measured by itself
-MARGIN = 6.0  # score that every accusation pays: keeps clean logs clean
-SMOOTH_PRICE = 18.0  # the same of an unnamed function beyond a named cause
-UNITED = 10.0  # score by which one cause is preferred that does the work of three
-GATHERED = 4.0  # score that one kind of effect at two places may cost beyond two kinds
-UNSEEN = 3.0  # score that play pays in a log without reversals: it stands behind the plain offset
-LINES = 4  # periodic lines a joint may have: more are the Fourier series of something else
-SMOOTH_TERMS = 2  # unnamed functions of a set: more add nothing
-LARGE = 450  # rows of the sample space from which many causes are looked for, one by one
+ACCUSATION_PENALTY = 6.0  # score that every accusation pays: keeps clean logs clean
+SMOOTH_PENALTY = 18.0  # the same of an unnamed function beyond a named cause
+SINGLE_CAUSE_PREFERENCE = 10.0  # score by which one cause is preferred that does the work of three
+FAMILY_PENALTY = 4.0  # score that one kind of effect at two places may cost beyond two kinds
+NO_REVERSAL_PENALTY = 3.0  # of play in a log without reversals: it stands behind the offset
+MAX_LINES = 4  # periodic lines a joint may have: more are the Fourier series of something else
+MAX_SMOOTH_TERMS = 2  # unnamed functions of a set: more add nothing
+LARGE_SAMPLE = 450  # rows of the sample space from which many causes are looked for, one by one
 # Sizes of an arm, by what Effect.parameters calls usual
-ABSURD = 200.0  # times the usual size: beyond, a fit is no explanation
-SHARP = 6000.0  # times the usual softening of a stiffness curve
-WEAK = 100.0  # times the usual size: how far the data may take a number against nothing
-OPEN = 30.0  # times the usual size: with a wider spread nothing is known of a number
+MAX_TIMES_USUAL = 200.0  # times the usual size: beyond, a fit is no explanation
+MAX_SOFTENING = 6000.0  # times the usual softening of a stiffness curve
+PRIOR_REACH = 100.0  # times the usual size: how far the data may take a number against nothing
+UNDETERMINED = 30.0  # times the usual size: with a wider spread nothing is known of a number
 # Unnamed functions against what they stand beside
-TAKEN = 1e-5  # eigenvalue of unit columns below which a direction is the unnamed functions' own
+DEGENERATE = 1e-5  # eigenvalue of unit columns below which a direction is the unnamed ones
 HELD_WHOLLY = 0.98  # share of an effect's column in an unnamed rival's span that makes it a part
 MOSTLY = 0.9  # share of what the rival takes that has to be this part: a pull nearly down, a weight
 # Noise and outliers
 KNOWN_SHARE = 0.7  # of a stated repeatability, which is an average: less is not assumed
 NOT_WHITE = 0.001  # probability below which the residual of a recording is not white
 EXCESS = 0.5  # times the floor: a correlated part smaller than that changes no answer
-WILD_SHARE = 0.1  # of the samples: more outliers than that are structure, not bad luck
-WILD_SIGMA = 5.0  # from which on a sample is an outlier
-FORETOLD = 0.5  # share of an outlier that may be left where something else explains it
+OUTLIER_SHARE = 0.1  # of the samples: more outliers than that are structure, not bad luck
+OUTLIER_SIGMA = 5.0  # from which on a sample is an outlier
+UNPREDICTED_SHARE = 0.5  # share of an outlier that may be left where something else explains it
 # Several sessions
 CHANCE = 0.001  # probability below which the values of sessions differ by more than chance
-MATTERS = 0.2  # share of a cause's size: sessions that differ by less are alike for a model
+MATERIAL_SHARE = 0.2  # share of a cause's size: sessions that differ by less are alike for a model

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from gapbridge.core.diagnosis.carrying import Carried, carried
 from gapbridge.core.diagnosis.channels import position, torque, tracking, wrench
 from gapbridge.core.diagnosis.channels.simulation import joined, predicted_by
-from gapbridge.core.diagnosis.every_row import on_every_row, still_accused, with_vague
+from gapbridge.core.diagnosis.every_row import on_every_row, still_accused, with_uncertain_terms
 from gapbridge.core.diagnosis.generalisation import NOWHERE, Generalisation, generalisation
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import (
@@ -31,7 +31,7 @@ from gapbridge.core.diagnosis.residual_structure import dependence
 from gapbridge.core.diagnosis.result import Cause, Considered, causes_of, considered_of
 from gapbridge.core.diagnosis.rigid_suspicion import softness_findings
 from gapbridge.core.diagnosis.selection.moments import slip_sentences
-from gapbridge.core.diagnosis.selection.selection import Selection, select, standing
+from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone, select
 from gapbridge.core.diagnosis.separation import Measurement, next_measurements
 from gapbridge.core.effects import CATALOGUE, Term, flexibility_effects
 from gapbridge.core.errors import LogError
@@ -138,7 +138,7 @@ def _diagnose(
     simulated: Log | None,
 ) -> Diagnosis:  # fmt: skip
     check_units(model, log)
-    told = _log_findings(model, log, metrology)
+    notes = _log_findings(model, log, metrology)
     observed: list[ChannelDiagnosis] = []
     hidden: list[NotObservable] = []
     if simulated is not None:
@@ -151,14 +151,14 @@ def _diagnose(
             continue
         whole = seen
         if len(seen.rows) > MOST[seen.channel]:
-            told.append(
+            notes.append(
                 f"{seen.channel}: causes were searched on {MOST[seen.channel]} of "
                 f"{len(seen.rows)} rows, evenly taken; fitted and judged on all of them"
             )
             seen = _thinned(seen, model, log, metrology, observe)
         enough = _enough(seen)
         if enough is not None:
-            told.append(enough)
+            notes.append(enough)
             hidden.append(NotObservable(seen.channel, ("more rows",)))
             continue
         observed.append(_channel(seen, whole, model, withhold, progress))
@@ -168,16 +168,16 @@ def _diagnose(
         hint = misspelt(log.unknown, lacking, log.n)
         raise LogError(f"{log.path}: found no channel to diagnose, expected one of: {needs}{hint}")
     for channel in observed:
-        told += _channel_findings(channel, log)
+        notes += _channel_findings(channel, log)
         soft = {*flexibility_effects().values()} - {*withhold}
         if simulated is None and len(soft) == 2 and _lacks_much(channel):
-            told += softness_findings(model, log, metrology)
+            notes += softness_findings(model, log, metrology)
     terms = _for_the_model(observed)
     if not log.one_clock:
         terms = [_slipped(term, log) for term in terms]
     return Diagnosis(
         _overall(observed), tuple(observed), tuple(hidden),
-        next_measurements(model, log, observed), tuple(told), with_found(model, terms),
+        next_measurements(model, log, observed), tuple(notes), with_found(model, terms),
         with_found(model, _and_stand_ins(observed, terms)),
         log.session_names, log.one_clock,
     )  # fmt: skip
@@ -192,13 +192,13 @@ def _log_findings(model: Model, log: Log, metrology: Metrology) -> list[str]:
         own = position.session_model(model, part, metrology)
         for text in findings(part, own, metrology):
             found.setdefault(text, []).append(name)
-    told = [f"session {', '.join(names)}: {text}" for text, names in found.items()]
+    notes = [f"session {', '.join(names)}: {text}" for text, names in found.items()]
     if not log.one_clock:
-        told.append(
+        notes.append(
             "the sessions' timestamps overlap: each has a clock of its own, so nothing is said of "
             "the time between them"
         )
-    return told + outside_findings(log)
+    return notes + outside_findings(log)
 
 
 def _thinned(
@@ -278,7 +278,7 @@ def _channel(
     if whole is not seen:
         if progress:
             progress(f"{seen.channel}: all {len(whole.rows)} rows")
-        verdict = with_vague(verdict)
+        verdict = with_uncertain_terms(verdict)
         selection = on_every_row(searched, verdict, whole, model)
         held = HeldOut(selection)
         selection, verdict = still_accused(selection, verdict, held, model)
@@ -337,11 +337,11 @@ def _stood_in(
     if not verdict.stand_ins:
         return {}
     both = (*verdict.accused, *verdict.stand_ins)
-    along = standing(selection, model.arm, both)
-    told = replace(verdict, accused=both, ties={})
+    along = refitted_alone(selection, model.arm, both)
+    notes = replace(verdict, accused=both, ties={})
     marked = [replace(along.terms[p], stand_in=p in verdict.stand_ins) for p in both]
     return {
-        "stand_ins": causes_of(along, told, held, model.arm, verdict.stand_ins),
+        "stand_ins": causes_of(along, notes, held, model.arm, verdict.stand_ins),
         "along": tuple(marked),
     }
 
@@ -397,24 +397,24 @@ def _line_of(log: Log, row: int) -> str:
 
 
 def _channel_findings(channel: ChannelDiagnosis, log: Log) -> list[str]:
-    told = []
-    wild = channel.selection.observation.rows[~channel.selection.kept]
-    if len(wild):
-        rows = ", ".join(_line_of(log, int(r)) for r in wild[:8])
-        told.append(
-            f"{channel.channel}: {len(wild)} outlier(s) excluded (row {rows}"
-            f"{', ...' if len(wild) > 8 else ''} of the file)"
+    notes = []
+    outliers = channel.selection.observation.rows[~channel.selection.kept]
+    if len(outliers):
+        rows = ", ".join(_line_of(log, int(r)) for r in outliers[:8])
+        notes.append(
+            f"{channel.channel}: {len(outliers)} outlier(s) excluded (row {rows}"
+            f"{', ...' if len(outliers) > 8 else ''} of the file)"
         )
     for position_, reason in channel.judgement.withdrawn:
         term = channel.selection.terms[position_]
         joint = f" of joint {term.site.joint}" if term.site.joint else ""
-        told.append(f"{channel.channel}: {term.effect}{joint} is not accused: {reason}")
+        notes.append(f"{channel.channel}: {term.effect}{joint} is not accused: {reason}")
         if position_ in channel.judgement.stand_ins:
-            told[-1] += "; poses not fitted gain by it: a stand-in"
+            notes[-1] += "; poses not fitted gain by it: a stand-in"
     terms = [term for cause in channel.causes for term in cause.terms]
     whole = channel.verdict == "explained"
     sentences = slip_sentences(terms, channel.selection.observation, whole)
-    told += [f"{channel.channel}: {sentence}" for sentence in sentences]
+    notes += [f"{channel.channel}: {sentence}" for sentence in sentences]
     for cause in channel.causes:
-        told += [f"{channel.channel}: {note}" for note in cause.notes]
-    return told
+        notes += [f"{channel.channel}: {note}" for note in cause.notes]
+    return notes

@@ -15,7 +15,7 @@ SCHEMA = "gapbridge.diagnosis/1"
 
 def document(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the diagnosis as JSON-ready values; a figure that cannot be had is None."""
-    told: dict[str, Any] = {
+    values: dict[str, Any] = {
         "schema": SCHEMA,
         "verdict": diagnosis.verdict,
         "channels": [_channel(c, diagnosis) for c in diagnosis.channels],
@@ -37,7 +37,7 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
         "findings": list(diagnosis.findings),
         "sessions": list(diagnosis.sessions),
     }
-    cleaned: dict[str, Any] = _finite(told)
+    cleaned: dict[str, Any] = _finite(values)
     return cleaned
 
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.diagnosis.criteria import OWN_SIGMAS, SIGMAS, TIE
+from gapbridge.core.diagnosis.criteria import OWN_SIGMAS, SIGMAS, TIE_SCORE
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import VAGUE, Judgement
 from gapbridge.core.diagnosis.observation import Observation
@@ -25,8 +25,8 @@ from gapbridge.core.diagnosis.selection.noise import carried_to
 from gapbridge.core.diagnosis.selection.outliers import inliers
 from gapbridge.core.diagnosis.selection.problem import fit
 from gapbridge.core.diagnosis.selection.refit import Remainder, refit, worth
-from gapbridge.core.diagnosis.selection.selection import Selection, standing
-from gapbridge.core.diagnosis.selection.state import Work, sample_space
+from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
+from gapbridge.core.diagnosis.selection.state import SelectionState, sample_space
 from gapbridge.core.effects import Term
 from gapbridge.core.model import Model
 
@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 MOST_RIVALS = 12  # of all causes together
 
 
-def with_vague(judgement: Judgement) -> Judgement:
+def with_uncertain_terms(judgement: Judgement) -> Judgement:
     """Return the judgement with what was too vague on some rows accused: all rows decide on it."""
     vague = tuple(p for p, why in judgement.withdrawn if why == VAGUE)
     return replace(
@@ -60,25 +60,27 @@ def on_every_row(
     terms = tuple(selection.terms[p] for p in accused)
     placed = _placed(whole, terms)
     noise = carried_to(placed, selection.noise)
-    work = Work(placed, model.arm, candidates, noise, np.ones(len(placed.rows), dtype=bool))
-    work.kept = inliers(work, placed.measured - placed.predict(terms))
+    state = SelectionState(
+        placed, model.arm, candidates, noise, np.ones(len(placed.rows), dtype=bool)
+    )
+    state.kept = inliers(state, placed.measured - placed.predict(terms))
     columns = [exact_columns(placed, c, terms) for c in candidates]
-    space, raw = sample_space(work, columns, terms, [])
+    space, unprojected = sample_space(state, columns, terms, [])
     links = {p: selection.prior[c] for p, c in enumerate(selection.term_index)
              if c in selection.prior and p in accused}  # fmt: skip
     near = links_of(space, links).beside(space, links) if links else space
     found = fit(near, tuple(p for p in accused if p not in links))
     remainder = None
     if judgement.remainder is not None:
-        region = np.repeat(regions(placed, work.kept), placed.measured.shape[1])
+        region = np.repeat(regions(placed, state.kept), placed.measured.shape[1])
         remainder = Remainder(np.zeros((len(region), 0)), np.zeros(0), region)
-    fitted, index, spread, residual = refit(work, space, found, links, remainder)
+    fitted, index, spread, residual = refit(state, space, found, links, remainder)
     values, covariance = list(selection.terms), list(selection.covariance)
     for c, term, own in zip(index, fitted, spread, strict=True):
         values[c], covariance[c] = term, own
     return Selection(
-        work.observation, space, found, tuple(values), tuple(range(len(values))),
-        tuple(covariance), work.kept, noise, residual, terms, raw, links,
+        state.observation, space, found, tuple(values), tuple(range(len(values))),
+        tuple(covariance), state.kept, noise, residual, terms, unprojected, links,
     )  # fmt: skip
 
 
@@ -139,7 +141,7 @@ def _sure(selection: Selection, judgement: Judgement, model: Model) -> tuple[Sel
 
 def _alone(selection: Selection, accused: Sequence[int], model: Model) -> Selection:
     """Return the selection on all rows with some of its terms refitted as all there is."""
-    whole = standing(selection, model.arm, accused)
+    whole = refitted_alone(selection, model.arm, accused)
     links = {p: own for p, own in selection.prior.items() if p in accused}
     whole = replace(whole, prior=links)
     single = tuple(p for p in accused if p not in links)
@@ -150,7 +152,7 @@ def _ties(selection: Selection, position: int) -> tuple[str, ...]:
     own = selection.terms[position].effect
     names = (
         selection.space.candidates[other].family
-        for _, other in rivals(selection.working, selection.found, position, TIE)
+        for _, other in rivals(selection.working, selection.found, position, TIE_SCORE)
     )
     return tuple(dict.fromkeys(name for name in names if name != own))
 
@@ -162,7 +164,7 @@ def _rivals(selection: Selection, accused: Sequence[int]) -> list[Candidate]:
     for p in accused:
         if selection.term_index[p] in selection.prior:
             continue
-        for score, other in rivals(space, selection.found, selection.term_index[p], TIE):
+        for score, other in rivals(space, selection.found, selection.term_index[p], TIE_SCORE):
             if space.candidates[other].named and other not in selection.term_index:
                 near[other] = min(score, near.get(other, np.inf))
     best = sorted(near, key=lambda c: near[c])[:MOST_RIVALS]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.diagnosis.criteria import WEAK
+from gapbridge.core.diagnosis.criteria import PRIOR_REACH
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.estimation.regions import joint_regions
@@ -61,13 +61,13 @@ class _Problem:
         self._own = min(self._k, 3) if observation.channel == "position" else self._k
         self._weight = observation.weight[: self._own]
         self._unwhiten = np.linalg.inv(selection.noise.whitener[kept])
-        raw = selection.raw
-        self._causes = raw.columns(selection.space, chosen)
+        unprojected = selection.unprojected
+        self._causes = unprojected.columns(selection.space, chosen)
         usual = [p.scale for c in chosen for p in selection.space.candidates[c].parameters]
-        weak = 1 / (WEAK * np.array(usual)) if usual else np.zeros(0)
+        weak = 1 / (PRIOR_REACH * np.array(usual)) if usual else np.zeros(0)
         self._hold = np.maximum(selection.pull(chosen), weak)
-        self._nuisance, self._gap = raw.nuisance, raw.target
-        self._owner = np.array(observation.nuisance_session or (0,) * raw.nuisance.shape[1])
+        self._nuisance, self._gap = unprojected.nuisance, unprojected.target
+        self._owner = np.array(observation.nuisance_session or (0,) * unprojected.nuisance.shape[1])
         whole = observation.session
         self._session = np.zeros(int(kept.sum()), dtype=np.int64) if whole is None else whole[kept]
         self._fold, self._near = regions(observation, kept)

@@ -36,8 +36,8 @@ class HeldOut:
         self, selection: Selection, seed: int = 0, parts: NDArray[np.int64] | None = None
     ) -> None:
         self._space = selection.space
-        self._raw, self._target = selection.raw, selection.raw.target
-        self._nuisance = selection.raw.nuisance
+        self._raw, self._target = selection.unprojected, selection.unprojected.target
+        self._nuisance = selection.unprojected.nuisance
         k = selection.observation.measured.shape[1]
         own = {"position": 3}.get(selection.observation.channel, k)
         # torques of a wrench count in N, as their noise compares: a cause may show in them alone

@@ -19,16 +19,16 @@ from gapbridge.core.diagnosis.bump import bumps
 from gapbridge.core.diagnosis.criteria import (
     ENOUGH_REPEATS,
     GAIN,
-    HINT,
-    INSTRUMENTS,
-    MINUTE,
-    REPEATED,
-    SAME,
+    HINT_P,
+    NEGLIGIBLE,
+    OVER_INSTRUMENT_SIGMA,
+    OVER_REPEAT_SCATTER,
+    OVER_STATED_NOISE,
+    SAME_SPAN,
     STAND_IN_GAIN,
-    STATED,
-    SURE,
-    TIE,
-    USUAL,
+    SURE_P,
+    TIE_SCORE,
+    USUAL_REPEATABILITY,
 )
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.regions import parts
@@ -43,12 +43,12 @@ from gapbridge.core.diagnosis.residual_structure import (
     dependence,
     structure_p_value,
 )
-from gapbridge.core.diagnosis.selection.bent import not_bent
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.local_search import rivals
-from gapbridge.core.diagnosis.selection.problem import Found, Space
+from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace
 from gapbridge.core.diagnosis.selection.refit import Remainder, worth
-from gapbridge.core.diagnosis.selection.selection import Selection, standing
+from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
+from gapbridge.core.diagnosis.selection.stiffness_curves import without_curvature
 from gapbridge.core.errors import InputError
 
 Array = NDArray[np.float64]
@@ -91,7 +91,7 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
     stays, remainder = withstanding(selection, believed)
     stays += with_the_links(selection, stays, [c for c in believed if c not in stays])
     withdrawn |= {c: BESIDE for c in believed if c not in stays}
-    for c in _without_mass(selection, stays):
+    for c in _without_companion(selection, stays):
         withdrawn[c] = "no load is declared, and none is accused"
         stays.remove(c)
     fallen = bool(withdrawn)
@@ -99,7 +99,7 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
     for c in _gainless(selection, stays, held):
         withdrawn[c] = "it does not shrink the gap on samples that its fit did not see"
         stays.remove(c)
-    judgement = _told(whole, selection, stays, withdrawn, fallen)
+    judgement = _verdict(whole, selection, stays, withdrawn, fallen)
     unknown = judgement.structured or remainder.columns.shape[1] > 0
     return replace(judgement, remainder=remainder if unknown else None)
 
@@ -126,7 +126,7 @@ def judge_geometry(
     return (whole, again) if accused & set(whole.block) else (selection, judgement)
 
 
-def _told(
+def _verdict(
     whole: Selection, selection: Selection, stays: list[int], withdrawn: dict[int, str],
     fallen: bool,
 ) -> Judgement:  # fmt: skip
@@ -139,7 +139,7 @@ def _told(
     unnamed = any(not space.candidates[c].named for c in selection.found.chosen)
     kinds = {space.candidates[c].family for c in stays}
     # the more is accused, the less may be left
-    structured = p_value < (HINT if unnamed or fallen else SURE * (1 + len(kinds)))
+    structured = p_value < (HINT_P if unnamed or fallen else SURE_P * (1 + len(kinds)))
     depends: tuple[tuple[str, float], ...] = ()
     if structured or not stays:
         depends = tuple(dependence(space, nuisance, single, selection.groups))
@@ -154,7 +154,7 @@ def _told(
 def _no_value(selection: Selection) -> dict[int, str]:
     """Return positions of terms that only a bound holds, or whose value may as well be none."""
     found = dict.fromkeys(
-        not_bent(selection.terms, selection.covariance),
+        without_curvature(selection.terms, selection.covariance),
         "its curve cannot be distinguished from a straight line",
     )
     for position, (c, term) in enumerate(zip(selection.term_index, selection.terms, strict=True)):
@@ -170,7 +170,7 @@ def _no_value(selection: Selection) -> dict[int, str]:
             found[position] = VAGUE
         usual = [p.scale for p in candidate.parameters]
         if candidate.curve is None and all(
-            abs(v) < MINUTE * size for v, size in zip(term.values, usual, strict=False)
+            abs(v) < NEGLIGIBLE * size for v, size in zip(term.values, usual, strict=False)
         ):
             found[position] = "its value is too small to matter"
     return found
@@ -183,9 +183,11 @@ def still_sure(selection: Selection, judgement: Judgement, arm: Arm) -> tuple[Se
     stiffness curve straight.
     """
     while True:
-        found = standing(selection, arm, judgement.accused, judgement.remainder)
+        found = refitted_alone(selection, arm, judgement.accused, judgement.remainder)
         single = [p for p in judgement.accused if found.term_index[p] not in found.block]
-        straight = {p for p in not_bent(found.terms, found.covariance) if judgement.remainder}
+        straight = {
+            p for p in without_curvature(found.terms, found.covariance) if judgement.remainder
+        }
         share = [
             0.0 if p in straight else worth(found.terms[p], found.covariance[p]) for p in single
         ]
@@ -199,7 +201,7 @@ def still_sure(selection: Selection, judgement: Judgement, arm: Arm) -> tuple[Se
         )  # fmt: skip
 
 
-def _without_mass(selection: Selection, stays: Sequence[int]) -> list[int]:
+def _without_companion(selection: Selection, stays: Sequence[int]) -> list[int]:
     """Return the candidates that show nothing without an effect that is not accused beside them."""
     own = selection.space.candidates
     families = {"", *(own[c].family for c in stays)}
@@ -276,11 +278,11 @@ def _too_much_left(selection: Selection) -> float:
     variance = float(np.sum(left**2)) / freedom
     pure, repeats = pure_error(left, observation.groups[selection.kept])
     if observation.sigma_is_whole:
-        least, times = observation.sigma**2, STATED
+        least, times = observation.sigma**2, OVER_STATED_NOISE
     elif repeats >= ENOUGH_REPEATS:
-        least, times = max(pure, observation.sigma**2), REPEATED
+        least, times = max(pure, observation.sigma**2), OVER_REPEAT_SCATTER
     else:
-        least, times = max(USUAL, INSTRUMENTS * observation.sigma) ** 2, 1.0
+        least, times = max(USUAL_REPEATABILITY, OVER_INSTRUMENT_SIGMA * observation.sigma) ** 2, 1.0
     if variance <= times**2 * least:
         return 1.0
     return float(gammaincc(freedom / 2, freedom * variance / least / 2))
@@ -300,24 +302,26 @@ def pure_error(left: Array, groups: NDArray[np.int64]) -> tuple[float, int]:
     return total / max(freedom, 1), freedom
 
 
-def _ties(space: Space, found: Found, accused: Sequence[int]) -> dict[int, tuple[str, ...]]:
+def _ties(
+    space: SampleSpace, found: CandidateFit, accused: Sequence[int]
+) -> dict[int, tuple[str, ...]]:
     """Return the effects that would do as well as each accused one, at its place."""
-    told: dict[int, tuple[str, ...]] = {}
+    listed: dict[int, tuple[str, ...]] = {}
     for c in accused:
         own = space.candidates[c].family
-        near = [other for _, other in rivals(space, found, c, TIE)]
+        near = [other for _, other in rivals(space, found, c, TIE_SCORE)]
         names: list[str] = []
-        for other in [*near, *holding(space, found, c)]:
+        for other in [*near, *covering_effects(space, found, c)]:
             family = space.candidates[other].family
             if not space.candidates[other].named or family in (own, *names):
                 continue
             if space.candidates[other].effect.contains != own:  # a curve holds its line: no rival
                 names.append(family)
-        told[c] = tuple(names)
-    return told
+        listed[c] = tuple(names)
+    return listed
 
 
-def holding(space: Space, found: Found, c: int) -> list[int]:
+def covering_effects(space: SampleSpace, found: CandidateFit, c: int) -> list[int]:
     """Return the named effects that do all that a candidate does, and more: nothing decides.
 
     The zero of the last joint is a shift of the tool; it is the simpler guess, and no surer.
@@ -328,15 +332,15 @@ def holding(space: Space, found: Found, c: int) -> list[int]:
     x = space.columns([c])
     x = x - rest @ (rest.T @ x)
     whole = float(np.sum(x**2))
-    told = []
+    listed = []
     for other, k in enumerate(space.candidates):
         if other == c or other in found.chosen or not _geometric(k):
             continue
         U = space.columns([other])
         U = basis_of(U - rest @ (rest.T @ U))
-        if whole > 0 and float(np.sum((x - U @ (U.T @ x)) ** 2)) < SAME * whole:
-            told.append(other)
-    return told
+        if whole > 0 and float(np.sum((x - U @ (U.T @ x)) ** 2)) < SAME_SPAN * whole:
+            listed.append(other)
+    return listed
 
 
 def _geometric(candidate: Candidate) -> bool:

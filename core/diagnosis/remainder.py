@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.criteria import (
-    CLOSED,
-    DRIFT,
+    CLOSED_SHARE,
+    DEGENERATE,
     HELD_WHOLLY,
+    MAX_DRIFT,
+    MAX_UNNAMED,
     MOSTLY,
     SIBLING,
     SIGMAS,
     STAND_IN_GAIN,
-    TAKEN,
-    UNKNOWNS,
 )
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.observation import Observation
@@ -36,7 +36,7 @@ from gapbridge.core.diagnosis.selection.smooth import targets
 
 Array = NDArray[np.float64]
 SHOWN = 0.3  # share of a number that may lie in such directions
-LARGE = 900  # rows of the sample space from which several accusations go at a time
+LARGE_SAMPLE = 900  # rows of the sample space from which several accusations go at a time
 HOPELESS = 0.6  # strength below which they do
 
 
@@ -49,7 +49,7 @@ def withstanding(selection: Selection, believed: Sequence[int]) -> tuple[list[in
         if strength.min() >= 1:
             break
         out = {int(np.argmin(strength))}
-        if len(remainder.space.y) > LARGE:
+        if len(remainder.space.y) > LARGE_SAMPLE:
             worst = np.argsort(strength)[: max(1, len(accused) // 8)]
             out |= {int(i) for i in worst if strength[i] < HOPELESS}
         accused = [c for i, c in enumerate(accused) if i not in out]
@@ -99,7 +99,7 @@ def closes_everywhere(selection: Selection) -> bool:
     count = np.bincount(part)
     left, gap = (np.bincount(part, held.squares(c)) for c in (list(selection.block), ()))
     alive = count > 0
-    return bool(np.all(left[alive] < CLOSED**2 * gap[alive]))
+    return bool(np.all(left[alive] < CLOSED_SHARE**2 * gap[alive]))
 
 
 class _Beside:
@@ -127,9 +127,9 @@ class _Beside:
     def strengths(self, accused: list[int]) -> Array:
         """Return of each accusation how far it is over what it takes to stay (1: just)."""
         # of a large log the functions asked for once stay, so that one more is asked for a round
-        large = len(self.space.y) > LARGE and len(self._asked) >= UNKNOWNS
-        asked = self.beside = self.asked_for(accused, 1 if large else UNKNOWNS)
-        if len(self.space.y) > LARGE:
+        large = len(self.space.y) > LARGE_SAMPLE and len(self._asked) >= MAX_UNNAMED
+        asked = self.beside = self.asked_for(accused, 1 if large else MAX_UNNAMED)
+        if len(self.space.y) > LARGE_SAMPLE:
             self._asked = asked
         value, spread, shown = self._values(accused, *self._beyond(accused, asked))
         found = [self._unit(accused), self.space.columns(self._first), self._zero(accused)]
@@ -149,11 +149,11 @@ class _Beside:
                 continue
             inverse = np.linalg.pinv(spread[np.ix_(own, own)], hermitian=True)
             sigmas.append(float(np.sqrt(max(float(b @ inverse @ b), 0.0) / len(own))))
-            steady.append(min(share * DRIFT, DRIFT / share))
+            steady.append(min(share * MAX_DRIFT, MAX_DRIFT / share))
         return self._with_siblings(accused, np.array(sigmas), np.array(steady))
 
-    def asked_for(self, accused: Sequence[int], most: int = UNKNOWNS) -> list[int]:
-        """Return the unnamed functions that the residual asks for, at the price of chance alone."""
+    def asked_for(self, accused: Sequence[int], most: int = MAX_UNNAMED) -> list[int]:
+        """Return the unnamed functions that the residual asks for, penalised for chance alone."""
         space, asked = self.space, list(self._asked)
         for _ in range(most if len(self._index) else 0):
             zero = self._zero(accused)
@@ -265,8 +265,8 @@ class _Beside:
             A, b, U = X[rows], y[rows], basis_of(beside[rows])
             A, b = A - U @ (U.T @ A), b - U @ (U.T @ b)
             size, V = np.linalg.eigh(A.T @ A)
-            open_ = size > TAKEN
-            inverse = (V * np.where(open_, 1 / np.maximum(size, TAKEN), 0)) @ V.T
+            open_ = size > DEGENERATE
+            inverse = (V * np.where(open_, 1 / np.maximum(size, DEGENERATE), 0)) @ V.T
             x = inverse @ (A.T @ b)
             return x, inverse, (V**2) @ ~open_, float(np.sum((b - A @ x) ** 2))
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.observation import HELD
-from gapbridge.core.diagnosis.selection.problem import Space
+from gapbridge.core.diagnosis.selection.problem import SampleSpace
 
 Array = NDArray[np.float64]
 DRAWS = 1500
@@ -35,7 +35,7 @@ def basis_of(columns: Array) -> Array:
 
 
 def structure_p_value(
-    space: Space,
+    space: SampleSpace,
     nuisance: Array,
     chosen: Sequence[int],
     seed: int = 0,
@@ -75,7 +75,7 @@ def _squares_along(X: Array, columns: NDArray[np.int64], sizes: Array, left: Arr
     return total
 
 
-def _families(space: Space, fitted: Array) -> Iterator[tuple[NDArray[np.int64], Array]]:
+def _families(space: SampleSpace, fitted: Array) -> Iterator[tuple[NDArray[np.int64], Array]]:
     """Yield for every family its columns' places (K,) and their sizes without what is fitted (K,).
 
     What is left has nothing of ``fitted`` in it, so that along the columns it is what it is along
@@ -96,7 +96,7 @@ def _families(space: Space, fitted: Array) -> Iterator[tuple[NDArray[np.int64], 
 
 
 def dependence(
-    space: Space,
+    space: SampleSpace,
     nuisance: Array,
     chosen: Sequence[int],
     groups: NDArray[np.int64],
@@ -146,13 +146,13 @@ def _loads_before_time(ranked: list[tuple[str, float]]) -> list[tuple[str, float
 
 def _one_of_a_kind(ranked: list[tuple[str, float]]) -> list[tuple[str, float]]:
     """Keep only the best joint temperature: they all rise together and crowd out the rest."""
-    told: list[tuple[str, float]] = []
+    kept: list[tuple[str, float]] = []
     for name, share in ranked:
         warm = name.startswith("joint_temperatures_")
-        if warm and any(n.startswith("joint_temperatures_") for n, _ in told):
+        if warm and any(n.startswith("joint_temperatures_") for n, _ in kept):
             continue
-        told.append((name, share))
-    return told
+        kept.append((name, share))
+    return kept
 
 
 def _held_out_shares(columns: Array, r: Array, fold: NDArray[np.int64]) -> Array:

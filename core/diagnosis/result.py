@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
-from gapbridge.core.diagnosis.criteria import OPEN
+from gapbridge.core.diagnosis.criteria import UNDETERMINED
 from gapbridge.core.diagnosis.held_out import HeldOut, Shrink
 from gapbridge.core.diagnosis.judgement import Judgement
-from gapbridge.core.diagnosis.selection.forward import children
-from gapbridge.core.diagnosis.selection.problem import Found, fit
+from gapbridge.core.diagnosis.selection.forward import joining
+from gapbridge.core.diagnosis.selection.problem import CandidateFit, fit
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import CATALOGUE, Reported, Term
 
@@ -87,12 +87,12 @@ def _cause(
     rest = [c for c in everything if c not in own]
     shrink = held.shrink(everything, rest) if held.possible else None
     alone = held.shrink(sorted(own), ()).shrink if held.possible else None
-    told: list[Reported] = []
+    listed: list[Reported] = []
     notes: list[str] = []
     relative = []
     for p in positions:
         term, covariance = selection.terms[p], selection.covariance[p]
-        told += CATALOGUE[effect].reported(arm, term, covariance)
+        listed += CATALOGUE[effect].reported(arm, term, covariance)
         value, deviation = np.array(term.values), np.sqrt(np.maximum(np.diag(covariance), 0))
         size = np.abs(value[: len(deviation)])
         relative.append(float(np.min(deviation / np.maximum(size, 1e-300))))
@@ -101,7 +101,7 @@ def _cause(
                      if t.site.joint is not None})  # fmt: skip
     ties = tuple(dict.fromkeys(n for p in positions for n in judgement.ties.get(p, ())))
     return Cause(
-        effect, tuple(joints), tuple(told), shrink, alone,
+        effect, tuple(joints), tuple(listed), shrink, alone,
         probability(selection, own), ties,
         tuple(selection.terms[p] for p in positions), tuple(relative), tuple(notes),
     )  # fmt: skip
@@ -124,7 +124,7 @@ def _not_shown(effect: str, term: Term, deviation: Array, arm: Arm) -> list[str]
     for parameter, spread in zip(
         CATALOGUE[effect].parameters(arm, term.site), deviation, strict=False
     ):
-        if spread == 0 or spread > OPEN * parameter.scale:
+        if spread == 0 or spread > UNDETERMINED * parameter.scale:
             name = CATALOGUE[effect].label(term.site, parameter)
             notes.append(f"{name} is not identifiable from these data: others can stand in for it")
     return notes
@@ -138,7 +138,7 @@ def probability(selection: Selection, own: set[int]) -> float:
     rest = fit(space, tuple(c for c in found.chosen if c not in own))
     best = rest.score
     families = {space.candidates[c].family for c in own}
-    for score, c in children(space, rest.chosen, 12):
+    for score, c in joining(space, rest.chosen, 12):
         if space.candidates[c].family not in families:
             best = min(best, score)
     odds = np.exp(-0.5 * min(max(best - found.score, 0.0), 700.0))
@@ -157,7 +157,7 @@ def considered_of(
     )
     base = fit(space, kept)
     reasons = {selection.terms[p].effect: why for p, why in judgement.withdrawn}
-    told = []
+    listed = []
     for identifier, effect in CATALOGUE.items():
         if channel not in effect.channels or identifier in accused or identifier in withhold:
             continue
@@ -166,7 +166,7 @@ def considered_of(
         excited = any(_shown(selection, c) for c in own)
         if not own or not excited:
             needs = effect.motion or ", ".join(effect.needs)
-            told.append(Considered(identifier, None, 0.0, False, f"not excited; needs {needs}",
+            listed.append(Considered(identifier, None, 0.0, False, f"not excited; needs {needs}",
                                    Outcome.NOT_EXCITED, needs))  # fmt: skip
             continue
         alone = held.shrink(own, ()).shrink if held.possible and len(own) < 40 else None
@@ -174,8 +174,8 @@ def considered_of(
         odds = float(np.exp(-0.5 * min(max(better - base.score, -700.0), 700.0)))
         reason = reasons.get(identifier, "does not pay for its parameters beside what is found")
         outcome = Outcome.WITHDRAWN if identifier in reasons else Outcome.NOT_NEEDED
-        told.append(Considered(identifier, alone, odds / (1 + odds), True, reason, outcome))
-    return tuple(told)
+        listed.append(Considered(identifier, alone, odds / (1 + odds), True, reason, outcome))
+    return tuple(listed)
 
 
 def _first_variants(selection: Selection, own: list[int]) -> list[int]:
@@ -197,7 +197,7 @@ def _shown(selection: Selection, c: int) -> bool:
     return bool(np.sqrt(np.sum(columns**2, axis=0)).max() > SHOWN)
 
 
-def _score_with(selection: Selection, base: Found, c: int) -> float:
+def _score_with(selection: Selection, base: CandidateFit, c: int) -> float:
     if c in base.chosen:
         return base.score
     return fit(selection.working, (*base.chosen, c)).score

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.diagnosis.criteria import TIE
+from gapbridge.core.diagnosis.criteria import TIE_SCORE
 from gapbridge.core.diagnosis.next_measurements import PREDICTED, Predict, Trials, draw_trials
 from gapbridge.core.diagnosis.selection.local_search import rivals
-from gapbridge.core.diagnosis.selection.problem import Found, Space, fit
+from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.effects import CATALOGUE, Site, Term
 from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.registration import frame_columns
@@ -66,7 +66,7 @@ def next_measurements(
     Motions through the poses where the log records motion; at rest else, where no pose shows how
     encoders follow.
     """
-    told: list[Measurement] = []
+    chosen: list[Measurement] = []
     drawn = draw_trials(model, log, seed)
     for channel in channels:
         moving = channel.selection.observation.order_in_time
@@ -80,8 +80,8 @@ def next_measurements(
             if difference is None:
                 continue
             gain = np.linalg.norm(difference, axis=1) / sigma
-            told += _best(moving, trials, question.separates, gain)
-    return tuple(told)
+            chosen += _best(moving, trials, question.separates, gain)
+    return tuple(chosen)
 
 
 def _questions(
@@ -95,12 +95,12 @@ def _questions(
         if own in selection.block:  # nothing stands for all links but they themselves
             continue
         family = selection.terms[position].effect
-        told = {family}
+        chosen = {family}
         rest = tuple(c for c in found.chosen if c != own)
-        for _, other in rivals(space, found, own, TIE):
+        for _, other in rivals(space, found, own, TIE_SCORE):
             candidate = space.candidates[other]
-            if candidate.named and candidate.family not in told:
-                told.add(candidate.family)
+            if candidate.named and candidate.family not in chosen:
+                chosen.add(candidate.family)
                 swapped = fit(space, (*rest, other))
                 yield _Question(
                     (family, candidate.family), _named(space, found), _named(space, swapped)
@@ -115,7 +115,7 @@ def _questions(
                     break
 
 
-def _named(space: Space, found: Found) -> tuple[Term, ...]:
+def _named(space: SampleSpace, found: CandidateFit) -> tuple[Term, ...]:
     return tuple(
         space.candidates[c].term(x)
         for c, x in zip(found.chosen, found.values, strict=True)
@@ -157,21 +157,21 @@ def _framed(nuisance: Array, seen: Array, position: Array) -> Array:
 
 
 def _best(moving: bool, trials: Trials, names: tuple[str, ...], gain: Array) -> list[Measurement]:
-    told: list[Measurement] = []
+    chosen: list[Measurement] = []
     q, loads = trials.q, trials.loads
     assert loads.payload_mass is not None and loads.approach is not None
     for r in np.argsort(-gain):
-        if gain[r] < VISIBLE or len(told) == EACH:
+        if gain[r] < VISIBLE or len(chosen) == EACH:
             break
-        if all(np.abs(q[r] - np.array(m.q)).max() > APART for m in told):
+        if all(np.abs(q[r] - np.array(m.q)).max() > APART for m in chosen):
             sided = any(CATALOGUE[name].by_approach for name in names)
             approach = tuple(int(v) for v in loads.approach[r]) if sided else None
-            told.append(Measurement(
+            chosen.append(Measurement(
                 _floats(q[r]), float(loads.payload_mass[r]), names, float(gain[r]), approach,
                 velocity=_floats(trials.qd[r]) if moving else None,
                 acceleration=_floats(trials.qdd[r]) if moving else None,
             ))  # fmt: skip
-    return told
+    return chosen
 
 
 def _floats(values: Array) -> tuple[float, ...]:

@@ -18,11 +18,11 @@ STRETCHES = 24  # conditions of a recording: even stretches of time
 FEWEST_CONDITIONS = 5
 SMALLEST_TORQUE = 1e-3  # Nm
 HARDLY = 1e-3  # share of the largest held torque by which one has to change to count
-REPEATED = 0.5  # distinct values over samples below which a signal comes in steps
+OVER_REPEAT_SCATTER = 0.5  # distinct values over samples below which a signal comes in steps
 VARIES = 1e-9  # spread below which a quantity counts as constant
 
 
-def picked(usable: NDArray[np.bool_], most: int = MOST_SAMPLES) -> Index:
+def subsampled(usable: NDArray[np.bool_], most: int = MOST_SAMPLES) -> Index:
     """Return at most ``most`` of the usable rows, evenly spread."""
     rows = np.flatnonzero(usable)
     if len(rows) <= most:
@@ -103,7 +103,7 @@ def signal_step(signal: Array) -> Array:
     for j, values in enumerate(signal.T):
         distinct = np.unique(values)
         # a continuous signal repeats no value; a stepped one has far fewer values than samples
-        if 2 < len(distinct) < REPEATED * len(values):
+        if 2 < len(distinct) < OVER_REPEAT_SCATTER * len(values):
             steps[j] = float(np.diff(distinct).min())
     return steps
 

@@ -12,8 +12,8 @@ from gapbridge.core.diagnosis.channels.recording import (
     instrument_noise,
     joint_axes,
     own_joints,
-    picked,
     quantities,
+    subsampled,
 )
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.diagnosis.selection.unnamed import unnamed_pulls
@@ -44,7 +44,7 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
         return NotObservable("torque", lacking)
     whole = motion_of(log)
     finite = np.isfinite(measured[whole.rows]).all(axis=1)
-    rows = picked(whole.valid & finite & _steady(whole))
+    rows = subsampled(whole.valid & finite & _steady(whole))
     if not len(rows):
         return NotObservable("torque", ("actual_current_as_torque",))
     return _observed(model, log, measured, whole, rows)

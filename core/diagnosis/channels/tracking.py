@@ -15,8 +15,8 @@ from gapbridge.core.diagnosis.channels.recording import (
     instrument_noise,
     joint_axes,
     own_joints,
-    picked,
     quantities,
+    subsampled,
 )
 from gapbridge.core.diagnosis.observation import NotObservable, Observation, Predict
 from gapbridge.core.dynamics import predict_tracking, with_held
@@ -45,7 +45,7 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     if needs:
         return NotObservable("tracking", needs)
     motion = with_held(model, motion_of(log))
-    return _observed(model, log, motion, picked(_known_past(motion)))
+    return _observed(model, log, motion, subsampled(_known_past(motion)))
 
 
 def _observed(model: Model, log: Log, motion: Motion, rows: Index) -> Observation:
@@ -57,7 +57,7 @@ def _observed(model: Model, log: Log, motion: Motion, rows: Index) -> Observatio
         channel="tracking",
         unit="rad",
         measured=part.q,
-        predict=_following(model, motion, rows),
+        predict=_encoders_under(model, motion, rows),
         nuisance=np.zeros((len(part), n, 0)),
         weight=np.ones(n),
         sigma=encoder_step(log.require("actual_q")) / np.sqrt(12),
@@ -74,7 +74,7 @@ def _observed(model: Model, log: Log, motion: Motion, rows: Index) -> Observatio
     )
 
 
-def _following(model: Model, motion: Motion, rows: Index) -> Predict:
+def _encoders_under(model: Model, motion: Motion, rows: Index) -> Predict:
     """Return where the encoders of some rows stand under further terms.
 
     A fit asks again and again with one joint changed: the others are remembered.
@@ -88,11 +88,11 @@ def _following(model: Model, motion: Motion, rows: Index) -> Predict:
     def predict(terms: Sequence[Term]) -> Array:
         if any(term.site.joint is None for term in terms):
             return np.asarray(predict_tracking(model, motion, terms)[rows])
-        told = plain.copy()
+        angles = plain.copy()
         for joint in {term.site.joint for term in terms if term.site.joint is not None}:
             own = tuple(term for term in terms if term.site.joint == joint)
-            told[:, joint - 1] = joint_under(joint, own)
-        return told
+            angles[:, joint - 1] = joint_under(joint, own)
+        return angles
 
     return predict
 

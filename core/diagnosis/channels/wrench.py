@@ -12,8 +12,8 @@ from gapbridge.core.diagnosis.channels.recording import (
     VARIES,
     conditions,
     instrument_noise,
-    picked,
     quantities,
+    subsampled,
 )
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.diagnosis.selection.unnamed import unnamed_pulls
@@ -46,7 +46,7 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     if measured is None or needs:
         return NotObservable("wrench", tuple(needs))
     whole = motion_of(log)
-    rows = picked(whole.valid & np.isfinite(measured[whole.rows]).all(axis=1))
+    rows = subsampled(whole.valid & np.isfinite(measured[whole.rows]).all(axis=1))
     if not len(rows):
         return NotObservable("wrench", ("ft_raw_wrench",))
     return _observed(model, log, measured, whole, rows)

@@ -43,20 +43,20 @@ def frame_findings(model: Model, log: Log, metrology: Metrology) -> list[str]:
         return []
     seen = measured[rows]
     distance = _off(seen, predicted)
-    told = []
+    notes = []
     if distance > FAR:
-        told.append(_why(model, q, measured, rows, distance, log.get("measured_rotation")))
+        notes.append(_why(model, q, measured, rows, distance, log.get("measured_rotation")))
     elif metrology.registered:
         here = float(np.median(np.linalg.norm(seen - predicted, axis=1)))
         if here > FAR and distance < BETTER * here:
-            told.append(
+            notes.append(
                 f"the measured positions lie {1e3 * here:.0f} mm from where the arm is, and fit it "
                 "in a frame of their own: they are not in base; set metrology.registered to false"
             )
     turned = log.get("measured_rotation")
-    if turned is not None and not told:
-        told += _rotations(model, q[rows], seen, turned[rows], metrology)
-    return told
+    if turned is not None and not notes:
+        notes += _rotations(model, q[rows], seen, turned[rows], metrology)
+    return notes
 
 
 def _off(measured: Array, predicted: Array) -> float:
@@ -76,10 +76,12 @@ def _why(
         left = _off(trial, trial_model.rigid_pose(trial_q).position)
         if left < CLEARLY * best:
             best, name = left, what
-    told = f"the measured positions do not follow the arm: {1e3 * distance:.0f} mm off in any frame"
+    problem = (
+        f"the measured positions do not follow the arm: {1e3 * distance:.0f} mm off in any frame"
+    )
     if name and best < BETTER * distance:
-        return f"{told}; {name}: then {1e3 * best:.1f} mm"
-    return f"{told}; is it the right arm, tool and order of joints and rows?"
+        return f"{problem}; {name}: then {1e3 * best:.1f} mm"
+    return f"{problem}; is it the right arm, tool and order of joints and rows?"
 
 
 def _mistakes(
@@ -130,10 +132,10 @@ def _rotations(
     base = np.eye(3) if metrology.registered else frame.rotation
     left, constant = _turned_off(poses.rotation, base, rotation_matrix(turned))
     if left > 10 * FAR:
-        told = "the measured rotations do not follow the arm"
+        problem = "the measured rotations do not follow the arm"
         if _turned_off(poses.rotation, base, _roll_pitch_yaw(turned))[0] < FAR:
-            return [f"{told}: they look like roll, pitch and yaw, expected rotation vectors"]
-        return [f"{told}: {left:.1f} rad off; expected rotation vectors of the TCP"]
+            return [f"{problem}: they look like roll, pitch and yaw, expected rotation vectors"]
+        return [f"{problem}: {left:.1f} rad off; expected rotation vectors of the TCP"]
     if constant > 10 * FAR:
         return [
             f"the measured rotations are turned by {constant:.2f} rad against the cell's tool, the "

@@ -36,14 +36,14 @@ def sign_findings(model: Model, log: Log) -> list[str]:
     q = log.get("actual_q") if log.has("actual_q") else log.get("target_q")
     if q is None:
         return []
-    told = []
+    notes = []
     for name in SHOWN_BY:
         if name == "ft_raw_wrench" or model.arm.mass.any():
-            told += _readings(model, log, q, name)
+            notes += _readings(model, log, q, name)
     pull = log.get("actual_TCP_force")
-    if pull is None or told:
-        return told
-    for judge in (_bending, *(_sensed(name) for name in SHOWN_BY)):
+    if pull is None or notes:
+        return notes
+    for judge in (_compliance_rivals, *(_sensed(name) for name in SHOWN_BY)):
         word = judge(model, log, q, pull)
         if word:
             return [f"actual_TCP_force {word}; expected what the surroundings do to the tool, "
@@ -86,7 +86,7 @@ def _best(left: dict[str, float]) -> str:
     return name if left[name] < HALF * left[""] else ""
 
 
-def _bending(model: Model, log: Log, q: Array, pull: Array) -> str:
+def _compliance_rivals(model: Model, log: Log, q: Array, pull: Array) -> str:
     """Return what the pull looks like by how the measured positions give way to it."""
     measured = log.get("measured_position")
     if measured is None:
@@ -98,14 +98,14 @@ def _bending(model: Model, log: Log, q: Array, pull: Array) -> str:
     left = {}
     try:
         for name, variant in _variants(model, q[rows], pull[rows]).items():
-            off = _unbent(model, q[rows], measured[rows], _loads(log, rows, variant))
+            off = _compliance_residual(model, q[rows], measured[rows], _loads(log, rows, variant))
             left[name] = float(np.median(np.linalg.norm(off[pulled], axis=1)))
     except InputError:
         return ""
     return _best(left)
 
 
-def _unbent(model: Model, q: Array, measured: Array, loads: Loads) -> Array:
+def _compliance_residual(model: Model, q: Array, measured: Array, loads: Loads) -> Array:
     """Return what joints that give way, never less than nothing, leave of the positions (N, 3)."""
     from scipy.optimize import lsq_linear  # a quarter of a second, only where pulls are judged
 

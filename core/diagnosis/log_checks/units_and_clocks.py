@@ -122,33 +122,33 @@ def findings(log: Log, model: Model | None = None, metrology: Metrology | None =
 
     With ``model`` also mistakes of frames and signs, by what the arm can do at all.
     """
-    told = [*_names(log), *_times(log), *_gaps(log)]
+    notes = [*_names(log), *_times(log), *_gaps(log)]
     measured = log.get("measured_position")
     still = False
     if measured is not None and len(measured) > 3 and np.isfinite(measured).any():
         still = float(np.nanmax(np.nanmax(measured, axis=0) - np.nanmin(measured, axis=0))) < 1e-3
         if still:
-            told.append("the measured positions hardly move: is it the right column?")
+            notes.append("the measured positions hardly move: is it the right column?")
     warm = log.get("joint_temperatures")
     if warm is not None and np.isfinite(warm).any() and float(np.nanmedian(warm)) > WARM:
-        told.append("the joint temperatures look like Fahrenheit, expected °C")
+        notes.append("the joint temperatures look like Fahrenheit, expected °C")
     if model is None:
-        return told
-    told += [*_limits(model, log), *_poses(log)]
+        return notes
+    notes += [*_limits(model, log), *_poses(log)]
     if not still:
-        told += frame_findings(model, log, metrology or Metrology())
-    return told + sign_findings(model, log)
+        notes += frame_findings(model, log, metrology or Metrology())
+    return notes + sign_findings(model, log)
 
 
 def _names(log: Log) -> list[str]:
     """Return columns that nobody reads but whose name nearly is one of a log's."""
-    told = []
+    notes = []
     lacking = [name for name in COLUMNS if not log.has(name)]
     for unknown in log.unknown:
         hint = misspelt([unknown], lacking, log.n)
         if hint:
-            told.append(f"a column was left out{hint}")
-    return told[:3]
+            notes.append(f"a column was left out{hint}")
+    return notes[:3]
 
 
 def _times(log: Log) -> list[str]:
@@ -161,17 +161,17 @@ def _times(log: Log) -> list[str]:
         moving = str(error).removeprefix(f"{log.path}: ")
     if moving is not None:
         return [moving]
-    told = []
+    notes = []
     repeated, back = int(np.sum(np.diff(t) == 0)), int(np.sum(np.diff(t) < 0))
     if repeated:
-        told.append(f"{repeated} timestamp(s) are repeated")
+        notes.append(f"{repeated} timestamp(s) are repeated")
     if back:
-        told.append(f"{back} timestamp(s) run backwards: rows should be in time order")
-    return told
+        notes.append(f"{back} timestamp(s) run backwards: rows should be in time order")
+    return notes
 
 
 def _gaps(log: Log) -> list[str]:
-    told = []
+    notes = []
     for name, what in (
         ("measured_position", "measured position"),
         ("measured_rotation", "measured rotation"),
@@ -181,8 +181,8 @@ def _gaps(log: Log) -> list[str]:
         column = log.get(name)
         gone = 0 if column is None else int(np.sum(~np.isfinite(column).all(axis=1)))
         if gone:
-            told.append(f"{gone} row(s) have no {what} and were left out")
-    return told
+            notes.append(f"{gone} row(s) have no {what} and were left out")
+    return notes
 
 
 def _limits(model: Model, log: Log) -> list[str]:

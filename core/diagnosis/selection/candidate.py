@@ -23,7 +23,7 @@ STEP = 1e-2  # of a parameter's usual scale, for central differences
 WHOLE_ORDERS = 128  # cycles a turn that are looked through one by one
 CYCLES = 1.5  # of a periodic line over the joint's range, at least
 HALF_ORDERS = 40  # up to here also the halves
-# (typical moment / M0)^2 that a bent stiffness curve starts from
+# (typical moment / M0)^2 that a nonlinear stiffness curve starts from
 SOFTENING = tuple(float(v) for v in np.geomspace(0.1, 3000, 13))
 
 UNNAMED = Effect()
@@ -37,7 +37,7 @@ class Candidate:
     site: Site
     parameters: tuple[Parameter, ...]
     fixed: tuple[float | None, ...]  # per parameter of the effect: None = fitted
-    curve: float | None = None  # softening of a bent stiffness curve: columns straight, and bent
+    curve: float | None = None  # softening of a nonlinear stiffness: columns linear, and softening
     tried: int = 1  # hypotheses that this one was picked from
     quantity: str = ""  # what a smooth candidate depends on
     target: str = ""  # and what it moves
@@ -179,7 +179,7 @@ def named_columns(observation: Observation, candidate: Candidate, base: Sequence
         if by_angle is not None:
             return by_angle
     if candidate.curve is not None:
-        return _bent_columns(observation, candidate)
+        return _stiffness_curve_columns(observation, candidate)
     columns = _differences(observation, candidate, base)
     mass = candidate.effect.shown_by
     if mass is not None and not columns.any():  # a load without mass has no centre of gravity
@@ -227,8 +227,8 @@ def angle_columns(observation: Observation, candidate: Candidate) -> Array | Non
     return None if shape is None else J[:, :, joint - 1, None] * shape[:, None, :]
 
 
-def _bent_columns(observation: Observation, candidate: Candidate) -> Array:
-    """Return the straight and the bent part of a stiffness curve (N, k, 2).
+def _stiffness_curve_columns(observation: Observation, candidate: Candidate) -> Array:
+    """Return the linear and the softening part of a stiffness curve (N, k, 2).
 
     Both: a joint that the model holds as compliant already only bends its own line.
     """

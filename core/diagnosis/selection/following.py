@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate, named_columns
-from gapbridge.core.diagnosis.selection.problem import Found, Space, fit
+from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.effects import CATALOGUE, Term
 
 Array = NDArray[np.float64]
@@ -61,7 +61,7 @@ def _alike(term: Term, candidate: Candidate) -> bool:
     return delays or term.effect == candidate.family
 
 
-def one_delay(space: Space, found: Found) -> Found:
+def one_delay(space: SampleSpace, found: CandidateFit) -> CandidateFit:
     """Return the set with all joints that answer late as one effect of the controller.
 
     Latency or lag, whichever fits all of these joints better: each joint by itself decides little.

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.diagnosis.criteria import LINES, SMOOTH_TERMS
-from gapbridge.core.diagnosis.selection.problem import Found, Space, fit, gains
+from gapbridge.core.diagnosis.criteria import MAX_LINES, MAX_SMOOTH_TERMS
+from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit, gains
 
 Array = NDArray[np.float64]
 BEAM = 6
@@ -29,11 +29,11 @@ class State:
     score: float
 
 
-def clash(space: Space, chosen: Sequence[int], new: int) -> bool:
+def exclusive(space: SampleSpace, chosen: Sequence[int], new: int) -> bool:
     """Return whether a candidate stands instead of, not beside, one that is chosen."""
     b = space.candidates[new]
     lines = 0
-    if not b.named and sum(not space.candidates[c].named for c in chosen) >= SMOOTH_TERMS:
+    if not b.named and sum(not space.candidates[c].named for c in chosen) >= MAX_SMOOTH_TERMS:
         return True
     if b.beside and b.beside not in {space.candidates[c].family for c in chosen}:
         return True
@@ -43,14 +43,14 @@ def clash(space: Space, chosen: Sequence[int], new: int) -> bool:
             continue
         if a.family == b.family and a.periodic:
             lines += 1
-            if abs((a.site.order or 0) - (b.site.order or 0)) < 0.75 or lines >= LINES:
+            if abs((a.site.order or 0) - (b.site.order or 0)) < 0.75 or lines >= MAX_LINES:
                 return True
         elif a.family in (b.family, b.effect.contains) or b.family == a.effect.contains:
             return True
     return False
 
 
-def grow(space: Space, state: State, new: int, score: float) -> State:
+def grow(space: SampleSpace, state: State, new: int, score: float) -> State:
     """Return the state with one more term."""
     block = _without(state.basis, space.X[:, space.start[new] : space.start[new + 1]])
     U = _directions(block)
@@ -69,7 +69,7 @@ def _directions(block: Array) -> Array:
     return np.asarray(U[:, s > DEPENDENT])
 
 
-def projected(space: Space, chosen: Sequence[int]) -> State:
+def projected(space: SampleSpace, chosen: Sequence[int]) -> State:
     """Return the state of a whole set."""
     if not chosen:
         return State((), np.zeros((len(space.y), 0)), space.y, float(space.y @ space.y), 0.0)
@@ -78,19 +78,19 @@ def projected(space: Space, chosen: Sequence[int]) -> State:
     return State(tuple(chosen), U, r, float(r @ r), 0.0)
 
 
-def offspring(
-    space: Space, state: State, width: int, named_only: bool = False
+def additions(
+    space: SampleSpace, state: State, width: int, named_only: bool = False
 ) -> list[tuple[float, int]]:
     """Return the best terms to join a state: (score of the joint set, index), best first."""
     gain, sign = gains(space, state.r, state.basis)
-    score = space.misfit(np.maximum(state.rss - gain, 1e-300)) + space.price
-    score += space.price[list(state.chosen)].sum()
+    score = space.misfit(np.maximum(state.rss - gain, 1e-300)) + space.penalty
+    score += space.penalty[list(state.chosen)].sum()
     found: list[tuple[float, int]] = []
     for c in np.argsort(score):
         candidate = space.candidates[c]
         if c in state.chosen or (named_only and not candidate.named):
             continue
-        if clash(space, state.chosen, int(c)):
+        if exclusive(space, state.chosen, int(c)):
             continue
         single = candidate.named and len(candidate.parameters) == 1
         if single and candidate.parameters[0].lower == 0 and sign[c] < 0:
@@ -101,23 +101,23 @@ def offspring(
     return found
 
 
-def children(space: Space, chosen: Sequence[int], width: int) -> list[tuple[float, int]]:
+def joining(space: SampleSpace, chosen: Sequence[int], width: int) -> list[tuple[float, int]]:
     """Return the best candidates to join a set: (score of the joint set, index), best first."""
-    return offspring(space, projected(space, chosen), width)
+    return additions(space, projected(space, chosen), width)
 
 
 def beam_search(
-    space: Space, allowed_depth: int = DEPTH, beam: int = BEAM, named_only: bool = False
-) -> list[Found]:
+    space: SampleSpace, allowed_depth: int = DEPTH, beam: int = BEAM, named_only: bool = False
+) -> list[CandidateFit]:
     """Return the best sets met, best first (the empty one among them)."""
     rss = float(space.y @ space.y)
     empty = replace(projected(space, ()), score=float(space.misfit(np.array(rss))))
     states, best, waited = [empty], empty.score, 0
-    met: dict[frozenset[int], Found] = {frozenset(): Found((), empty.score, rss)}
+    met: dict[frozenset[int], CandidateFit] = {frozenset(): CandidateFit((), empty.score, rss)}
     for _ in range(allowed_depth):
         born: dict[frozenset[int], tuple[float, int, int]] = {}
         for s, state in enumerate(states):
-            for score, c in offspring(space, state, max(2 * beam, 12), named_only):
+            for score, c in additions(space, state, max(2 * beam, 12), named_only):
                 key = frozenset((*state.chosen, c))
                 if key not in born or score < born[key][0]:
                     born[key] = (score, s, c)

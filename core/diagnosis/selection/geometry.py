@@ -5,7 +5,7 @@ show (base parameters; Gautier, Khalil, IEEE Trans. Robotics and Automation 6 (1
 
 The numbers have a prior (a normal one of an engineer's size), so that what the data do not show
 stays nominal. To a search it is then one more source of correlated noise: the sample space is
-whitened by it, and log det of what it adds is the price that it pays (marginal likelihood).
+whitened by it, and log det of what it adds is the penalty (marginal likelihood).
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.criteria import (
+    ACCUSATION_PENALTY,
     ANGLE,
     FEW_LINKS,
-    GEOMETRIC,
     LENGTH,
-    MARGIN,
+    MIN_GEOMETRIC_CAUSES,
     SHARES,
 )
 from gapbridge.core.diagnosis.selection.candidate import Candidate
-from gapbridge.core.diagnosis.selection.problem import Found, Space
+from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace
 from gapbridge.core.diagnosis.selection.search import screened_search
 
 Array = NDArray[np.float64]
-NEVER = 1e9  # a price that no fit is worth
+NEVER = 1e9  # a penalty that no fit is worth
 
 
-def members(space: Space) -> tuple[int, ...]:
+def link_candidates(space: SampleSpace) -> tuple[int, ...]:
     """Return the candidates of all links' geometry."""
     return tuple(c for c, k in enumerate(space.candidates) if k.effect.together)
 
@@ -51,7 +51,7 @@ class Links:
     spread: Array  # (d,) 1 sigma of the samples along each, by the prior alone
 
     @property
-    def price(self) -> float:
+    def penalty(self) -> float:
         """Return what their numbers cost in -2 log likelihood: log det of what they add."""
         return float(np.sum(np.log1p(self.spread**2)))
 
@@ -66,14 +66,14 @@ class Links:
         along = self.directions.T @ columns
         return np.asarray(columns - self.directions @ (less * along.T).T)
 
-    def beside(self, space: Space, block: Iterable[int]) -> Space:
+    def beside(self, space: SampleSpace, block: Iterable[int]) -> SampleSpace:
         """Return the space beside them; ``block``, their candidates, can be in no set there."""
-        price = space.price.copy()
-        price[list(block)] = NEVER
-        return replace(space, y=self.whitened(space.y), X=self.whitened(space.X), price=price)
+        penalty = space.penalty.copy()
+        penalty[list(block)] = NEVER
+        return replace(space, y=self.whitened(space.y), X=self.whitened(space.X), penalty=penalty)
 
 
-def links_of(space: Space, sigma: Mapping[int, Array]) -> Links:
+def links_of(space: SampleSpace, sigma: Mapping[int, Array]) -> Links:
     """Return the geometry of all links in a space; ``sigma`` is the prior of each candidate."""
     size = np.concatenate(list(sigma.values()))
     U, s, _ = np.linalg.svd(space.columns(list(sigma)) * size, full_matrices=False)
@@ -81,15 +81,15 @@ def links_of(space: Space, sigma: Mapping[int, Array]) -> Links:
 
 
 def with_links(
-    space: Space, best: Found, base: Sequence[int]
-) -> tuple[Space, Found, dict[int, Array]]:
+    space: SampleSpace, best: CandidateFit, base: Sequence[int]
+) -> tuple[SampleSpace, CandidateFit, dict[int, Array]]:
     """Return the better explanation: as it is, or beside the links' geometry as a whole.
 
     The space returned is the one in which the set was found; the links are in no set, and their
     prior is returned (empty where they are no cause). A search beside them pays where they do so
     beside that set, or where it holds several geometric causes.
     """
-    block = members(space)
+    block = link_candidates(space)
     moments = [c for c in best.chosen if c in block and _of_mass(space.candidates[c])]
     if len(block) < 2 or (_of_mass(space.candidates[block[0]]) and len(moments) < FEW_LINKS):
         return space, best, {}
@@ -97,17 +97,17 @@ def with_links(
     for share in SHARES:
         sigma = {c: prior(space.candidates[c], share) for c in block}
         links = links_of(space, sigma)
-        tried.append((_beside_set(space, best, links, block) + links.price, sigma, links))
+        tried.append((_beside_set(space, best, links, block) + links.penalty, sigma, links))
     score, sigma, links = min(tried, key=lambda t: t[0])
     families = {c.family for c in space.candidates if c.named}
-    tries = 2 * float(np.log(len(families) * len(SHARES))) + MARGIN
+    tries = 2 * float(np.log(len(families) * len(SHARES))) + ACCUSATION_PENALTY
     kin = [c for c in best.chosen if _geometric(space.candidates[c])]
-    if len(kin) < GEOMETRIC and score + tries >= best.score:
+    if len(kin) < MIN_GEOMETRIC_CAUSES and score + tries >= best.score:
         return space, best, {}
     start = sorted({*base, *best.chosen} - set(block))
     start = [c for c in start if space.candidates[c].named]
-    other = screened_search(space, base=start, beside=lambda p: links.beside(p, members(p)))
-    if other.score + links.price + tries < best.score:
+    other = screened_search(space, base=start, beside=lambda p: links.beside(p, link_candidates(p)))
+    if other.score + links.penalty + tries < best.score:
         return links.beside(space, block), other, sigma
     return space, best, {}
 
@@ -122,9 +122,11 @@ def _of_mass(candidate: Candidate) -> bool:
     return any(p.unit == "kg m" for p in candidate.parameters)
 
 
-def _beside_set(space: Space, best: Found, links: Links, block: Sequence[int]) -> float:
-    """Return the score of a set beside the links, the price of these left out."""
+def _beside_set(
+    space: SampleSpace, best: CandidateFit, links: Links, block: Sequence[int]
+) -> float:
+    """Return the score of a set beside the links, the penalty of these left out."""
     rest = [c for c in best.chosen if c not in block]
     A, y = links.whitened(space.columns(rest)), links.whitened(space.y)
     rss = float(np.sum((y - A @ np.linalg.lstsq(A, y, rcond=1e-9)[0]) ** 2))
-    return float(space.misfit(np.array(rss)) + space.price[rest].sum())
+    return float(space.misfit(np.array(rss)) + space.penalty[rest].sum())

@@ -5,16 +5,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.diagnosis.criteria import GATHERED
-from gapbridge.core.diagnosis.selection.forward import children, clash, grow, offspring, projected
-from gapbridge.core.diagnosis.selection.problem import Found, Space, fit, gains
+from gapbridge.core.diagnosis.criteria import FAMILY_PENALTY
+from gapbridge.core.diagnosis.selection.forward import (
+    additions,
+    exclusive,
+    grow,
+    joining,
+    projected,
+)
+from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit, gains
 
 Array = NDArray[np.float64]
 MERGED = 9  # terms up to which every pair is tried against one
 GROWTH = 30  # terms added to a set at most
 
 
-def improve(space: Space, found: Found, named_only: bool = False) -> Found:
+def improve(space: SampleSpace, found: CandidateFit, named_only: bool = False) -> CandidateFit:
     """Return the set after dropping and swapping terms as long as that pays."""
     for _ in range(4):
         better = found
@@ -23,7 +29,7 @@ def improve(space: Space, found: Found, named_only: bool = False) -> Found:
             trial = fit(space, rest)
             if trial.score < better.score:
                 better = trial
-            for _, other in offspring(space, projected(space, rest), 3, named_only):
+            for _, other in additions(space, projected(space, rest), 3, named_only):
                 if other != c:
                     trial = fit(space, (*rest, other))
                     if trial.score < better.score - 1e-6:
@@ -36,20 +42,20 @@ def improve(space: Space, found: Found, named_only: bool = False) -> Found:
     return found
 
 
-def _merged(space: Space, found: Found, named_only: bool) -> Found:
+def _merged(space: SampleSpace, found: CandidateFit, named_only: bool) -> CandidateFit:
     """Return the set with two terms replaced by one, where that pays: two that imitate a third."""
     better = found
     for i, one in enumerate(found.chosen):
         for other in found.chosen[i + 1 :]:
             rest = tuple(c for c in found.chosen if c not in (one, other))
-            for _, new in offspring(space, projected(space, rest), 2, named_only):
+            for _, new in additions(space, projected(space, rest), 2, named_only):
                 trial = fit(space, (*rest, new))
                 if trial.score < better.score - 1e-6:
                     better = trial
     return better
 
 
-def pruned(space: Space, found: Found) -> Found:
+def pruned(space: SampleSpace, found: CandidateFit) -> CandidateFit:
     """Return the set without the terms that it is better off without, dropped one by one."""
     while found.chosen:
         better = None
@@ -65,7 +71,7 @@ def pruned(space: Space, found: Found) -> Found:
     return found
 
 
-def _drops(space: Space, found: Found) -> list[tuple[float, int]]:
+def _drops(space: SampleSpace, found: CandidateFit) -> list[tuple[float, int]]:
     """Return the score of the set less each of its terms, best first, out of one inverse."""
     X = space.columns(found.chosen)
     unit = 1 / np.sqrt(np.einsum("ij,ij->j", X, X) + 1e-300)
@@ -73,24 +79,24 @@ def _drops(space: Space, found: Found) -> list[tuple[float, int]]:
     inverse = np.linalg.pinv(A.T @ A, rcond=1e-12, hermitian=True)
     x = inverse @ (A.T @ space.y)
     rss = float(np.sum((space.y - A @ x) ** 2))
-    paid = float(space.price[list(found.chosen)].sum())
+    paid = float(space.penalty[list(found.chosen)].sum())
     begin, scores = 0, []
     for c in found.chosen:
         own = slice(begin, begin + len(space.candidates[c].parameters))
         begin = own.stop
         more = float(x[own] @ np.linalg.pinv(inverse[own, own], hermitian=True) @ x[own])
-        scores.append((float(space.misfit(np.array(rss + more))) + paid - space.price[c], c))
+        scores.append((float(space.misfit(np.array(rss + more))) + paid - space.penalty[c], c))
     return sorted(scores)
 
 
-def joined_sets(space: Space, found: Found) -> list[Found]:
+def joined_sets(space: SampleSpace, found: CandidateFit) -> list[CandidateFit]:
     """Return the set with one more term, less what that makes needless: unnamed rivals above all.
 
     Named causes that together imitate something unknown fall away where it is given its own term;
     where they stand in each other's way, the set grows from that term anew.
     """
     unnamed = {c for c, k in enumerate(space.candidates) if k.of_no_quantity}
-    joiners = unnamed | {c for _, c in children(space, found.chosen, 4)}
+    joiners = unnamed | {c for _, c in joining(space, found.chosen, 4)}
     new = sorted(joiners - set(found.chosen))
     sets = [pruned(space, fit(space, (*found.chosen, c))) for c in new]
     if found.chosen:
@@ -98,11 +104,11 @@ def joined_sets(space: Space, found: Found) -> list[Found]:
     return sets
 
 
-def grown(space: Space, found: Found, named_only: bool = False) -> Found:
+def grown(space: SampleSpace, found: CandidateFit, named_only: bool = False) -> CandidateFit:
     """Return the set with the best terms added one by one as long as that pays."""
     state = projected(space, found.chosen)
     for _ in range(GROWTH):
-        nearest = offspring(space, state, 1, named_only)
+        nearest = additions(space, state, 1, named_only)
         if not nearest or nearest[0][0] >= found.score:
             break
         better = fit(space, (*found.chosen, nearest[0][1]))
@@ -112,22 +118,24 @@ def grown(space: Space, found: Found, named_only: bool = False) -> Found:
     return found
 
 
-def rivals(space: Space, found: Found, c: int, within: float) -> list[tuple[float, int]]:
+def rivals(
+    space: SampleSpace, found: CandidateFit, c: int, within: float
+) -> list[tuple[float, int]]:
     """Return the candidates that could stand for ``c`` in a set: (score above the best, index)."""
     rest = tuple(o for o in found.chosen if o != c)
-    told = []
-    for score, other in offspring(space, projected(space, rest), 40):
+    near = []
+    for score, other in additions(space, projected(space, rest), 40):
         if score > found.score + within:
             break
         if other == c:
             continue
         trial = fit(space, (*rest, other))
         if trial.score <= found.score + within:
-            told.append((trial.score - found.score, other))
-    return sorted(told)
+            near.append((trial.score - found.score, other))
+    return sorted(near)
 
 
-def gathered(space: Space, found: Found) -> Found:
+def with_fewest_families(space: SampleSpace, found: CandidateFit) -> CandidateFit:
     """Return the set with as few kinds of effects as fit the data about as well.
 
     Which kinds are at work is one guess, at which places another: a kind that is there anyway is
@@ -138,14 +146,14 @@ def gathered(space: Space, found: Found) -> Found:
         kinds = {space.candidates[o].family for o in found.chosen if o != c}
         if not space.candidates[c].named or family in kinds:
             continue
-        for _, other in rivals(space, found, c, GATHERED):
+        for _, other in rivals(space, found, c, FAMILY_PENALTY):
             if space.candidates[other].named and space.candidates[other].family in kinds:
                 rest = tuple(o for o in found.chosen if o != c)
-                return gathered(space, fit(space, (*rest, other)))
+                return with_fewest_families(space, fit(space, (*rest, other)))
     return found
 
 
-def unpack(space: Space, found: Found) -> Found:
+def as_periodic_lines(space: SampleSpace, found: CandidateFit) -> CandidateFit:
     """Return the set with smooth functions of a joint's own angle as periodic lines.
 
     A few lines together look smooth, and each alone is dearer than one smooth function.
@@ -160,7 +168,7 @@ def unpack(space: Space, found: Found) -> Found:
     return found
 
 
-def packed(space: Space, found: Found) -> list[Found]:
+def as_smooth_function(space: SampleSpace, found: CandidateFit) -> list[CandidateFit]:
     """Return sets with all that a joint does by its own angle as one smooth function."""
     sets = []
     joints = {space.candidates[c].site.joint for c in found.chosen}
@@ -178,22 +186,22 @@ def packed(space: Space, found: Found) -> list[Found]:
     return sorted(sets, key=lambda f: f.score)[:4]
 
 
-def _lines(space: Space, rest: tuple[int, ...], joint: int) -> list[Found]:
+def _lines(space: SampleSpace, rest: tuple[int, ...], joint: int) -> list[CandidateFit]:
     """Return the best sets of up to three lines of a joint beside ``rest``."""
     own = [
         k
         for k, candidate in enumerate(space.candidates)
         if candidate.periodic and candidate.site.joint == joint
     ]
-    grown: list[Found] = []
+    grown: list[CandidateFit] = []
     sets = [rest]
     for _ in range(3):
-        step: list[Found] = []
+        step: list[CandidateFit] = []
         for chosen in sets:
             state = projected(space, chosen)
             gain, _ = gains(space, state.r, state.basis)
             ranked = sorted(own, key=lambda k: -gain[k])[:6]
-            step += [fit(space, (*chosen, k)) for k in ranked if not clash(space, chosen, k)]
+            step += [fit(space, (*chosen, k)) for k in ranked if not exclusive(space, chosen, k)]
         step.sort(key=lambda f: f.score)
         grown += step
         sets = [f.chosen for f in step[:5]]

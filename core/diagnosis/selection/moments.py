@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gapbridge.core.arm import Arm
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate
-from gapbridge.core.diagnosis.selection.state import Work, flat
+from gapbridge.core.diagnosis.selection.state import SelectionState, flat
 from gapbridge.core.effects import CATALOGUE, Effect, Site, Term
 
 Array = NDArray[np.float64]
@@ -31,14 +31,17 @@ FEWEST = 3  # rows on either side of a moment
 
 
 def step_candidates(
-    work: Work, columns: Sequence[Array], base: Sequence[Term], withheld: Iterable[str] = ()
+    state: SelectionState,
+    columns: Sequence[Array],
+    base: Sequence[Term],
+    withheld: Iterable[str] = (),
 ) -> list[Pair]:
     """Return the best moments of each effect that steps, with their columns (N, k, d).
 
     ``columns`` are those of ``work.candidates`` at the model of ``base``; what steps in ``base``
     keeps its moment beside the new ones.
     """
-    observation = work.observation
+    observation = state.observation
     times, channel = observation.times, observation.channel
     effects = [
         e for name, e in CATALOGUE.items()
@@ -47,18 +50,18 @@ def step_candidates(
     if times is None or not effects or len(times) < 2 * FEWEST + 2:
         return []
     still = tuple(t for t in base if not CATALOGUE[t.effect].at_moment)
-    target, basis = _integrated(work, columns, still)
+    target, basis = _integrated(state, columns, still)
     found: list[Pair] = []
     for effect in effects:
-        sites = effect.sites(work.arm)
+        sites = effect.sites(state.arm)
         for site in sites:
-            always = _always(work, effect, site, still)
-            gain = _gains(work, always, target, basis)
+            always = _always(state, effect, site, still)
+            gain = _gains(state, always, target, basis)
             kept = _best(gain, times)
             had = [t.values[-1] for t in base if t.effect == effect.identifier and t.site == site]
             tried = max(round(len(times) / max(len(kept) + len(had), 1)), 1)
             for moment in (*(_between(times, k) for k in kept), *had):
-                candidate = _candidate(work.arm, effect, site, moment, tried)
+                candidate = _candidate(state.arm, effect, site, moment, tried)
                 after = (times > moment).astype(float)
                 found.append((candidate, always * after[:, None, None]))
     return found
@@ -70,9 +73,9 @@ def _candidate(arm: Arm, effect: Effect, site: Site, moment: float, tried: int) 
     return Candidate(effect.identifier, site, sizes, fixed, tried=tried)
 
 
-def _always(work: Work, effect: Effect, site: Site, base: Sequence[Term]) -> Array:
+def _always(state: SelectionState, effect: Effect, site: Site, base: Sequence[Term]) -> Array:
     """Return d prediction / d size (N, k, d) of a step that is there in all rows."""
-    sizes = effect.parameters(work.arm, site)[:-1]
+    sizes = effect.parameters(state.arm, site)[:-1]
     columns = []
     for k, parameter in enumerate(sizes):
         ends = []
@@ -80,26 +83,28 @@ def _always(work: Work, effect: Effect, site: Site, base: Sequence[Term]) -> Arr
             step = [0.0] * len(sizes)
             step[k] = way * parameter.scale
             term = Term(effect.identifier, site, (*step, -np.inf))
-            ends.append(work.observation.predict([*base, term]))
+            ends.append(state.observation.predict([*base, term]))
         columns.append((ends[0] - ends[1]) / (2e-2 * parameter.scale))
     return np.stack(columns, axis=-1)
 
 
-def _integrated(work: Work, columns: Sequence[Array], base: Sequence[Term]) -> tuple[Array, Array]:
+def _integrated(
+    state: SelectionState, columns: Sequence[Array], base: Sequence[Term]
+) -> tuple[Array, Array]:
     """Return the gap (m,) and rows C (p, m) with everything else integrated out.
 
     For any two columns a and b the inner product is then a b - (C a)(C b).
     """
     from scipy.linalg import solve_triangular  # takes its time, and only steps need it
 
-    observation = work.observation
+    observation = state.observation
     blocks, prior = [observation.nuisance], [np.full(observation.nuisance.shape[2], FREE)]
-    for candidate, block in zip(work.candidates, columns, strict=True):
+    for candidate, block in zip(state.candidates, columns, strict=True):
         if candidate.periodic and (candidate.site.order or 0.0) > 2.0:
             continue
         blocks.append(block)
         prior.append(np.array([PRIOR * p.scale for p in candidate.parameters]))
-    A = flat(np.concatenate(blocks, axis=2), work)
+    A = flat(np.concatenate(blocks, axis=2), state)
     spread = np.concatenate(prior)
     spread[: observation.nuisance.shape[2]] /= np.maximum(
         np.sqrt(np.mean(A[:, : observation.nuisance.shape[2]] ** 2, axis=0)), 1e-300
@@ -108,16 +113,16 @@ def _integrated(work: Work, columns: Sequence[Array], base: Sequence[Term]) -> t
     # the root of A'A + 1 by QR: squared, wide priors would leave nothing of the narrow ones
     root = np.linalg.qr(np.vstack([A, np.eye(A.shape[1])]), mode="r")
     C = solve_triangular(root, A.T, trans="T")
-    gap = flat((observation.measured - observation.predict(base))[..., None], work)[:, 0]
+    gap = flat((observation.measured - observation.predict(base))[..., None], state)[:, 0]
     return gap, C
 
 
-def _gains(work: Work, always: Array, target: Array, C: Array) -> Array:
+def _gains(state: SelectionState, always: Array, target: Array, C: Array) -> Array:
     """Return what a step after each row k takes of the squares of the gap (N,)."""
     N, k, d = always.shape
     rows = np.zeros((N * k, d))
-    rows[np.repeat(work.kept, k)] = flat(always, work)
-    kept = np.repeat(work.kept, k)
+    rows[np.repeat(state.kept, k)] = flat(always, state)
+    kept = np.repeat(state.kept, k)
     wide = np.zeros((len(C) + 1, N * k))
     wide[:-1, kept], wide[-1, kept] = C, target
 
@@ -164,7 +169,7 @@ def slip_sentences(terms: Sequence[Term], observation: Observation, whole: bool)
 
     ``whole``: nothing else remains, so that the model holds on both sides.
     """
-    told = []
+    sentences = []
     for term, before, after in slips(terms, observation.times):
         effect, joint = CATALOGUE[term.effect], term.site.joint
         what = "the target on the tool" if joint is None else f"the zero of joint {joint}"
@@ -177,8 +182,8 @@ def slip_sentences(terms: Sequence[Term], observation: Observation, whole: bool)
         if "timestamp" not in observation.quantities:
             when = f"rows {before:g} and {after:g} of the log"
         rest = "; before and after it nothing else changed" if whole else ""
-        told.append(f"{effect.identifier}: {what} moved by {far} between {when}{rest}")
-    return told
+        sentences.append(f"{effect.identifier}: {what} moved by {far} between {when}{rest}")
+    return sentences
 
 
 def _clock(time: float) -> str:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gapbridge.core.diagnosis.observation import Observation
 
 Array = NDArray[np.float64]
-LARGE = 150  # samples from which every coordinate is taken to scatter alike
+LARGE_SAMPLE = 150  # samples from which every coordinate is taken to scatter alike
 ENOUGH = 400  # samples from which the sizes are estimated
 
 
@@ -47,7 +47,7 @@ def estimate_noise(
     block = blocks(observation)
     count = int(block.max()) + 1
     # a large log is asked for many causes: joint noise would swallow those not yet found
-    J = observation.joint_columns if len(kept) < LARGE else None
+    J = observation.joint_columns if len(kept) < LARGE_SAMPLE else None
     use = np.flatnonzero(kept)
     if len(use) > ENOUGH:
         use = use[:: len(use) // ENOUGH + 1]

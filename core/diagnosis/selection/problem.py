@@ -1,4 +1,4 @@
-"""The sample space in which candidates compete: whitened, without nuisance, every try priced."""
+"""The sample space in which candidates compete: whitened, without nuisance, every try penalised."""
 
 from __future__ import annotations
 
@@ -10,7 +10,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.diagnosis.criteria import ABSURD, MARGIN, SHARP, SMOOTH_PRICE
+from gapbridge.core.diagnosis.criteria import (
+    ACCUSATION_PENALTY,
+    MAX_SOFTENING,
+    MAX_TIMES_USUAL,
+    SMOOTH_PENALTY,
+)
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 
 Array = NDArray[np.float64]
@@ -42,14 +47,14 @@ def _blocks(X: Array, index: NDArray[np.int64], columns: NDArray[np.int64]) -> B
 
 
 @dataclass(frozen=True)
-class Space:
+class SampleSpace:
     """The whitened sample space: y and the blocks of columns, nuisance projected out."""
 
     y: Array  # (m,)
     X: Array  # (m, K)
     start: NDArray[np.int64]  # (C+1,) first column of each candidate
     candidates: tuple[Candidate, ...]
-    price: Array  # (C,)
+    penalty: Array  # (C,)
     freedom: float  # m minus nuisance
     floor: float  # variance of one coordinate that is known to be there
 
@@ -80,7 +85,7 @@ class Space:
 
 
 @dataclass(frozen=True)
-class Found:
+class CandidateFit:
     """One set of candidates with its joint least-squares fit."""
 
     chosen: tuple[int, ...]
@@ -90,7 +95,7 @@ class Found:
     deviations: tuple[Array, ...] = field(default=())  # per candidate (d,), 1 sigma
 
 
-def prices(candidates: Sequence[Candidate], freedom: float) -> Array:
+def penalties(candidates: Sequence[Candidate], freedom: float) -> Array:
     """Return what each candidate pays: d log m + 2 log(number of its like) + a margin."""
     families = {c.family for c in candidates if c.named} or {""}
     count: dict[str, int] = {}
@@ -100,7 +105,7 @@ def prices(candidates: Sequence[Candidate], freedom: float) -> Array:
     for c in candidates:
         tried = count[_kind(c)] * (len(families) if c.named else 1)
         d = len(c.parameters)
-        extra = MARGIN if c.named else SMOOTH_PRICE
+        extra = ACCUSATION_PENALTY if c.named else SMOOTH_PENALTY
         paid.append(d * np.log(max(freedom, 2.0)) + 2 * np.log(tried) + extra)
     return np.array(paid)
 
@@ -114,7 +119,7 @@ def _kind(candidate: Candidate) -> str:
     return candidate.family
 
 
-def gains(space: Space, r: Array, basis: Array | None = None) -> tuple[Array, Array]:
+def gains(space: SampleSpace, r: Array, basis: Array | None = None) -> tuple[Array, Array]:
     """Return how much of |r|^2 each candidate takes (C,), and its first value's sign (C,).
 
     ``basis`` (m, p), orthonormal, is projected out of the columns; of them all only their parts
@@ -141,11 +146,11 @@ def gains(space: Space, r: Array, basis: Array | None = None) -> tuple[Array, Ar
     return gain, sign
 
 
-def fit(space: Space, chosen: Sequence[int]) -> Found:
+def fit(space: SampleSpace, chosen: Sequence[int]) -> CandidateFit:
     """Return the joint fit of a set; its score is infinite where it breaks a bound or is absurd."""
     if not chosen:
         rss = float(space.y @ space.y)
-        return Found((), float(space.misfit(np.array(rss))), rss)
+        return CandidateFit((), float(space.misfit(np.array(rss))), rss)
     X = space.columns(chosen)
     unit = 1 / np.sqrt(np.einsum("ij,ij->j", X, X) + 1e-300)
     U, s, V = np.linalg.svd(X * unit, full_matrices=False)
@@ -155,7 +160,7 @@ def fit(space: Space, chosen: Sequence[int]) -> Found:
     variance = max(rss / max(space.freedom - X.shape[1], 1.0), space.floor)
     values = solution * unit
     deviation = np.sqrt(np.einsum("ij,ij->j", V, V) * variance) * unit
-    score = float(space.misfit(np.array(rss)) + space.price[list(chosen)].sum())
+    score = float(space.misfit(np.array(rss)) + space.penalty[list(chosen)].sum())
     ends = np.cumsum([0, *(len(space.candidates[c].parameters) for c in chosen)]).tolist()
     own = [slice(begin, end) for begin, end in pairwise(ends)]
     parts, spread = [values[o] for o in own], [deviation[o] for o in own]
@@ -165,7 +170,7 @@ def fit(space: Space, chosen: Sequence[int]) -> Found:
             score = np.inf
         if not _plausible(space.candidates[c], x, s):
             score = np.inf
-    return Found(tuple(chosen), score, rss, tuple(parts), tuple(spread))
+    return CandidateFit(tuple(chosen), score, rss, tuple(parts), tuple(spread))
 
 
 def _plausible(candidate: Candidate, x: Array, s: Array) -> bool:
@@ -177,7 +182,9 @@ def _plausible(candidate: Candidate, x: Array, s: Array) -> bool:
         lower = -np.inf if candidate.curve is not None else parameter.lower
         if value < lower - 2.5 * deviation or value > parameter.upper:
             return False
-        most = (SHARP if parameter.name == "softening" else ABSURD) * parameter.scale
+        most = (
+            MAX_SOFTENING if parameter.name == "softening" else MAX_TIMES_USUAL
+        ) * parameter.scale
         if parameter.unit not in SENSED and abs(value) - 3 * deviation > most:
             return False
     return True

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from scipy.special import ndtri, stdtrit
 
 from gapbridge.core.arm import Arm
-from gapbridge.core.diagnosis.criteria import OWN_SIGMAS, WEAK
+from gapbridge.core.diagnosis.criteria import OWN_SIGMAS, PRIOR_REACH
 from gapbridge.core.diagnosis.selection.candidate import Candidate, angle_columns
-from gapbridge.core.diagnosis.selection.problem import Found, Space
-from gapbridge.core.diagnosis.selection.state import Work, flat
+from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace
+from gapbridge.core.diagnosis.selection.state import SelectionState, flat
 from gapbridge.core.effects import Term
 from gapbridge.core.errors import InputError
 
@@ -42,7 +42,8 @@ class Remainder:
 
 
 def refit(
-    work: Work, space: Space, found: Found, links: Mapping[int, Array] = NO_PRIOR,
+    state: SelectionState, space: SampleSpace, found: CandidateFit,
+    links: Mapping[int, Array] = NO_PRIOR,
     remainder: Remainder | None = None,
 ) -> tuple[tuple[Term, ...], tuple[int, ...], tuple[Array, ...], Array]:  # fmt: skip
     """Refit the named terms exactly, smooth ones kept linear; moves the frame along.
@@ -52,7 +53,7 @@ def refit(
     these are wider than those of white noise: what is unknown is not the same everywhere.
     """
     index = (*(c for c in found.chosen if space.candidates[c].named), *links)
-    freed = {c: _freed(work.arm, space.candidates[c]) for c in index}
+    freed = {c: _freed(state.arm, space.candidates[c]) for c in index}
     smooth = [c for c in found.chosen if not space.candidates[c].named]
     x = [
         np.array(space.candidates[c].term(v).values)[: len(freed[c].parameters)]
@@ -64,16 +65,16 @@ def refit(
     if remainder is not None:
         extra = np.hstack([extra, remainder.columns])
     for _ in range(REFITS):
-        observation = work.observation
+        observation = state.observation
         terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
         gap = observation.measured - observation.predict(terms)
         blocks = []
         for k, c in enumerate(index):
             others = terms[:k] + terms[k + 1 :]
-            blocks.append(flat(_slope(work, freed[c], x[k], others), work))
-        nuisance = flat(observation.nuisance, work)
+            blocks.append(flat(_slope(state, freed[c], x[k], others), state))
+        nuisance = flat(observation.nuisance, state)
         A = np.hstack([*blocks, extra, nuisance])
-        b = flat(gap[..., None], work)[:, 0]
+        b = flat(gap[..., None], state)[:, 0]
         pull, towards = _pull(usual, x, A.shape[1], remainder, nuisance.shape[1])
         # with the pull: what the data do not show is as large as its prior, and hides no other
         size = np.sqrt(np.einsum("ij,ij->j", A, A) + np.einsum("ij,ij->j", pull, pull))
@@ -82,7 +83,7 @@ def refit(
         sizes = [len(v) for v in x]
         cuts = np.cumsum([*sizes, extra.shape[1]])
         parts = np.split(step, cuts)
-        moved, share = 0.0, _share(work, freed, index, x, parts, A, b)
+        moved, share = 0.0, _share(state, freed, index, x, parts, A, b)
         for k in range(len(x)):
             x[k] = _within(freed[index[k]], x[k] + share * parts[k])
             scale = np.array([p.scale for p in freed[index[k]].parameters])
@@ -90,7 +91,7 @@ def refit(
         if observation.rebase is not None:
             moved_terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
             left = observation.measured - observation.predict(moved_terms)
-            work.observation = observation.rebase(_along(extra, nuisance, left, work))
+            state.observation = observation.rebase(_along(extra, nuisance, left, state))
         if moved < 1e-6:
             break
     residual_ss = float(np.sum((b - A @ step) ** 2))
@@ -100,18 +101,18 @@ def refit(
     spread = inverse * np.outer(unit, unit) * variance
     if remainder is not None and len(index):
         right = np.concatenate([b, towards])
-        spread = _widened(spread, whole, right, unit, remainder.region)
+        spread = _cluster_covariance(spread, whole, right, unit, remainder.region)
     begin = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
     covariance = [spread[i:j, i:j] for i, j in itertools.pairwise(begin)]
     terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
-    gap = work.observation.measured - work.observation.predict(terms)
-    nuisance = work.observation.nuisance
+    gap = state.observation.measured - state.observation.predict(terms)
+    nuisance = state.observation.nuisance
     if nuisance.shape[2]:
-        gap = gap - nuisance @ _along(extra, flat(nuisance, work), gap, work)
+        gap = gap - nuisance @ _along(extra, flat(nuisance, state), gap, state)
     return terms, index, tuple(covariance), gap
 
 
-def _widened(
+def _cluster_covariance(
     white: Array, A: Array, b: Array, unit: Array, region: NDArray[np.int64]
 ) -> Array:  # fmt: skip
     """Return the covariance (p, p) by leaving out regions, nowhere narrower than ``white``.
@@ -168,9 +169,9 @@ def _step(
     return step
 
 
-def _along(extra: Array, nuisance: Array, gap: Array, work: Work) -> Array:
+def _along(extra: Array, nuisance: Array, gap: Array, state: SelectionState) -> Array:
     """Return what of the nuisance (p,) a gap (N, k) asks for, unnamed functions beside it."""
-    b = flat(gap[..., None], work)[:, 0]
+    b = flat(gap[..., None], state)[:, 0]
     solution = np.linalg.lstsq(np.hstack([extra, nuisance]), b, rcond=1e-12)[0]
     return np.asarray(solution[extra.shape[1] :])
 
@@ -199,11 +200,11 @@ def _pull(
 
 def _wide(candidate: Candidate) -> Array:
     """Return how far (d,) the data may take a cause that stands for itself."""
-    return np.array([WEAK * p.scale for p in candidate.parameters])
+    return np.array([PRIOR_REACH * p.scale for p in candidate.parameters])
 
 
 def _share(
-    work: Work, freed: dict[int, Candidate], index: tuple[int, ...], x: list[Array],
+    state: SelectionState, freed: dict[int, Candidate], index: tuple[int, ...], x: list[Array],
     parts: list[Array], A: Array, b: Array,
 ) -> float:  # fmt: skip
     """Return the share of a Gauss-Newton step to go: less than all where it would overshoot."""
@@ -216,10 +217,10 @@ def _share(
         terms = [freed[c].term(_within(freed[c], v + share * part))
                  for c, v, part in zip(index, x, parts, strict=False)]  # fmt: skip
         try:
-            gap = work.observation.measured - work.observation.predict(terms)
+            gap = state.observation.measured - state.observation.predict(terms)
         except InputError:
             return float("inf")
-        r = flat(gap[..., None], work)[:, 0]
+        r = flat(gap[..., None], state)[:, 0]
         r = r - Q @ (Q.T @ r)
         return float(r @ r)
 
@@ -238,17 +239,19 @@ def _freed(arm: Arm, candidate: Candidate) -> Candidate:
     return replace(candidate, parameters=parameters, fixed=(None,) * len(parameters), curve=None)
 
 
-def _slope(work: Work, candidate: Candidate, x: Array, others: tuple[Term, ...]) -> Array:
+def _slope(
+    state: SelectionState, candidate: Candidate, x: Array, others: tuple[Term, ...]
+) -> Array:
     """Return d prediction / d parameter (N, k, d) at the term's present values."""
-    by_angle = angle_columns(work.observation, candidate)
+    by_angle = angle_columns(state.observation, candidate)
     if by_angle is not None:
         return by_angle
     columns = []
     for k, parameter in enumerate(candidate.parameters):
         h = np.zeros(len(x))
         h[k] = 1e-2 * parameter.scale
-        ahead = work.observation.predict([*others, candidate.term(x + h)])
-        behind = work.observation.predict([*others, candidate.term(x - h)])
+        ahead = state.observation.predict([*others, candidate.term(x + h)])
+        behind = state.observation.predict([*others, candidate.term(x - h)])
         columns.append((ahead - behind) / (2 * h[k]))
     return np.stack(columns, axis=-1)
 

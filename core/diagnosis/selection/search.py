@@ -1,7 +1,7 @@
-"""The search: which set of candidates explains a gap best, at the price of having tried so many.
+"""The search: which set of candidates explains a gap best, at the penalty of having tried so many.
 
 All candidates compete in one whitened sample space out of which the nuisance (frames) has been
-projected. A set's score is -2 log likelihood plus a price per term (extended BIC, Chen and Chen
+projected. A set's score is -2 log likelihood plus a penalty per term (extended BIC, Chen and Chen
 2008: it grows with the number of parameters *and* with the number of hypotheses that were tried).
 Sets grow in a beam and are then improved by dropping and swapping.
 """
@@ -14,19 +14,30 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.diagnosis.criteria import LARGE, UNITED
+from gapbridge.core.diagnosis.criteria import LARGE_SAMPLE, SINGLE_CAUSE_PREFERENCE
 from gapbridge.core.diagnosis.selection.candidate import Candidate
-from gapbridge.core.diagnosis.selection.forward import DEPTH, beam_search, children, projected
+from gapbridge.core.diagnosis.selection.forward import (
+    DEPTH,
+    beam_search,
+    joining,
+    projected,
+)
 from gapbridge.core.diagnosis.selection.local_search import (
-    gathered,
+    as_periodic_lines,
+    as_smooth_function,
     grown,
     improve,
     joined_sets,
-    packed,
     pruned,
-    unpack,
+    with_fewest_families,
 )
-from gapbridge.core.diagnosis.selection.problem import USUAL_ORDERS, Found, Space, fit, gains
+from gapbridge.core.diagnosis.selection.problem import (
+    USUAL_ORDERS,
+    CandidateFit,
+    SampleSpace,
+    fit,
+    gains,
+)
 
 BEST_LINES = 10  # lines of a joint that a search looks at
 BEST_SMOOTH = 60  # smooth functions that a search looks at
@@ -34,9 +45,9 @@ DEEP = 40  # terms that a large log may show
 
 
 def screened_search(
-    space: Space, depth: int = DEPTH, base: Sequence[int] = (),
-    beside: Callable[[Space], Space] = lambda space: space,
-) -> Found:  # fmt: skip
+    space: SampleSpace, depth: int = DEPTH, base: Sequence[int] = (),
+    beside: Callable[[SampleSpace], SampleSpace] = lambda space: space,
+) -> CandidateFit:  # fmt: skip
     """Return the best set among the candidates worth a search, in the indices of ``space``.
 
     ``beside`` changes the part of the space that is searched (links that are noise in it).
@@ -44,11 +55,11 @@ def screened_search(
     keep = screened(space, base)
     place = {int(c): i for i, c in enumerate(keep)}
     near = beside(part(space, keep))
-    found = gathered(near, search(near, depth, [place[c] for c in base]))
+    found = with_fewest_families(near, search(near, depth, [place[c] for c in base]))
     return replace(found, chosen=tuple(int(keep[c]) for c in found.chosen))
 
 
-def search(space: Space, depth: int = DEPTH, base: Sequence[int] = ()) -> Found:
+def search(space: SampleSpace, depth: int = DEPTH, base: Sequence[int] = ()) -> CandidateFit:
     """Return the best set: named causes alone, unless an unnamed function beside them pays.
 
     ``base`` is a set already found (named causes), from which the search starts as well.
@@ -56,27 +67,29 @@ def search(space: Space, depth: int = DEPTH, base: Sequence[int] = ()) -> Found:
     The catalogue is searched by itself first, so that a smooth function, which imitates several
     causes at once, does not stand in their way.
     """
-    if len(space.y) >= LARGE:
+    if len(space.y) >= LARGE_SAMPLE:
         return _deep_search(space, base)
     named = improve(space, beam_search(space, depth, named_only=True)[0], named_only=True)
     if base:
         again = improve(space, fit(space, tuple(base)), named_only=True)
         named = min([named, again], key=lambda f: f.score)
-    joined = [*joined_sets(space, named), *packed(space, named)]
+    joined = [*joined_sets(space, named), *as_smooth_function(space, named)]
     simplest = min([named, *joined], key=lambda f: _counted(f, named))
     if _counted(simplest, named) >= named.score:
         return named
-    whole = improve(space, unpack(space, beam_search(space, depth)[0]))
+    whole = improve(space, as_periodic_lines(space, beam_search(space, depth)[0]))
     better = improve(space, simplest)
     return min([named, whole, better, simplest], key=lambda f: _counted(f, named))
 
 
-def _counted(found: Found, named: Found) -> float:
+def _counted(found: CandidateFit, named: CandidateFit) -> float:
     """Return the score for a choice against ``named``: one unknown beats many accomplices."""
-    return found.score - (UNITED if len(found.chosen) <= len(named.chosen) - 2 else 0.0)
+    return found.score - (
+        SINGLE_CAUSE_PREFERENCE if len(found.chosen) <= len(named.chosen) - 2 else 0.0
+    )
 
 
-def _deep_search(space: Space, base: Sequence[int]) -> Found:
+def _deep_search(space: SampleSpace, base: Sequence[int]) -> CandidateFit:
     """Return the best set of a large log: many causes at once, each cheap to separate.
 
     Terms are added one by one and dropped again where later ones make them needless; an unnamed
@@ -87,15 +100,15 @@ def _deep_search(space: Space, base: Sequence[int]) -> Found:
     if base:
         again = grown(space, pruned(space, fit(space, tuple(base))), named_only=True)
         found = min([found, pruned(space, again)], key=lambda f: f.score)
-    beside = [fit(space, (*found.chosen, c)) for _, c in children(space, found.chosen, 4)]
+    beside = [fit(space, (*found.chosen, c)) for _, c in joining(space, found.chosen, 4)]
     nearest = min([found, *beside], key=lambda f: f.score)
     if nearest.score < found.score:
         return nearest  # no named cause goes for an unknown beside them
-    sets = [found, *joined_sets(space, found), *packed(space, found)]
+    sets = [found, *joined_sets(space, found), *as_smooth_function(space, found)]
     return min(sets, key=lambda f: _counted(f, found))
 
 
-def screened(space: Space, base: Sequence[int] = ()) -> NDArray[np.int64]:
+def screened(space: SampleSpace, base: Sequence[int] = ()) -> NDArray[np.int64]:
     """Return the candidates worth a search: all single causes, the best of the many alike.
 
     Periodic lines and smooth functions come by the thousand; of each joint's lines and of all
@@ -115,7 +128,7 @@ def screened(space: Space, base: Sequence[int] = ()) -> NDArray[np.int64]:
     for r in targets:
         gain, _ = gains(space, r)
         pools: dict[tuple[str, int | None], list[int]] = {}
-        for c in np.flatnonzero(many)[np.argsort(-(gain[many] / space.price[many]))]:
+        for c in np.flatnonzero(many)[np.argsort(-(gain[many] / space.penalty[many]))]:
             candidate = space.candidates[c]
             pool = pools.setdefault((candidate.family, candidate.site.joint), [])
             if len(pool) < (BEST_LINES if candidate.named else BEST_SMOOTH):
@@ -130,12 +143,12 @@ def _many(candidate: Candidate) -> bool:
     return not candidate.named or (candidate.periodic and not usual)
 
 
-def part(space: Space, keep: NDArray[np.int64]) -> Space:
+def part(space: SampleSpace, keep: NDArray[np.int64]) -> SampleSpace:
     """Return the space with some of its candidates only."""
     columns = np.concatenate([np.arange(space.start[c], space.start[c + 1]) for c in keep])
     size = np.diff(space.start)[keep]
     return replace(
         space, X=np.ascontiguousarray(space.X[:, columns]),
         start=np.concatenate([[0], np.cumsum(size)]),
-        candidates=tuple(space.candidates[c] for c in keep), price=space.price[keep],
+        candidates=tuple(space.candidates[c] for c in keep), penalty=space.penalty[keep],
     )  # fmt: skip

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
-from gapbridge.core.diagnosis.criteria import HEAVIEST, LARGE
+from gapbridge.core.diagnosis.criteria import HEAVIEST, LARGE_SAMPLE
 from gapbridge.core.diagnosis.observation import Observation
-from gapbridge.core.diagnosis.selection.bent import straightened
 from gapbridge.core.diagnosis.selection.candidate import (
     Candidate,
     joint_quantity,
@@ -26,8 +25,8 @@ from gapbridge.core.diagnosis.selection.candidate import (
 from gapbridge.core.diagnosis.selection.following import exact_columns, one_delay
 from gapbridge.core.diagnosis.selection.geometry import (
     Links,
+    link_candidates,
     links_of,
-    members,
     prior,
     with_links,
 )
@@ -35,15 +34,22 @@ from gapbridge.core.diagnosis.selection.local_search import grown, pruned
 from gapbridge.core.diagnosis.selection.moments import step_candidates
 from gapbridge.core.diagnosis.selection.noise import Noise, estimate_noise
 from gapbridge.core.diagnosis.selection.outliers import (
-    look_again,
-    look_for_wild,
-    with_wild_explained,
+    mark_outliers,
+    readmit_explained_outliers,
+    revise_noise_and_outliers,
 )
-from gapbridge.core.diagnosis.selection.problem import Found, Space, fit
+from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.refit import Remainder, refit, worth
 from gapbridge.core.diagnosis.selection.search import screened_search
 from gapbridge.core.diagnosis.selection.smooth import smooth_candidates
-from gapbridge.core.diagnosis.selection.state import Raw, Work, flat, locate, sample_space
+from gapbridge.core.diagnosis.selection.state import (
+    SelectionState,
+    UnprojectedRows,
+    flat,
+    locate,
+    sample_space,
+)
+from gapbridge.core.diagnosis.selection.stiffness_curves import with_straight_stiffness
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import InputError
 from gapbridge.core.load_bounds import LoadBounds
@@ -52,7 +58,7 @@ from gapbridge.core.model import Model
 Array = NDArray[np.float64]
 ROUNDS = 8
 NOTHING = 1e-4  # worth of a value: a thirtieth of its sigma
-FORBIDDEN = 1e9  # a price that no fit is worth
+FORBIDDEN = 1e9  # a penalty that no fit is worth
 
 
 @dataclass(frozen=True)
@@ -60,8 +66,8 @@ class Selection:
     """What explains an observation, and the space in which it won."""
 
     observation: Observation  # frame as finally estimated
-    space: Space  # columns at the final model; kept samples only
-    found: Found  # without the links, where their geometry as a whole is a cause
+    space: SampleSpace  # columns at the final model; kept samples only
+    found: CandidateFit  # without the links, where their geometry as a whole is a cause
     terms: tuple[Term, ...]  # the named part, refitted exactly
     term_index: tuple[int, ...]  # candidate index of each term
     covariance: tuple[Array, ...]  # per term (d, d) of its fitted parameters
@@ -69,14 +75,14 @@ class Selection:
     noise: Noise
     residual: Array  # (N, k) measured - predicted by the named terms, frame estimated along
     base: tuple[Term, ...]
-    raw: Raw  # the space before the nuisance was projected out
+    unprojected: UnprojectedRows  # the space before the nuisance was projected out
     prior: dict[int, Array] = field(default_factory=dict)  # 1 sigma (d,) of the numbers of each
     # link's candidate, where the geometry of all links is a cause
 
     @property
     def nuisance_basis(self) -> Array:
         """Return an orthonormal basis (m, p) of the nuisance in the sample space."""
-        return self.raw.basis
+        return self.unprojected.basis
 
     @property
     def block(self) -> tuple[int, ...]:
@@ -89,7 +95,7 @@ class Selection:
         return links_of(self.space, self.prior) if self.prior else None
 
     @cached_property
-    def working(self) -> Space:
+    def working(self) -> SampleSpace:
         """Return the space in which ``found`` won: beside the links, where they are a cause."""
         return self.space if self.links is None else self.links.beside(self.space, self.block)
 
@@ -135,17 +141,17 @@ class Selection:
 
         What else was found stays as far as it pays beside them; None where the arm has no links.
         """
-        space, block = self.space, members(self.space)
+        space, block = self.space, link_candidates(self.space)
         if len(block) < 2:
             return None
         sigma = {c: prior(space.candidates[c]) for c in block}
         near = links_of(space, sigma).beside(space, block)
         chosen = [c for c in self.found.chosen if c not in block]
         found = pruned(near, fit(near, chosen))
-        work = Work(self.observation, arm, [], self.noise, self.kept)
-        terms, index, covariance, residual = refit(work, space, found, sigma)
+        state = SelectionState(self.observation, arm, [], self.noise, self.kept)
+        terms, index, covariance, residual = refit(state, space, found, sigma)
         return replace(
-            self, observation=work.observation, prior=sigma, found=found, terms=terms,
+            self, observation=state.observation, prior=sigma, found=found, terms=terms,
             term_index=index, covariance=covariance, residual=residual,
         )  # fmt: skip
 
@@ -153,7 +159,10 @@ class Selection:
     def used(self) -> float:
         """Return the number of fitted unknowns, nuisance included; of the links what they use."""
         links = 0.0 if self.links is None else self.links.used
-        return float(self.raw.nuisance.shape[1] + sum(len(v) for v in self.found.values)) + links
+        return (
+            float(self.unprojected.nuisance.shape[1] + sum(len(v) for v in self.found.values))
+            + links
+        )
 
     @property
     def groups(self) -> NDArray[np.int64]:
@@ -179,17 +188,17 @@ def select(
     ]
     kept = np.ones(len(observation.rows), dtype=bool)
     first = estimate_noise(observation, observation.measured - observation.predict(()), kept)
-    work = Work(observation, arm, [], first, kept)
-    found: Found | None = None
-    space: Space | None = None
-    near: Space | None = None  # the same, beside the links where their geometry is a cause
+    state = SelectionState(observation, arm, [], first, kept)
+    found: CandidateFit | None = None
+    space: SampleSpace | None = None
+    near: SampleSpace | None = None  # the same, beside the links where their geometry is a cause
     columns: list[Array] = []
     smooth = smooth_candidates(observation)
     none: set[tuple[str, Site]] = set()  # what the exact refit takes back: its place is free
     for turn in range(ROUNDS):
         if progress:
             progress(f"{observation.channel}: round {turn + 1}")
-        work.candidates = [
+        state.candidates = [
             with_what_it_needs(observation, _bounded(c, model, observation))
             for c in named_candidates(arm, observation.channel, withheld, rotation, base, turns)
             if _has_what_it_needs(c, observation) and (c.family, c.site) not in none
@@ -199,36 +208,40 @@ def select(
             None,
             [],
         )  # the last round's, as large as the new ones: not both at a time
-        columns = [exact_columns(work.observation, c, base) for c in work.candidates]
+        columns = [exact_columns(state.observation, c, base) for c in state.candidates]
         if turn == 0:
-            look_for_wild(work, columns)
-        stepping = step_candidates(work, columns, base, withheld)
-        work.candidates += [candidate for candidate, _ in stepping]
+            mark_outliers(state, columns)
+        stepping = step_candidates(state, columns, base, withheld)
+        state.candidates += [candidate for candidate, _ in stepping]
         columns += [own for _, own in stepping]
-        space, raw = sample_space(work, columns, base, smooth)
-        inside = [locate(work.candidates, t)[0] for t in base]
+        space, unprojected = sample_space(state, columns, base, smooth)
+        inside = [locate(state.candidates, t)[0] for t in base]
         best = one_delay(space, screened_search(space, base=inside))
-        if turn > 0 and not work.kept.all():
-            space, raw, best = with_wild_explained(work, columns, base, smooth, (space, raw, best))
+        if turn > 0 and not state.kept.all():
+            space, unprojected, best = readmit_explained_outliers(
+                state, columns, base, smooth, (space, unprojected, best)
+            )
         near, best, links = with_links(space, best, inside)
-        counted, whitened_by = work.kept.copy(), work.noise
-        framed = work.observation
+        counted, whitened_by = state.kept.copy(), state.noise
+        framed = state.observation
         try:
-            exact = _exactly(near, best, work)
-            terms, index, covariance, residual = refit(work, space, exact, links)
+            exact = _exactly(near, best, state)
+            terms, index, covariance, residual = refit(state, space, exact, links)
         except InputError:  # absurd flexibilities: the arm would buckle
-            work.observation = framed  # not the frame that went astray with them
-            best, near, links = _stiff(space, best, inside), space, {}
-            terms, index, covariance, residual = refit(work, space, best)
-        straight = straightened(space, best.chosen, index, terms, covariance)
+            state.observation = framed  # not the frame that went astray with them
+            best, near, links = _without_compliance(space, best, inside), space, {}
+            terms, index, covariance, residual = refit(state, space, best)
+        straight = with_straight_stiffness(space, best.chosen, index, terms, covariance)
         if straight is not None:
             best = pruned(near, fit(near, straight))
-            terms, index, covariance, residual = refit(work, space, best, links)
+            terms, index, covariance, residual = refit(state, space, best, links)
         same = terms_alike(terms, base) and turn > 0
         found = best
         used = sum(len(v) for v in best.values) + (links_of(space, links).used if links else 0)
         free = 1 - used / space.freedom
-        changed = look_again(work, _less_smooth(work, space, best, smooth, residual), free)
+        changed = revise_noise_and_outliers(
+            state, _without_smooth_part(state, space, best, smooth, residual), free
+        )
         single = [p for p, c in enumerate(index) if c not in links]
         share = [worth(terms[p], covariance[p]) for p in single]
         settled = same and not changed
@@ -243,59 +256,63 @@ def select(
             break
         base = terms
     assert space is not None and near is not None and found is not None
-    if len(space.y) >= LARGE and any(not space.candidates[c].named for c in found.chosen):
-        work.kept, work.noise = counted.copy(), whitened_by
+    if len(space.y) >= LARGE_SAMPLE and any(not space.candidates[c].named for c in found.chosen):
+        state.kept, state.noise = counted.copy(), whitened_by
         # what goes into a model has to predict without the unnamed function beside it
         named = [c for c in found.chosen if space.candidates[c].named]
         # nor may it stand where a named cause would without it: friction of the same joint
         alone = fit(near, named)
         alone = pruned(near, grown(near, alone, named_only=True))
-        terms, index, covariance, residual = refit(work, space, alone, links)
+        terms, index, covariance, residual = refit(state, space, alone, links)
         found = fit(near, (*alone.chosen, *(c for c in found.chosen if c not in named)))
     return Selection(
-        work.observation, space, found, terms, index, covariance, counted, whitened_by,
-        residual, base, raw, links,
+        state.observation, space, found, terms, index, covariance, counted, whitened_by,
+        residual, base, unprojected, links,
     )  # fmt: skip
 
 
-def _stiff(space: Space, best: Found, inside: list[int]) -> Found:
+def _without_compliance(space: SampleSpace, best: CandidateFit, inside: list[int]) -> CandidateFit:
     """Return the best set without anything that gives way: what was found makes no arm."""
     gives_way = np.array([c.gives_way for c in space.candidates])
-    stiff = replace(space, price=np.where(gives_way, FORBIDDEN, space.price))
+    stiff = replace(space, penalty=np.where(gives_way, FORBIDDEN, space.penalty))
     start = {*inside, *best.chosen} - {int(c) for c in np.flatnonzero(gives_way)}
     return screened_search(stiff, base=sorted(start))
 
 
-def _exactly(space: Space, best: Found, work: Work) -> Found:
+def _exactly(space: SampleSpace, best: CandidateFit, state: SelectionState) -> CandidateFit:
     """Return what of a set is refitted: of delays and lags the named alone.
 
     Beside them an unnamed function takes up what their curves lack at a first guess, and they would
     never come to where it is not needed.
     """
-    if work.observation.channel != "tracking":
+    if state.observation.channel != "tracking":
         return best
     return fit(space, [c for c in best.chosen if space.candidates[c].named])
 
 
-def _less_smooth(
-    work: Work, space: Space, best: Found, smooth: list[tuple[Candidate, Array]], residual: Array
+def _without_smooth_part(
+    state: SelectionState,
+    space: SampleSpace,
+    best: CandidateFit,
+    smooth: list[tuple[Candidate, Array]],
+    residual: Array,
 ) -> Array:
     """Return the residual (N, k) less what the set's unnamed functions take of it.
 
     They are part of the explanation: what they account for is no noise. Not so in a large log of
     poses, where causes and a function of time share out the same: the causes stand alone there.
     """
-    named = len(work.candidates)
+    named = len(state.candidates)
     columns = [smooth[c - named][1] for c in best.chosen if c >= named]
-    poses = work.observation.channel == "position" and len(space.y) >= LARGE
+    poses = state.observation.channel == "position" and len(space.y) >= LARGE_SAMPLE
     if not columns or poses:
         return residual
-    both = np.concatenate([*columns, work.observation.nuisance], axis=2)
-    rows, target = flat(both, work), flat(residual[..., None], work)[:, 0]
+    both = np.concatenate([*columns, state.observation.nuisance], axis=2)
+    rows, target = flat(both, state), flat(residual[..., None], state)[:, 0]
     return np.asarray(residual - both @ np.linalg.lstsq(rows, target, rcond=1e-9)[0])
 
 
-def standing(
+def refitted_alone(
     selection: Selection, arm: Arm, accused: Sequence[int], remainder: Remainder | None = None
 ) -> Selection:
     """Return the selection with some of its terms (positions) refitted as all there is.
@@ -306,20 +323,20 @@ def standing(
     """
     if not accused or (len(accused) == len(selection.terms) and remainder is None):
         return selection
-    if remainder is not None and len(selection.space.y) >= LARGE:
+    if remainder is not None and len(selection.space.y) >= LARGE_SAMPLE:
         remainder = remainder.scatter_alone()
-    work = Work(selection.observation, arm, [], selection.noise, selection.kept)
+    state = SelectionState(selection.observation, arm, [], selection.noise, selection.kept)
     chosen = [selection.term_index[p] for p in accused]
     links = selection.prior if set(chosen) & set(selection.prior) else {}
     space = selection.working if links else selection.space
     alone = fit(space, [c for c in chosen if c not in links])
-    fitted, index, spread, residual = refit(work, selection.space, alone, links, remainder)
+    fitted, index, spread, residual = refit(state, selection.space, alone, links, remainder)
     terms, covariance = list(selection.terms), list(selection.covariance)
     for c, term, own in zip(index, fitted, spread, strict=True):
         position = selection.term_index.index(c)
         terms[position], covariance[position] = term, own
     return replace(
-        selection, observation=work.observation, terms=tuple(terms),
+        selection, observation=state.observation, terms=tuple(terms),
         covariance=tuple(covariance), residual=residual,
     )  # fmt: skip
 
@@ -330,7 +347,7 @@ def _bounded(candidate: Candidate, model: Model, observation: Observation) -> Ca
     Of a curve the bound holds for what its two parts come to together.
     """
     if candidate.effect.adds_mass:
-        least, most = _loads_that_can_be(model, observation)
+        least, most = _payload_bounds(model, observation)
         mass = replace(candidate.parameters[0], lower=least, upper=most)
         return replace(candidate, parameters=(mass, *candidate.parameters[1:]))
     kind, curved = candidate.effect.flexibility, candidate.curve is not None
@@ -344,7 +361,7 @@ def _bounded(candidate: Candidate, model: Model, observation: Observation) -> Ca
     return replace(candidate, parameters=(bounded, *candidate.parameters[1:]))
 
 
-def _loads_that_can_be(model: Model, observation: Observation) -> tuple[float, float]:
+def _payload_bounds(model: Model, observation: Observation) -> tuple[float, float]:
     """Return how far a payload may be off: the true one is no less than nothing, and no giant."""
     declared = observation.quantities.get("payload", np.array([model.payload_mass]))
     most = HEAVIEST * max(float(declared.max()), LoadBounds.of(model).rated)

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
-from gapbridge.core.diagnosis.criteria import KNOWN_SHARE, UNSEEN
+from gapbridge.core.diagnosis.criteria import KNOWN_SHARE, NO_REVERSAL_PENALTY
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.noise import Noise
-from gapbridge.core.diagnosis.selection.problem import AT_ONCE, Space, prices
+from gapbridge.core.diagnosis.selection.problem import AT_ONCE, SampleSpace, penalties
 from gapbridge.core.effects import CATALOGUE, Term
 
 Array = NDArray[np.float64]
@@ -21,7 +21,7 @@ DEAD = 1e-7  # share of a column that the nuisance leaves: below, nothing is lef
 
 
 @dataclass
-class Work:
+class SelectionState:
     """What a selection works on; candidates, noise and kept samples change from round to round."""
 
     observation: Observation
@@ -32,7 +32,7 @@ class Work:
 
 
 @dataclass(frozen=True)
-class Raw:
+class UnprojectedRows:
     """The whitened rows of the kept samples before the nuisance was projected out.
 
     All columns are as large as the sample space itself, so they are put together when asked for.
@@ -43,41 +43,41 @@ class Raw:
     basis: Array  # (m, p) orthonormal, of the nuisance
     taken: Array  # (p, K) what the nuisance took of every column
 
-    def columns(self, space: Space, chosen: Sequence[int]) -> Array:
+    def columns(self, space: SampleSpace, chosen: Sequence[int]) -> Array:
         """Return the columns (m, sum d) of a set of candidates as they were."""
         taken = self.taken[:, space.column_indices(chosen)]
         return np.asarray(space.columns(chosen) + self.basis @ taken)
 
 
-def flat(columns: Array, work: Work) -> Array:
+def flat(columns: Array, state: SelectionState) -> Array:
     """Return (N, k, d) columns as whitened (m, d) rows of the kept samples."""
-    kept = work.noise.whitener[work.kept] @ columns[work.kept]
+    kept = state.noise.whitener[state.kept] @ columns[state.kept]
     return np.asarray(kept.reshape(kept.shape[0] * kept.shape[1], columns.shape[-1]))
 
 
 def sample_space(
-    work: Work,
+    state: SelectionState,
     columns: list[Array],
     base: tuple[Term, ...],
     smooth: list[tuple[Candidate, Array]],
-) -> tuple[Space, Raw]:
+) -> tuple[SampleSpace, UnprojectedRows]:
     """Return the sample space at the model found so far, and what it was before projection."""
-    observation = work.observation
-    candidates = [*work.candidates, *(c for c, _ in smooth)]
+    observation = state.observation
+    candidates = [*state.candidates, *(c for c, _ in smooth)]
     size = np.array([len(c.parameters) for c in candidates])
     start = np.concatenate([[0], np.cumsum(size)])
-    X = np.empty((int(work.kept.sum()) * observation.measured.shape[1], int(start[-1])))
+    X = np.empty((int(state.kept.sum()) * observation.measured.shape[1], int(start[-1])))
     for c, block in enumerate([*columns, *(s for _, s in smooth)]):
-        X[:, start[c] : start[c + 1]] = flat(block, work)
+        X[:, start[c] : start[c + 1]] = flat(block, state)
     delays = all(CATALOGUE[term.effect].delays for term in base)
     chords = observation.channel == "tracking" and delays  # from nothing: nothing to put back
     gap = (observation.measured - observation.predict(() if chords else base))[..., None]
     # what the terms already in the model explain is put back, in the linear form at hand
     for term in () if chords else base:
-        c, x = locate(work.candidates, term)
+        c, x = locate(state.candidates, term)
         gap = gap + columns[c] @ x[:, None]
-    target = flat(gap, work)[:, 0]
-    nuisance = flat(observation.nuisance, work)
+    target = flat(gap, state)[:, 0]
+    nuisance = flat(observation.nuisance, state)
     Q = np.linalg.qr(nuisance)[0] if nuisance.shape[1] else nuisance
     whole = _sizes(X)
     taken, y = Q.T @ X, target - Q @ (Q.T @ target)
@@ -85,26 +85,32 @@ def sample_space(
         X[:, few] -= Q @ taken[:, few]
     X[:, _sizes(X) < DEAD * whole] = 0.0  # the frame takes it up wholly; the rest is rounding
     freedom = float(len(target) - Q.shape[1])
-    price = prices(candidates, freedom) + np.array([_unseen(c, observation) for c in candidates])
-    space = Space(
-        y, X, start, tuple(candidates), price, freedom,
-        KNOWN_SHARE if observation.sigma_is_whole else work.noise.floor_share,
+    penalty = penalties(candidates, freedom) + np.array(
+        [_no_reversal_penalty(c, observation) for c in candidates]
+    )
+    space = SampleSpace(
+        y, X, start, tuple(candidates), penalty, freedom,
+        KNOWN_SHARE if observation.sigma_is_whole else state.noise.floor_share,
     )  # fmt: skip
-    return space, Raw(nuisance, target, Q, taken)
+    return space, UnprojectedRows(nuisance, target, Q, taken)
 
 
 def _sizes(X: Array) -> Array:
     return np.asarray(np.sqrt(np.einsum("ij,ij->j", X, X)))
 
 
-def _unseen(candidate: Candidate, observation: Observation) -> float:
+def _no_reversal_penalty(candidate: Candidate, observation: Observation) -> float:
     """Return what an effect pays more whose motion the log does not show: play without reversals.
 
     It then stands behind the plain offset that it equals, as a tie.
     """
     if not candidate.effect.by_approach or candidate.site.joint is None:
         return 0.0
-    return 0.0 if f"approach_{candidate.site.joint - 1}" in observation.quantities else UNSEEN
+    return (
+        0.0
+        if f"approach_{candidate.site.joint - 1}" in observation.quantities
+        else NO_REVERSAL_PENALTY
+    )
 
 
 def locate(candidates: list[Candidate], term: Term) -> tuple[int, Array]:

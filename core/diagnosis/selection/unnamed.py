@@ -33,13 +33,13 @@ def unnamed_rivals(model: Model, q: Array, loads: Loads, k: int) -> tuple[tuple[
     any direction of base, in any direction of the tool.
     """
     return (
-        *_bending(model, q, loads, k),
+        *_compliance_rivals(model, q, loads, k),
         *_links(model, q, loads, k),
         *_pulls(model, q, loads, k),
     )
 
 
-def _bending(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Array]]:
+def _compliance_rivals(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Array]]:
     chain, rows = model.chain(), model.rows(q, loads)
     step = 1e-2 * 1e-3 / typical_moment(model.arm)
     found = []

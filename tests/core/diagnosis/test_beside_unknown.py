@@ -12,14 +12,14 @@ import small_arm as small
 from benchmarks.blind.session import Plan
 from gapbridge.core.diagnosis.channels.position import observe as observe_position
 from gapbridge.core.diagnosis.channels.wrench import observe
-from gapbridge.core.diagnosis.criteria import MINUTE
+from gapbridge.core.diagnosis.criteria import NEGLIGIBLE
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import Judgement, judge, judge_geometry, still_sure
 from gapbridge.core.diagnosis.remainder import closes_everywhere, with_the_links
 from gapbridge.core.diagnosis.selection import selection
 from gapbridge.core.diagnosis.selection.candidate import named_candidates, with_what_it_needs
-from gapbridge.core.diagnosis.selection.refit import Remainder, _widened, worth
+from gapbridge.core.diagnosis.selection.refit import Remainder, _cluster_covariance, worth
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.metrology import Metrology
 
@@ -119,7 +119,7 @@ def test_intervals_hold_where_regions_differ():
     off = []
     for seed in range(150):
         white, A, b, region = linear(seed, 1.0)
-        spread = np.sqrt(np.diag(_widened(white, A, b, np.ones(2), region)))
+        spread = np.sqrt(np.diag(_cluster_covariance(white, A, b, np.ones(2), region)))
         off.append((np.linalg.lstsq(A, b, rcond=None)[0] - [1.0, 2.0]) / spread)
         assert np.all(spread >= np.sqrt(np.diag(white)) * (1 - 1e-9))
     inside = np.mean(np.abs(off) < 1.96, axis=0)
@@ -134,7 +134,7 @@ def test_intervals_hold_where_regions_differ():
 def test_rows_after_the_regions_are_a_prior_that_always_stays():
     white, A, b, region = linear(0, 0.0)
     held = np.vstack([A, [1e6, 0.0]])
-    spread = _widened(white * 0, held, np.append(b, 1e6), np.ones(2), region)
+    spread = _cluster_covariance(white * 0, held, np.append(b, 1e6), np.ones(2), region)
     assert spread[0, 0] < 1e-9
 
 
@@ -195,7 +195,7 @@ def test_a_value_far_below_its_usual_size_is_no_accusation():
     found = small.diagnosed("backlash").channels[0].selection
     (term,), (c,) = found.terms, found.term_index
     usual = found.space.candidates[c].parameters[0].scale
-    for size, stays in ((0.5 * MINUTE * usual, False), (2 * MINUTE * usual, True)):
+    for size, stays in ((0.5 * NEGLIGIBLE * usual, False), (2 * NEGLIGIBLE * usual, True)):
         small_one = replace(
             found, terms=(term.with_values(np.array([size])),),
             covariance=(np.array([[(size / 50) ** 2]]),),

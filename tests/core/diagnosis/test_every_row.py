@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import small_arm as small
 
-from gapbridge.core.diagnosis.every_row import on_every_row, still_accused, with_vague
+from gapbridge.core.diagnosis.every_row import on_every_row, still_accused, with_uncertain_terms
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import VAGUE, judge
 
@@ -33,7 +33,7 @@ def withdrawn_as_vague(judgement, position):
 def test_what_was_too_vague_on_some_rows_is_accused_where_all_rows_are_sure(searched):
     selection, judgement = searched
     position = judgement.accused[0]
-    asked = with_vague(withdrawn_as_vague(judgement, position))
+    asked = with_uncertain_terms(withdrawn_as_vague(judgement, position))
     assert asked.vague == (position,)
     whole, held = on_all(selection, asked)
     _, decided = still_accused(whole, asked, held, small.model_of())
@@ -44,7 +44,7 @@ def test_what_was_too_vague_on_some_rows_is_accused_where_all_rows_are_sure(sear
 def test_what_is_vague_on_all_rows_too_is_withdrawn(searched):
     selection, judgement = searched
     position = judgement.accused[0]
-    asked = with_vague(withdrawn_as_vague(judgement, position))
+    asked = with_uncertain_terms(withdrawn_as_vague(judgement, position))
     whole, held = on_all(selection, asked)
     covariance = list(whole.covariance)
     value = np.array(whole.terms[position].values[: len(covariance[position])])

@@ -19,12 +19,12 @@ def selection():
 
 
 def with_target(selection, target: np.ndarray):
-    return replace(selection, raw=replace(selection.raw, target=target))
+    return replace(selection, unprojected=replace(selection.unprojected, target=target))
 
 
 def jolted(selection, sample: int, size: float = JOLT):
     """Return the selection with one kept sample's reading moved."""
-    target = selection.raw.target.copy()
+    target = selection.unprojected.target.copy()
     target[3 * sample : 3 * sample + 3] += size
     return with_target(selection, target)
 
@@ -77,7 +77,7 @@ def test_held_out_figures_are_those_of_a_cross_validation_by_hand(selection):
     assert held.possible
     # noise-free exact linear data: nothing is left, whatever pose was out
     space = selection.space
-    block = selection.raw.columns(space, chosen[:1])
+    block = selection.unprojected.columns(space, chosen[:1])
     exact = with_target(selection, block @ np.ones(block.shape[1]))
     assert HeldOut(exact).rms(chosen) < 1e-9 * HeldOut(exact).rms(())
     assert held.rms(chosen) == pytest.approx(np.sqrt(np.mean(held.squares(chosen))))
@@ -133,10 +133,11 @@ def test_a_number_that_moves_nothing_takes_nothing_from_the_others(selection):
     chosen = list(selection.found.chosen)
     dead = next(c for c in range(len(selection.space.candidates)) if c not in chosen)
     own = selection.space.column_indices([dead])
-    X, taken = selection.space.X.copy(), selection.raw.taken.copy()
+    X, taken = selection.space.X.copy(), selection.unprojected.taken.copy()
     X[:, own] = taken[:, own] = 0.0
     blind = replace(
-        selection, space=replace(selection.space, X=X), raw=replace(selection.raw, taken=taken),
+        selection, space=replace(selection.space, X=X),
+        unprojected=replace(selection.unprojected, taken=taken),
         prior={dead: np.full(len(own), 1e-3)},
     )  # fmt: skip
     held = HeldOut(blind)

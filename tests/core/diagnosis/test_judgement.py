@@ -78,8 +78,8 @@ def test_more_left_than_the_stated_noise_is_structure():
 def test_what_does_not_shrink_the_gap_of_unseen_samples_is_withdrawn():
     selection = channel_of("backlash").selection
     rng = np.random.default_rng(0)
-    drawn = rng.normal(size=len(selection.raw.target))
-    noise = replace(selection, raw=replace(selection.raw, target=drawn))
+    drawn = rng.normal(size=len(selection.unprojected.target))
+    noise = replace(selection, unprojected=replace(selection.unprojected, target=drawn))
     kept = judge(selection, HeldOut(selection))
     assert len(kept.accused) == 1
     left = judge(selection, HeldOut(noise))
@@ -87,6 +87,19 @@ def test_what_does_not_shrink_the_gap_of_unseen_samples_is_withdrawn():
     assert [why for _, why in left.withdrawn] == [
         "it does not shrink the gap on samples that its fit did not see"
     ]
+
+
+def test_a_value_on_its_bound_is_no_accusation():
+    selection = channel_of("backlash").selection
+    (term,), (c,) = selection.terms, selection.term_index
+    candidate = selection.space.candidates[c]
+    bounded = tuple(replace(p, upper=term.values[0]) for p in candidate.parameters)
+    candidates = list(selection.space.candidates)
+    candidates[c] = replace(candidate, parameters=bounded)
+    space = replace(selection.space, candidates=tuple(candidates))
+    judged = judge(replace(selection, space=space), HeldOut(selection))
+    assert judged.accused == ()
+    assert [why for _, why in judged.withdrawn] == ["its value stands on its bound"]
 
 
 @pytest.mark.parametrize(("sigmas", "stays"), [(0.5, False), (40.0, True)])

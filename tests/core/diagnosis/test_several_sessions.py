@@ -145,9 +145,9 @@ def test_one_session_has_no_figure_for_a_new_one() -> None:
 def test_a_session_too_short_for_its_frame_is_refused() -> None:
     logs = [session(small.NOMINAL, 1), session(small.NOMINAL, 2).select(slice(0, 2))]
     log = join_sessions(logs, MODEL)
-    for work in (diagnose, identify_compliance):
+    for state in (diagnose, identify_compliance):
         with pytest.raises(LogError, match=r"session 2\.csv: found 2 measured pose\(s\), expected"):
-            work(MODEL, log, Metrology(sigma=small.SIGMA))
+            state(MODEL, log, Metrology(sigma=small.SIGMA))
 
 
 def test_a_fit_of_sessions_shares_the_flexibilities() -> None:
@@ -177,11 +177,11 @@ def test_a_parameter_that_one_session_does_not_show_is_not_compared() -> None:
     other = own - 1 if own else own + 1
     column = selection.space.start[other]
     X[:, column] = np.where(rows == 0, X[:, column] + 1e-3, 0.0)
-    taken = selection.raw.taken.copy()
+    taken = selection.unprojected.taken.copy()
     taken[:, column] = 0.0
     changed = replace(
         selection, space=replace(selection.space, X=X),
-        raw=replace(selection.raw, taken=taken),
+        unprojected=replace(selection.unprojected, taken=taken),
     )  # fmt: skip
     reported = carried(changed, (own, other), MODEL.arm)
     assert all(np.isfinite(c.p_value) for c in reported)

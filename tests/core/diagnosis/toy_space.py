@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gapbridge.core.diagnosis.selection.candidate import Candidate
-from gapbridge.core.diagnosis.selection.problem import Space, prices
+from gapbridge.core.diagnosis.selection.problem import SampleSpace, penalties
 from gapbridge.core.effects import Parameter, Site
 
 
@@ -23,13 +23,13 @@ def smooth(quantity: str, target: str = "position", size: int = 1):
     return Candidate("smooth", Site(), parameters, (None,) * size, quantity=quantity, target=target)
 
 
-def space_of(candidates: Sequence[Candidate], y, X) -> Space:
+def space_of(candidates: Sequence[Candidate], y, X) -> SampleSpace:
     """Return the space of these candidates, noise of unit size."""
     size = np.array([len(c.parameters) for c in candidates])
     start = np.concatenate([[0], np.cumsum(size)])
     assert X.shape == (len(y), start[-1])
-    return Space(
-        y, X, start, tuple(candidates), prices(candidates, float(len(y))), float(len(y)), 1e-6
+    return SampleSpace(
+        y, X, start, tuple(candidates), penalties(candidates, float(len(y))), float(len(y)), 1e-6
     )
 
 

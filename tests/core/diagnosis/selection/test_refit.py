@@ -17,12 +17,12 @@ from gapbridge.core.diagnosis.selection.candidate import named_candidates, named
 from gapbridge.core.diagnosis.selection.noise import estimate_noise
 from gapbridge.core.diagnosis.selection.problem import fit
 from gapbridge.core.diagnosis.selection.refit import refit
-from gapbridge.core.diagnosis.selection.state import Work, sample_space
+from gapbridge.core.diagnosis.selection.state import SelectionState, sample_space
 from gapbridge.core.metrology import Metrology
 
 MODEL = small.model_of()
 SESSION = small.session_of(0)
-LARGE = 0.06  # rad: its square times the reach is a millimetre
+LARGE_SAMPLE = 0.06  # rad: its square times the reach is a millimetre
 
 
 def refitted(position, effects, registered=True, left=None):
@@ -35,11 +35,11 @@ def refitted(position, effects, registered=True, left=None):
     kept = np.ones(len(seen.rows), dtype=bool)
     left = np.full(seen.measured.shape, small.FLOOR) if left is None else left
     noise = estimate_noise(seen, left, kept)
-    work = Work(seen, MODEL.arm, wanted, noise, kept)
+    state = SelectionState(seen, MODEL.arm, wanted, noise, kept)
     columns = [named_columns(seen, c, ()) for c in wanted]
-    space, *_ = sample_space(work, columns, (), [])
+    space, *_ = sample_space(state, columns, (), [])
     found = fit(space, tuple(range(len(wanted))))
-    terms, _, covariance, residual = refit(work, space, found)
+    terms, _, covariance, residual = refit(state, space, found)
     spread = [np.sqrt(np.diag(c)) for c in covariance]
     return found, terms, spread, residual
 
@@ -66,13 +66,13 @@ def test_a_large_offset_is_found_exactly_where_a_line_is_far_off(angle, joint):
 
 def test_effects_that_meet_in_one_joint_are_refitted_together():
     real = replace(
-        offset(2, LARGE), axial=np.array([0.0, 2e-5, 0.0]),
+        offset(2, LARGE_SAMPLE), axial=np.array([0.0, 2e-5, 0.0]),
         tool_position=small.TOOL + np.array([2e-3, -1e-3, 3e-3]),
     )  # fmt: skip
     effects = [("joint_offset", 2), ("axial_compliance", 2), ("tool_frame", None)]
     _, terms, _, residual = refitted(exact(real), effects)
     values = {t.effect: t.values for t in terms}
-    assert values["joint_offset"][0] == pytest.approx(LARGE, abs=1e-8)
+    assert values["joint_offset"][0] == pytest.approx(LARGE_SAMPLE, abs=1e-8)
     assert values["axial_compliance"][0] == pytest.approx(2e-5, rel=1e-5)
     assert np.allclose(values["tool_frame"][:3], [2e-3, -1e-3, 3e-3], atol=1e-8)
     assert np.abs(residual).max() < 1e-8
@@ -84,9 +84,9 @@ def test_where_the_instrument_stands_changes_nothing(seed):
     rng = np.random.default_rng(seed)
     frame = turn(rng.normal(0, 1.5, (1, 3)))[0], rng.uniform(-5, 5, 3)
     _, (term,), _, residual = refitted(
-        exact(offset(2, LARGE), frame), [("joint_offset", 2)], registered=False
+        exact(offset(2, LARGE_SAMPLE), frame), [("joint_offset", 2)], registered=False
     )
-    assert term.values[0] == pytest.approx(LARGE, abs=1e-7)
+    assert term.values[0] == pytest.approx(LARGE_SAMPLE, abs=1e-7)
     assert np.abs(residual).max() < 1e-7
 
 
@@ -133,11 +133,11 @@ def test_a_number_that_moves_nothing_hides_no_other():
                   if (c.family, c.site.joint) in wanted]  # fmt: skip
     kept = np.ones(len(seen.rows), dtype=bool)
     noise = estimate_noise(deaf, np.full(deaf.measured.shape, small.FLOOR), kept)
-    work = Work(deaf, MODEL.arm, candidates, noise, kept)
+    state = SelectionState(deaf, MODEL.arm, candidates, noise, kept)
     columns = [named_columns(deaf, c, ()) for c in candidates]
-    space, *_ = sample_space(work, columns, (), [])
+    space, *_ = sample_space(state, columns, (), [])
     alone = [c.family for c in candidates].index("joint_offset")
-    _, _, (expected,), _ = refit(work, space, fit(space, (alone,)))
-    terms, _, covariance, _ = refit(work, space, fit(space, (0, 1)))
+    _, _, (expected,), _ = refit(state, space, fit(space, (alone,)))
+    terms, _, covariance, _ = refit(state, space, fit(space, (0, 1)))
     assert terms[alone].values[0] == pytest.approx(0.01, abs=1e-6)
     assert covariance[alone][0, 0] == pytest.approx(expected[0, 0], rel=0.05)

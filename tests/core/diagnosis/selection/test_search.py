@@ -8,7 +8,7 @@ import toy_space as toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gapbridge.core.diagnosis.selection.forward import clash
+from gapbridge.core.diagnosis.selection.forward import exclusive
 from gapbridge.core.diagnosis.selection.local_search import improve, pruned, rivals
 from gapbridge.core.diagnosis.selection.problem import fit
 from gapbridge.core.diagnosis.selection.search import part, screened, screened_search, search
@@ -80,8 +80,8 @@ def test_what_stands_for_the_same_is_never_named_beside_each_other():
                   toy.named("axial_compliance", 1, 3)]  # fmt: skip
     candidates += FAMILIES[-6:]
     space = toy.random_space(0, candidates, planted=(0, 1, 2))
-    assert clash(space, (0,), 1)
-    assert not clash(space, (0,), 2)
+    assert exclusive(space, (0,), 1)
+    assert not exclusive(space, (0,), 2)
     assert not {0, 1} <= set(search(space).chosen)
 
 

@@ -1,4 +1,4 @@
-"""The space in which candidates compete: fits, gains, prices and bounds."""
+"""The space in which candidates compete: fits, gains, penalties and bounds."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import toy_space as toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gapbridge.core.diagnosis.selection.forward import children, grow, projected
-from gapbridge.core.diagnosis.selection.problem import fit, gains, prices
+from gapbridge.core.diagnosis.selection.forward import grow, joining, projected
+from gapbridge.core.diagnosis.selection.problem import fit, gains, penalties
 
 FAMILIES = [toy.named("a", 1, 1), toy.named("a", 1, 2), toy.named("b", 3), toy.named("c", 2),
             toy.smooth("time", size=4)]  # fmt: skip
@@ -30,7 +30,7 @@ def test_a_fit_is_the_least_squares_solution(seed, chosen):
     left = space.y - X @ expected
     assert found.rss == pytest.approx(float(left @ left))
     assert np.allclose(np.concatenate([*found.values, []]), expected)
-    paid = space.price[list(chosen)].sum()
+    paid = space.penalty[list(chosen)].sum()
     assert found.score == pytest.approx(float(space.misfit(np.array(found.rss))) + paid)
 
 
@@ -58,7 +58,7 @@ def test_one_more_term_never_fits_worse_and_always_pays(seed, chosen, new):
     space = toy.random_space(seed, FAMILIES)
     before, after = fit(space, chosen), fit(space, [*chosen, new])
     assert after.rss <= before.rss + 1e-9
-    assert space.price[new] > 0
+    assert space.penalty[new] > 0
     assert space.misfit(np.array(after.rss)) <= space.misfit(np.array(before.rss)) + 1e-9
 
 
@@ -91,7 +91,7 @@ def test_a_gain_is_what_a_fit_would_take(seed, chosen):
 @given(seed=seeds)
 def test_children_come_best_first_with_the_score_of_the_joint_set(seed):
     space = toy.random_space(seed, FAMILIES, planted=(2,))
-    reported = children(space, (0,), 10)
+    reported = joining(space, (0,), 10)
     scores = [score for score, _ in reported]
     assert scores == sorted(scores)
     assert reported[0][1] == 2
@@ -121,7 +121,7 @@ def test_what_cannot_be_negative_has_no_score_where_it_would_have_to():
     bounded = [toy.named("play", lower=0.0), toy.named("free")]
     space = toy.random_space(3, bounded, planted=(0,), size=-5.0)
     assert fit(space, (0,)).score == np.inf
-    assert all(c != 0 for _, c in children(space, (), 5))
+    assert all(c != 0 for _, c in joining(space, (), 5))
     assert np.isfinite(fit(toy.random_space(3, bounded, planted=(0,), size=5.0), (0,)).score)
 
 
@@ -134,12 +134,12 @@ def test_an_absurd_size_is_no_explanation():
 def test_more_parameters_more_alternatives_and_no_name_cost_more():
     alone = [toy.named("a", 1, 1), toy.named("b", 2), toy.smooth("time")]
     many = [*(toy.named("a", 1, j) for j in range(1, 8)), toy.named("b", 2), toy.smooth("time")]
-    few, more = prices(alone, 90.0), prices(many, 90.0)
+    few, more = penalties(alone, 90.0), penalties(many, 90.0)
     assert more[0] > few[0]  # tried at seven joints
     assert more[-2] == few[1]
     assert few[1] > few[0]
     assert few[2] > few[0]
-    assert np.all(prices(alone, 900.0) > few)
+    assert np.all(penalties(alone, 900.0) > few)
     lines = [toy.named("transmission_error", 2, 1, order=o) for o in range(1, 60)]
-    paid = prices(lines, 90.0)
+    paid = penalties(lines, 90.0)
     assert paid[0] < paid[40]  # one turn is usual, forty are not

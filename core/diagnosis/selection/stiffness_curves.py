@@ -1,4 +1,4 @@
-"""Stiffness curves: whether they are bent at all, and the straight ones as what they are."""
+"""Stiffness curves: whether curved at all, and the straight ones as plain compliance."""
 
 from __future__ import annotations
 
@@ -7,27 +7,27 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.diagnosis.criteria import BENT
-from gapbridge.core.diagnosis.selection.problem import Space
+from gapbridge.core.diagnosis.criteria import CURVATURE_GAIN
+from gapbridge.core.diagnosis.selection.problem import SampleSpace
 from gapbridge.core.effects import CATALOGUE, Term
 
 Array = NDArray[np.float64]
 
 
-def not_bent(terms: Sequence[Term], covariance: Sequence[Array]) -> list[int]:
+def without_curvature(terms: Sequence[Term], covariance: Sequence[Array]) -> list[int]:
     """Return positions of stiffness curves that a straight line would fit as well."""
     straight = []
     for position, (term, spread) in enumerate(zip(terms, covariance, strict=True)):
         if not CATALOGUE[term.effect].curved:
             continue
         softening, deviation = term.values[1], float(np.sqrt(max(spread[1, 1], 0)))
-        if softening <= 0 or softening < np.sqrt(BENT) * deviation:
+        if softening <= 0 or softening < np.sqrt(CURVATURE_GAIN) * deviation:
             straight.append(position)
     return straight
 
 
-def straightened(
-    space: Space,
+def with_straight_stiffness(
+    space: SampleSpace,
     chosen: Sequence[int],
     index: Sequence[int],
     terms: Sequence[Term],
@@ -39,7 +39,7 @@ def straightened(
     stays.
     """
     instead: dict[int, int] = {}
-    for position in not_bent(terms, covariance):
+    for position in without_curvature(terms, covariance):
         joint, straight = terms[position].site.joint, CATALOGUE[terms[position].effect].contains
         for c, candidate in enumerate(space.candidates):
             if candidate.family == straight and candidate.site.joint == joint:
