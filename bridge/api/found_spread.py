@@ -27,7 +27,7 @@ def accused(found: Diagnosis, earlier: Sequence[Any] = ()) -> list[dict[str, Any
 
     ``earlier``: entries of the cell that was diagnosed, which are kept where nothing new is said.
     """
-    entries = [
+    entries: list[dict[str, Any]] = [
         {
             "effect": cause.effect, "joints": list(cause.joints), "channel": channel.channel,
             "parameters": [

@@ -254,7 +254,7 @@ class _Patch:
             body = self.scene.body_of(self.names[i + 1])
             stiffness = 2 / (length * flexibility)
             name = f"{self.names[i]}_link_flexibility"
-            hinges = []
+            hinges: list[Hinge] = []
             for share in GAUSS:
                 point = root + share * (end - root)
                 for axis in np.linalg.svd((end - root)[None])[2][1:]:

@@ -135,7 +135,7 @@ def _attributes(path: Path, model: Model, options: PatchOptions) -> dict[tuple[s
     elements = {
         "body": spec.bodies, "joint": spec.joints, "site": spec.sites, "actuator": spec.actuators,
     }  # fmt: skip
-    found = {
+    found: dict[tuple[str, ...], Array] = {
         (kind, element.name, attribute): np.atleast_1d(getattr(element, attribute)).astype(float)
         for kind, listed in elements.items()
         for element in listed

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum, auto
 
@@ -36,7 +36,7 @@ class SimulatorChange:
 
 
 def along_axes(
-    kind: Kind, joint: int | None, vector: Sequence[float]
+    kind: Kind, joint: int | None, vector: Iterable[float]
 ) -> tuple[SimulatorChange, ...]:
     """Return one change an axis of a vector (3,) that is not zero."""
     return tuple(SimulatorChange(kind, joint, float(v), k) for k, v in enumerate(vector) if v)
