@@ -73,9 +73,10 @@ PIECES = 8  # of a bent link, each with its hinges in the middle
 
 
 def mjcf(arm: Arm, names: tuple[str, ...], kp: float = 0.0, tcp: float = 0.1,
-         load: float = 0.0, soft: Soft | None = None) -> str:  # fmt: skip
+         load: float = 0.0, soft: Soft | None = None, kv: float = 0.0) -> str:  # fmt: skip
     """Return an MJCF model with body frames that are not the joints' frames."""
     soft = soft or Soft()
+    damping = f'kv="{kv}"' if kv else 'dampratio="1"'
     turns = frame_turns(arm.n)
     base = BASE_TURN.as_quat()[[3, 0, 1, 2]]
     text = f'<body name="base" pos="{numbers(BASE_AT)}" quat="{numbers(base)}">'
@@ -116,7 +117,7 @@ def mjcf(arm: Arm, names: tuple[str, ...], kp: float = 0.0, tcp: float = 0.1,
             'diaginertia="1e-4 1e-4 1e-4"/></body>'
         )
     drives = "".join(
-        f'<position name="drive_{name}" joint="{name}" kp="{kp}" dampratio="1"/>' for name in names
+        f'<position name="drive_{name}" joint="{name}" kp="{kp}" {damping}/>' for name in names
     )
     keyframe = f'<key name="home" qpos="{numbers(0.1 * np.arange(arm.n))}"/>'
     if any(soft.base) or soft.link:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.patch.arms import Soft, WrittenArm
 from benchmarks.patch.simulated import Servo
 
-KP = 4e4  # Nm/rad of every position servo
+KP, KV = 4e4, 1200.0  # Nm/rad and Nm s/rad of every position servo
 STATIC, APPROACHED, WRENCH, DROOP = "poses", "poses from both sides", "wrench", "servo"
 MOVING, TORQUE = "motion", "torque"
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.patch.arms import WrittenArm, mjcf
-from benchmarks.patch.cases import APPROACHED, DROOP, KP, MOVING, TORQUE, WRENCH, Case
+from benchmarks.patch.cases import APPROACHED, DROOP, KP, KV, MOVING, TORQUE, WRENCH, Case
 from benchmarks.patch.simulated import (
     LOAD_COG,
     Plant,
@@ -74,7 +74,7 @@ def run(arm: WrittenArm, case: Case, folder: Path) -> dict[str, Any]:
 
 
 def _text(arm: WrittenArm, **given: Any) -> Callable[[float], str]:
-    return lambda load: mjcf(arm.arm, arm.joints, kp=KP, load=load, **given)
+    return lambda load: mjcf(arm.arm, arm.joints, kp=KP, kv=KV, load=load, **given)
 
 
 def _patched(folder: Path) -> Callable[[float], str]:

@@ -12,9 +12,9 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from benchmarks.patch.arms import written_arms  # noqa: E402
-from benchmarks.patch.cases import cases  # noqa: E402
-from benchmarks.patch.run import run  # noqa: E402
+from benchmarks.patch.arms import written_arms
+from benchmarks.patch.cases import cases
+from benchmarks.patch.run import run
 
 pytestmark = pytest.mark.slow
 
