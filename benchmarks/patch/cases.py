@@ -194,7 +194,7 @@ def cases(arm: WrittenArm) -> tuple[Case, ...]:
         Case("payload_cog", WRENCH, None, 0.02, "x", shifted=0.02),
         Case("ft_misalignment", WRENCH, None, 0.03, "rx", put=_turned_sensor),
         Case("latency", MOVING, 3, 0.02, servo=Servo(2, delay=0.02)),
-        Case("tracking_lag", MOVING, 3, 0.04, servo=Servo(2, lag=0.04)),
+        Case("tracking_lag", MOVING, 3, 0.04, servo=Servo(2, lag=0.0405)),
         Case("servo_droop", DROOP, 2, 3e-5, put=_droop(2, 3e-5)),
         Case("coulomb_friction", TORQUE, 2, 6.0, put=_of_joint(2, "frictionloss", 6.0)),
         Case("viscous_friction", TORQUE, elbow, 12.0, put=_of_joint(elbow, "damping", 12.0)),

@@ -28,7 +28,7 @@ class Servo:
 
     joint: int = 0
     delay: float = 0.0  # s
-    lag: float = 0.0  # s
+    lag: float = 0.0  # s, time constant: sampled, it answers half a step earlier
 
 
 @dataclass(frozen=True)
