@@ -1,4 +1,4 @@
-"""What a diagnosis found, as cells keep it: covariance, and what was accused with its ties."""
+"""What a diagnosis found, as cells keep it: covariance, intervals, what was accused, with ties."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from gapbridge.bridge.document.provenance import intervals_of
 from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
+from gapbridge.core.estimation.identification import Identification
 
 
 def spread_of(found: Diagnosis) -> Spread:
@@ -46,3 +48,26 @@ def accused(found: Diagnosis, earlier: Sequence[Any] = ()) -> list[dict[str, Any
 
 def _known(std: float | None) -> float | None:
     return None if std is None or not math.isfinite(std) else float(std)
+
+
+def intervals_applied(
+    found: Diagnosis, *, stand_ins: bool = False
+) -> dict[str, tuple[float, float]]:
+    """Return the 95 % interval of each number that ``--apply`` writes, by name."""
+    applied = [
+        cause
+        for channel in found.channels
+        for cause in (*channel.causes, *(channel.stand_ins if stand_ins else ()))
+    ]
+    return intervals_of((p.name, p.value, p.std) for cause in applied for p in cause.parameters)
+
+
+def fit_intervals(found: Identification) -> dict[str, tuple[float, float]]:
+    """Return the 95 % interval of each flexibility that a fit determines, by name, rad/Nm."""
+    both = (("axial", found.axial, found.std_axial), ("radial", found.radial, found.std_radial))
+    every = [
+        (f"{kind}_compliance_{i + 1}", float(values[i]), float(std[i]))
+        for kind, values, std in both
+        for i in range(len(values))
+    ]
+    return intervals_of(one for one, shown in zip(every, found.identifiable, strict=True) if shown)

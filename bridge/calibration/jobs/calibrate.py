@@ -156,7 +156,8 @@ class WholeJob(Job):
         log = read_log(folder / "readings.csv", self.cell.arm.n)
         spread = Spread(tuple(e.name for e in found.estimates), found.whole_covariance)
         origin = provenance({"log": [folder / "readings.csv"], "cell": [self.cell.path]})
-        sections = {"provenance": fitted_on(origin, range_of(log), spread)}
+        intervals = self.cell.intervals | {e.name: e.interval for e in found.estimates if e.shown}
+        sections = {"provenance": fitted_on(origin, range_of(log), spread, intervals)}
         target = self.hand_over(found.model, "the calibrated cell", sections)
         if target is not None:
             write_document(baseline_beside(target), baseline)

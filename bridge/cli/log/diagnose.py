@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from gapbridge.bridge.api.found_spread import accused, spread_of
+from gapbridge.bridge.api.found_spread import accused, intervals_applied, spread_of
 from gapbridge.bridge.cell import Cell, save_cell
 from gapbridge.bridge.cell.opened_log import open_simulated
 from gapbridge.bridge.cli.log.answer import answer
@@ -127,9 +127,10 @@ def diagnose(
     if new_cell is not None:
         applied = found.with_stand_ins if stand_ins else found.model
         spread = spread_of(found).beside(given.spread)
+        intervals = given.intervals | intervals_applied(found, stand_ins=stand_ins)
         causes = accused(found, given.accused)
-        from_here = fitted(origin, range_of(rows), spread, causes)
-        save_cell(given, new_cell, applied, {"provenance": from_here})
+        written_by = fitted(origin, range_of(rows), spread, intervals, causes)
+        save_cell(given, new_cell, applied, {"provenance": written_by})
     written = [] if out is None else _write_folder(out, reported, found, given, rows)
     for file in (*written, json_file, new_cell):
         if file is not None:

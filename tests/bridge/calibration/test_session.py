@@ -153,7 +153,7 @@ def test_an_ended_input_and_quit_end_in_order_and_show_how_to_go_on(tmp_path: Pa
     played = play(cell, "--session", tmp_path / "s", lines=["", "?", value, "quit"])
     assert played.code == 0
     assert "take the last reading back" in played.out
-    assert "1 of 19 stops are measured and kept; go on with: gapbridge calibrate" in played.out
+    assert "1 of 24 stops are measured and kept; go on with: gapbridge calibrate" in played.out
     played = play(cell, "--session", tmp_path / "s", lines=["skip"])
     assert "stop 2 is left out" in played.out
     assert "the input ended" in played.out
@@ -168,6 +168,7 @@ def test_an_ended_input_and_quit_end_in_order_and_show_how_to_go_on(tmp_path: Pa
         (["--verify"], {}, "expected the promise that `gapbridge calibrate` writes"),
         (["--payload-only"], {}, "link: found nothing"),
         (["--verify", "--tool-only"], {}, "more than one of"),
+        ([], {"held_out": 7}, "calibration.held_out: found 7"),
         ([], {"joints": "link"}, "link: found nothing, expected the robot's address"),
         ([], {"instrument": "{kind: sphere}"}, "calibration.instrument_at: found nothing"),
         ([], {"instrument": "{kind: file, unit: mm, file: none/x.csv}"}, "no such file"),
