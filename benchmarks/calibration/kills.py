@@ -43,7 +43,7 @@ calibration:
   loads: [{name: light, mass: 1.0}, {name: heavy, mass: 9.0, cog: [0.0, 0.0, 0.1]}]
   effects: [axial_compliance]
   poses: 24
-  held_out: 6
+  held_out: 8
   repeats: 2
   folder: sessions
 """

@@ -13,7 +13,7 @@ from benchmarks.mutants.mutant import Mutant
 
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT = 600.0  # s for the tests of one mutant; one that hangs them is noticed
-COPIED = ("benchmarks", "bridge", "core", "docs", "drivers", "examples", "gapbridge", "tests")
+COPIED = ("benchmarks", "bridge", "config", "core", "docs", "drivers", "gapbridge", "tests")
 PASSED, FAILED = 0, 1  # pytest's exit codes
 
 

@@ -1,9 +1,11 @@
-"""The covariance of what a diagnosis found, as cells keep it."""
+"""The covariance and the intervals of what a diagnosis found, as cells keep them."""
 
 from __future__ import annotations
 
+from gapbridge.bridge.document.provenance import intervals_of
 from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
+from gapbridge.core.estimation.identification import Identification
 
 
 def spread_of(found: Diagnosis) -> Spread:
@@ -16,3 +18,26 @@ def spread_of(found: Diagnosis) -> Spread:
             terms, covariance = [t for t, _ in causes], [own for _, own in causes]
             return Spread.of_terms(found.model, terms, covariance)
     return Spread.none()
+
+
+def intervals_applied(
+    found: Diagnosis, *, stand_ins: bool = False
+) -> dict[str, tuple[float, float]]:
+    """Return the 95 % interval of each number that ``--apply`` writes, by name."""
+    applied = [
+        cause
+        for channel in found.channels
+        for cause in (*channel.causes, *(channel.stand_ins if stand_ins else ()))
+    ]
+    return intervals_of((p.name, p.value, p.std) for cause in applied for p in cause.parameters)
+
+
+def fit_intervals(found: Identification) -> dict[str, tuple[float, float]]:
+    """Return the 95 % interval of each flexibility that a fit determines, by name, rad/Nm."""
+    both = (("axial", found.axial, found.std_axial), ("radial", found.radial, found.std_radial))
+    every = [
+        (f"{kind}_compliance_{i + 1}", float(values[i]), float(std[i]))
+        for kind, values, std in both
+        for i in range(len(values))
+    ]
+    return intervals_of(one for one, shown in zip(every, found.identifiable, strict=True) if shown)

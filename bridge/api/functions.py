@@ -68,6 +68,7 @@ def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
     ``remounted``: the target was taken off between sessions. Raises ExcitationError where nothing
     in the log excites the compliance.
     """
+    from gapbridge.bridge.api.found_spread import fit_intervals
     from gapbridge.core.estimation.identification import (
         identify_compliance,  # predict need not wait for it
     )
@@ -84,6 +85,7 @@ def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
         notes=(*found.notes, *found.combinations), provenance=fitted(
             _origin(cell, log), range_of(log),
             Spread.of_fit(found.identifiable, found.covariance).beside(cell.spread),
+            cell.intervals | fit_intervals(found),
         ),
     )  # fmt: skip
 
@@ -97,7 +99,7 @@ def diagnose(
     ``withhold`` names effects to take out of the catalogue; ``simulated`` is the log of another
     simulator, row by row, whose values are the prediction.
     """
-    from gapbridge.bridge.api.found_spread import spread_of
+    from gapbridge.bridge.api.found_spread import intervals_applied, spread_of
     from gapbridge.core.diagnosis.diagnosis import diagnose as diagnose_log
     from gapbridge.core.diagnosis.document import document
     from gapbridge.core.effects import effect_named
@@ -108,7 +110,10 @@ def diagnose(
     found = diagnose_log(cell.model, log, metrology, withhold=withhold, simulated=simulated)
     origin = _origin(cell, log)
     told = document(found) | {"provenance": origin}
-    applied = fitted(origin, range_of(log), spread_of(found).beside(cell.spread))
+    applied = fitted(
+        origin, range_of(log), spread_of(found).beside(cell.spread),
+        cell.intervals | intervals_applied(found),
+    )  # fmt: skip
     return Diagnosed(cell, found.model, str(found.verdict), told, applied)
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
 from gapbridge.bridge.cell.document import Document, read_document
 from gapbridge.bridge.cell.effects import compliance_terms, term_of
-from gapbridge.bridge.cell.message import message, messages
+from gapbridge.bridge.cell.message import key_path, message, messages
 from gapbridge.bridge.cell.plausibility import findings
 from gapbridge.bridge.cell.robot import build_arm
 from gapbridge.bridge.cell.schema import CellFile, Frame, Simulation
@@ -133,6 +135,12 @@ class Cell:
         return Spread(tuple(origin.parameters), np.array(origin.covariance, dtype=float))
 
     @property
+    def intervals(self) -> dict[str, tuple[float, float]]:
+        """Return the 95 % interval of each number that was applied, by name, SI."""
+        origin = self.file.provenance
+        return {} if origin is None else dict(origin.intervals)
+
+    @property
     def simulation(self) -> Simulation:
         """Return section ``simulation``."""
         return self.file.simulation
@@ -170,8 +178,7 @@ def complaints(path: Path) -> list[str]:
         if not found:
             cell_of(file, document)
     except (ArmError, CellError) as error:
-        text = str(error)
-        found = [text if str(path) in text else f"{path}: {text}"]
+        found = [_placed(document, str(error))]
     return found
 
 
@@ -190,8 +197,7 @@ def cell_of(file: CellFile, document: Document) -> Cell:
             term_of(entry, arm, f"effects entry {i + 1}") for i, entry in enumerate(file.effects)
         )
     except (ArmError, CellError) as error:
-        text = str(error)
-        raise type(error)(text if text.startswith(str(path)) else f"{path}: {text}") from None
+        raise type(error)(_placed(document, str(error))) from None
     model = Model(
         arm=arm,
         tool_in_flange=_transform(file.tool.tcp),
@@ -211,6 +217,28 @@ def cell_of(file: CellFile, document: Document) -> Cell:
         metrology,
         (*found.warnings, *(f"{path}: {w}" for w in warnings)),
     )
+
+
+def _placed(document: Document, text: str) -> str:
+    """Return a message with its file, and the line of the key that it begins with."""
+    path = str(document.path)
+    if text.startswith(path):
+        return text
+    name = text.partition(":")[0]
+    named = [keys for keys in _paths((), document.data) if key_path(keys) == name]
+    return f"{path}, line {document.line(named[0])}: {text}" if named else f"{path}: {text}"
+
+
+def _paths(keys: tuple[str | int, ...], value: object) -> Iterator[tuple[str | int, ...]]:
+    """Yield the path of every key and entry."""
+    entries: Iterable[tuple[Any, object]] = ()
+    if isinstance(value, dict):
+        entries = value.items()
+    elif isinstance(value, list):
+        entries = enumerate(value)
+    for key, own in entries:
+        yield (*keys, key)
+        yield from _paths((*keys, key), own)
 
 
 def _transform(frame: Frame) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,11 +11,19 @@ from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.cell import Cell
 from gapbridge.bridge.cell.message import key_path
+from gapbridge.core.effects import Site, Term
 from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 from gapbridge.core.rotation import rotation_vector
 
 Array = NDArray[np.float64]
 POSES = 200
+FIELDS = {  # part of a cell -> fields of its model
+    "tool": ("tool_in_flange",),
+    "payload": ("payload_mass", "payload_cog"),
+    "gravity": ("gravity",),
+    "reference_temperature": ("reference_temperature",),
+}
 LEFT_OUT = ("provenance",)  # where a value comes from is no value
 WIDEST = np.pi  # rad: joints without limits are drawn within
 
@@ -27,6 +35,21 @@ class Change:
     key: str
     before: Any
     after: Any
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part of the model that differs, and how far it alone moves the predicted TCP.
+
+    ``name`` is tool, payload, gravity, reference_temperature, or an effect, then with its terms
+    ``before`` and ``after`` and where they sit.
+    """
+
+    name: str
+    moved: Moved | None
+    site: Site | None = None
+    before: Term | None = None
+    after: Term | None = None
 
 
 @dataclass(frozen=True)
@@ -92,11 +115,47 @@ def moved(before: Cell, after: Cell, q: Array | None = None, loads: Loads | None
     """
     if before.arm.n != after.arm.n:
         return None
-    if q is None:
-        limits = before.arm.limits
-        low, high = np.maximum(limits.lower, -WIDEST), np.minimum(limits.upper, WIDEST)
-        q = np.random.default_rng(seed).uniform(low, high, (POSES, before.arm.n))
-    one, other = (cell.model.predict(q, loads) for cell in (before, after))
+    return _moved(before.model, after.model, _drawn(before, seed) if q is None else q, loads)
+
+
+def parts(before: Cell, after: Cell, q: Array | None = None, loads: Loads | None = None,
+          seed: int = 0) -> list[Part]:  # fmt: skip
+    """Return the parts in which the models differ, the one that moves the TCP farthest first.
+
+    Each is put by itself into the model of ``before``, over the poses of ``moved``. Empty where the
+    arms have other joints.
+    """
+    if before.arm.n != after.arm.n:
+        return []
+    old, new = before.model, after.model
+    q = _drawn(before, seed) if q is None else q
+    found = [
+        Part(name, _moved(old, replace(old, **{key: getattr(new, key) for key in keys}), q, loads))
+        for name, keys in FIELDS.items()
+        if any(not np.array_equal(getattr(old, key), getattr(new, key)) for key in keys)
+    ]
+    one, other = ({(t.effect, t.site): t for t in model.terms if any(t.values)}
+                  for model in (old, new))  # fmt: skip
+    for at in dict.fromkeys([*one, *other]):
+        if one.get(at) != other.get(at):
+            kept = [term for term in old.terms if (term.effect, term.site) != at]
+            put = [other[at]] if at in other else []
+            trial = replace(old, terms=(*kept, *put))
+            found.append(Part(at[0], _moved(old, trial, q, loads), at[1], one.get(at),
+                              other.get(at)))  # fmt: skip
+    return sorted(found, key=lambda part: -(part.moved.rms if part.moved else 0.0))
+
+
+def _drawn(cell: Cell, seed: int) -> Array:
+    """Return random poses (POSES, n) within the joint limits, rad."""
+    limits = cell.arm.limits
+    low, high = np.maximum(limits.lower, -WIDEST), np.minimum(limits.upper, WIDEST)
+    return np.random.default_rng(seed).uniform(low, high, (POSES, cell.arm.n))
+
+
+def _moved(before: Model, after: Model, q: Array, loads: Loads | None) -> Moved | None:
+    """Return how far predicted TCP poses lie apart; None: no pose with an equilibrium."""
+    one, other = (model.predict(q, loads) for model in (before, after))
     apart = other.position - one.position
     fine = np.isfinite(apart).all(axis=1)
     if not fine.any():

@@ -157,6 +157,9 @@ class Provenance(Section):
     fitted: dict[str, tuple[Number, Number]] = Field(
         default={}, description="least and largest value of each column that was fitted on"
     )
+    intervals: dict[str, tuple[Number, Number]] = Field(
+        default={}, description="95 % interval of each number that was applied, SI"
+    )
     parameters: list[str] = Field(default=[], description="that were fitted, by name")
     covariance: list[list[Number]] = Field(
         default=[], description="of those parameters, SI: one row and column each"

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -15,6 +16,7 @@ from gapbridge.bridge.document.blocks import Block, Columns, Heading, Pairs, Tab
 from gapbridge.core.calibration.spread import Spread
 
 BLOCK = 1 << 20  # bytes read at a time
+SIDE = 1.96  # sigmas on each side of a 95 % interval
 
 
 def provenance(files: Mapping[str, Sequence[Path]]) -> dict[str, Any]:
@@ -62,14 +64,31 @@ def _argument(value: Any) -> str:
 
 
 def fitted(
-    origin: dict[str, Any], ranges: Mapping[str, tuple[float, float]], spread: Spread
-) -> dict[str, Any]:
-    """Return the provenance of a cell: with what its model was fitted on, and its covariance."""
+    origin: dict[str, Any], ranges: Mapping[str, tuple[float, float]], spread: Spread,
+    intervals: Mapping[str, tuple[float, float]],
+) -> dict[str, Any]:  # fmt: skip
+    """Return the provenance of a cell: with what its model was fitted on, and how surely.
+
+    ``intervals`` are the 95 % intervals of the numbers that were applied, by name, SI.
+    """
     listed = {name: [low, high] for name, (low, high) in ranges.items()}
     result = {**origin, "fitted": listed}
+    if intervals:
+        result["intervals"] = {name: [low, high] for name, (low, high) in intervals.items()}
     if spread.names:
         result |= {"parameters": list(spread.names), "covariance": spread.covariance.tolist()}
     return result
+
+
+def intervals_of(
+    found: Iterable[tuple[str, float, float | None]],
+) -> dict[str, tuple[float, float]]:
+    """Return the 95 % interval of each (name, value, 1 sigma); one without a sigma has none."""
+    return {
+        name: (float(value - SIDE * std), float(value + SIDE * std))
+        for name, value, std in found
+        if std is not None and math.isfinite(std)
+    }
 
 
 def installed_version() -> str:

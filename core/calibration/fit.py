@@ -95,7 +95,7 @@ def fit_session(
     how = observable or make_observable(readings.kind, registered=metrology.registered)
     if readings.held_out.all():
         raise ExcitationError("found no readings to fit: all are held out, expected others")
-    readings, lonely = _with_places(readings)
+    readings, lonely = _with_places(readings, how)
     to_fit = np.flatnonzero(~readings.held_out)
     with threadpool_limits(1, "blas"):  # matrices of this size gain nothing from threads
         problem, rest = converged_fit(
@@ -168,20 +168,26 @@ def _floor(diagnosis: Diagnosis | None) -> float:
     return float("nan") if not floors or floors[0] is None else float(floors[0])
 
 
-def _with_places(readings: Readings) -> tuple[Readings, tuple[str, ...]]:
-    """Return the readings with those to verify fitted where nothing else determines their place.
+def _with_places(readings: Readings, how: Observable) -> tuple[Readings, tuple[str, ...]]:
+    """Return the readings with those to verify fitted where too few others determine their place.
 
     Where an instrument stands, or a target sits, only readings there can say; and a note of it.
     """
+    layout = how.layout(readings)
+    unknown = len(layout.frame) + int(layout.length)
+    # one reading more than there are equations for: two positions leave a frame free to turn
+    enough = unknown // how.equations + 1 if unknown else 1
     held, fitted = readings.held_out, ~readings.held_out
     alone = np.zeros(len(readings), dtype=bool)
-    for place in (readings.station, readings.target):
-        alone |= held & ~np.isin(place, place[fitted])
+    for place, least in ((readings.station, enough), (readings.target, 1)):
+        for one in np.unique(place):  # poses, not readings: a second visit is no second point
+            if len(np.unique(readings.pose[fitted & (place == one)])) < least:
+                alone |= held & (place == one)
     if not alone.any():
         return readings, ()
     note = (
-        f"{int(alone.sum())} reading(s) to verify were fitted: no others determine where their "
-        "instrument stands, or their target sits"
+        f"{int(alone.sum())} reading(s) to verify were fitted: too few others determine where "
+        "their instrument stands, or their target sits"
     )
     return replace(readings, held_out=held & ~alone), (note,)
 

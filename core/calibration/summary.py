@@ -102,8 +102,9 @@ def verdict_of(
     held = len(errors[2].rows) > 0
     before, after = (errors[2], errors[3]) if held else (errors[0], errors[1])
     where = "on poses that the fit never saw" if held else "on the fitted poses (none held out)"
+    change = "rises" if after.rms > before.rms else "falls"
     text = (
-        f"the error falls from {1e3 * before.rms:.3f} to {1e3 * after.rms:.3f} mm rms {where}; "
+        f"the error {change} from {1e3 * before.rms:.3f} to {1e3 * after.rms:.3f} mm rms {where}; "
         f"the fit leaves {1e3 * rest.noise.coordinate():.3f} mm a coordinate"
     )
     if np.isfinite(floor):

@@ -86,8 +86,14 @@ def _begin(A: Array, b: Array, unit: Index, units: int) -> tuple[Array, Array]:
         root = 1 / np.sqrt(np.maximum(left, 0.1 * typical[unit]) * typical[unit])
         values = np.linalg.lstsq(A * root[:, None], b * root, rcond=None)[0]
     left = np.abs(b - A @ values)
-    spare = np.sqrt(len(b) / max(len(b) - A.shape[1], 1))
-    noise = [max(1.4826 * spare * float(np.median(left[unit == u])), TINY) for u in range(units)]
+    # absolute deviations meet as many cells exactly as there are numbers: these show no noise
+    shows = np.ones(len(b), dtype=bool)
+    shows[np.argsort(left / size[unit])[: A.shape[1]]] = False
+    noise = []
+    for u in range(units):
+        own = unit == u
+        cells = left[own & shows] if (own & shows).any() else left[own]
+        noise.append(max(1.4826 * float(np.median(cells)), TINY))
     return values, np.array(noise)
 
 

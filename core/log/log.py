@@ -203,10 +203,7 @@ def _read_csv(path: Path) -> tuple[list[str], Array, NDArray[np.int64] | None]:
     width = lines[0].count(delimiter)
     for number, line in zip(kept[1:], lines[1:], strict=True):
         if line.count(delimiter) != width:
-            raise LogError(
-                f"{path}: row {number}: found {line.count(delimiter) + 1} cells, "
-                f"expected {width + 1} as in the header"
-            )
+            raise cell_count(path, number, line.count(delimiter) + 1, width + 1)
     wanted = _wanted(names)
     if not wanted:
         return names, np.empty((len(lines) - 1, 0)), numbers
@@ -232,6 +229,14 @@ def is_comment(line: str) -> bool:
 def delimiter_of(header: str) -> str:
     """Return what stands between the cells of a CSV file."""
     return ";" if header.count(";") > header.count(",") else ","
+
+
+def cell_count(path: Path, row: int, found: int, expected: int) -> LogError:
+    """Return the error of a row with another number of cells than the header."""
+    more = " (decimal commas? then ; between the cells)" if found > expected else ""
+    return LogError(
+        f"{path}: row {row}: found {found} cells, expected {expected} as in the header{more}"
+    )
 
 
 def cell_number(path: Path, row: int, name: str, cell: str, delimiter: str) -> float:

@@ -19,6 +19,7 @@ from gapbridge.core.log.columns import is_known
 from gapbridge.core.log.log import (
     GZIP,
     Log,
+    cell_count,
     cell_number,
     delimiter_of,
     is_comment,
@@ -134,10 +135,7 @@ def _csv(path: Path, rows: int) -> Iterator[tuple[list[str], Array]]:
             for k, (number, line) in enumerate(lines):
                 cells = line.strip().split(delimiter)
                 if len(cells) != len(names):
-                    raise LogError(
-                        f"{path}: row {number}: found {len(cells)} cells, expected "
-                        f"{len(names)} as in the header"
-                    )
+                    raise cell_count(path, number, len(cells), len(names))
                 table[k] = [
                     cell_number(path, number, names[c], cells[c], delimiter) for c in wanted
                 ]

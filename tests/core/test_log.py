@@ -13,6 +13,7 @@ from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.log import last_motion, read_log
 from gapbridge.core.log.pieces import LogPieces
+from gapbridge.core.log.sources import SourceOptions, source_of
 from gapbridge.core.model import Model
 
 RECORDING = Path(__file__).parents[2] / ".." / "shared" / "data" / "rad_ur3e_rtde" / "log.csv"
@@ -71,6 +72,22 @@ def test_decimal_commas_comments_and_gzip_are_read(tmp_path):
     packed.write_bytes(packed.read_bytes()[:40])
     with pytest.raises(LogError, match="no readable file"):
         read_log(packed, 6)
+
+
+def test_decimal_commas_between_commas_are_refused_with_the_cure(tmp_path):
+    rows = [[str(v).replace(".", ",") for v in r] for r in joints()]
+    path = write(tmp_path, table(JOINTS, rows, ","))
+    for read in (lambda: read_log(path, 6), lambda: list(LogPieces(path, 6))):
+        with pytest.raises(LogError, match=r"decimal commas.*then ; between"):
+            read()
+
+
+def test_decimal_commas_between_tabs_are_read(tmp_path):
+    rows = [[f"{v:.3f}".replace(".", ",") for v in r] for r in joints()]
+    path = write(tmp_path, table(JOINTS, rows, "\t"))
+    source = source_of(path)
+    found = source.read(path, JOINTS, SourceOptions()).columns["actual_q"]
+    np.testing.assert_allclose(found, joints(), atol=1e-3)
 
 
 def test_columns_may_stand_in_any_order_and_unknown_ones_are_ignored(tmp_path):

@@ -164,6 +164,27 @@ def test_offsets_are_judged_by_envelope_step_and_rate() -> None:
         found.check(setpoint())
 
 
+@pytest.mark.parametrize("axis", [0, 4])
+def test_no_number_of_small_steps_leaves_the_envelope_of_offsets(axis: int) -> None:
+    found, clock = opened(moves_arm=False)
+    bounds = GateBounds()
+    rate, most = (0.05, bounds.offset) if axis < 3 else (0.1, bounds.offset_rotation)
+    reached = []
+
+    def walk() -> None:
+        for k in range(1, int(20 * RATE)):
+            offset = np.zeros(6)
+            offset[axis] = rate * k / RATE
+            found.check(setpoint(offset=offset))
+            found.sent()
+            reached.append(offset[axis])
+            clock.now += 1.0 / RATE
+
+    with pytest.raises(GateError, match="offset"):
+        walk()
+    assert most - rate / RATE < reached[-1] <= most * (1 + 1e-6)
+
+
 def test_the_envelope_of_joints_is_where_they_bring_the_tcp() -> None:
     found, _ = opened(moves_arm=True, bounds=GateBounds(joint_offset=0.5))
     q = spoilt(0, Q[0] + 0.02)  # 0.7 m from the first joint's axis: 14 mm

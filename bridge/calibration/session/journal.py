@@ -5,6 +5,7 @@ A power cut may tear the last line, and no other: it is cut off when the session
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import json
 import math
@@ -64,15 +65,21 @@ class Journal:
         self.entries = read_entries(self.path)
 
     def add(self, kind: str, **told: Any) -> Entry:
-        """Write an entry and have it on disk; returns it. Raises RunError."""
+        """Write an entry and have it on disk; returns it.
+
+        Raises RunError where that cannot be; the journal then is as it was.
+        """
         entry = {"kind": kind, "time": time.time(), **told}
         line = json.dumps(plain(entry), allow_nan=False, separators=(",", ":")) + "\n"
+        end = os.fstat(self._fd).st_size
         try:
             data = line.encode()
             if os.write(self._fd, data) != len(data):
                 raise OSError(0, "the disk is full")
             os.fsync(self._fd)
         except OSError as error:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._fd, end)
             raise RunError(f"{self.path}: cannot be written: {error.strerror}") from None
         return entry
 

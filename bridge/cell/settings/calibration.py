@@ -13,6 +13,7 @@ Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 NotNegative = Annotated[Number, Field(ge=0)]
 Positive = Annotated[Number, Field(gt=0)]
 Vector3 = Annotated[list[Number], Field(min_length=3, max_length=3)]
+FEWEST_HELD_OUT = 8  # poses kept out of the fit by which an accuracy can be decided
 
 
 class _Section(BaseModel):
@@ -68,7 +69,11 @@ class CalibrationSettings(_Section):
     )
     poses: int = Field(default=30, ge=6, le=1000, strict=True, description="poses to fit")
     held_out: int = Field(
-        default=8, ge=0, le=200, strict=True, description="poses to verify, never fitted"
+        default=8,
+        ge=FEWEST_HELD_OUT,
+        le=200,
+        strict=True,
+        description="poses to verify, never fitted",
     )
     repeats: int = Field(
         default=4, ge=0, le=50, strict=True, description="further visits: the arm's repeatability"

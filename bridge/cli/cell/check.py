@@ -9,6 +9,7 @@ import click
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.cell import complaints
 from gapbridge.bridge.cell.live import live_findings
+from gapbridge.bridge.cell.log_fit import log_findings
 from gapbridge.bridge.cell.run_settings import read_configuration
 from gapbridge.bridge.cli.options import cell_argument
 from gapbridge.core.errors import InputError
@@ -17,12 +18,23 @@ from gapbridge.core.errors import InputError
 @click.command()
 @cell_argument
 @click.option("--live", is_flag=True, help="Compare with the controller too; moves nothing.")
-def check(cell: Path, live: bool) -> None:
+@click.option(
+    "--log",
+    "logs",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    metavar="LOG",
+    help="Hold the arm against measured poses too: order and signs of joints, DH rows, frames.",
+)
+def check(cell: Path, live: bool, logs: tuple[Path, ...]) -> None:
     """Say whether a cell is fit to be used: everything that is wrong or odd in it, with its line.
 
     Units by their size (m, rad, kg, °C), reach, masses, limits; what cannot be meant is an error,
     what is only odd a warning. With --live also the controller's TCP, payload, gravity, geometry
-    and rate beside the cell's. Exits 0 where the cell is fit, 2 where it is not.
+    and rate beside the cell's. With --log also whether the arm is the one that was measured; where
+    it is not, each mistake that people make is tried (modified DH rows, a sign, inches, the order
+    of joints, frames), and the one that fits is named. Exits 0 where the cell is fit, 2 where it is
+    not.
 
     Example: gapbridge check config/ur10e_simulated.yaml --live
     """
@@ -40,6 +52,10 @@ def check(cell: Path, live: bool) -> None:
             found = live_findings(given)
             errors += found.errors
             warnings += found.warnings
+        for log in logs if not errors else ():
+            found = log_findings(given, log)
+            errors += found.errors
+            warnings += found.warnings
     for line in warnings:
         click.echo(f"warning: {line}", err=True)
     for line in errors:
@@ -47,4 +63,6 @@ def check(cell: Path, live: bool) -> None:
     if errors:
         raise click.exceptions.Exit(2)
     counted = f", {len(warnings)} warning{'s' * (len(warnings) != 1)}" if warnings else ""
-    click.echo(f"{cell}: fit to be used{' with its controller' * live}{counted}")
+    beside = [*["its controller"] * live, *map(str, logs)]
+    text = f" with {' and '.join(beside)}" if beside else ""
+    click.echo(f"{cell}: fit to be used{text}{counted}")

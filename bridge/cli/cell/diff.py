@@ -10,9 +10,16 @@ import click
 import numpy as np
 
 from gapbridge.bridge.cell import Cell
-from gapbridge.bridge.cell.difference import Change, Moved, changes, moved
+from gapbridge.bridge.cell.difference import FIELDS, Change, Moved, Part, changes, moved, parts
 from gapbridge.bridge.cell.opened_log import open_log
 from gapbridge.bridge.cli.options import open_cell
+from gapbridge.bridge.document.provenance import provenance
+from gapbridge.bridge.report.labels import effect_title, unit_of
+from gapbridge.core.arm import Arm
+from gapbridge.core.effects import Reported, Term, effect_named
+from gapbridge.core.rotation import rotation_vector
+
+MODEL = (*FIELDS, "compliance", "effect")  # beginnings of keys that are parts of the model
 
 
 @click.command()
@@ -24,10 +31,11 @@ from gapbridge.bridge.cli.options import open_cell
 @click.option("--seed", type=click.IntRange(min=0), default=0, help="Of the random poses.")
 @click.option("--json", "as_json", is_flag=True, help="As JSON, SI units.")
 def diff(before: Path, after: Path, log: Path | None, seed: int, as_json: bool) -> None:
-    """Say what changed from one cell to another: its keys, and millimetres over the workspace.
+    """Say what changed from one cell to another, in words and in millimetres over the workspace.
 
     The predicted TCP is compared over 200 random poses within the joint limits, under each cell's
-    own payload, or over the poses and loads of a log.
+    own payload, or over the poses and loads of a log: each change by itself, the one that moves it
+    farthest first, and all together.
 
     Example: gapbridge diff cell.yaml calibrated.yaml
     """
@@ -35,16 +43,24 @@ def diff(before: Path, after: Path, log: Path | None, seed: int, as_json: bool) 
     found = changes(one, other)
     rows = None if log is None else open_log(log, one)
     q = None if rows is None else rows.require("actual_q", "target_q")
-    shift = moved(one, other, q, None if rows is None else rows.loads(), seed)
+    loads = None if rows is None else rows.loads()
+    shift, several = moved(one, other, q, loads, seed), parts(one, other, q, loads, seed)
     if as_json:
-        reported = {"changes": [vars(change) for change in found],
-                "moved": None if shift is None else shift.to_json()}  # fmt: skip
+        reported = {
+            "changes": [vars(change) for change in found],
+            "parts": [_part_json(part, one, other) for part in several],
+            "moved": None if shift is None else shift.to_json(),
+            "provenance": provenance({"cell": [before, after], "log": [log] if log else []}),
+        }
         click.echo(json.dumps(reported, indent=1))
         return
     if not found:
         click.echo("no key differs")
     for change in found:
-        click.echo(_line(change))
+        if not (several and change.key.partition(".")[0].partition(" ")[0] in MODEL):
+            click.echo(_line(change))
+    for part in several:
+        click.echo(f"{_words(part, one, other)}{_by_itself(part.moved)}")
     _tell_origin(other)
     click.echo(_in_space(shift, "the log" if log else "the workspace"))
 
@@ -65,6 +81,78 @@ def _text(value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{key} {_text(item)}" for key, item in value.items() if item is not None)
     return str(value)
+
+
+def _part_json(part: Part, one: Cell, other: Cell) -> dict[str, Any]:
+    """Return a part in words, and how far it alone moves the predicted TCP, SI."""
+    shift = None if part.moved is None else part.moved.to_json()
+    return {"part": part.name, "words": _words(part, one, other), "moved": shift}
+
+
+def _by_itself(shift: Moved | None) -> str:
+    if shift is None:
+        return ""
+    return f"; alone {1e3 * shift.rms:.3f} mm rms at the TCP, at most {1e3 * shift.largest:.3f} mm"
+
+
+def _words(part: Part, one: Cell, other: Cell) -> str:
+    """Return what differs in a part, in units that people read."""
+    old, new = one.model, other.model
+    if part.name == "tool":
+        apart = np.asarray(np.linalg.solve(old.tool_in_flange, new.tool_in_flange), dtype=float)
+        turned = 1e3 * float(np.linalg.norm(rotation_vector(apart[:3, :3])))
+        return (
+            f"TCP: {_mm(old.tool_in_flange[:3, 3])} -> {_mm(new.tool_in_flange[:3, 3])} in the "
+            f"flange frame, {1e3 * np.linalg.norm(apart[:3, 3]):.3f} mm apart"
+            + (f", turned by {turned:.3f} mrad" if turned > 1e-6 else "")
+        )
+    if part.name == "payload":
+        return (
+            f"payload: {old.payload_mass:g} kg at {_mm(old.payload_cog)} -> "
+            f"{new.payload_mass:g} kg at {_mm(new.payload_cog)} in the flange frame"
+        )
+    if part.name == "gravity":
+        before, after = (", ".join(f"{v:.4g}" for v in model.gravity) for model in (old, new))
+        return f"gravity: ({before}) -> ({after}) m/s2 in base"
+    if part.name == "reference_temperature":
+        before, after = (f"{model.reference_temperature:g}" for model in (old, new))
+        return f"reference temperature: {before} -> {after} °C"
+    site = part.site
+    where = "" if site is None or site.joint is None else f" of joint {site.joint}"
+    where += "" if site is None or site.order is None else f", {site.order:g} a turn"
+    return f"{effect_title(part.name)} ({part.name}){where}: {_values(part, one.arm, other.arm)}"
+
+
+def _mm(vector: np.ndarray[Any, Any]) -> str:
+    return "(" + ", ".join(f"{1e3 * v + 0.0:.6g}" for v in vector) + ") mm"
+
+
+def _values(part: Part, one: Arm, other: Arm) -> str:
+    """Return the numbers of an effect, before and after; zeros that stay are left out."""
+    before, after = _reported(part.before, one), _reported(part.after, other)
+    pairs = [(b, a) for b, a in zip(before or after, after or before, strict=True)]
+    texts = []
+    for old, new in pairs:
+        unit, factor = unit_of(new.unit)
+        name = _own_name(part, new) if len(pairs) > 1 else ""
+        values = [v.value * factor for v in (old, new)]
+        if not any(values):
+            continue
+        shown = f"{values[1]:.4g}" if not before or not after else (
+            f"{values[0]:.4g} -> {values[1]:.4g}"
+        )  # fmt: skip
+        texts.append(f"{name} {shown} {unit}".strip())
+    return f"{'' if before else 'added, '}{'' if after else 'removed, was '}{', '.join(texts)}"
+
+
+def _reported(term: Term | None, arm: Arm) -> tuple[Reported, ...]:
+    return () if term is None else effect_named(term.effect).reported(arm, term, None)
+
+
+def _own_name(part: Part, value: Reported) -> str:
+    """Return a number's name without its effect and joint: ``a`` of ``link_geometry_3_a``."""
+    joint = "" if part.site is None or part.site.joint is None else f"_{part.site.joint}"
+    return value.name.removeprefix(f"{part.name}{joint}_")
 
 
 def _tell_origin(cell: Cell) -> None:

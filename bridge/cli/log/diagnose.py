@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from gapbridge.bridge.api.found_spread import spread_of
+from gapbridge.bridge.api.found_spread import intervals_applied, spread_of
 from gapbridge.bridge.cell import Cell, save_cell
 from gapbridge.bridge.cell.opened_log import open_log
 from gapbridge.bridge.cli.log.answer import answer
@@ -128,7 +128,9 @@ def diagnose(
     if new_cell is not None:
         applied = found.with_stand_ins if stand_ins else found.model
         spread = spread_of(found).beside(given.spread)
-        save_cell(given, new_cell, applied, {"provenance": fitted(origin, range_of(rows), spread)})
+        intervals = given.intervals | intervals_applied(found, stand_ins=stand_ins)
+        written_by = fitted(origin, range_of(rows), spread, intervals)
+        save_cell(given, new_cell, applied, {"provenance": written_by})
     written = [] if out is None else _write_folder(out, reported, found, given, rows)
     for file in (*written, json_file, new_cell):
         if file is not None:

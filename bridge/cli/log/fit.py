@@ -11,6 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from gapbridge.bridge.api.found_spread import fit_intervals
 from gapbridge.bridge.cell import Cell, save_cell
 from gapbridge.bridge.cli.log.large_log import LargeLog, has_sessions, is_large
 from gapbridge.bridge.cli.options import (
@@ -62,7 +63,8 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     except ExcitationError as error:
         raise ExcitationError(f"{', '.join(map(str, logs))}: {error}") from None
     spread = Spread.of_fit(found.identifiable, found.covariance).beside(given.spread)
-    origin = fitted(provenance({"log": logs, "cell": [cell]}), ranges, spread)
+    intervals = given.intervals | fit_intervals(found)
+    origin = fitted(provenance({"log": logs, "cell": [cell]}), ranges, spread, intervals)
     # frame and tool point that were estimated along stay out of the cell
     model = given.model.with_compliance(found.axial, found.radial)
     save_cell(given, out, model, {"provenance": origin})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -94,7 +94,23 @@ def _vectors(path: Path, delimiter: str | None, wanted: dict[str, str]) -> dict[
 
 def _numbers(path: Path, delimiter: str | None, places: list[int]) -> Array:
     try:
-        return np.loadtxt(path, delimiter=delimiter, skiprows=1, usecols=places, ndmin=2,
-                          comments=None, encoding="utf-8-sig")  # fmt: skip
+        return _loaded(path, delimiter, places, None)
     except (ValueError, OSError) as error:
-        raise LogError(f"{path}: found {error}, expected rows of numbers") from None
+        try:
+            # between blanks a comma can only be the decimal point
+            return _loaded(path, delimiter, places, None if delimiter else _comma_number)
+        except (ValueError, OSError):
+            raise LogError(f"{path}: found {error}, expected rows of numbers") from None
+
+
+def _loaded(
+    path: Path, delimiter: str | None, places: list[int], convert: Callable[[str], float] | None
+) -> Array:
+    return np.loadtxt(
+        path, delimiter=delimiter, skiprows=1, usecols=places, ndmin=2, comments=None,
+        encoding="utf-8-sig", converters=convert,
+    )  # fmt: skip
+
+
+def _comma_number(text: str) -> float:
+    return float(text.replace(",", "."))

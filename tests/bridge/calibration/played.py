@@ -58,7 +58,7 @@ class Played:
 def write_cell(folder: Path, **changed: object) -> Path:
     given = {
         "registered": "false", "instrument": "{kind: typed, unit: m}", "joints": "planned",
-        "poses": 14, "held_out": 3, **changed,
+        "poses": 14, "held_out": 8, **changed,
     }  # fmt: skip
     path = folder / "cell.yaml"
     path.write_text(CELL.format(**given), encoding="utf-8")

@@ -84,5 +84,8 @@ def test_the_cell_says_where_it_comes_from_and_how_well_it_is_known(
     assert origin.command == "calibrate"
     assert {file.role for file in origin.files} == {"log", "cell"}
     assert "transmission_error_2_order2_cos" in " ".join(cell.spread.names)
+    assert set(cell.intervals) <= set(cell.spread.names)
+    assert all(low < high for low, high in cell.intervals.values())
+    assert len(cell.intervals) > 20
     std = cell.spread.position_std(cell.model, np.array([p.q for p in plan_in(folder / "s").poses]))
     assert 0 < std.max() < 2e-4

@@ -19,7 +19,7 @@ AT = (2.5, -0.8, 0.6)
 
 
 def cell_with(folder: Path, *lines: str, **changed: object) -> Path:
-    path = write_cell(folder, **{"poses": 12, "held_out": 2, **changed})
+    path = write_cell(folder, **{"poses": 12, "held_out": 8, **changed})
     with path.open("a", encoding="utf-8") as file:
         file.write("".join(f"  {line}\n" for line in lines))
     return path

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +63,8 @@ def test_a_session_ends_with_a_cell_that_knows_the_arm(clean: tuple[Path, Played
     assert axial[1] == pytest.approx(AXIAL[1], rel=0.15)
     for name in ("calibration.html", "calibration.pdf", "readings.csv", "promise.json"):
         assert (folder / "s" / name).stat().st_size > 500
-    assert (folder / "new.promise.json").exists()
+    promise = json.loads((folder / "new.promise.json").read_text())
+    assert [file["role"] for file in promise["provenance"]["files"]] == ["log", "cell"]
     assert "\ncompliance:" not in (folder / "cell.yaml").read_text()
 
 
@@ -136,7 +138,6 @@ def _kept(folder: Path) -> list[dict[str, object]]:
 
 
 def _same_within_intervals(one: Path, other: Path) -> None:
-    import json
 
     from gapbridge.core.calibration.accuracy_baseline import baseline_in
 
@@ -153,7 +154,7 @@ def test_an_ended_input_and_quit_end_in_order_and_show_how_to_go_on(tmp_path: Pa
     played = play(cell, "--session", tmp_path / "s", lines=["", "?", value, "quit"])
     assert played.code == 0
     assert "take the last reading back" in played.out
-    assert "1 of 19 stops are measured and kept; go on with: gapbridge calibrate" in played.out
+    assert "1 of 24 stops are measured and kept; go on with: gapbridge calibrate" in played.out
     played = play(cell, "--session", tmp_path / "s", lines=["skip"])
     assert "stop 2 is left out" in played.out
     assert "the input ended" in played.out
@@ -168,6 +169,7 @@ def test_an_ended_input_and_quit_end_in_order_and_show_how_to_go_on(tmp_path: Pa
         (["--verify"], {}, "expected the promise that `gapbridge calibrate` writes"),
         (["--payload-only"], {}, "link: found nothing"),
         (["--verify", "--tool-only"], {}, "more than one of"),
+        ([], {"held_out": 7}, "calibration.held_out: found 7"),
         ([], {"joints": "link"}, "link: found nothing, expected the robot's address"),
         ([], {"instrument": "{kind: sphere}"}, "calibration.instrument_at: found nothing"),
         ([], {"instrument": "{kind: file, unit: mm, file: none/x.csv}"}, "no such file"),

@@ -32,7 +32,7 @@ calibration:
   loads: [{{mass: 1.5, cog: [0, 0, 0.05]}}, {{mass: 9.5, cog: [0, 0, 0.09]}}]
   effects: [axial_compliance]
   poses: {poses}
-  held_out: 3
+  held_out: 8
   repeats: 2
   floor: 0.1
   joint_range: {{lower: [-1.2, -2.4, 0.4, -2.8, -2.4, -1.5], upper: [1.2, -0.6, 2.3, -0.6, -0.8, 1.5]}}

@@ -13,6 +13,7 @@ from daemon_cell import plant
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.arm import builtin_arm
+from gapbridge.core.model import Model
 from gapbridge.core.plausibility import flange_in_first
 from gapbridge.drivers.simulated.ur.process import SimulatedController
 from gapbridge.drivers.simulated.ur.settings import announced_rows
@@ -60,6 +61,76 @@ def test_a_fit_cell_ends_with_zero_and_says_so(tmp_path: Path) -> None:
     assert answer.code == 0
     assert answer.out == f"{path}: fit to be used, 1 warning\n"
     assert answer.err.startswith(f"warning: {path}, line 2: metrology.sigma")
+
+
+@pytest.mark.parametrize(
+    ("lines", "place"),
+    [
+        ("payload: {mass: 5000}", "line 2: payload.mass: found 5000 kg"),
+        ("effects:\n  - {effect: backlash, joint: 9, parameters: {value: 1}}",
+         "line 3: effects entry 1.joint: found 9"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_the_arm_is_named_with_its_line(
+    tmp_path: Path, lines: str, place: str
+) -> None:
+    path = tmp_path / "cell.yaml"
+    path.write_text(f"robot: {{model: ur10e}}\n{lines}\n")
+    assert f"error: {path}, {place}" in gapbridge("check", path).err
+    assert f"{path}, {place}" in refused("simulate", path)
+
+
+Q = np.random.default_rng(3).uniform(-2.0, 2.0, (30, 6))
+CRAIG = """robot:
+  dh:  # of a UR10e, in Craig's convention
+    - {a: 0, d: 0.1807, alpha: 0, offset: 0}
+    - {a: 0, d: 0, alpha: 1.570796327, offset: 0}
+    - {a: -0.6127, d: 0, alpha: 0, offset: 0}
+    - {a: -0.57155, d: 0.17415, alpha: 0, offset: 0}
+    - {a: 0, d: 0.11985, alpha: 1.570796327, offset: 0}
+    - {a: 0, d: 0.11655, alpha: -1.570796327, offset: 0}
+"""
+
+
+def measured_log(folder: Path, order: tuple[int, ...] = (0, 1, 2, 3, 4, 5)) -> Path:
+    """Write poses of a UR10e as an instrument in base measured them, joints in an ``order``."""
+    position = Model(arm=builtin_arm("ur10e")).rigid_pose(Q).position
+    names = [f"actual_q_{i}" for i in range(6)] + [f"measured_position_{i}" for i in range(3)]
+    path = folder / "log.csv"
+    np.savetxt(path, np.hstack([Q[:, order], position]), delimiter=",", header=",".join(names),
+               comments="")  # fmt: skip
+    return path
+
+
+@pytest.mark.parametrize(
+    ("robot", "order", "phrase"),
+    [
+        (CRAIG, (0, 1, 2, 3, 4, 5), "robot.dh looks like modified DH rows (Craig)"),
+        ("robot: {model: ur10e}\n", (2, 1, 0, 3, 4, 5), "joints 1 and 3 look swapped (a UR's"),
+        ("robot: {model: ur10e}\n", (0, 1, 2, 5, 3, 4), "the joints look out of order: joint 4 is"),
+        ("robot: {model: ur3e}\n", (0, 1, 2, 3, 4, 5), "is it the right arm, tool and order"),
+    ],
+)  # fmt: skip
+def test_another_arm_than_was_measured_is_named_by_its_mistake(
+    tmp_path: Path, robot: str, order: tuple[int, ...], phrase: str
+) -> None:
+    path, log = tmp_path / "cell.yaml", measured_log(tmp_path, order)
+    path.write_text(robot)
+    answer = gapbridge("check", path, "--log", log)
+    assert answer.code == 2
+    (line,) = [line for line in answer.err.splitlines() if line.startswith("error")]
+    assert phrase in line
+
+
+def test_the_arm_that_was_measured_fits_its_log(tmp_path: Path) -> None:
+    path, log = tmp_path / "cell.yaml", measured_log(tmp_path)
+    path.write_text("robot: {model: ur10e}\n")
+    answer = gapbridge("check", path, "--log", log)
+    assert (answer.code, answer.out) == (0, f"{path}: fit to be used with {log}\n")
+    log.write_text(
+        "actual_q_0,actual_q_1,actual_q_2,actual_q_3,actual_q_4,actual_q_5\n0,0,0,0,0,0\n"
+    )
+    assert "columns measured_position_0..2: not found" in refused("check", path, "--log", log)
 
 
 def test_every_command_refuses_it_in_one_line(tmp_path: Path) -> None:

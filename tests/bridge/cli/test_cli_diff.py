@@ -23,7 +23,8 @@ def test_a_longer_tool_moves_the_tcp_by_as_much_everywhere(tmp_path: Path) -> No
     paths = cells(tmp_path, BEFORE.replace("0.18", "0.183"))
     answer = gapbridge("diff", *paths)
     assert answer.code == 0
-    assert "tool.tcp.xyz: [0, 0, 0.18] -> [0, 0, 0.183]" in answer.out
+    expected = "TCP: (0, 0, 180) mm -> (0, 0, 183) mm in the flange frame, 3.000 mm apart; alone"
+    assert f"{expected} 3.000 mm rms at the TCP, at most 3.000 mm" in answer.out
     assert "moves by 3.000 mm rms, at most 3.000 mm" in answer.out
 
 
@@ -37,8 +38,17 @@ def test_an_effect_and_a_flexibility_are_named(tmp_path: Path) -> None:
     assert {c["key"] for c in reported["changes"]} == {
         "effect joint_offset of joint 1", "compliance.axial"
     }  # fmt: skip
+    assert [p["words"] for p in reported["parts"]] == [
+        "joint zero is off (joint_offset) of joint 1: added, 1 mrad",
+        "joint twists under load (axial_compliance) of joint 2: added, 10 µrad/Nm",
+    ]
+    alone = [p["moved"]["rms"] for p in reported["parts"]]
+    assert alone[0] > alone[1] > 1e-5
     assert 1e-4 < reported["moved"]["rms"] < reported["moved"]["largest"] < 0.02
     assert reported["moved"]["poses"] == 200
+    origin = reported["provenance"]
+    assert (origin["command"], len(origin["files"])) == ("diff", 2)
+    assert all(len(file["sha256"]) == 64 for file in origin["files"])
 
 
 def test_over_a_log_only_its_poses_count(tmp_path: Path) -> None:

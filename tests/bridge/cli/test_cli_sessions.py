@@ -98,7 +98,16 @@ def test_provenance_stands_in_the_json_and_in_the_cell(answered) -> None:
     parameters, covariance = written.pop("parameters"), np.array(written.pop("covariance"))
     assert covariance.shape == (len(parameters),) * 2
     assert (np.diag(covariance) > 0).all()
+    intervals = written.pop("intervals")
     assert written == origin
+    applied = [
+        p for c in reported["channels"] for cause in c["causes"] for p in cause["parameters"]
+    ]
+    assert set(intervals) == {p["name"] for p in applied}
+    for p in applied:
+        low, high = intervals[p["name"]]
+        assert (low + high) / 2 == pytest.approx(p["value"])
+        assert (high - low) / 2 == pytest.approx(1.96 * p["std"])
     assert set(fitted) >= {"actual_q_0", "actual_q_5", "payload"}
     assert load_cell(folder / "new.yaml").fitted_range["payload"] == tuple(fitted["payload"])
 
@@ -136,6 +145,9 @@ def test_two_logs_are_one_fit(tmp_path: Path) -> None:
     assert cell.model.compliance()[0][1] == pytest.approx(2e-5, rel=0.05)
     assert cell.file.provenance is not None
     assert cell.file.provenance.command == "fit"
+    low, high = cell.intervals["axial_compliance_2"]
+    assert low < 2e-5 < high
+    assert high - low < 5e-6
 
 
 def test_a_column_session_is_read_too(tmp_path: Path) -> None:

@@ -103,6 +103,14 @@ def test_every_pair_of_state_and_cause_keeps_the_rules(state: State, cause: Caus
         assert after == State.FAULT
 
 
+@pytest.mark.parametrize(
+    "cause", [Cause.SILENCE, Cause.UNSAFE, Cause.WRITE_FAILED, Cause.BAD_OUTPUT]
+)
+def test_what_no_ramp_can_follow_is_a_fault_at_once(cause: Cause) -> None:
+    for state in (State.ARMED, State.COMPENSATING, State.HOLDING):
+        assert TRANSITIONS[state, cause] == State.FAULT
+
+
 def reached(start: State, causes: set[Cause]) -> set[State]:
     found, waiting = {start}, [start]
     while waiting:

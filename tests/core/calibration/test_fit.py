@@ -213,6 +213,24 @@ def test_what_is_left_to_be_added_is_named_and_then_completes_it(
     assert play.interval[0] < 8e-4 < play.interval[1]
 
 
+@pytest.mark.parametrize(("alone", "fitted"), [(2, True), (3, False)])
+def test_a_place_that_too_few_fitted_poses_determine_takes_those_to_verify_as_well(
+    model: Model, parameters: Parameters, session: tuple[Readings, dict[str, float], Instrument],
+    alone: int, fitted: bool,
+) -> None:  # fmt: skip
+    """Two positions leave a frame free to turn about their line; a repeat is no third."""
+    readings = session[0]
+    poses = np.unique(readings.pose[~readings.held_out])[:alone]
+    second = np.isin(readings.pose, poses).astype(np.int64)
+    second[np.flatnonzero(readings.held_out)[-4:]] = 1
+    some = calibrate(
+        model, replace(readings, station=second), parameters, METROLOGY, diagnose=False
+    )
+    assert any("4 reading(s) to verify were fitted" in note for note in some.notes) == fitted
+    assert len(some.held_out_after.rows) == readings.held_out.sum() - 4 * fitted
+    assert some.held_out_after.rms < 2e-3
+
+
 def test_the_diagnosis_finds_nothing_in_what_a_complete_calibration_leaves(
     model: Model, parameters: Parameters, session: tuple[Readings, dict[str, float], Instrument]
 ) -> None:

@@ -82,6 +82,32 @@ def test_a_joint_whose_zero_moved_is_named_with_how_far(calibrated: Calibrated) 
     assert "joint 3" in seen.verdict
 
 
+@pytest.mark.parametrize("size", [0.01, 0.05])
+def test_a_zero_that_moved_far_is_named_all_the_same(calibrated: Calibrated, size: float) -> None:
+    found, document, real, instrument = calibrated
+    slipped = with_values(real, {"joint_offset_5": size})
+    seen = verify(found.model, _again(slipped, instrument, poses=8), document, METROLOGY)
+    assert seen.moved is not None
+    assert seen.moved.name == "joint_offset_5"
+    assert abs(seen.moved.estimates[0].value - size) < 4.0 * seen.moved.estimates[0].std
+    assert "the zero of joint 5 moved by" in seen.verdict
+
+
+def test_a_zero_that_the_calibration_left_open_may_be_off_by_as_much(
+    calibrated: Calibrated,
+) -> None:
+    found, document, real, instrument = calibrated
+    baseline = baseline_in(document)
+    covariance = baseline.covariance.copy()
+    at = baseline.names.index("joint_offset_3")
+    covariance[at, at] += 4e-4**2
+    readings = _again(with_values(real, {"joint_offset_3": 4e-4}), instrument)
+    stated = verify(found.model, readings, baseline, METROLOGY)
+    vague = verify(found.model, readings, replace(baseline, covariance=covariance), METROLOGY)
+    assert vague.holds and not stated.holds
+    assert np.all(vague.promised > stated.promised)
+
+
 def test_a_tool_that_was_deflected_is_named(calibrated: Calibrated) -> None:
     found, document, real, instrument = calibrated
     deflected = with_values(real, {"tool_frame_x": 4e-4, "tool_frame_z": -2e-4})

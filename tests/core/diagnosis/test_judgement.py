@@ -89,6 +89,19 @@ def test_what_does_not_shrink_the_gap_of_unseen_samples_is_withdrawn():
     ]
 
 
+def test_a_value_on_its_bound_is_no_accusation():
+    selection = channel_of("backlash").selection
+    (term,), (c,) = selection.terms, selection.term_index
+    candidate = selection.space.candidates[c]
+    bounded = tuple(replace(p, upper=term.values[0]) for p in candidate.parameters)
+    candidates = list(selection.space.candidates)
+    candidates[c] = replace(candidate, parameters=bounded)
+    space = replace(selection.space, candidates=tuple(candidates))
+    judged = judge(replace(selection, space=space), HeldOut(selection))
+    assert judged.accused == ()
+    assert [why for _, why in judged.withdrawn] == ["its value stands on its bound"]
+
+
 @pytest.mark.parametrize(("sigmas", "stays"), [(0.5, False), (40.0, True)])
 def test_a_value_that_may_as_well_be_none_is_no_accusation(sigmas, stays):
     selection = channel_of("backlash").selection

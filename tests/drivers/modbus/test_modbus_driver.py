@@ -97,7 +97,9 @@ def test_registers_that_a_dead_client_left_move_nothing(ur: ModbusCase) -> None:
         assert driver._look().answer == (0, encode.EXPIRED)
 
 
-def test_a_client_that_dies_is_withdrawn_at_the_rates_of_its_cell(ur: ModbusCase) -> None:
+def test_a_client_that_dies_is_withdrawn_at_the_rates_of_its_cell(
+    ur: ModbusCase, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rate, turn = 0.002, 0.004  # m/s, rad/s
     with ur.driver() as driver:
         driver.gate.hold_to(GateBounds(offset_rate=rate, offset_rotation_rate=turn))
@@ -111,7 +113,12 @@ def test_a_client_that_dies_is_withdrawn_at_the_rates_of_its_cell(ur: ModbusCase
         stream(driver, towards, 1.0)
         largest = program_of(ur).applied[0]
         assert largest > 5e-4
-        driver.release()  # as a kill: nothing more is sent
+        sent = []
+        with monkeypatch.context() as watched:
+            for way in ("write", "exchange"):
+                watched.setattr(driver.transport, way, lambda *a: sent.append(a))
+            driver.release()
+        assert sent == []  # as a kill: no zero from here, which would be a step
         path = [(time.monotonic(), largest)]
         while path[-1][1] > 0.0:
             path.append((time.monotonic(), program_of(ur).applied[0]))

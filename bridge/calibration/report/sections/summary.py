@@ -6,6 +6,7 @@ import numpy as np
 
 from gapbridge.bridge.calibration.report.figures import mm
 from gapbridge.bridge.calibration.report.material import Material
+from gapbridge.bridge.cell.settings.calibration import FEWEST_HELD_OUT
 from gapbridge.bridge.document.blocks import (
     BAD,
     DOUBTFUL,
@@ -19,8 +20,6 @@ from gapbridge.bridge.document.blocks import (
 )
 from gapbridge.bridge.report.labels import listed
 from gapbridge.bridge.report.names import sentence
-
-FEWEST_HELD_OUT = 8  # poses kept out of the fit by which an accuracy can be decided
 
 
 def summary(material: Material) -> list[Block]:

@@ -18,7 +18,7 @@ from gapbridge.bridge.calibration.session.journal import FILE, Journal, plain, r
 from gapbridge.bridge.calibration.session.plan_document import plan_entry, plan_of
 from gapbridge.bridge.calibration.session.session import Reading, Session
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
-from gapbridge.core.errors import InputError
+from gapbridge.core.errors import InputError, RunError
 
 
 def small_plan(stops: int = 4) -> Plan:
@@ -86,6 +86,20 @@ def test_readings_after_a_knock_belong_to_the_new_place(tmp_path: Path) -> None:
     with Journal(tmp_path) as journal:
         again = Session.of(journal)
     assert [t.station for t in again.taken] == [0, 1, 1]
+
+
+def test_an_entry_that_did_not_fit_on_the_disk_leaves_the_journal_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = os.write
+    with Journal(tmp_path) as journal:
+        journal.add("note", text="before")
+        with monkeypatch.context() as full:
+            full.setattr(os, "write", lambda fd, data: write(fd, data[: len(data) // 2]))
+            with pytest.raises(RunError, match="the disk is full"):
+                journal.add("note", text="lost")
+        journal.add("note", text="after")
+    assert [entry["text"] for entry in read_entries(tmp_path / FILE)] == ["before", "after"]
 
 
 @given(st.integers(0, 400))

@@ -1,0 +1,38 @@
+"""A cell beside a log: whether the arm that was measured is the cell's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gapbridge.bridge.cell.cell import Cell
+from gapbridge.bridge.cell.opened_log import open_log
+from gapbridge.bridge.cell.plausibility import Findings
+from gapbridge.core.diagnosis.log_checks.frames import frame_findings
+from gapbridge.core.diagnosis.log_checks.units_and_clocks import findings
+from gapbridge.core.errors import LogError
+from gapbridge.core.sessions import sessions_in
+
+MEASURED = "measured_position"
+
+
+def log_findings(cell: Cell, path: Path) -> Findings:
+    """Return where a log's measured poses are not those of the cell's arm, and what is odd in it.
+
+    Raises InputError where the log cannot be used.
+    """
+    log = open_log(path, cell)
+    if not log.has(MEASURED):
+        raise LogError(
+            f"{path}: columns {MEASURED}_0..2: not found, expected them: without measured "
+            "positions nothing shows which arm it was"
+        )
+    errors: dict[str, None] = {}  # in order, each once
+    odd: dict[str, None] = {}
+    for part in sessions_in(log):
+        wrong = frame_findings(cell.model, part, cell.metrology)
+        errors |= dict.fromkeys(wrong)
+        odd |= dict.fromkeys(findings(part, cell.model, cell.metrology))
+    return Findings(
+        [f"{cell.path} with {path}: {text}" for text in errors],
+        [f"{path}: {text}" for text in odd if text not in errors],
+    )

@@ -1,0 +1,95 @@
+"""The robust fit: what least squares says without outliers, and the same beside them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import t as student
+
+from gapbridge.core.estimation.robust import INLIER, scaled_length, weighed
+
+ROWS, WIDTH, NUMBERS = 30, 3, 5
+
+
+def drawn(
+    seed: int, rows: int = ROWS, numbers: int = NUMBERS
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return equations of ``rows`` readings of three cells, true values, and each cell's row."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(rows * WIDTH, numbers))
+    truth = rng.normal(size=numbers)
+    b = A @ truth + rng.normal(0.0, 1e-3, rows * WIDTH)
+    return A, b, truth, np.repeat(np.arange(rows), WIDTH)
+
+
+def one_unit(b: np.ndarray) -> np.ndarray:
+    return np.zeros(len(b), dtype=np.int64)
+
+
+def test_without_outliers_it_is_about_least_squares() -> None:
+    for seed in range(10):
+        A, b, _, row = drawn(seed)
+        found = weighed(A, b, one_unit(b), row)
+        plain = np.linalg.lstsq(A, b, rcond=None)[0]
+        deviation = np.sqrt(np.diag(found.covariance))
+        assert np.all(np.abs(found.values - plain) < 1.0 * deviation)
+        assert len(found.outliers) <= 1
+
+
+@pytest.mark.parametrize(("rows", "numbers"), [(5, 6), (12, 6), (12, 18), (40, 60)])
+def test_the_stated_deviations_are_those_of_the_errors(rows: int, numbers: int) -> None:
+    """Also where a third to a half of the cells is spent, as in a session of a few touches."""
+    scaled, noise = [], []
+    for seed in range(150):
+        A, b, truth, row = drawn(seed, rows=rows, numbers=numbers)
+        found = weighed(A, b, one_unit(b), row)
+        scaled.append((found.values - truth) / np.sqrt(np.diag(found.covariance)))
+        noise.append(found.noise[0])
+    assert np.median(noise) == pytest.approx(1e-3, rel=0.15)
+    free = rows * WIDTH - numbers
+    spread = np.quantile(np.abs(scaled), 0.68) / student.ppf(0.84, free)
+    assert spread == pytest.approx(1.0, rel=0.15)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3])
+@pytest.mark.parametrize("seed", range(5))
+def test_outliers_are_found_as_wholes_and_change_nothing(seed: int, share: float) -> None:
+    A, b, _, row = drawn(seed)
+    bad = np.random.default_rng(seed).choice(ROWS, int(share * ROWS), replace=False)
+    good = ~np.isin(row, bad)
+    alone = np.linalg.lstsq(A[good], b[good], rcond=None)[0]
+    for k in bad:  # all to one side: a fit of least squares follows them
+        b[row == k] += 0.05 * (1.0 + A[row == k, 0])
+    found = weighed(A, b, one_unit(b), row)
+    assert set(bad) <= set(found.outliers.tolist())
+    assert np.abs(found.values - alone).max() < 5e-4
+    assert np.abs(np.linalg.lstsq(A, b, rcond=None)[0] - alone).max() > 2e-3
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_third_of_gross_outliers_to_one_side_are_seen(seed: int) -> None:
+    A, b, truth, row = drawn(seed, numbers=2)
+    bad = np.random.default_rng(seed).choice(ROWS, ROWS // 3, replace=False)
+    A[:, 0] = 1.0
+    b = A @ truth + np.random.default_rng(seed + 50).normal(0.0, 1e-3, len(b))
+    b[np.isin(row, bad)] += 0.02
+    found = weighed(A, b, one_unit(b), row)
+    assert set(bad) == set(found.outliers.tolist())
+    assert np.abs(found.values - truth).max() < 1e-3
+
+
+def test_cells_of_two_units_have_each_their_own_noise() -> None:
+    rng = np.random.default_rng(3)
+    A, b, truth, row = drawn(3, rows=200)
+    unit = (np.arange(len(b)) % WIDTH == 2).astype(np.int64)
+    b[unit == 1] += rng.normal(0.0, 0.02, int(unit.sum()))
+    found = weighed(A, b, unit, row)
+    np.testing.assert_allclose(found.noise, [1e-3, 0.02], rtol=0.15)
+    assert np.abs(found.values - truth).max() < 3e-4
+
+
+@pytest.mark.parametrize("width", [1, 3, 6, 12])
+def test_one_limit_means_the_same_chance_for_any_width(width: int) -> None:
+    square = np.random.default_rng(0).chisquare(width, 200_000)
+    lengths = scaled_length(square, np.full(len(square), float(width)))
+    assert np.mean(lengths > INLIER) == pytest.approx(0.0139, rel=0.3)
