@@ -13,6 +13,10 @@ SIGMAS = 6.0  # of its value; 4 gives 11 false of 72 unknown alone, 6 to 8 7, 12
 SIBLING = 3.0  # at further joints of an effect that stays at one: 7 of 218 true terms lost without
 MAX_DRIFT = 1.5  # times, of its value: 2 gives one false more, 1.3 loses real friction
 MAX_UNNAMED = 6  # unnamed functions asked for at a time: more span the short logs
+VARIES = (
+    1 / 3
+)  # of a number's constant, how far it may go by a quantity: unknowns that an effect is
+# the first order of go by 0.39 to 0.87
 # An accusation by itself
 OWN_SIGMAS = 3.0  # of at least one of its numbers: what an engineer calls a finding
 NEGLIGIBLE = 1e-3  # of its parameters' usual sizes: the tail of a servo is a dead band of 5e-9 rad

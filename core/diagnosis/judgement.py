@@ -16,6 +16,7 @@ from scipy.special import gammaincc
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.diagnosis.bump import bumps
+from gapbridge.core.diagnosis.constancy import not_constant
 from gapbridge.core.diagnosis.criteria import (
     ENOUGH_REPEATS,
     GAIN,
@@ -91,6 +92,9 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
     stays, remainder = withstanding(selection, believed)
     stays += with_the_links(selection, stays, [c for c in believed if c not in stays])
     withdrawn |= {c: BESIDE for c in believed if c not in stays}
+    for c, quantity in not_constant(selection, stays, remainder.columns).items():
+        withdrawn[c] = f"its value is no constant: it goes by {quantity}"
+        stays.remove(c)
     for c in _without_companion(selection, stays):
         withdrawn[c] = "no load is declared, and none is accused"
         stays.remove(c)

@@ -25,7 +25,8 @@ from gapbridge.core.diagnosis.criteria import (
     SHARES,
 )
 from gapbridge.core.diagnosis.selection.candidate import Candidate
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace
+from gapbridge.core.diagnosis.selection.local_search import pruned
+from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.search import screened_search
 
 Array = NDArray[np.float64]
@@ -107,8 +108,12 @@ def with_links(
     start = sorted({*base, *best.chosen} - set(block))
     start = [c for c in start if space.candidates[c].named]
     other = screened_search(space, base=start, beside=lambda p: links.beside(p, link_candidates(p)))
+    near = links.beside(space, block)
+    # a search goes its own way, and of a long log seldom the best: what was found stands beside too
+    rest = [c for c in best.chosen if c not in block]
+    other = min([other, pruned(near, fit(near, rest))], key=lambda f: f.score)
     if other.score + links.penalty + tries < best.score:
-        return links.beside(space, block), other, sigma
+        return near, other, sigma
     return space, best, {}
 
 

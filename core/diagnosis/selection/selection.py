@@ -229,8 +229,8 @@ def select(
             terms, index, covariance, residual = refit(state, space, exact, links)
         except InputError:  # absurd flexibilities: the arm would buckle
             state.observation = framed  # not the frame that went astray with them
-            best, near, links = _without_compliance(space, best, inside), space, {}
-            terms, index, covariance, residual = refit(state, space, best)
+            best = _without_compliance(near, best, [c for c in inside if c not in links])
+            terms, index, covariance, residual = refit(state, space, best, links)
         straight = with_straight_stiffness(space, best.chosen, index, terms, covariance)
         if straight is not None:
             best = pruned(near, fit(near, straight))

@@ -1,0 +1,110 @@
+"""Whether an accused number is a constant, or the mean of something that goes by a quantity.
+
+Play that opens with the load looks like play, and a joint that is softer on one side like a soft
+joint: the catalogue's effect is the first order of what is there. So each accused number is let go
+by every quantity of the log in turn, by an unnamed function beside its constant. Where the residual
+asks for that and the function is no small part of the constant, the form is not the effect's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapbridge.core.diagnosis.criteria import VARIES
+from gapbridge.core.diagnosis.residual_structure import basis_of
+from gapbridge.core.diagnosis.selection.candidate import Candidate
+from gapbridge.core.diagnosis.selection.following import exact_columns
+from gapbridge.core.diagnosis.selection.selection import Selection
+from gapbridge.core.diagnosis.selection.smooth import spline_basis
+from gapbridge.core.effects import Term
+
+Array = NDArray[np.float64]
+
+
+def not_constant(
+    selection: Selection, accused: Sequence[int], beside: Array
+) -> dict[int, str]:  # fmt: skip
+    """Return the candidates, of those accused, whose number is none, and the quantity it goes by.
+
+    ``beside`` (m, d) are the unnamed functions that stand beside the accused, as rows of the sample
+    space. Poses alone are judged: in motion friction and delay go by a joint's speed in their own
+    right.
+    """
+    if selection.observation.channel != "position":
+        return {}
+    if selection.links is not None:
+        beside = selection.links.whitened(beside)
+    found = {}
+    for c in accused:
+        if _is_a_number(selection.working.candidates[c]):
+            quantity, share = _variation(selection, c, accused, beside)
+            if share > VARIES:
+                found[c] = quantity
+    return found
+
+
+def _is_a_number(candidate: Candidate) -> bool:
+    """Return whether an effect is one number times a physical quantity.
+
+    Not so offsets, whose mean is theirs whatever else is there, lines, curves and moments.
+    """
+    effect = candidate.effect
+    form = effect.beside_links or effect.together or effect.curved or effect.at_moment
+    return not (form or candidate.periodic)
+
+
+def _variation(
+    selection: Selection, c: int, accused: Sequence[int], beside: Array
+) -> tuple[str, float]:
+    """Return by which quantity a number goes, and how much: rms of what varies over the constant.
+
+    ("", 0) where the residual asks for no variation at the price of chance.
+    """
+    space, observation = selection.working, selection.observation
+    own = exact_columns(observation, space.candidates[c], _others(selection, c))
+    constant = selection.rows_of(own)
+    rest = np.hstack([space.columns([o for o in accused if o != c]), beside])
+    basis = basis_of(_unit(np.hstack([constant, rest])))
+    left = space.y - basis @ (basis.T @ space.y)
+    variance = max(float(left @ left) / max(space.freedom - basis.shape[1], 1.0), space.floor)
+    quantities = _quantities(selection, space.candidates[c])
+    most, name, varying = 0.0, "", constant[:, :0]
+    for quantity, z in quantities.items():
+        shape = spline_basis(z)
+        columns = own[:, :, :, None] * shape[:, None, None, :]
+        rows = _unit(selection.rows_of(columns.reshape(*own.shape[:2], -1)))
+        further = basis_of(rows - basis @ (basis.T @ rows))
+        gain = float(np.sum((further.T @ left) ** 2)) / variance
+        gain -= further.shape[1] * np.log(space.freedom) + 2 * np.log(len(quantities))
+        if gain > most:
+            most, name, varying = gain, quantity, rows
+    if not name:
+        return "", 0.0
+    both = np.hstack([constant, varying])
+    A = np.hstack([both, rest])
+    size = np.linalg.norm(A, axis=0) + 1e-300
+    x = np.linalg.lstsq(A / size, space.y, rcond=1e-9)[0] / size
+    whole = both @ x[: both.shape[1]]
+    mean = constant @ np.linalg.lstsq(constant, whole, rcond=1e-9)[0]
+    share = float(np.linalg.norm(whole - mean) / max(float(np.linalg.norm(mean)), 1e-300))
+    return name, share
+
+
+def _others(selection: Selection, c: int) -> list[Term]:
+    return [t for o, t in zip(selection.term_index, selection.terms, strict=True) if o != c]
+
+
+def _quantities(selection: Selection, candidate: Candidate) -> dict[str, Array]:
+    """Return what a number may go by: the columns of the log, and the load that its joint holds."""
+    observation, joint = selection.observation, candidate.site.joint
+    found = dict(observation.quantities)
+    if observation.axial_moment is not None and joint is not None:
+        found["load"] = np.abs(observation.axial_moment[:, joint - 1])
+    return {name: z for name, z in found.items() if len(np.unique(z)) > 2}
+
+
+def _unit(columns: Array) -> Array:
+    return np.asarray(columns / (np.linalg.norm(columns, axis=0) + 1e-300))

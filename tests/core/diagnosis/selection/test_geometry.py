@@ -1,0 +1,57 @@
+"""All links as one cause: never behind what the same set makes of them, whatever a search finds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import small_arm as small
+
+from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.selection import geometry
+from gapbridge.core.diagnosis.selection.problem import fit
+from gapbridge.core.metrology import Metrology
+
+STRETCHED = tuple(
+    replace(row, a=row.a + da, d=row.d + dd, alpha=row.alpha + turn)
+    for row, da, dd, turn in zip(
+        small.NOMINAL.rows, (6e-4, -7e-4, 0.0), (5e-4, 4e-4, 0.0), (7e-4, -6e-4, 0.0), strict=True
+    )
+)
+
+
+@pytest.fixture(scope="module")
+def singles():
+    """Return the space of an arm whose links are all off, and the set of two links singly."""
+    session = small.session_of(0)
+    real = replace(small.REAL["joint_offset"], rows=STRETCHED)
+    log = small.log_of(session, small.readings(real, session))
+    found = diagnose(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
+    space = found.channels[0].selection.space
+    own = [
+        c for c, k in enumerate(space.candidates)
+        if k.family == "link_geometry" or (k.family == "joint_offset" and k.site.joint == 2)
+    ]  # fmt: skip
+    return space, fit(space, own)
+
+
+def test_a_search_that_finds_nothing_takes_no_links_away(singles, monkeypatch):
+    space, best = singles
+    worse = replace(fit(space, ()), score=np.inf)
+    monkeypatch.setattr(geometry, "screened_search", lambda *_, **__: worse)
+    near, found, links = geometry.with_links(space, replace(best, score=best.score + 100), ())
+    block = geometry.link_candidates(space)
+    assert set(links) == set(block)
+    assert not set(found.chosen) & set(block)
+    zero = next(c for c in best.chosen if space.candidates[c].family == "joint_offset")
+    assert zero in found.chosen
+    assert np.isfinite(near.penalty[zero])
+
+
+def test_links_that_pay_less_than_the_set_are_no_cause(singles):
+    space, best = singles
+    near, found, links = geometry.with_links(space, replace(best, score=-1e9), ())
+    assert near is space
+    assert found.score == -1e9
+    assert links == {}

@@ -1,0 +1,61 @@
+"""A number that goes by a quantity is no constant of an arm, however well its mean fits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import small_arm as small
+
+from benchmarks.blind.measuring import axial_moments
+from benchmarks.blind.session import play
+from gapbridge.core.diagnosis.constancy import not_constant
+from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.metrology import Metrology
+
+GAP = 9e-4  # rad, of joint 2
+
+
+def by_load(share):
+    """Return the arm whose play has a part that opens with the load that the joint holds."""
+
+    def angle(session, q):
+        load = np.abs(axial_moments(small.NOMINAL, session)[:, 1])
+        opened = (load / np.quantile(load, 0.8)) ** 1.5
+        return play(session, 1, GAP) * (1 - share + share * opened)
+
+    return small.turned(2, angle)
+
+
+def diagnosed(share):
+    session = small.session_of(0)
+    log = small.log_of(session, small.readings(by_load(share), session))
+    found = diagnose(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
+    return found.channels[0]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.15])
+def test_a_constant_is_accused_though_it_varies_a_little(share):
+    channel = diagnosed(share)
+    (cause,) = [c for c in channel.causes if c.effect == "backlash"]
+    assert cause.joints == (2,)
+    assert cause.parameters[0].value == pytest.approx(GAP, rel=0.2)
+
+
+def test_play_that_opens_with_the_load_is_no_backlash():
+    channel = diagnosed(1.0)
+    assert not channel.causes
+    assert channel.structured
+
+
+def test_only_numbers_of_poses_are_judged():
+    """An offset is the mean of whatever turns its joint, and lines have forms of their own."""
+    selection = diagnosed(1.0).selection
+    candidates = selection.space.candidates
+    nothing = np.zeros((len(selection.space.y), 0))
+    for family in ("joint_offset", "transmission_error", "link_geometry", "joint_slip"):
+        own = [c for c, k in enumerate(candidates) if k.family == family and k.site.joint == 2][:1]
+        assert not_constant(selection, own, nothing) == {}
+    (play_of_2,) = [
+        c for c, k in enumerate(candidates) if k.family == "backlash" and k.site.joint == 2
+    ]
+    assert list(not_constant(selection, [play_of_2], nothing).values()) == ["load"]
