@@ -1,6 +1,10 @@
-"""The covariance and the intervals of what a diagnosis found, as cells keep them."""
+"""What a diagnosis found, as cells keep it: covariance, intervals, what was accused, with ties."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
 
 from gapbridge.bridge.document.provenance import intervals_of
 from gapbridge.core.calibration.spread import Spread
@@ -18,6 +22,32 @@ def spread_of(found: Diagnosis) -> Spread:
             terms, covariance = [t for t, _ in causes], [own for _, own in causes]
             return Spread.of_terms(found.model, terms, covariance)
     return Spread.none()
+
+
+def accused(found: Diagnosis, earlier: Sequence[Any] = ()) -> list[dict[str, Any]]:
+    """Return the causes with values, standard deviations and ties, as the cell's provenance.
+
+    ``earlier``: entries of the cell that was diagnosed, which are kept where nothing new is said.
+    """
+    entries: list[dict[str, Any]] = [
+        {
+            "effect": cause.effect, "joints": list(cause.joints), "channel": channel.channel,
+            "parameters": [
+                {"name": p.name, "value": float(p.value), "std": _known(p.std), "unit": p.unit}
+                for p in cause.parameters
+            ],
+            "indistinguishable_from": list(cause.indistinguishable_from),
+        }
+        for channel in found.channels
+        for cause in channel.causes
+    ]  # fmt: skip
+    new = {p["name"] for entry in entries for p in entry["parameters"]}
+    kept = [one.model_dump() for one in earlier if not new & {p.name for p in one.parameters}]
+    return [*entries, *kept]
+
+
+def _known(std: float | None) -> float | None:
+    return None if std is None or not math.isfinite(std) else float(std)
 
 
 def intervals_applied(

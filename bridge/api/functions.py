@@ -12,7 +12,7 @@ from pathlib import Path
 
 from gapbridge.bridge.api.records import Corrected, Diagnosed, Fitted, Predicted
 from gapbridge.bridge.cell import Cell, load_cell
-from gapbridge.bridge.cell.opened_log import open_log
+from gapbridge.bridge.cell.opened_log import at_joints_of, open_log
 from gapbridge.bridge.document.provenance import fitted, provenance
 from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.compensation import correct
@@ -101,20 +101,23 @@ def diagnose(
     ``withhold`` names effects to take out of the catalogue; ``simulated`` is the log of another
     simulator, row by row, whose values are the prediction.
     """
-    from gapbridge.bridge.api.found_spread import intervals_applied, spread_of
+    from gapbridge.bridge.api.found_spread import accused, intervals_applied, spread_of
     from gapbridge.core.diagnosis.diagnosis import diagnose as diagnose_log
     from gapbridge.core.diagnosis.document import document
     from gapbridge.core.effects import effect_named
+    from gapbridge.core.log.alignment import aligned
 
     for name in withhold:
         effect_named(name)
+    if simulated is not None:
+        simulated = at_joints_of(log, aligned(simulated, log), cell)
     metrology = replace(cell.metrology, remounted=remounted)
     found = diagnose_log(cell.model, log, metrology, withhold=withhold, simulated=simulated)
     origin = _origin(cell, log)
     told = document(found) | {"provenance": origin}
     applied = fitted(
         origin, range_of(log), spread_of(found).beside(cell.spread),
-        cell.intervals | intervals_applied(found),
+        cell.intervals | intervals_applied(found), accused(found, cell.accused),
     )  # fmt: skip
     return Diagnosed(cell, found.model, str(found.verdict), told, applied)
 

@@ -15,7 +15,7 @@ from gapbridge.bridge.cell.effects import compliance_terms, term_of
 from gapbridge.bridge.cell.message import key_path, message, messages
 from gapbridge.bridge.cell.plausibility import findings
 from gapbridge.bridge.cell.robot import build_arm
-from gapbridge.bridge.cell.schema import CellFile, Frame, Simulation
+from gapbridge.bridge.cell.schema import Accused, CellFile, Frame, Simulation
 from gapbridge.bridge.cell.sections import (
     LimitSettings,
     LinkSettings,
@@ -133,6 +133,12 @@ class Cell:
         if origin is None or not origin.parameters:
             return Spread.none()
         return Spread(tuple(origin.parameters), np.array(origin.covariance, dtype=float))
+
+    @property
+    def accused(self) -> tuple[Accused, ...]:
+        """Return what a diagnosis accused, as the cell's provenance has it."""
+        origin = self.file.provenance
+        return () if origin is None else tuple(origin.causes)
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -11,6 +12,7 @@ from gapbridge.bridge.cell.cell import Cell
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units
 from gapbridge.core.errors import LogError
 from gapbridge.core.load_bounds import HEAVIEST
+from gapbridge.core.log.alignment import aligned
 from gapbridge.core.log.log import Log, read_log
 from gapbridge.core.log.sources import SourceOptions, source_of
 
@@ -25,12 +27,40 @@ def open_log(path: Path, cell: Cell) -> Log:
     if source is None:
         log = read_log(path, cell.arm.n)
     else:
-        converted = source.read(path, joint_names(cell), SourceOptions())
+        try:
+            converted = source.read(path, joint_names(cell), SourceOptions())
+        except LogError as error:
+            if "--" not in str(error):
+                raise
+            raise LogError(f"{error} (options of gapbridge convert)") from None
         for note in converted.notes:
             click.echo(f"note: {path}: {note}", err=True)
         log = converted.log(path, cell.arm.n)
     check_log(log, cell)
     return log
+
+
+def open_simulated(path: Path, cell: Cell, log: Log) -> Log:
+    """Return a simulator's log at the rows of ``log``, its TCP where the log's joints are.
+
+    Raises LogError where its rows are not those of the log.
+    """
+    return at_joints_of(log, aligned(open_log(path, cell), log), cell)
+
+
+def at_joints_of(log: Log, simulated: Log, cell: Cell) -> Log:
+    """Return a simulator's log with its TCP moved to the joint angles of ``log``, row by row.
+
+    A simulated servo rests elsewhere than the real one: that is the tracking channel's gap, and
+    none of the way from the joints to the TCP. The move is the difference of the cell's own model
+    at both angles. Logs without ``actual_q`` in both stay as they are.
+    """
+    found, wanted = simulated.get("actual_q"), log.get("actual_q")
+    position = simulated.get("measured_position")
+    if found is None or wanted is None or position is None:
+        return simulated
+    moved = cell.model.predict(wanted).position - cell.model.predict(found).position
+    return replace(simulated, columns={**simulated.columns, "measured_position": position + moved})
 
 
 def joint_names(cell: Cell) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.served.credentials import check_credentials, read_token
 from gapbridge.core.errors import CellError, InputError
 from gapbridge.core.files import read_bytes, recorded
+from gapbridge.core.model import Model
 from gapbridge.core.ranges import Range
 
 
@@ -29,6 +30,7 @@ class Configuration:
     text: str
     files: Mapping[str, bytes]  # all that was read for it, by absolute path
     fitted: Range = field(default_factory=dict)  # what the model was fitted on, by log column
+    model: Model | None = None  # for what the daemon itself compares; the loop reads its own
 
     @property
     def hash(self) -> str:
@@ -41,7 +43,7 @@ def configuration_for(settings: DaemonSettings) -> Configuration:
     with recorded() as files:
         cell = load_cell(settings.cell)
         _read_named(settings)
-    return Configuration(settings, cell.arm.n, cell.document.text, files, cell.fitted_range)
+    return _configuration(settings, cell, files)
 
 
 def read_configuration(path: Path) -> Configuration:
@@ -50,7 +52,14 @@ def read_configuration(path: Path) -> Configuration:
         cell = load_cell(path)
         settings = settings_of(cell)
         _read_named(settings)
-    return Configuration(settings, cell.arm.n, cell.document.text, files, cell.fitted_range)
+    return _configuration(settings, cell, files)
+
+
+def _configuration(
+    settings: DaemonSettings, cell: Cell, files: Mapping[str, bytes]
+) -> Configuration:
+    text, fitted = cell.document.text, cell.fitted_range
+    return Configuration(settings, cell.arm.n, text, files, fitted, cell.model)
 
 
 def _read_named(settings: DaemonSettings) -> None:

@@ -146,6 +146,25 @@ class SourceFile(Section):
     sha256: str | None = Field(default=None, description="of its bytes")
 
 
+class AccusedParameter(Section):
+    """A number of a cause, as the diagnosis gave it."""
+
+    name: str
+    value: Number
+    std: NotNegative | None = Field(default=None, description="1 sigma")
+    unit: str = ""
+
+
+class Accused(Section):
+    """A cause that the diagnosis named, and what it could not distinguish from it."""
+
+    effect: str
+    joints: list[int] = []
+    channel: str = ""
+    parameters: list[AccusedParameter] = []
+    indistinguishable_from: list[str] = []
+
+
 class Provenance(Section):
     """Where the model in this cell comes from, as fit, calibrate and --apply write it."""
 
@@ -164,6 +183,7 @@ class Provenance(Section):
     covariance: list[list[Number]] = Field(
         default=[], description="of those parameters, SI: one row and column each"
     )
+    causes: list[Accused] = Field(default=[], description="that a diagnosis named, with its ties")
 
     @model_validator(mode="after")
     def _square(self) -> Provenance:

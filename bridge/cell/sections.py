@@ -85,6 +85,12 @@ class LimitSettings(BaseModel):
     following: float = Field(
         0.1, gt=0.0, le=0.5, description="farthest a command may be from the actual joint, rad"
     )
+    zero_slip: float = Field(
+        0.003,
+        ge=0.0,
+        le=0.1,
+        description="smallest slip of a joint's zero that `run` holds for, rad; 0: not watched",
+    )
     ramp_time: float = Field(
         0.5, gt=0.0, le=10.0, description="s in which offsets ramp in and out at least"
     )

@@ -26,6 +26,7 @@ from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.daemon.reload import Reload
 from gapbridge.bridge.daemon.service_manager import ServiceManager
 from gapbridge.bridge.daemon.sides import Sides
+from gapbridge.bridge.daemon.slip_watch import Slip, SlipWatch
 from gapbridge.bridge.daemon.status import DaemonStatus
 from gapbridge.bridge.daemon.status_document import SCHEMA
 from gapbridge.bridge.daemon.summary import RunSummary, Tally
@@ -90,6 +91,7 @@ class Daemon:
         self.session = ""
         self._status = DaemonStatus(self.page.slices, clock)
         self._fitted = FittedWatch(given.fitted, self.page.slices)
+        self._slips = self._slip_watch()
         self._status_at = 0.0
         self._reload = Reload(self.manager, self.event_log)
         self.control = Control(self, clock)
@@ -172,6 +174,7 @@ class Daemon:
             "armed_by": status.armed_by,
             "latched": status.latched,
             "correction": status.correction,
+            "zeros": self._slips.detail,
             "loop": {
                 "pid": self.loop_pid,
                 "restarts": self.restarts,
@@ -192,6 +195,10 @@ class Daemon:
             "recording": None if recording is None else str(recording),
             "lost_rows": self.lost_rows,
         }
+
+    def _slip_watch(self) -> SlipWatch:
+        smallest = self.settings.limits.zero_slip
+        return SlipWatch(self.configuration.model, self.page.slices, smallest)
 
     def note(self, event: Event) -> None:
         """Emit an event from the daemon's own thread."""
@@ -241,7 +248,7 @@ class Daemon:
             words = f"{name} asked for by {by}"
             self.event_log.add(
                 {"kind": "request", "command": name, "number": number, "by": by,
-                 "detail": words}
+                 "acknowledges": command == Command.DISARM, "detail": words}
             )  # fmt: skip
             self._commands.ask(command, number)
 
@@ -256,6 +263,7 @@ class Daemon:
                 swap = self._reload.swap()
                 self.configuration = swap.configuration or self.configuration
                 self._fitted = FittedWatch(self.configuration.fitted, self.page.slices)
+                self._slips = self._slip_watch()
                 arm = swap.rearms  # else only a person starts the writing again
                 by = "the cell file" if arm else ""
                 if not self._stopping.is_set() and not swap.in_order:
@@ -408,6 +416,10 @@ class Daemon:
             self.event_log.add(event)
         for words in self._fitted.take(rows, self._clock.monotonic()):
             self.event_log.add({"kind": "warning", "what": "outside_fitted", "detail": words})
+        for found in self._slips.take(rows):
+            self.event_log.add(found.event)
+            if isinstance(found, Slip):
+                self._commands.ask(Command.ZERO_MOVED)  # behind the event that says why
 
     def _on_event(self, event: Event) -> None:
         """Act on an event, and report it to the person at the terminal."""

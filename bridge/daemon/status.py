@@ -46,6 +46,7 @@ class DaemonStatus:
         self._asked_by = ""  # of the last request to arm
         self.latched = ""  # the fault that waits for being acknowledged
         self._heals = False  # it ends with the link
+        self._slipped = False  # it is a joint's zero, of which the loop only holds
         self._batches: deque[tuple[float, int]] = deque()  # s, cycles
         self._heard: float | None = None  # s, monotonic: when the last state was received
         self._received = slices["received"].start
@@ -71,6 +72,10 @@ class DaemonStatus:
             self.configured = event
         if event["kind"] == "request" and event["command"] == "arm":
             self._asked_by = event["by"]
+        if event["kind"] == "slip":
+            self.latched, self._heals, self._slipped = event["detail"], False, True
+        if event["kind"] == "request" and event["acknowledges"] and self._slipped:
+            self.latched, self._slipped = "", False
         if event["kind"] == "compiling":
             self._compiling = event["detail"]
         if event["kind"] == "granted":  # compiled, and about to connect

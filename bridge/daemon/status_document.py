@@ -27,6 +27,7 @@ def lines(status: dict[str, Any]) -> list[str]:
         found.append(f"  fault: {status['latched']}; acknowledge with `gapbridge disarm`")
     if status["correction"]["detail"]:
         found.append(f"  model: {status['correction']['detail']}")
+    found.append(f"  joints' zeros: {status['zeros']}")
     counted = {k: v for k, v in status["counts"].items() if v}
     if counted:
         found.append("  counted: " + ", ".join(f"{k} {v}" for k, v in counted.items()))

@@ -65,11 +65,12 @@ def _argument(value: Any) -> str:
 
 def fitted(
     origin: dict[str, Any], ranges: Mapping[str, tuple[float, float]], spread: Spread,
-    intervals: Mapping[str, tuple[float, float]],
+    intervals: Mapping[str, tuple[float, float]], causes: Sequence[Mapping[str, Any]] = (),
 ) -> dict[str, Any]:  # fmt: skip
     """Return the provenance of a cell: with what its model was fitted on, and how surely.
 
-    ``intervals`` are the 95 % intervals of the numbers that were applied, by name, SI.
+    ``intervals`` are the 95 % intervals of the numbers that were applied, by name, SI; ``causes``
+    what was accused, as the schema of cells has it.
     """
     listed = {name: [low, high] for name, (low, high) in ranges.items()}
     result = {**origin, "fitted": listed}
@@ -77,6 +78,8 @@ def fitted(
         result["intervals"] = {name: [low, high] for name, (low, high) in intervals.items()}
     if spread.names:
         result |= {"parameters": list(spread.names), "covariance": spread.covariance.tolist()}
+    if causes:
+        result["causes"] = [dict(cause) for cause in causes]
     return result
 
 

@@ -27,6 +27,7 @@ class Command(IntEnum):
     DISARM = 2  # a person's: ramp out and observe; in a fault, acknowledge it
     RAMP_OUT = 3  # ramp out and observe; acknowledges nothing
     STOP = 4  # ramp out and end
+    ZERO_MOVED = 5  # ramp out, observe, and refuse to arm until a person has sent DISARM
 
 
 class CommandPage:

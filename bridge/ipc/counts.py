@@ -34,6 +34,7 @@ class Count(IntEnum):
     LOAD = 24  # a payload or force that the arm cannot bear
     NOT_FOLLOWING = 25  # the robot's program does not play, or at another speed
     MISMATCH = 26  # the controller is set otherwise than the cell says
+    ZERO_MOVED = 27  # a joint's zero has slipped, as the daemon's watch has found
 
     @property
     def label(self) -> str:

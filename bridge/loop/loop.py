@@ -102,6 +102,7 @@ class Loop:
             settings.setpoints, driver, source, self._stream, self._supervisor, reports,
             self._in_force,
         )  # fmt: skip
+        self._zero_moved = False  # the daemon has found it, and nobody has acknowledged it
         self._acknowledged = False  # a person has seen the fault; it ends when the robot is fine
         self._stop_by: float | None = None  # s, monotonic
         self._exit: Exit | None = None
@@ -144,6 +145,8 @@ class Loop:
                 wanted = command == Command.ARM
                 if command in (Command.DISARM, Command.RAMP_OUT):
                     self._disarm(command == Command.DISARM)
+                if command == Command.ZERO_MOVED:
+                    self._hold_for_zero()
             if asked:
                 self._page.tell_taken(commands.taken)
             if self._stop_requested or commands.stop:
@@ -175,6 +178,8 @@ class Loop:
     def _not_ready(self) -> str:
         """Return in words why writing could come to nothing here; empty: it can."""
         stream = self._stream
+        if self._zero_moved:
+            return "a joint's zero has moved: acknowledge it first (gapbridge disarm)"
         self._model_check.forget()
         if self._checks.rate.doubt:
             return self._checks.rate.doubt
@@ -191,7 +196,14 @@ class Loop:
             )
         return ""
 
+    def _hold_for_zero(self) -> None:
+        """Ramp out: every pose is off by what the zero has moved."""
+        self._zero_moved = True
+        self._page.count(Count.ZERO_MOVED)
+        self._supervisor.take(Cause.ZERO_MOVED, "the slip was reported just before")
+
     def _disarm(self, by_a_person: bool) -> None:
+        self._zero_moved &= not by_a_person
         if self._supervisor.state == State.FAULT:
             self._acknowledged |= by_a_person
         else:

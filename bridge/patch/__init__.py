@@ -8,9 +8,10 @@ from gapbridge.bridge.patch.changes import ModelChanges, changes_of
 from gapbridge.bridge.patch.mjcf import Mjcf
 from gapbridge.bridge.patch.model_format import ModelFormat, Patched, PatchOptions
 from gapbridge.bridge.patch.urdf import Urdf
+from gapbridge.bridge.patch.usd import Usd
 from gapbridge.core.errors import InputError
 
-FORMATS: tuple[ModelFormat, ...] = (Mjcf(), Urdf())
+FORMATS: tuple[ModelFormat, ...] = (Mjcf(), Urdf(), Usd())
 
 
 def format_of(path: Path) -> ModelFormat:

@@ -6,13 +6,14 @@ without; the rest is what each effect says in a simulator's terms. No effect is 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.effects import CATALOGUE
-from gapbridge.core.effects.effect import Effect
+from gapbridge.core.effects.effect import Effect, Term
 from gapbridge.core.effects.simulator import Kind, SimulatorChange
 from gapbridge.core.errors import InputError
 from gapbridge.core.model import Model
@@ -54,6 +55,7 @@ class ModelChanges:
     springs: Springs
     settings: tuple[SimulatorChange, ...]
     not_held: tuple[tuple[str, str], ...]  # effect, what people do instead: no format holds it
+    left_out: tuple[str, ...] = ()  # effects that were not accused, one line each
 
     @property
     def n(self) -> int:
@@ -69,6 +71,14 @@ class ModelChanges:
         """Return the sum of the settings of a kind at a joint (from 1)."""
         return sum(s.value for s in self.settings if (s.kind, s.joint) == (kind, joint))
 
+    def vector(self, kind: Kind, joint: int | None = None) -> Array:
+        """Return the sum (3,) of the settings of a kind that have axes, at a joint (from 1)."""
+        found = np.zeros(3)
+        for s in self.settings:
+            if s.axis is not None and (s.kind, s.joint) == (kind, joint):
+                found[s.axis] += s.value
+        return found
+
     def moved(self, joint: int, base_in_world: Array) -> Array:
         """Return the motion (4, 4) in world of everything from joint (from 0; n: flange) on."""
         frame = base_in_world @ self.joint_in_base[joint]
@@ -76,7 +86,12 @@ class ModelChanges:
 
 
 def changes_of(model: Model) -> ModelChanges:
-    """Return what the terms of a model change of its nominal arm."""
+    """Return what the terms of a model change of its nominal arm; stand-ins are left out."""
+    stand_ins = tuple(dict.fromkeys(_named(t) for t in model.terms if t.stand_in))
+    accused = [t for t in model.terms if not t.stand_in]
+    elsewhere = _not_held([t for t in accused if not CATALOGUE[t.effect].of_the_arm], model)
+    kept = [t for t in accused if CATALOGUE[t.effect].of_the_arm]
+    model = model.without_terms().with_terms(kept)
     nominal, real, arm = model.without_terms().chain(), model.chain(), model.arm
     n = arm.n
     steps = [transform(nominal.rotation[i], nominal.position[i]) for i in range(n + 1)]
@@ -102,16 +117,21 @@ def changes_of(model: Model) -> ModelChanges:
     return ModelChanges(
         model, np.array(frames), shift, frames[-1] @ tool,
         np.linalg.inv(tool) @ shift[n] @ real_tool, real.gravity if turned else None, springs,
-        settings, _not_held(model),
+        settings, (*_not_held(kept, model), *elsewhere),
+        tuple(f"{name}: a stand-in, not accused" for name in stand_ins),
     )  # fmt: skip
 
 
-def _not_held(model: Model) -> tuple[tuple[str, str], ...]:
+def _named(term: Term) -> str:
+    return term.effect + ("" if term.site.joint is None else f" of joint {term.site.joint}")
+
+
+def _not_held(terms: Sequence[Term], model: Model) -> tuple[tuple[str, str], ...]:
     """Return the effects that are neither in the chain nor anything a simulator knows."""
     found: dict[str, str] = {}
-    for term in model.terms:
+    for term in terms:
         effect = CATALOGUE[term.effect]
-        in_chain = type(effect).shape is not Effect.shape
+        in_chain = effect.of_the_arm and type(effect).shape is not Effect.shape
         if not in_chain and not effect.simulator(term, model.arm):
             found[effect.identifier] = effect.instead
     return tuple(found.items())

@@ -1,7 +1,8 @@
 """MJCF through MuJoCo's own MjSpec: what compiles there is what a user's simulation runs.
 
 Flexibility and play are further joints in the joint's own body, named after it; sensors and
-actuators stay on the joint itself, whose angle is the encoder's.
+actuators stay on the joint itself, whose angle is the encoder's. What acts before a joint (the
+base's yielding, the bending of the link before it) is a body put between, with hinges.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.bridge.patch.changes import TINY, Axes, ModelChanges, base_in_world
+from gapbridge.bridge.patch.changes import TINY, ModelChanges, base_in_world
+from gapbridge.bridge.patch.mjcf_scene import Hinge, Scene
 from gapbridge.bridge.patch.model_format import (
     ModelFormat,
     Patched,
@@ -21,14 +23,16 @@ from gapbridge.bridge.patch.model_format import (
     named_one,
     pick_joints,
 )
+from gapbridge.core.effects.effect import typical_moment
 from gapbridge.core.effects.simulator import Kind
 from gapbridge.core.errors import InputError
-from gapbridge.core.rotation import transform
+from gapbridge.core.rotation import rotation_matrix, transform
 
 Array = NDArray[np.float64]
-ARMATURE = 1e-3  # kg m2 of a further joint, which MuJoCo needs to integrate stiff springs
-DAMPING = 0.3  # ratio of a further joint's damping to the critical one
-PLAY_ARMATURE, PLAY_SOLREF = 1e-3, (0.004, 1.0)
+TAKEN_UP = 0.2  # rad/s2: an arm that slows down no faster leaves its play behind it
+GAUSS = (0.5 - 3**0.5 / 6, 0.5 + 3**0.5 / 6)  # of a length: two points of quadrature
+HEAVY = 1.5  # times a joint's usual moment: up to there a stiffening spring has to hold
+LINEAR = 1  # of an actuator's interp
 SMALL = 1e-6  # kg m2 of a point mass: MuJoCo asks for more than none
 
 
@@ -40,291 +44,327 @@ class Mjcf(ModelFormat):
     def patch(self, path: Path, changes: ModelChanges, options: PatchOptions,
               notes: Sequence[str]) -> Patched:  # fmt: skip
         """Return the MJCF with the changes in it, as MjSpec writes it."""
-        scene = _Scene(path)
+        scene = Scene(path)
         names = pick_joints(path, scene.hinges(), changes, options)
         world = base_in_world(changes.axes(), scene.axes(names), str(path), names)
-        changed: list[str] = []
-        for i, name in enumerate(names):
-            if not np.allclose(changes.shift[i], np.eye(4), rtol=0, atol=TINY):
-                scene.move(scene.body_of(name), changes.moved(i, world))
-                changed.append(f"joint {name}: its body's frame")
-            changed += _joint(scene, name, i + 1, changes)
-            changed += _actuator(scene, name, i + 1, changes, options)
-            changed += _springs(scene, name, i, changes, world)
-            changed += _scale(scene, name, changes.of_joint(Kind.LINK_SCALE, i + 1))
-        missing = _tool(scene, path, changes, options, world, changed)
-        missing += _load(scene, names, changes, world, changed)
-        missing += _rest(scene, changes)
+        done = _Patch(scene, names, world, changes, options)
+        for joint, name in enumerate(names, start=1):
+            done.frame(name, joint)
+            done.friction(name, joint)
+            done.actuator(name, joint)
+            done.springs(name, joint)
+            done.inertial(name, joint)
+        done.base()
+        done.links()
+        done.tool()
+        done.sensor()
+        done.load()
         if changes.gravity is not None:
             scene.spec.option.gravity = world[:3, :3] @ changes.gravity
-            changed.append("option: gravity")
-        before = scene.compiled.nq
-        scene.pad_keyframes()
-        after = scene.spec.compile().nq
-        if after != before:
-            changed.append(f"nq is {after} instead of {before}: actuators stay as they are, "
-                           "qpos has the further joints in it")  # fmt: skip
-        scene.spec.comment = "\n".join(
-            ["Patched by gapbridge.", *changed, *notes, *(f"not in here: {m}" for m in missing)]
-        ).replace("--", "- -")  # fmt: skip
-        return Patched(scene.spec.to_xml(), tuple(changed), tuple(missing))
+            done.changed.append("option: gravity")
+        if scene.further:
+            before = scene.compiled.nq
+            done.changed.append(
+                f"nq is {before + scene.further} instead of {before}: actuators stay as they are, "
+                "qpos has the further joints in it"
+            )
+        missing = done.not_held()
+        comment = ["Patched by gapbridge.", *done.changed, *notes,
+                   *(f"not in here: {line}" for line in missing)]  # fmt: skip
+        return Patched(scene.text(comment, options.folder), tuple(done.changed), tuple(missing))
 
 
-class _Scene:
-    """A user's model: its spec, which is changed, and what it compiles to as it came."""
+def _stiffening(c: float, softening: float, most: float) -> tuple[float, float, float]:
+    """Return a spring's polynomial for theta = c M / sqrt(1 + softening M^2), up to ``most`` Nm.
 
-    def __init__(self, path: Path) -> None:
-        try:
-            import mujoco
-        except ImportError:
-            raise InputError(
-                f"{path}: found an MJCF model, expected MuJoCo to be installed: pip install mujoco"
-            ) from None
-        self.mujoco = mujoco
-        try:
-            self.spec: Any = mujoco.MjSpec.from_file(str(path))
-            self.compiled: Any = self.spec.compile()
-        except (ValueError, OSError) as error:
-            text = " ".join(str(error).split())
-            raise InputError(f"{path}: found no MJCF that compiles ({text})") from None
-        self.data: Any = mujoco.MjData(self.compiled)
-        for j in range(self.compiled.njnt):  # joints at their angle zero, ref is no angle
-            self.data.qpos[self.compiled.jnt_qposadr[j]] = 0
-        mujoco.mj_kinematics(self.compiled, self.data)
-        mujoco.mj_comPos(self.compiled, self.data)
-
-    def hinges(self) -> list[str]:
-        hinge = self.mujoco.mjtJoint.mjJNT_HINGE
-        return [j.name for j in self.spec.joints if j.type == hinge]
-
-    def axes(self, names: Sequence[str]) -> Axes:
-        ids = [self.compiled.joint(name).id for name in names]
-        return Axes(self.data.xanchor[ids].copy(), self.data.xaxis[ids].copy())
-
-    def body_of(self, joint: str) -> Any:
-        return self.spec.joint(joint).parent
-
-    def frame(self, body: Any) -> Array:
-        """Return a body's frame (4, 4) in world, joints at zero, as the model came."""
-        i = self.compiled.body(body.name).id if body.name else 0
-        return transform(self.data.xmat[i].reshape(3, 3), self.data.xpos[i])
-
-    def move(self, body: Any, motion: Array) -> None:
-        """Move a body and all beyond by a motion (4, 4) in world."""
-        parent = self.frame(body.parent)
-        local = np.linalg.inv(parent) @ motion @ self.frame(body)
-        self.place(body, local)
-
-    def place(self, element: Any, local: Array) -> None:
-        """Set an element's frame in its parent's."""
-        quat = np.zeros(4)
-        self.mujoco.mju_mat2Quat(quat, local[:3, :3].ravel())
-        element.pos, element.quat = local[:3, 3], quat
-        element.alt.type = self.mujoco.mjtOrientation.mjORIENTATION_QUAT
-
-    def inertia_about(self, joint: str, axis: Array) -> float:
-        """Return the inertia (kg m2) of all beyond a joint about an axis (world) at its anchor."""
-        j = self.compiled.joint(joint).id
-        body, anchor = self.compiled.jnt_bodyid[j], self.data.xanchor[j]
-        total = 0.0
-        for k in range(body, self.compiled.nbody):
-            up = k
-            while up > body:
-                up = self.compiled.body_parentid[up]
-            if up == body:
-                away = np.cross(axis, self.data.xipos[k] - anchor)
-                total += self.compiled.body_mass[k] * float(away @ away)
-        return total + ARMATURE
-
-    def further_joint(self, joint: str, name: str, axis: Array, **settings: Any) -> None:
-        """Add a hinge after a joint, in its body and at its anchor; ``axis`` in body axes."""
-        own = self.spec.joint(joint)
-        own.parent.add_joint(
-            name=f"{joint}_{name}", type=self.mujoco.mjtJoint.mjJNT_HINGE, axis=axis,
-            pos=np.array(own.pos), **settings,
-        )  # fmt: skip
-
-    def pad_keyframes(self) -> None:
-        """Write the keyframes' qpos anew, further joints at zero."""
-        given = [(key, np.array(key.qpos)) for key in self.spec.keys]
-        if not any(len(qpos) for _, qpos in given):
-            return
-        old = self.compiled
-        size = {0: 7, 1: 4, 2: 1, 3: 1}  # of qpos: free, ball, slide, hinge
-        for key, qpos in given:
-            if not len(qpos):
-                continue
-            parts = []
-            for joint in self.spec.joints:
-                if joint.name and _has(old, joint.name):
-                    begin = old.joint(joint.name).qposadr[0]
-                    parts.append(qpos[begin : begin + size[int(joint.type)]])
-                else:
-                    parts.append(np.zeros(1))
-            key.qpos = np.concatenate(parts)
-            key.qvel = []
+    The law's inverse has no end of odd powers, MuJoCo's spring two of them: linear and cubic. Their
+    factors are those with the least squares of the angle's error.
+    """
+    moment = np.linspace(0.0, most, 200)[1:]
+    root = np.sqrt(1 + softening * moment**2)
+    angle, slope = c * moment / root, c / root**3
+    columns = np.column_stack([angle, angle**3]) * slope[:, None]
+    scale = np.linalg.norm(columns, axis=0)
+    linear, cubic = np.linalg.lstsq(columns / scale, moment * slope, rcond=None)[0] / scale
+    return float(linear), 0.0, float(cubic)
 
 
-def _has(compiled: Any, joint: str) -> bool:
-    try:
-        compiled.joint(joint)
-    except KeyError:
-        return False
-    return True
+class _Patch:
+    """One model being patched: what was changed, and what could not be."""
 
+    def __init__(self, scene: Scene, names: Sequence[str], world: Array, changes: ModelChanges,
+                 options: PatchOptions) -> None:  # fmt: skip
+        self.scene, self.names, self.world = scene, names, world
+        self.changes, self.options = changes, options
+        self.changed: list[str] = []
+        self.missing: list[str] = []
 
-def _joint(scene: _Scene, name: str, joint: int, changes: ModelChanges) -> list[str]:
-    """Add friction, damping and armature."""
-    own, lines = scene.spec.joint(name), []
-    friction = changes.of_joint(Kind.FRICTION, joint)
-    damping = changes.of_joint(Kind.DAMPING, joint)
-    armature = changes.of_joint(Kind.ARMATURE, joint)
-    if friction:
-        own.frictionloss += friction
-        lines.append(f"joint {name}: frictionloss {own.frictionloss:.6g}")
-    if damping:
-        linear = np.array(own.damping)
-        linear[0] += damping
-        own.damping = linear
-        lines.append(f"joint {name}: damping {linear[0]:.6g}")
-    if armature:
-        own.armature += armature
-        lines.append(f"joint {name}: armature {own.armature:.6g}")
-    return lines
+    def joint_in_world(self, joint: int) -> Array:
+        """Return the nominal frame (4, 4) of a joint (from 1; n + 1: the flange)."""
+        return np.asarray(self.world @ self.changes.joint_in_base[joint - 1])
 
+    def frame(self, name: str, joint: int) -> None:
+        """Move a joint's body."""
+        if not np.allclose(self.changes.shift[joint - 1], np.eye(4), rtol=0, atol=TINY):
+            self.scene.move(self.scene.body_of(name), self.changes.moved(joint - 1, self.world))
+            self.changed.append(f"joint {name}: its body's frame")
 
-def _actuator(scene: _Scene, name: str, joint: int, changes: ModelChanges,
-              options: PatchOptions) -> list[str]:  # fmt: skip
-    """Set delay, lag and gain of the position actuator of a joint."""
-    delay, lag = changes.of_joint(Kind.DELAY, joint), changes.of_joint(Kind.LAG, joint)
-    droop = changes.of_joint(Kind.SERVO_COMPLIANCE, joint)
-    if not (delay or lag or droop):
-        return []
-    drive = next((a for a in scene.spec.actuators if a.target == name), None)
-    if drive is None:
-        raise InputError(
-            f"{scene.spec.modelname}: joint {name}: found no actuator, expected one for its "
-            "delay, lag or gain"
+    def friction(self, name: str, joint: int) -> None:
+        """Add friction, damping and armature."""
+        own = self.scene.spec.joint(name)
+        friction = self.changes.of_joint(Kind.FRICTION, joint)
+        damping = self.changes.of_joint(Kind.DAMPING, joint)
+        armature = self.changes.of_joint(Kind.ARMATURE, joint)
+        if friction:
+            own.frictionloss += friction
+            self.changed.append(f"joint {name}: frictionloss {own.frictionloss:.6g}")
+        if damping:
+            linear = np.array(own.damping)
+            linear[0] += damping
+            own.damping = linear
+            self.changed.append(f"joint {name}: damping {linear[0]:.6g}")
+        if armature:
+            own.armature += armature
+            self.changed.append(f"joint {name}: armature {own.armature:.6g}")
+
+    def actuator(self, name: str, joint: int) -> None:
+        """Set delay, lag and gain of the position actuator of a joint."""
+        delay, lag, droop = (
+            self.changes.of_joint(kind, joint)
+            for kind in (Kind.DELAY, Kind.LAG, Kind.SERVO_COMPLIANCE)
         )
-    lines = []
-    if delay:
-        drive.delay = delay
-        drive.nsample = int(np.ceil(delay / scene.spec.option.timestep)) + 1
-        lines.append(f"actuator of {name}: delay {delay:.6g} s")
-    if lag:
-        drive.dyntype = scene.mujoco.mjtDyn.mjDYN_FILTEREXACT
-        parameters = np.array(drive.dynprm)
-        parameters[0] = lag
-        drive.dynprm = parameters
-        lines.append(f"actuator of {name}: timeconst {lag:.6g} s")
-    if droop:
+        if not (delay or lag or droop):
+            return
+        drive = next((a for a in self.scene.spec.actuators if a.target == name), None)
+        if drive is None:
+            self.missing.append(f"delay, lag or gain of {name}: it has no actuator; put them into "
+                                "the controller")  # fmt: skip
+            return
+        if delay:
+            drive.delay = delay + (drive.delay if self.options.on_top else 0.0)
+            drive.interp = LINEAR  # a held command would come whole steps late
+            drive.nsample = int(np.ceil(drive.delay / self.scene.spec.option.timestep)) + 1
+            self.changed.append(f"actuator of {name}: delay {drive.delay:.6g} s")
+        if lag:
+            filtered = self.scene.mujoco.mjtDyn.mjDYN_FILTEREXACT
+            parameters = np.array(drive.dynprm)
+            given = parameters[0] if drive.dyntype == filtered and self.options.on_top else 0.0
+            # sampled, the filter answers half a step earlier than its time constant says
+            parameters[0] = lag + (given or self.scene.spec.option.timestep / 2)
+            drive.dyntype, drive.dynprm, drive.actearly = filtered, parameters, 1
+            self.changed.append(f"actuator of {name}: timeconst {parameters[0]:.6g} s")
+        if droop:
+            self._soften(drive, droop)
+            self.changed.append(f"actuator of {name}: kp {drive.gainprm[0]:.6g}")
+
+    def _soften(self, drive: Any, droop: float) -> None:
+        """Set the gain of a position actuator so that it gives way by ``droop`` rad/Nm."""
         gain, bias = np.array(drive.gainprm), np.array(drive.biasprm)
-        given = 1 / gain[0] if options.on_top and gain[0] > 0 else 0.0  # rad/Nm, as it came
+        given = 1 / gain[0] if self.options.on_top and gain[0] > 0 else 0.0  # as it came
         droop += given
         if gain[0] > 0 > bias[2]:  # a damping ratio, which is positive there, holds by itself
             bias[2] /= np.sqrt(droop * gain[0])
         gain[0], bias[1] = 1 / droop, -1 / droop
         drive.gainprm, drive.biasprm = gain, bias
-        lines.append(f"actuator of {name}: kp {1 / droop:.6g}")
-    return lines
 
+    def springs(self, name: str, joint: int) -> None:
+        """Put play and springs behind a joint: about its axis, then across it."""
+        axes = self.joint_in_world(joint)[:3, :3]
+        self._play(name, joint, axes[:, 2])
+        flexibility = self.changes.springs.joint[joint - 1]
+        softening = self.changes.springs.softening[joint - 1]
+        for k, label in ((2, "axial_compliance"), (0, "radial_x"), (1, "radial_y")):
+            c = float(flexibility[k])
+            if c <= 0:
+                continue
+            stiffness: tuple[float, ...] = (1 / c,)
+            if k == 2 and softening > 0:
+                stiffness = _stiffening(
+                    c, softening, HEAVY * typical_moment(self.changes.model.arm)
+                )
+            inertia = self.scene.inertia_about(name, axes[:, k])
+            self._behind(name, label, axes[:, k], stiffness=stiffness, inertia=inertia)
+            self.changed.append(f"joint {name}_{label}: stiffness {1 / c:.6g} Nm/rad")
 
-def _springs(scene: _Scene, name: str, i: int, changes: ModelChanges, world: Array) -> list[str]:
-    """Add play and springs behind a joint: about its axis, then across it."""
-    lines = []
-    turned = scene.frame(scene.body_of(name))[:3, :3]
-    frame = (world @ changes.joint_in_base[i])[:3, :3]
-    play = changes.of_joint(Kind.PLAY, i + 1)
-    if play:
-        half = play / 2
-        degrees = scene.spec.compiler.degree
-        limits = np.degrees([-half, half]) if degrees else np.array([-half, half])
-        scene.further_joint(
-            name, "backlash", turned.T @ frame[:, 2], limited=1, range=limits,
-            armature=PLAY_ARMATURE, solref_limit=PLAY_SOLREF,
-        )  # fmt: skip
-        lines.append(f"joint {name}_backlash: +-{half:.6g} rad")
-    flexibility, softening = changes.springs.joint[i], changes.springs.softening[i]
-    for k, label in ((2, "axial_compliance"), (0, "radial_x"), (1, "radial_y")):
-        c = float(flexibility[k])
-        if c <= 0:
-            continue
-        stiffness = np.zeros(3)
-        stiffness[0] = 1 / c
-        if k == 2 and softening > 0:
-            # the inverse of theta = c M / sqrt(1 + M^2 s) is M = theta/c (1 + theta^2 s / 2 c^2)
-            stiffness[2] = softening / (2 * c**3)
-        inertia = scene.inertia_about(name, frame[:, k])
-        damping = np.zeros(3)
-        damping[0] = 2 * DAMPING * np.sqrt(inertia / c)
-        scene.further_joint(
-            name, label, turned.T @ frame[:, k], stiffness=stiffness, damping=damping,
-            armature=ARMATURE,
-        )  # fmt: skip
-        lines.append(f"joint {name}_{label}: stiffness {1 / c:.6g} Nm/rad")
-    return lines
+    def _play(self, name: str, joint: int, axis: Array) -> None:
+        """Put a limited hinge behind a joint, and a friction that leaves the link behind."""
+        half = self.changes.of_joint(Kind.PLAY, joint) / 2
+        if not half:
+            return
+        friction = TAKEN_UP * self.scene.inertia_about(name, axis)
+        self._behind(name, "backlash", axis, half_range=half)
+        self.scene.rub_behind(name, f"{name}_backlash", friction)
+        self.changed.append(
+            f"joint {name}_backlash: +-{half:.6g} rad; tendon {name}_backlash_friction, "
+            f"{friction:.3g} Nm, takes it up against the motion where no load does"
+        )
 
+    def _behind(self, name: str, label: str, axis: Array, **settings: Any) -> None:
+        body = self.scene.body_of(name)
+        hinge = Hinge(f"{name}_{label}", self.scene.anchor(name), self.scene.in_body(body, axis),
+                      **settings)  # fmt: skip
+        self.scene.put_behind(name, hinge)
 
-def _scale(scene: _Scene, name: str, increase: float) -> list[str]:
-    """Scale mass and inertia of a joint's body."""
-    if not increase:
-        return []
-    body = scene.body_of(name)
-    compiled = scene.compiled.body(body.name)
-    factor = 1 + increase
-    body.explicitinertial = True
-    body.mass = float(compiled.mass[0]) * factor
-    body.ipos, body.iquat = compiled.ipos, compiled.iquat
-    body.inertia = compiled.inertia * factor
-    return [f"body {body.name}: mass and inertia times {factor:.6g}"]
+    def inertial(self, name: str, joint: int) -> None:
+        """Scale mass and inertia of a joint's body, and move its centre of gravity."""
+        scale = 1 + self.changes.of_joint(Kind.LINK_SCALE, joint)
+        moment = self.changes.vector(Kind.LINK_MOMENT, joint)
+        body = self.scene.body_of(name)
+        if scale != 1:
+            own = self.scene.inertial(body)
+            own.mass *= scale
+            own.inertia = np.array(own.inertia) * scale
+            self.changed.append(f"body {body.name}: mass and inertia times {scale:.6g}")
+        if moment.any():
+            own = self.scene.inertial(body)
+            in_world = self.joint_in_world(joint)[:3, :3] @ moment
+            own.ipos = np.array(own.ipos) + self.scene.in_body(body, in_world) / own.mass
+            self.changed.append(f"body {body.name}: centre of gravity")
 
+    def base(self) -> None:
+        """Put the base on springs about its axes, before the first joint."""
+        springs = self.changes.springs.base
+        first = self.scene.body_of(self.names[0])
+        anchor = self.scene.point_in(first, self.world[:3, 3])
+        hinges = []
+        for k, c in enumerate(springs):
+            if c > 0:
+                axis = self.world[:3, k]
+                inertia = self.scene.inertia_about(self.names[0], axis, self.world[:3, 3])
+                name = f"base_compliance_{'xyz'[k]}"
+                turned = self.scene.in_body(first, axis)
+                hinges.append(Hinge(name, anchor, turned, (1 / c,), inertia))
+                self.changed.append(
+                    f"joint {name}: stiffness {1 / c:.6g} Nm/rad, before the first joint"
+                )
+        if hinges:
+            self.scene.put_before(first, "base_compliance", hinges)
 
-def _tool(
-    scene: _Scene, path: Path, changes: ModelChanges, options: PatchOptions, world: Array,
-    changed: list[str],
-) -> list[str]:  # fmt: skip
-    if np.allclose(changes.tcp_shift, np.eye(4), rtol=0, atol=TINY):
-        return []
-    sites = [site.name for site in scene.spec.sites]
-    if not options.tcp:
-        return [f"tool: name the site of the TCP with --tcp ({', '.join(sites) or 'none'})"]
-    site = scene.spec.site(named_one(path, "--tcp", options.tcp, sites))
-    frame = world @ changes.tcp_in_base
-    motion = frame @ changes.tcp_shift @ np.linalg.inv(frame)
-    i = scene.compiled.site(site.name).id
-    own = transform(scene.data.site_xmat[i].reshape(3, 3), scene.data.site_xpos[i])
-    scene.place(site, np.linalg.inv(scene.frame(site.parent)) @ motion @ own)
-    changed.append(f"site {site.name}: TCP")
-    return []
+    def links(self) -> None:
+        """Let links bend: two pairs of hinges across the link, each of 2 EI / L.
 
+        At the two Gauss points of its length, so that shift and slope of its end are those of the
+        cantilever, for a force and for a moment.
+        """
+        for i, flexibility in enumerate(self.changes.springs.link[:-1]):
+            root, end = self.joint_in_world(i + 1)[:3, 3], self.joint_in_world(i + 2)[:3, 3]
+            length = float(np.linalg.norm(end - root))
+            if flexibility <= 0 or length == 0:
+                continue
+            body = self.scene.body_of(self.names[i + 1])
+            stiffness = 2 / (length * flexibility)
+            name = f"{self.names[i]}_link_flexibility"
+            hinges: list[Hinge] = []
+            for share in GAUSS:
+                point = root + share * (end - root)
+                for axis in np.linalg.svd((end - root)[None])[2][1:]:
+                    inertia = self.scene.inertia_about(self.names[i + 1], axis, point)
+                    hinges.append(Hinge(
+                        f"{name}_{len(hinges) + 1}", self.scene.point_in(body, point),
+                        self.scene.in_body(body, axis), (stiffness,), inertia,
+                    ))  # fmt: skip
+            self.scene.put_before(body, name, hinges)
+            self.changed.append(
+                f"joints {name}_1 to _4: stiffness {stiffness:.6g} Nm/rad across the link"
+            )
 
-def _load(
-    scene: _Scene, names: Sequence[str], changes: ModelChanges, world: Array, changed: list[str]
-) -> list[str]:
-    """Hang what the load weighs more onto the last body."""
-    extra = sum(s.value for s in changes.settings if s.kind is Kind.PAYLOAD)
-    if not extra:
-        return []
-    if extra < 0:
-        return [f"load: {-extra:.6g} kg less than declared; take it off the body that models it"]
-    last = scene.body_of(names[-1])
-    centre = world @ changes.joint_in_base[-1] @ np.append(changes.model.payload_cog, 1.0)
-    at = np.linalg.inv(scene.frame(last)) @ centre
-    load = last.add_body(name="payload_difference", pos=at[:3])
-    load.explicitinertial, load.mass, load.inertia = True, extra, [SMALL] * 3
-    load.ipos = np.zeros(3)  # without it MuJoCo's writer leaves the inertial out
-    changed.append(f"body payload_difference: {extra:.6g} kg")
-    return []
+    def tool(self) -> None:
+        """Move the TCP's site."""
+        if np.allclose(self.changes.tcp_shift, np.eye(4), rtol=0, atol=TINY):
+            return
+        sites = [site.name for site in self.scene.spec.sites]
+        if not self.options.tcp:
+            listed = ", ".join(sites) or "none"
+            self.missing.append(f"tool: name the site of the TCP with --tcp ({listed})")
+            return
+        site = self.scene.spec.site(named_one(self.scene.path, "--tcp", self.options.tcp, sites))
+        frame = self.world @ self.changes.tcp_in_base
+        motion = frame @ self.changes.tcp_shift @ np.linalg.inv(frame)
+        self._place_site(site, motion @ self._site_in_world(site))
+        self.changed.append(f"site {site.name}: TCP")
 
+    def sensor(self) -> None:
+        """Turn the site of the flange's force sensor."""
+        turn = self.changes.vector(Kind.SENSOR_TURN)
+        if not turn.any():
+            return
+        kinds = (
+            self.scene.mujoco.mjtSensor.mjSENS_FORCE,
+            self.scene.mujoco.mjtSensor.mjSENS_TORQUE,
+        )
+        names = {s.objname for s in self.scene.spec.sensors if s.type in kinds}
+        if len(names) != 1:
+            self.missing.append(
+                f"ft_misalignment: found {len(names)} sites with force or torque sensors, expected "
+                "one; turn its frame by hand"
+            )
+            return
+        site = self.scene.spec.site(names.pop())
+        flange = self.joint_in_world(self.changes.n + 1)[:3, :3]
+        pose = self._site_in_world(site)
+        pose[:3, :3] = flange @ rotation_matrix(turn) @ flange.T @ pose[:3, :3]
+        self._place_site(site, pose)
+        self.changed.append(f"site {site.name}: the force sensor's frame")
 
-def _rest(scene: _Scene, changes: ModelChanges) -> list[str]:
-    lines = []
-    if changes.springs.link.any():
-        lines.append("flexible links: a pair of springs across the link at a third of its length, "
-                     "4 EI / 3 L each")  # fmt: skip
-    if changes.springs.base.any():
-        lines.append("flexible base: two joints with springs in the base's body")
-    lifted = [b.name for b in scene.spec.bodies if b.gravcomp]
-    if lifted:
-        lines.append(f"gravcomp of {', '.join(lifted)} takes out what springs and servos give way")
-    return lines + [f"{name}: {instead}" for name, instead in changes.not_held]
+    def _site_in_world(self, site: Any) -> Array:
+        i = self.scene.compiled.site(site.name).id
+        data = self.scene.data
+        return transform(data.site_xmat[i].reshape(3, 3), data.site_xpos[i])
+
+    def _place_site(self, site: Any, in_world: Array) -> None:
+        parent = self.scene.frame(site.parent)
+        self.scene.place("site", site, np.linalg.inv(parent) @ in_world)
+
+    def load(self) -> None:
+        """Change the body that models the load; where none is named, hang a mass beside it."""
+        extra = sum(s.value for s in self.changes.settings if s.kind is Kind.PAYLOAD)
+        shift = self.changes.vector(Kind.PAYLOAD_COG)
+        if not extra and not shift.any():
+            return
+        if self.options.load:
+            self._change_load(extra, shift)
+        elif extra > 0 and not shift.any():
+            self._hang(extra)
+        else:
+            bodies = ", ".join(b.name for b in self.scene.spec.bodies if b.name)
+            self.missing.append(
+                f"load: {extra:+.6g} kg, its centre {1e3 * np.linalg.norm(shift):.4g} mm off: name "
+                f"the body that models it with --load ({bodies})"
+            )
+
+    def _change_load(self, extra: float, shift: Array) -> None:
+        named = [b.name for b in self.scene.spec.bodies if b.name]
+        body = self.scene.spec.body(named_one(self.scene.path, "--load", self.options.load, named))
+        own = self.scene.inertial(body)
+        if own.mass + extra <= 0:
+            raise InputError(
+                f"{self.scene.path}: --load: found {own.mass:.6g} kg in {body.name}, expected more "
+                f"than the {-extra:.6g} kg that the load is lighter"
+            )
+        own.mass += extra
+        in_world = self.joint_in_world(self.changes.n + 1)[:3, :3] @ shift
+        own.ipos = np.array(own.ipos) + self.scene.in_body(body, in_world)
+        if extra:
+            self.changed.append(f"body {body.name}: mass {own.mass:.6g} kg")
+        if shift.any():
+            self.changed.append(f"body {body.name}: centre of gravity")
+
+    def _hang(self, extra: float) -> None:
+        last = self.scene.body_of(self.names[-1])
+        flange = self.joint_in_world(self.changes.n + 1)
+        centre = flange[:3, :3] @ self.changes.model.payload_cog + flange[:3, 3]
+        load = last.add_body(name="payload_difference", pos=self.scene.point_in(last, centre))
+        load.explicitinertial, load.mass, load.inertia = True, extra, [SMALL] * 3
+        load.ipos = np.zeros(3)  # without it MuJoCo's writer leaves the inertial out
+        self.changed.append(f"body payload_difference: {extra:.6g} kg")
+
+    def not_held(self) -> list[str]:
+        """Return what is not in the model, with what people do instead."""
+        lines = list(self.missing)
+        lifted = [b.name for b in self.scene.spec.bodies if b.gravcomp]
+        if lifted:
+            lines.append(
+                f"gravcomp of {', '.join(lifted)} takes out what springs and servos give way"
+            )
+        lines += [f"{name}: {text}" for name, text in self.changes.not_held]
+        return [*lines, *self.changes.left_out]

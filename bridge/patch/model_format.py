@@ -20,7 +20,9 @@ class PatchOptions:
 
     joints: tuple[str, ...] = ()  # its joints, in the order of the arm's
     tcp: str = ""  # its TCP: a site, link or prim
+    load: str = ""  # its body that models the declared payload
     on_top: bool = False  # the cell was diagnosed against this simulator: servos give way further
+    folder: Path | None = None  # where the patched model will stand, if not beside the model
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,8 @@ INSTEAD = {
     Kind.SERVO_COMPLIANCE: "gain of the servo: in the controller's settings",
     Kind.PLAY: "play: SDF or MJCF with a second, limited joint",
     Kind.PAYLOAD: "load: change the inertial of the link that carries it",
+    Kind.PAYLOAD_COG: "load: move the centre of the inertial of the link that carries it",
+    Kind.SENSOR_TURN: "sensor's frame: turn the fixed joint of its link, or its readings",
 }
 
 
@@ -53,6 +55,7 @@ class Urdf(ModelFormat):
                 changed.append(f"joint {name}: origin")
             changed += _dynamics(document, name, i + 1, changes)
         changed += _inertials(document, names, changes)
+        changed += _centres(document, names, changes, world, frames)
         missing = [*_tool(document, path, changes, options, world, frames, changed),
                    *_springs(changes), *_settings(changes)]  # fmt: skip
         document.comment(["Patched by gapbridge.", *changed, *notes,
@@ -123,21 +126,32 @@ class _Document:
         self.write("joint", joint, "origin",
                    {"xyz": origin[:3, 3], "rpy": _roll_pitch_yaw(origin[:3, :3])})  # fmt: skip
 
-    def write(self, kind: str, name: str, tag: str, values: dict[str, Array | float]) -> None:
-        """Rewrite attributes of <tag> in <kind name=...>; the element is made where missing."""
+    def write(
+        self, kind: str, name: str, tag: str, values: dict[str, Array | float], inside: str = ""
+    ) -> None:
+        """Rewrite attributes of <tag> in <kind name=...>; the element is made where missing.
+
+        ``inside``: the element of it that <tag> is in; '': it itself.
+        """
         with_type = r"(?=[^>]*\btype\s*=)" if kind == "joint" else ""  # no transmission's joint
         block = re.search(
             rf"<{kind}\b{with_type}[^>]*\bname\s*=\s*([\"']){re.escape(name)}\1[^>]*>.*?</{kind}>",
             self.text, re.DOTALL,
         )  # fmt: skip
         assert block is not None, f"{kind} {name}"
-        inside = block[0]
+        begin, end = block.span()
+        if inside:
+            part = re.search(rf"<{inside}\b[^>]*>.*?</{inside}>", _without_comments(block[0]),
+                             re.DOTALL)  # fmt: skip
+            assert part is not None, f"{name}: {inside}"
+            begin, end, kind = begin + part.start(), begin + part.end(), inside
+        given = self.text[begin:end]
         numbers = {key: " ".join(f"{v:.17g}" for v in np.atleast_1d(value))
                    for key, value in values.items()}  # fmt: skip
-        element = re.search(rf"<{tag}\b[^>]*?/?>", _without_comments(inside))
+        element = re.search(rf"<{tag}\b[^>]*?/?>", _without_comments(given))
         if element is None:
             attributes = " ".join(f'{key}="{value}"' for key, value in numbers.items())
-            new = inside.replace(f"</{kind}>", f"  <{tag} {attributes}/>\n  </{kind}>")
+            new = given.replace(f"</{kind}>", f"  <{tag} {attributes}/>\n  </{kind}>")
         else:
             old = written = element[0]
             for key, value in numbers.items():
@@ -147,8 +161,8 @@ class _Document:
                 else:
                     written = re.sub(r"\s*(/?>)$", rf' {key}="{value}"\1', written)
             place = element.start()
-            new = inside[:place] + written + inside[place + len(old) :]
-        self.text = self.text[: block.start()] + new + self.text[block.end() :]
+            new = given[:place] + written + given[place + len(old) :]
+        self.text = self.text[:begin] + new + self.text[end:]
 
     def comment(self, lines: Sequence[str]) -> None:
         """Put lines into a comment right inside of <robot>."""
@@ -204,6 +218,29 @@ def _inertials(document: _Document, names: Sequence[str], changes: ModelChanges)
     return lines
 
 
+def _centres(
+    document: _Document, names: Sequence[str], changes: ModelChanges, world: Array,
+    frames: dict[str, Array],
+) -> list[str]:  # fmt: skip
+    """Move links' centres of gravity by their first moments over their masses."""
+    lines = []
+    for i, name in enumerate(names):
+        moment, link = changes.vector(Kind.LINK_MOMENT, i + 1), document.end(name, "child")
+        inertial = document.links[link].find("inertial")
+        mass = None if inertial is None else inertial.find("mass")
+        if inertial is None or mass is None or not moment.any():
+            continue
+        turned = frames[link][:3, :3].T @ (world @ changes.joint_in_base[i])[:3, :3] @ moment
+        found = inertial.find("origin")
+        given = "0 0 0" if found is None else found.get("xyz", "0 0 0")
+        scale = 1 + changes.of_joint(Kind.LINK_SCALE, i + 1)
+        shift = turned / (float(mass.get("value", 1)) * scale)
+        place = np.array(given.split(), dtype=float) + shift
+        document.write("link", link, "origin", {"xyz": place}, inside="inertial")
+        lines.append(f"link {link}: centre of gravity")
+    return lines
+
+
 def _tool(
     document: _Document, path: Path, changes: ModelChanges, options: PatchOptions, world: Array,
     frames: dict[str, Array], changed: list[str],
@@ -241,4 +278,5 @@ def _springs(changes: ModelChanges) -> list[str]:
 def _settings(changes: ModelChanges) -> list[str]:
     kinds = {setting.kind for setting in changes.settings}
     own = [text for kind, text in INSTEAD.items() if kind in kinds]
-    return own + [f"{name}: {instead}" for name, instead in changes.not_held]
+    own += [f"{name}: {instead}" for name, instead in changes.not_held]
+    return [*own, *changes.left_out]

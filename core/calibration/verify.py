@@ -8,7 +8,7 @@ moved since compete: the tool, one joint's zero, the load, the instrument, one b
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,7 @@ from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 BROKEN = 1e-3  # chance below which a model has moved since its calibration
+STEPS = 5  # of Gauss-Newton: a zero that moved by a tooth is no small change
 BESIDE = 6.0  # of chi-square: suspects that explain as much are reported beside the best one
 
 
@@ -118,6 +119,8 @@ def verify(
     chance = float(fisher.sf(rest / freedom, freedom, baseline.freedom))
     holds = chance > BROKEN
     suspects = () if holds else _suspects(model, how, readings, nuisance, task)
+    if suspects and suspects[0].chance <= BROKEN:  # far from where the model was, perhaps
+        suspects = _suspects(model, how, readings, nuisance, task, STEPS)
     moved = suspects[0] if suspects and suspects[0].chance > BROKEN else None
     errors = Errors(left[:, :3], np.arange(len(readings)))
     return Verification(
@@ -159,14 +162,26 @@ def _instrument(baseline: AccuracyBaseline, metrology: Metrology) -> float:
 
 
 def _suspects(
-    model: Model, how: Observable, readings: Readings, nuisance: Nuisance, task: _Task
-) -> tuple[Suspect, ...]:
-    """Return what may have moved, the most likely first: by what it leaves and what it costs."""
+    model: Model, how: Observable, readings: Readings, nuisance: Nuisance, task: _Task,
+    steps: int = 1,
+) -> tuple[Suspect, ...]:  # fmt: skip
+    """Return what may have moved, the most likely first: by what it leaves and what it costs.
+
+    ``steps``: of Gauss-Newton, for each of them.
+    """
     found = []
     for name, effects in _stories(model, readings):
         own = Parameters.every(model, effects)
-        J, _ = how.columns(own, np.zeros(len(own)), readings, nuisance)
-        found.append(_suspect(name, task, J, own.names, own.units))
+        at, where, there = np.zeros(len(own)), nuisance, task
+        for step in range(steps):
+            if step:
+                moved = own.model(at)
+                where = how.start(moved, readings)
+                there = replace(task, left=how.residual(moved, readings, where).ravel())
+            J, F = how.columns(own, at, readings, where)
+            there = replace(there, F=F)
+            at = at + there.chi_square(J)[2]
+        found.append(_suspect(name, there, J, own.names, own.units, at))
     if how.registered and how.frame:
         free = make_observable(readings.kind)
         F = free.nuisance_columns(model.predict(readings.q, readings.loads), readings, nuisance)
@@ -200,9 +215,11 @@ def _cost(suspect: Suspect, width: int) -> int:
 
 def _suspect(
     name: str, task: _Task, columns: Array, names: tuple[str, ...] | list[str],
-    units: tuple[str, ...],
+    units: tuple[str, ...], found: Array | None = None,
 ) -> tuple[Suspect, int]:  # fmt: skip
+    """Return a suspect and its degrees of freedom; ``found``: its values after several steps."""
     left, freedom, values, covariance = task.chi_square(columns)
+    values = values if found is None else found
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     # a direction that nothing shows has neither value nor width
     seen = (std > 0) | (np.abs(values) > 0)

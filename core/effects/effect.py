@@ -86,6 +86,7 @@ class Effect(ABC):
     motion: ClassVar[str] = ""  # what a log must contain so that the effect shows
     alike: ClassVar[Mapping[str, str]] = {}  # another effect: the data on which it looks the same
     instead: ClassVar[str] = ""  # what people do where a simulator's model cannot hold it
+    of_the_arm: ClassVar[bool] = True  # False: of what measures, so that no model of an arm has it
 
     # how people read it
     title: ClassVar[str] = ""  # in plain words; left out: the identifier without underscores

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
+from gapbridge.core.effects.simulator import Kind, SimulatorChange, along_axes
 from gapbridge.core.rotation import rotation_matrix
 
 if TYPE_CHECKING:
@@ -38,6 +39,10 @@ class FtMisalignment(Effect):
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the rotation vector of the sensor in the flange."""
         return tuple(Parameter(axis, "rad", 0.01, -np.pi, np.pi) for axis in ("rx", "ry", "rz"))
+
+    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
+        """Return it in a simulator's terms."""
+        return along_axes(Kind.SENSOR_TURN, None, term.values)
 
     def sense(
         self, term: Term, arm: Arm, wrench: NDArray[np.float64], motion: Motion

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term, typical_moment
+from gapbridge.core.effects.simulator import Kind, SimulatorChange, along_axes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -47,6 +48,13 @@ class LinkCog(JointEffect):
         """Return the first moment in the link's axes."""
         scale = 1e-3 * typical_moment(arm)  # some centimetres of a link of some kg
         return tuple(Parameter(k, "kg m", scale, -1e3 * scale, 1e3 * scale) for k in "xyz")
+
+    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
+        """Return it in a simulator's terms."""
+        assert term.site.joint is not None
+        i, moment = term.site.joint - 1, np.array(term.values)
+        in_joint = moment if arm.body_axes is None else arm.body_axes[i] @ moment
+        return along_axes(Kind.LINK_MOMENT, term.site.joint, in_joint)
 
     def drive(
         self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion

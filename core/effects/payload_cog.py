@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
+from gapbridge.core.effects.simulator import Kind, SimulatorChange, along_axes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -47,6 +48,10 @@ class PayloadCog(Effect):
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the shift in flange axes."""
         return tuple(Parameter(k, "m", 0.02, -1.0, 1.0) for k in "xyz")
+
+    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
+        """Return it in a simulator's terms."""
+        return along_axes(Kind.PAYLOAD_COG, None, term.values)
 
     def condition(
         self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum, auto
 
@@ -18,7 +19,10 @@ class Kind(Enum):
     SERVO_COMPLIANCE = auto()  # rad/Nm: 1 / proportional gain of a position servo
     PLAY = auto()  # rad: whole clearance
     PAYLOAD = auto()  # kg, at the declared centre of gravity
+    PAYLOAD_COG = auto()  # m, flange axes: shift of the load's centre of gravity
     LINK_SCALE = auto()  # relative increase of a link's mass and inertia
+    LINK_MOMENT = auto()  # kg m, the joint's frame: a link's mass times the shift of its centre
+    SENSOR_TURN = auto()  # rad, flange axes: rotation vector of the flange sensor's own axes
 
 
 @dataclass(frozen=True)
@@ -28,3 +32,11 @@ class SimulatorChange:
     kind: Kind
     joint: int | None
     value: float
+    axis: int | None = None  # 0, 1, 2 of the kind's axes, where it is a part of a vector
+
+
+def along_axes(
+    kind: Kind, joint: int | None, vector: Iterable[float]
+) -> tuple[SimulatorChange, ...]:
+    """Return one change an axis of a vector (3,) that is not zero."""
+    return tuple(SimulatorChange(kind, joint, float(v), k) for k, v in enumerate(vector) if v)

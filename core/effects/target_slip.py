@@ -38,6 +38,7 @@ class TargetSlip(Effect):
         "tool_frame": "no pose before the moment",
         "joint_slip": "one orientation of the flange after the moment",
     }
+    of_the_arm = False
     instead = "none needed: a simulated target does not move"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:

@@ -23,6 +23,7 @@ from gapbridge.bridge.calibration.planning import (
 )
 from gapbridge.bridge.calibration.session.progress import seconds_left
 from gapbridge.core.calibration.accuracy_baseline import baseline_in
+from gapbridge.core.calibration.moved import moved_words
 from gapbridge.core.calibration.plan import Plan, PlannedPose
 from gapbridge.core.calibration.verify import Verification, verify
 from gapbridge.core.errors import InputError
@@ -108,7 +109,9 @@ class VerifyJob(Job):
         facts = session_facts(self.cell, options, self.session)
         for file in write_report(VerificationMaterial(found, facts, readings), folder):
             prompt.say(f"{file}: written")
-        self.session.add("ended", holds=found.holds)
+        moved = None if found.moved is None else found.moved.name
+        others = [other.name for other in found.suspects]
+        self.session.add("ended", holds=found.holds, moved=moved, or_else=others)
 
     def _tell(self, found: Verification) -> None:
         prompt = self.prompt
@@ -122,6 +125,8 @@ class VerifyJob(Job):
                 f"  {estimate.name} {parameter(estimate.value, estimate.unit)} "
                 f"± {parameter(estimate.std, estimate.unit)}"
             )
+        for other in found.suspects:
+            prompt.say(f"  these readings cannot tell it from: {moved_words(other, ())}")
         for note in found.notes:
             prompt.say(f"  note: {note}")
 

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import click
 
+from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cli.options import cell_option, open_cell
 from gapbridge.bridge.document.output_file import require_writable, write_text
+from gapbridge.bridge.patch.model_format import PatchOptions
 from gapbridge.core.errors import InputError
 
 
@@ -19,30 +21,47 @@ from gapbridge.core.errors import InputError
 )
 @click.option("--joints", metavar="A,B,...", help="The model's joints, in the order of the arm's.")
 @click.option("--tcp", metavar="NAME", help="The model's TCP: a site (MJCF) or a link (URDF).")
-def patch(model: Path, cell: Path, out: Path, joints: str | None, tcp: str | None) -> None:
+@click.option("--load", metavar="NAME", help="The model's body that is the declared payload.")
+@click.option(
+    "--parameters",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write bounds for MuJoCo's sysid: .py (with modifiers) or .yaml.",
+)
+def patch(
+    model: Path,
+    cell: Path,
+    out: Path,
+    joints: str | None,
+    tcp: str | None,
+    load: str | None,
+    parameters: Path | None,
+) -> None:
     """Write a cell's effects into a simulator's model.
 
-    MODEL is an MJCF (.xml) or a URDF model of the cell's nominal arm. Geometry, offsets,
+    MODEL is an MJCF (.xml), URDF or USD model of the cell's nominal arm. Geometry, offsets,
     tool, masses, friction, damping, armature, delay, lag, gain, flexibility and play go where the
-    format holds them; what it cannot hold is listed with what people do instead. MODEL itself stays
-    as it is.
+    format holds them; what it cannot hold is listed with what people do instead. What the diagnosis
+    could not distinguish is written as a comment with both candidates. MODEL itself stays as it is;
+    of USD a stronger layer is written over it.
+
+    --parameters also writes the effects as bounds for MuJoCo's own system identification: free
+    within three standard deviations what was accused, frozen what else the cell has.
 
     Example: gapbridge patch ur10e.xml --cell better.yaml --out ur10e_real.xml --tcp attachment_site
     """
-    from gapbridge.bridge.patch import PatchOptions, changes_of, format_of
+    from gapbridge.bridge.patch import changes_of, format_of
+    from gapbridge.bridge.patch.ties import tie_lines
 
     kind = format_of(model)
     if not model.is_file():
         raise InputError(f"{model}: file not found, expected a model")
     given = open_cell(cell)
     require_writable(out, model, cell)
-    names = tuple(name.strip() for name in joints.split(",")) if joints else ()
-    origin = given.file.provenance
-    on_top = origin is not None and any(file.role == "sim" for file in origin.files)
-    patched = kind.patch(
-        model, changes_of(given.model), PatchOptions(names, tcp or "", on_top),
-        [f"cell: {cell.name}"],
-    )  # fmt: skip
+    options = _options(given, out, joints, tcp, load)
+    bounds = None if parameters is None else _bounds(model, given, options, parameters, (out, cell))
+    ties = tie_lines(given.accused, given.model.terms)
+    patched = kind.patch(model, changes_of(given.model), options, [f"cell: {cell.name}", *ties])
     write_text(out, patched.text)
     for line in patched.changed:
         click.echo(line)
@@ -50,4 +69,35 @@ def patch(model: Path, cell: Path, out: Path, joints: str | None, tcp: str | Non
         click.echo("nothing changed: the cell has no effect that this format holds")
     for line in patched.not_held:
         click.echo(f"not held: {line}")
+    for line in ties:
+        click.echo(line)
     click.echo(f"{out}: written")
+    if parameters is not None and bounds is not None:
+        write_text(parameters, bounds)
+        click.echo(f"{parameters}: written")
+
+
+def _options(
+    cell: Cell, out: Path, joints: str | None, tcp: str | None, load: str | None
+) -> PatchOptions:
+    names = tuple(name.strip() for name in joints.split(",")) if joints else ()
+    origin = cell.file.provenance
+    on_top = origin is not None and any(file.role == "sim" for file in origin.files)
+    return PatchOptions(names, tcp or "", load or "", on_top, out.parent)
+
+
+def _bounds(
+    model: Path, cell: Cell, options: PatchOptions, file: Path, others: tuple[Path, ...]
+) -> str:
+    """Return the text of --parameters."""
+    from gapbridge.bridge.patch.sysid import MODELS, SUFFIXES, parameters_text
+
+    if model.suffix.lower() not in MODELS:
+        raise InputError(f"--parameters: found the model {model}, expected an MJCF (.xml)")
+    suffix = file.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InputError(
+            f"--parameters {file}: found {suffix or 'no suffix'}, expected {' or '.join(SUFFIXES)}"
+        )
+    require_writable(file, model, *others)
+    return parameters_text(model, cell, options, suffix)

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from gapbridge.bridge.api.found_spread import intervals_applied, spread_of
+from gapbridge.bridge.api.found_spread import accused, intervals_applied, spread_of
 from gapbridge.bridge.cell import Cell, save_cell
-from gapbridge.bridge.cell.opened_log import open_log
+from gapbridge.bridge.cell.opened_log import open_simulated
 from gapbridge.bridge.cli.log.answer import answer
 from gapbridge.bridge.cli.options import (
     cell_option,
@@ -29,7 +29,6 @@ from gapbridge.core.diagnosis.diagnosis import diagnose as diagnose_log
 from gapbridge.core.diagnosis.document import document
 from gapbridge.core.effects import effect_named
 from gapbridge.core.errors import InputError
-from gapbridge.core.log.alignment import aligned
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.ranges import range_of
@@ -110,7 +109,7 @@ def diagnose(
     rows = open_logs(logs, given)
     warn_outside(rows, given)
     _check_effects(withhold)
-    simulated = None if sim is None else _simulated(sim, given, rows)
+    simulated = None if sim is None else open_simulated(sim, given, rows)
     inputs = [*logs, cell, *([sim] if sim else [])]
     for file in (json_file, new_cell):
         if file is not None:
@@ -129,7 +128,8 @@ def diagnose(
         applied = found.with_stand_ins if stand_ins else found.model
         spread = spread_of(found).beside(given.spread)
         intervals = given.intervals | intervals_applied(found, stand_ins=stand_ins)
-        written_by = fitted(origin, range_of(rows), spread, intervals)
+        causes = accused(found, given.accused)
+        written_by = fitted(origin, range_of(rows), spread, intervals, causes)
         save_cell(given, new_cell, applied, {"provenance": written_by})
     written = [] if out is None else _write_folder(out, reported, found, given, rows)
     for file in (*written, json_file, new_cell):
@@ -155,11 +155,6 @@ def _check_effects(names: tuple[str, ...]) -> None:
             effect_named(name)
         except InputError as error:
             raise InputError(f"--withhold: {error}") from None
-
-
-def _simulated(path: Path, cell: Cell, log: Log) -> Log:
-    """Return the simulator's log; raises LogError where its rows are not those of the log."""
-    return aligned(open_log(path, cell), log)
 
 
 def _folder(path: Path) -> None:

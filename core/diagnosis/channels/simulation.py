@@ -54,7 +54,7 @@ def predicted_by(channel: str, observe: Observe) -> Observe:
         model: Model, log: Log, metrology: Metrology
     ) -> Observation | NotObservable:
         values = log.get(PREFIX + SHOWN_BY[channel])
-        seen = observe(model, log, metrology)
+        seen = observe(model, _behind(log, channel, values), metrology)
         if isinstance(seen, NotObservable):
             return seen
         if values is None:
@@ -64,8 +64,18 @@ def predicted_by(channel: str, observe: Observe) -> Observe:
     return seen_by_simulator
 
 
+def _behind(log: Log, channel: str, values: Array | None) -> Log:
+    """Return the log of a tracking channel with the simulator's encoders as its command.
+
+    A delay or lag that is sought comes behind the simulated servo's own: filters in a row.
+    """
+    if channel != "tracking" or values is None or not log.has("target_q"):
+        return log
+    return replace(log, columns={**log.columns, "target_q": values})
+
+
 def _with_prediction(seen: Observation, values: Array) -> Observation:
-    own, rebase = seen.predict, seen.rebase
+    own, rebase, fewer = seen.predict, seen.rebase, seen.fewer
     nominal = own(())
     base = nominal.copy()
     part = values[seen.rows]
@@ -75,4 +85,5 @@ def _with_prediction(seen: Observation, values: Array) -> Observation:
         return np.asarray(base + (own(terms) - nominal)) if terms else base
 
     moved = None if rebase is None else lambda step: _with_prediction(rebase(step), values)
-    return replace(seen, predict=predict, rebase=moved)
+    thinned = None if fewer is None else lambda take: _with_prediction(fewer(take), values)
+    return replace(seen, predict=predict, rebase=moved, fewer=thinned)

@@ -6,7 +6,7 @@ Topics are found by their type, times are those of the headers, joints are order
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,6 +29,18 @@ TYPES = {  # role -> types of messages
     "wrench": ("geometry_msgs/msg/WrenchStamped",),
     "pose": ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped"),
 }
+CONTROLLER = TYPES["controller"][0]
+POINTS, MULTI = (
+    "trajectory_msgs/JointTrajectoryPoint",
+    "trajectory_msgs/MultiDOFJointTrajectoryPoint",
+)
+LAYOUTS = (  # of the controller's state by ROS distribution: points, then points of many axes
+    (("reference", "feedback", "error", "output", "desired", "actual"),
+     ("reference", "feedback", "error", "output", "desired", "actual")),  # Humble
+    (("reference", "feedback", "error", "output"),
+     ("reference", "feedback", "error", "output")),  # Jazzy and later
+    (("desired", "actual", "error"), ()),  # before Humble
+)  # fmt: skip
 WRENCHES = ("ft_raw_wrench", "actual_TCP_force")
 
 
@@ -163,9 +175,11 @@ def _collect(path: Path, bag: AnyReader, topic: str) -> _Samples:
 
     found = _Samples(topic)
     connections = [c for c in bag.connections if c.topic == topic]
+    read: Callable[[bytes, str], Any] | None = None
     try:
         for connection, received, raw in bag.messages(connections):
-            message: Any = bag.deserialize(raw, connection.msgtype)
+            read = read or _reader(path, bag, connection.msgtype, raw)
+            message: Any = read(raw, connection.msgtype)
             stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
             if stamp == 0:
                 stamp, found.received = received * 1e-9, found.received + 1
@@ -177,6 +191,34 @@ def _collect(path: Path, bag: AnyReader, topic: str) -> _Samples:
     if not found.rows:
         raise LogError(f"{path}: topic {topic}: found no messages, expected some")
     return found
+
+
+def _reader(path: Path, bag: AnyReader, kind: str, raw: bytes) -> Callable[[bytes, str], Any]:
+    """Return what reads messages of a type, of which ``raw`` is one.
+
+    Bags of SQLite before ROS 2 Iron hold no definitions: a controller's state is then read by the
+    first layout that fits its bytes. Raises LogError where none does.
+    """
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    if kind in bag.typestore.fielddefs:
+        return bag.deserialize
+    for points, many in LAYOUTS if _type(kind) == CONTROLLER else ():
+        lines = ["std_msgs/Header header", "string[] joint_names"]
+        lines += [f"{POINTS} {name}" for name in points]
+        lines += ["string[] multi_dof_joint_names"] if many else []
+        lines += [f"{MULTI} multi_dof_{name}" for name in many]
+        store = get_typestore(Stores.ROS2_HUMBLE)
+        store.register(get_types_from_msg("\n".join(lines), kind))
+        try:
+            store.deserialize_cdr(raw, kind)
+        except Exception:  # whatever another layout's bytes lead to
+            continue
+        return store.deserialize_cdr
+    raise LogError(
+        f"{path}: found no definition of {kind} in the bag, expected one; rewrite it with "
+        "`ros2 bag convert` as MCAP, which holds them"
+    )
 
 
 def _values(kind: str, message: Any) -> dict[str, Any]:

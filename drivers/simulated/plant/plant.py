@@ -69,6 +69,7 @@ class Plant:
         self.tool = Frame(from_vector(settings.tcp[3:]), tip)
         cog, wrench = settings.payload_cog, settings.wrench
         self.load = Load(settings.payload_mass, cog, wrench[:3], wrench[3:])
+        self.zero: tuple[float, ...] = settings.zero or (0.0,) * len(q)
         self.placements = 0  # times that the arm has come to rest
         self._random = np.random.default_rng(settings.seed)
         self._moving = False
@@ -123,8 +124,13 @@ class Plant:
 
     def true_angles(self) -> tuple[float, ...]:
         """Return what the joints really stand at (rad): encoders, zeros, the placement error."""
-        zero = self.settings.zero or (0.0,) * len(self.q)
-        return tuple(a + b + c for a, b, c in zip(self.q, self.scatter, zero, strict=True))
+        return tuple(a + b + c for a, b, c in zip(self.q, self.scatter, self.zero, strict=True))
+
+    def slip(self, joint: int, angle: float) -> None:
+        """Have the zero of a joint (from 0) slip: its true angle is ``angle`` rad more from now."""
+        zero = list(self.zero)
+        zero[joint] += angle
+        self.zero = tuple(zero)
 
     def shape(self, angles: Sequence[float], load: Load | None = None) -> Shape:
         """Return the equilibrium of the arm at joint `angles` (n, rad)."""

@@ -166,7 +166,9 @@ class Sensors:
     def update_slowly(self, clock: float) -> None:
         """Refresh what needs the equilibrium or changes slowly."""
         plant, memory, declared = self._plant, self._memory, self._declared
-        key = (plant.q, plant.scatter, plant.load, declared.tool, declared.payload_mass)
+        key = (
+            plant.q, plant.scatter, plant.zero, plant.load, declared.tool, declared.payload_mass
+        )  # fmt: skip
         if key != self._bent_at:
             self._bent_at = key
             angles = plant.true_angles()
@@ -187,7 +189,7 @@ class Sensors:
         load, s = plant.load, plant.settings
         pull = (*load.force, *load.torque)
         self._wrench = holding_torque(
-            plant.arm, plant.q, s.gravity, load.mass, load.cog, pull, plant.tool
+            plant.arm, plant.true_angles(), s.gravity, load.mass, load.cog, pull, plant.tool
         )
         reckoned = holding_torque(
             plant.arm, plant.q, s.gravity, declared.payload_mass, declared.payload_cog,

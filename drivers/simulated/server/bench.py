@@ -87,6 +87,7 @@ class BenchServer:
             "measure": (0, self._measure, "timestamp,x,y,z,rx,ry,rz of the true TCP, with noise"),
             "payload": (4, self._payload, "MASS CX CY CZ: hang a load on the flange, kg, m"),
             "wrench": (6, self._wrench, "FX FY FZ TX TY TZ: pull at the TCP, base axes, N, Nm"),
+            "slip": (2, self._slip, "JOINT ANGLE: the joint's zero slips by ANGLE, rad"),
             "move": (n, self._move, f"Q1..Q{n}: the robot's own program moves there, rad"),
             "protective_stop": (0, self._protective_stop, "as a collision would"),
             "emergency_stop": (0, self._emergency_stop, "press the button"),
@@ -148,6 +149,13 @@ class BenchServer:
         fx, fy, fz, tx, ty, tz = numbers
         load = self._controller.plant.load
         self._controller.plant.load = Load(load.mass, load.cog, (fx, fy, fz), (tx, ty, tz))
+        return "ok"
+
+    def _slip(self, numbers: list[float]) -> str:
+        plant, joint = self._controller.plant, numbers[0]
+        if joint not in range(1, len(plant.q) + 1):
+            raise BenchError(f"slip: found joint {joint:g}, expected 1 to {len(plant.q)}")
+        plant.slip(int(joint) - 1, numbers[1])
         return "ok"
 
     def _move(self, numbers: list[float]) -> str:

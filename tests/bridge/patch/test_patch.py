@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.patch.arms import BASE_AT, BASE_TURN, UR_JOINTS, frame_turns, mjcf, urdf
 from gapbridge.bridge.patch import PatchOptions, changes_of, format_of
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import InputError
 from gapbridge.core.model import Model
-from tests.bridge.patch.arms_written import BASE_AT, BASE_TURN, UR_JOINTS, mjcf, urdf
 
 mujoco = pytest.importorskip("mujoco")
 pinocchio = pytest.importorskip("pinocchio")
@@ -154,7 +154,8 @@ def test_moving_effects_become_the_joints_and_actuators_own(tmp_path: Path) -> N
     assert compiled.dof_frictionloss[dof[0]] == pytest.approx(3.0)
     assert np.ravel(compiled.dof_damping[dof[1]])[0] == pytest.approx(5.0)
     assert compiled.dof_armature[dof[2]] == pytest.approx(before.dof_armature[dof[2]] + 0.4)
-    assert compiled.actuator_dynprm[4, 0] == pytest.approx(0.05)
+    half = 0.5 * compiled.opt.timestep  # by which a sampled filter answers earlier
+    assert compiled.actuator_dynprm[4, 0] == pytest.approx(0.05 + half)
     play = compiled.joint("wrist_3_joint_backlash")
     assert np.allclose(play.range, [-0.001, 0.001])
     ratio = compiled.body("link_2").mass[0] / before.body("link_2").mass[0]
@@ -191,6 +192,23 @@ def test_a_delayed_actuator_moves_later(tmp_path: Path) -> None:
         mujoco.mj_step(compiled, data)
         moved.append(abs(data.joint(UR_JOINTS[0]).qpos[0]) > 1e-9)
     assert 19 <= moved.index(True) <= 23
+
+
+def test_a_links_centre_moves_by_its_moment_over_its_mass(tmp_path: Path) -> None:
+    """The weight's torque at the joints says where the centre is, in both formats."""
+    model = NOMINAL.with_terms([Term("link_cog", Site(2), (0.4, -0.2, 0.1))])
+    given = {"a.xml": mjcf(ARM, UR_JOINTS), "a.urdf": urdf(ARM, UR_JOINTS)}
+    texts = {name: patched(tmp_path / name, text, model, "tcp" if name == "a.xml" else "")[0]
+             for name, text in given.items()}  # fmt: skip
+    axes = np.eye(3) if ARM.body_axes is None else ARM.body_axes[1]
+    in_link = frame_turns(6)[1].inv().apply(axes @ [0.4, -0.2, 0.1])
+    after, before = (mujoco.MjModel.from_xml_string(t) for t in (texts["a.xml"], given["a.xml"]))
+    moved = after.body("link_2").ipos - before.body("link_2").ipos
+    assert np.allclose(moved * before.body("link_2").mass, in_link, rtol=0, atol=1e-5)
+    (tmp_path / "b.urdf").write_text(texts["a.urdf"])
+    robot = pinocchio.buildModelFromUrdf(str(tmp_path / "b.urdf"))
+    link = robot.inertias[2]
+    assert np.allclose(link.lever * link.mass, in_link, rtol=0, atol=1e-9)
 
 
 def test_what_no_format_holds_is_listed_with_what_people_do(tmp_path: Path) -> None:

@@ -82,6 +82,17 @@ def test_a_joint_whose_zero_moved_is_named_with_how_far(calibrated: Calibrated) 
     assert "joint 3" in seen.verdict
 
 
+@pytest.mark.parametrize("size", [0.01, 0.05])
+def test_a_zero_that_moved_far_is_named_all_the_same(calibrated: Calibrated, size: float) -> None:
+    found, document, real, instrument = calibrated
+    slipped = with_values(real, {"joint_offset_5": size})
+    seen = verify(found.model, _again(slipped, instrument, poses=8), document, METROLOGY)
+    assert seen.moved is not None
+    assert seen.moved.name == "joint_offset_5"
+    assert abs(seen.moved.estimates[0].value - size) < 4.0 * seen.moved.estimates[0].std
+    assert "the zero of joint 5 moved by" in seen.verdict
+
+
 def test_a_zero_that_the_calibration_left_open_may_be_off_by_as_much(
     calibrated: Calibrated,
 ) -> None:

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import small_arm as small
 
+from gapbridge.core.diagnosis.channels import torque, tracking
 from gapbridge.core.diagnosis.channels.position import observe
-from gapbridge.core.diagnosis.channels.simulation import joined, predicted_by
+from gapbridge.core.diagnosis.channels.simulation import SHOWN_BY, joined, predicted_by
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import LogError
@@ -103,3 +104,48 @@ def test_a_channel_that_the_simulator_lacks_is_not_observable():
     found = diagnose(small.model_of(), log, METROLOGY, simulated=simulated(small.NOMINAL))
     (hidden,) = [h for h in found.not_observable if h.channel == "wrench"]
     assert hidden.needs == ("ft_raw_wrench (in the simulator's log)",)
+
+
+def moving_log(seed: int = 0) -> Log:
+    """Return two seconds of motion with all that the moving channels need."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(400) * 5e-3
+    target = 0.3 * np.sin(2 * np.pi * (0.4 * t[:, None] + rng.uniform(size=3)))
+    return Log(
+        "log.csv",
+        {"timestamp": t, "target_q": target, "actual_q": target + rng.normal(0, 1e-5, target.shape),
+         "actual_current_as_torque": rng.normal(0, 1, target.shape)}, 3,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("channel", ["torque", "tracking"])
+def test_a_search_over_fewer_rows_keeps_the_simulators_prediction(channel: str):
+    log = moving_log()
+    name = SHOWN_BY[channel]
+    simulator = Log("sim.csv", {name: log.require(name) + 0.05}, 3)
+    observers = {"torque": torque.observe, "tracking": tracking.observe}
+    seen = predicted_by(channel, observers[channel])(
+        small.model_of(), joined(log, simulator), METROLOGY
+    )
+    take = np.arange(0, len(seen.rows), 3)
+    assert seen.fewer is not None
+    fewer = seen.fewer(take)
+    assert np.allclose(fewer.predict(()), simulator.require(name)[seen.rows[take]])
+
+
+def test_a_delay_is_sought_behind_the_simulators_own_servo():
+    """The simulator comes 30 ms late of itself, the real arm 20 ms later still."""
+    log, late, own = moving_log(), 0.02, 0.03
+    t = log.require("timestamp")
+    command = log.require("target_q")
+
+    def shifted(by: float) -> np.ndarray:
+        return np.column_stack([np.interp(t - by, t, command[:, j]) for j in range(3)])
+
+    simulator = Log("sim.csv", {"actual_q": shifted(own)}, 3)
+    seen = predicted_by("tracking", tracking.observe)(
+        small.model_of(), joined(log, simulator), METROLOGY
+    )
+    found = seen.predict([Term("latency", Site(1), (late,))])[:, 0]
+    assert np.abs(found - shifted(own + late)[seen.rows, 0]).max() < 2e-4
+    assert np.abs(shifted(own)[seen.rows, 0] - shifted(own + late)[seen.rows, 0]).max() > 1e-2

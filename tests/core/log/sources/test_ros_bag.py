@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -198,6 +200,57 @@ def test_messages_without_stamps_count_at_their_time_of_recording(bag: Bag, tmp_
     found = source_of(tmp_path / "bag").read(tmp_path / "bag", UR_JOINTS, SourceOptions())
     assert np.allclose(found.columns["timestamp"], 100.5 + 0.01 * np.arange(ROWS))
     assert any("no stamp" in note for note in found.notes)
+
+
+HUMBLE = ("reference", "feedback", "error", "output", "desired", "actual")
+LAYOUTS = {
+    "humble": (HUMBLE, HUMBLE), "jazzy": (HUMBLE[:4], HUMBLE[:4]),
+    "foxy": (("desired", "actual", "error"), ()),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("distribution", LAYOUTS)
+def test_a_controller_state_is_read_from_a_bag_without_definitions(
+    tmp_path: Path, distribution: str
+) -> None:
+    points, many = LAYOUTS[distribution]
+    kind = "control_msgs/msg/JointTrajectoryControllerState"
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    text = "std_msgs/Header header\nstring[] joint_names\n"
+    text += "".join(f"trajectory_msgs/JointTrajectoryPoint {name}\n" for name in points)
+    text += "string[] multi_dof_joint_names\n" if many else ""
+    text += "".join(
+        f"trajectory_msgs/MultiDOFJointTrajectoryPoint multi_dof_{name}\n" for name in many
+    )
+    store.register(get_types_from_msg(text, kind))
+    types, empty = store.types, np.zeros(0)
+    duration = types["builtin_interfaces/msg/Duration"](sec=0, nanosec=0)
+    with Writer(tmp_path / "bag", version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connection = writer.add_connection("/state", kind, typestore=store)
+        for k in range(5):
+            q = np.array([angles(k)[name] for name in UR_JOINTS])
+            whole = {
+                name: types["trajectory_msgs/msg/JointTrajectoryPoint"](
+                    q + 0.001 * (name in ("reference", "desired")), empty, empty, empty, duration
+                )
+                for name in points
+            }  # fmt: skip
+            multi = types["trajectory_msgs/msg/MultiDOFJointTrajectoryPoint"]
+            rest = {f"multi_dof_{name}": multi([], [], [], duration) for name in many}
+            rest |= {"multi_dof_joint_names": []} if many else {}
+            stamp = types["builtin_interfaces/msg/Time"](sec=100 + k, nanosec=0)
+            message = types[kind](
+                header=types["std_msgs/msg/Header"](stamp=stamp, frame_id=""),
+                joint_names=list(UR_JOINTS), **whole, **rest,
+            )  # fmt: skip
+            writer.write(connection, (100 + k) * 10**9, store.serialize_cdr(message, kind))
+    with contextlib.closing(sqlite3.connect(tmp_path / "bag" / "bag.db3")) as database:
+        database.execute("delete from message_definitions")
+        database.commit()
+    found = source_of(tmp_path / "bag").read(tmp_path / "bag", (), SourceOptions())
+    expected = np.array([[angles(k)[name] for name in UR_JOINTS] for k in range(5)])
+    assert np.allclose(found.columns["actual_q"], expected)
+    assert np.allclose(found.columns["target_q"], expected + 0.001)
 
 
 def test_a_ros_1_bag_is_read(tmp_path: Path) -> None:

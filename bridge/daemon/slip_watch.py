@@ -1,0 +1,532 @@
+"""Watching for a joint whose zero has moved: rests at the same pose, compared over a run.
+
+A robot's program comes back to the same poses. What the flange sensor and the motors measure there
+repeats but for noise, whatever the model gets wrong, so that each rest is compared with earlier
+rests at its own pose. A zero that has slipped by delta turns the weights beyond the joint: every
+pose then changes by its own known share, d(prediction)/dq_j times delta. The likelihood ratio of
+that one number is tested at every rest for each joint and for several moments in the past (a
+generalised likelihood-ratio test with nuisances: Basseville and Nikiforov, "Detection of Abrupt
+Changes" (1993), ch. 2.4). A step of the sensor's or the motors' zeros, and of payload and its first
+moment, is free on both sides, so that none of them counts as a slip.
+
+A person who touches the arm makes a force that comes and goes: it does not repeat at the next
+poses in the shares of a joint. It is reported as what it is, and kept out of the comparison.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapbridge.bridge.ipc.events import Event
+from gapbridge.core.dynamics import predict_torque, predict_wrench, with_pieces
+from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
+from gapbridge.core.motion import Motion
+from gapbridge.core.rotation import rotation_matrix
+
+Array = NDArray[np.float64]
+
+STILL = 1e-3  # rad from where a rest began: farther, the arm has moved on
+SETTLING = 0.1  # s at the begin of a rest that are left out
+WINDOW = 0.3  # s of one mean
+WINDOWS = 20  # of a rest that count
+SAME_POSE = 0.02  # rad
+SAME_MASS = 0.01  # kg
+TURNED = 0.01  # rad: a joint that came at least this far has come from that side
+KEPT = 120  # rests
+PLACES = 64  # poses at most; a program with more forgets those not seen for longest
+SUFFIXES = (4, 5, 6, 8, 12, 18, 27, 40)  # rests since the moment that is tried
+LEARNED = 18  # differences between rests at one pose that the noise is taken from
+FEWEST_PLACES = 4  # poses that a slip must show at
+BEFORE_STEPS = 0.5  # of the threshold: how far a slip is ahead of any step of zeros and payload
+WITHOUT_ONE = 0.25  # share of the threshold that a slip keeps whichever pose is left out
+THRESHOLD = 45.0  # of the likelihood ratio (chi-square of one number)
+CONSISTENT = 3.0  # chi-square per number that a slip may leave: more, it is something else
+BESIDE = 9.0  # of the ratio: a joint that explains as much is reported beside the best
+FLOORS = (0.05, 0.005, 0.05)  # N, Nm of the flange sensor, Nm of a motor: 1 sigma at least
+LARGEST_SLIP = 0.05  # rad: what no slip makes is a force
+FORCE = 1.0  # N on top of that
+FORCE_SIGMAS = 8.0
+LASTING = 3  # rests in a row after which a force counts as the new state of things
+STEP = 1e-4  # rad, kg, kg m: of the differences
+TIPS = 0.1  # rad: poses closer than this are one to the test
+
+
+@dataclass(frozen=True)
+class Slip:
+    """A joint's zero that has moved."""
+
+    joints: tuple[int, ...]  # from 1; the first explains most, the others as well as it
+    size: float  # rad, of the first: the true angle is now the encoder's and this more
+    std: float  # rad
+    since: float  # s, controller's clock: the first rest after it
+    detail: str
+
+    @property
+    def event(self) -> Event:
+        """Return the event of the run that reports it."""
+        return {
+            "kind": "slip", "joints": list(self.joints), "size": self.size, "std": self.std,
+            "since": self.since, "detail": self.detail,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Force:
+    """A force that came while the arm stood, or held during a rest."""
+
+    size: float  # N
+    since: float  # s, controller's clock
+    detail: str
+
+    @property
+    def event(self) -> Event:
+        """Return the event of the run that reports it."""
+        return {
+            "kind": "warning", "what": "unexpected_force", "size": self.size, "since": self.since,
+            "detail": self.detail,
+        }  # fmt: skip
+
+
+@dataclass
+class _Place:
+    """A pose that the program comes back to."""
+
+    q: Array  # (n,) rad
+    mass: float  # kg, declared
+    side: bytes  # from which each joint has come
+    predicted: Array  # (m,) readings of the rigid arm
+    slip: Array  # (m, n) change of the readings per rad of each joint's zero
+    free: Array  # (m, f) what a step of sensors' zeros and of the payload changes
+
+
+@dataclass(frozen=True)
+class _Rest:
+    place: int
+    time: float  # s
+    readings: Array  # (m,) less the model's; NaN where there is no such sensor
+
+
+class _Change(NamedTuple):
+    """The rests at one pose after a moment, less those before it; whitened."""
+
+    b: Array  # (k,)
+    slip: Array  # (k, n)
+    free: Array  # (k, f)
+
+
+class _Standing:
+    """The arm since it came to a stop at ``q`` (n,) rad, ``since`` s: means of short windows."""
+
+    def __init__(self, q: Array, since: float) -> None:
+        self.q, self.since = q, since
+        self.windows: list[Array] = []
+        self._last: Array | None = None  # window
+        self._sum: Array | float = 0.0
+        self._count, self._begun = 0, 0.0  # rows of the window, and s of the first
+
+    def take(self, rows: Array, begun: float, ended: float) -> tuple[Array, Array] | None:
+        """Return a window that has ended, and how it differs from the one before it, if any."""
+        self._begun = self._begun if self._count else begun
+        self._sum, self._count = self._sum + rows.sum(axis=0), self._count + len(rows)
+        if ended - self._begun < WINDOW:
+            return None
+        mean = np.asarray(self._sum / self._count)
+        self._sum, self._count = 0.0, 0
+        before, self._last = self._last, mean
+        if len(self.windows) < WINDOWS:
+            self.windows.append(mean)
+        return None if before is None else (mean, mean - before)
+
+
+class SlipWatch:
+    """Compares the rests of a run with each other; ``model`` None, or ``smallest`` 0: never.
+
+    ``slices``: where each field stands in a cycle's row (SharedMemory.slices). ``smallest``: rad,
+    of a slip that is reported.
+    """
+
+    def __init__(self, model: Model | None, slices: Mapping[str, slice], smallest: float) -> None:
+        # bending is the same at each visit to a pose, and cancels
+        self._model = None if model is None or smallest <= 0.0 else model.without_terms()
+        self._smallest = smallest
+        names = (
+            "actual_q", "ft_raw_wrench", "actual_TCP_force", "actual_current_as_torque", "payload",
+            "payload_cog",
+        )  # fmt: skip
+        n = slices["actual_q"].stop - slices["actual_q"].start
+        self._n = n
+        self._taken = np.concatenate([np.arange(slices[k].start, slices[k].stop) for k in names])
+        self._time = slices["timestamp"].start
+        self._q = slices["actual_q"]
+        self._floor = np.repeat(FLOORS, (3, 3, n))
+        self.forget()
+
+    def forget(self) -> None:
+        """Learn anew: the arm is another from now on."""
+        self._places: list[_Place] = []
+        self._rests: deque[_Rest] = deque(maxlen=KEPT)
+        self._standing: _Standing | None = None
+        self._touched = False  # a force has come or gone during this rest
+        self._before: Array | None = None  # (n,) rad: the rest before this one
+        self._odd: list[_Rest] = []  # rests in a row under a force
+        self._sigma: Array | None = None  # (m,) of one rest
+
+    @property
+    def learned(self) -> bool:
+        """Return whether poses have come back often enough to compare them."""
+        return self._model is not None and self._sigma is not None
+
+    @property
+    def detail(self) -> str:
+        """Return in words what is watched."""
+        if self._model is None:
+            return "not watched"
+        seen = len({rest.place for rest in self._rests})
+        words = f"{len(self._rests)} rests at {seen} poses compared"
+        return words if self.learned else f"{words}; learning, until poses have come back"
+
+    def take(self, rows: Array) -> list[Slip | Force]:
+        """Return what has just been found. ``rows`` (k, width): cycles of the loop, in order."""
+        if self._model is None or not len(rows):
+            return []
+        found: list[Slip | Force] = []
+        q, t = rows[:, self._q], rows[:, self._time]
+        standing = self._standing
+        if (
+            standing is None
+            or np.abs(q - standing.q).max() > STILL
+            or not standing.since <= t[-1]  # a new clock
+        ):
+            found += self._end_rest()
+            self._standing, self._touched = _Standing(q[-1].copy(), float(t[-1])), False
+        elif t[0] >= standing.since + SETTLING:
+            window = standing.take(rows[:, self._taken], float(t[0]), float(t[-1]))
+            found += [] if window is None else self._jump(*window, float(t[-1]))
+        return found
+
+    # -- one rest ---------------------------------------------------------------------------------
+
+    def _jump(self, mean: Array, change: Array, now: float) -> list[Slip | Force]:
+        """Report a force that comes or goes while the arm stands: nobody's zero, once a rest."""
+        if self._touched or self._sigma is None:
+            return []
+        n = self._n
+        size = float(np.linalg.norm(_first_finite(change[n : n + 3], change[n + 6 : n + 9])))
+        self._touched = size > self._most(LARGEST_SLIP * 9.81 * self._payload(mean)[0])
+        return [_force(size, now, "came or went while the arm stood still")] * self._touched
+
+    def _most(self, slip: float) -> float:
+        """Return the force, N, above which a change is more than noise and a slip's ``slip``, N."""
+        assert self._sigma is not None
+        return slip + max(FORCE, FORCE_SIGMAS * float(self._sigma[:3].max()))
+
+    def _end_rest(self) -> list[Slip | Force]:
+        """Take the rest that has ended into the comparison."""
+        standing = self._standing
+        if standing is None or not standing.windows:
+            return []
+        # the middle window: a touch that is shorter than half of the rest leaves no trace
+        mean = _middle(standing.windows)
+        place = self._place_of(mean)
+        rest = _Rest(place, standing.since, self._readings(mean, self._places[place]))
+        self._before = mean[: self._n]
+        found = self._forces(rest)
+        if self._odd:
+            return found
+        self._rests.append(rest)
+        self._sigma = self._noise()
+        slip = self._slip()
+        if slip is not None:
+            found.append(slip)
+            self.forget()
+        return found
+
+    def _forces(self, rest: _Rest) -> list[Slip | Force]:
+        """Keep rests under a force out, as long as they are few in a row."""
+        excess = self._excess(rest)
+        if excess is None:
+            self._odd = []
+            return []
+        self._odd.append(rest)
+        if len(self._odd) == 1:
+            return [_force(excess, rest.time, "beside what this pose had at its rests before")]
+        if len(self._odd) > LASTING:  # not a touch: a slip, a load, a sensor's new zero
+            self._rests.extend(self._odd[:-1])
+            self._odd = []
+        return []
+
+    def _excess(self, rest: _Rest) -> float | None:
+        """Return the force, N, that no slip makes beside the former rests at a pose, or None."""
+        former = [r.readings for r in self._rests if r.place == rest.place]
+        if self._sigma is None or len(former) < 2:
+            return None
+        size = float(np.linalg.norm((rest.readings - _middle(former))[:3]))
+        slip = LARGEST_SLIP * np.linalg.norm(self._places[rest.place].slip[:3], axis=0).max()
+        return size if size > self._most(float(slip)) else None  # NaN: no sensor
+
+    def _place_of(self, mean: Array) -> int:
+        """Return the number of the pose, a new one where it has not been seen yet."""
+        n = self._n
+        q, mass = mean[:n], self._payload(mean)[0]
+        way = np.zeros(n) if self._before is None else q - self._before
+        side = np.where(np.abs(way) > TURNED, np.sign(way), 0).astype(np.int8).tobytes()
+        for number, place in enumerate(self._places):
+            near = np.abs(place.q - q).max() < SAME_POSE and abs(place.mass - mass) < SAME_MASS
+            if near and place.side == side:
+                return number
+        if len(self._places) >= PLACES:
+            self._forget_oldest()
+        self._places.append(_Place(q, mass, side, *self._columns(mean)))
+        return len(self._places) - 1
+
+    def _forget_oldest(self) -> None:
+        """Drop the pose that has not been seen for longest."""
+        last = {rest.place: i for i, rest in enumerate(self._rests)}
+        oldest = min(range(len(self._places)), key=lambda place: last.get(place, -1))
+        del self._places[oldest]
+        kept = [
+            replace(rest, place=rest.place - (rest.place > oldest))
+            for rest in self._rests
+            if rest.place != oldest
+        ]
+        self._rests = deque(kept, maxlen=KEPT)
+
+    def _payload(self, mean: Array) -> tuple[float, Array]:
+        """Return mass, kg, and centre (3,), m, that the controller declares, or else the cell."""
+        assert self._model is not None
+        declared = mean[2 * self._n + 12 :]
+        if np.isfinite(declared).all():
+            return float(declared[0]), declared[1:]
+        return self._model.payload_mass, np.asarray(self._model.payload_cog)
+
+    def _readings(self, mean: Array, place: _Place) -> Array:
+        """Return what was measured less the model's (6 + n,): flange wrench, motor torques."""
+        n = self._n
+        wrench, at_tcp = mean[n : n + 6], mean[n + 6 : n + 12]
+        predicted = place.predicted + place.slip @ (mean[:n] - place.q)
+        if np.isfinite(wrench).all():
+            felt = wrench - predicted[:6]
+        else:  # the controller's own, its payload taken off: the flange feels what is left of it
+            felt = self._at_flange(mean[:n], at_tcp)
+        return np.concatenate([felt, mean[n + 12 : 2 * n + 12] - predicted[6:]])
+
+    def _at_flange(self, q: Array, at_tcp: Array) -> Array:
+        """Return a wrench (6,) at the TCP, base axes, as one at the flange in its own axes."""
+        assert self._model is not None
+        tool = self._model.tool_in_flange
+        flange_in_base = rotation_matrix(self._model.rigid_pose(q[None]).rotation_vector)[0]
+        flange_in_base = flange_in_base @ tool[:3, :3].T
+        force, torque = flange_in_base.T @ at_tcp[:3], flange_in_base.T @ at_tcp[3:]
+        return np.concatenate([force, torque + np.cross(tool[:3, 3], force)])
+
+    def _columns(self, mean: Array) -> tuple[Array, Array, Array]:
+        """Return readings, and how each joint's zero changes them, and what is no slip."""
+        n = self._n
+        mass, cog = self._payload(mean)
+        steps = STEP * np.vstack([np.eye(n), -np.eye(n), np.zeros(n)])
+        turned = self._predicted(mean[:n] + steps, mass, cog)
+        slip, here = (turned[:n] - turned[n:-1]).T / (2.0 * STEP), turned[-1]
+        moment = mass * cog
+        payload = [
+            (self._predicted(mean[None, :n], mass + STEP, (moment + m) / (mass + STEP))[0] - here)
+            / STEP
+            for m in STEP * np.vstack([np.zeros(3), np.eye(3)])
+        ]
+        payload[1:] = [column - payload[0] for column in payload[1:]]  # the moment's own
+        return here, slip, np.column_stack([np.eye(6 + n), *payload])
+
+    def _predicted(self, q: Array, mass: float, cog: Array) -> Array:
+        """Return the rigid arm's readings (N, 6 + n) at rest."""
+        assert self._model is not None
+        count, still = len(q), np.zeros(q.shape)
+        motion = Motion(
+            t=np.zeros(count), q=q, qd=still, qdd=still, target_q=None,
+            loads=Loads(np.full(count, mass), np.tile(cog, (count, 1))), rows=np.arange(count),
+            valid=np.ones(count, dtype=bool), stretch=np.zeros(count, dtype=np.int64), start=0.0,
+            moving=False, still=np.ones(self._n),
+        )  # fmt: skip
+        motion = with_pieces(self._model, motion)
+        wrench, torque = predict_wrench(self._model, motion), predict_torque(self._model, motion)
+        return np.hstack([wrench, torque])
+
+    # -- the test ---------------------------------------------------------------------------------
+
+    def _noise(self) -> Array | None:
+        """Return 1 sigma (m,) of one rest, from rests at one pose in a row; None: too few yet."""
+        last: dict[int, Array] = {}
+        steps = []
+        for rest in self._rests:
+            if rest.place in last:
+                steps.append(rest.readings - last[rest.place])
+            last[rest.place] = rest.readings
+        if len(steps) < LEARNED:
+            return None
+        # the median: a slip, or a touch, among them does not raise it
+        spread = 1.4826 * _middle(np.abs(steps)) / np.sqrt(2.0)
+        return np.asarray(np.maximum(spread, self._floor))
+
+    def _slip(self) -> Slip | None:
+        """Return the slip that the rests up to now show."""
+        if self._sigma is None or not any(self._holds(length) for length in SUFFIXES):
+            return None
+        tried = {
+            length: _ratios(self._changes(length))
+            for length in range(SUFFIXES[0], SUFFIXES[-1] + 1)
+        }
+        known = {length: found for length, found in tried.items() if found is not None}
+        ahead = max(known.values(), key=lambda found: float(found[0].max()))
+        left, count = self._left(int(np.argmax(ahead[0]))), len(self._rests)
+        length = min(known, key=lambda one: left(count - one))  # the likeliest moment
+        gains, values, stds, _ = known[length]
+        order = np.argsort(-gains)
+        joints = tuple(int(j) + 1 for j in order if gains[j] > gains[order[0]] - BESIDE)
+        # as sure as the moment is: other moments that are nearly as likely have sizes of their own
+        best = order[0]
+        likely = [f[1][best] for f in known.values() if f[0][best] > gains[best] - BESIDE]
+        size, std = float(values[best]), float(np.hypot(stds[best], np.std(likely)))
+        return Slip(
+            joints, size, std, list(self._rests)[-length].time,
+            f"the zero of joint {' or '.join(map(str, joints))} has moved by {1e3 * size:.1f} mrad "
+            f"(1 sigma {1e3 * std:.1f}): what is measured at rest has changed in {length} rests in "
+            "a row as that changes it, beside former rests at the same poses",
+        )  # fmt: skip
+
+    def _holds(self, length: int) -> bool:
+        """Return whether a slip before the last ``length`` rests is beyond doubt."""
+        changes = self._changes(length)
+        found = _ratios(changes)
+        if found is None:
+            return False
+        gains, values, _, left = found
+        j = int(np.argmax(gains))
+        if gains[j] < THRESHOLD or left[j] > CONSISTENT or abs(values[j]) < self._smallest:
+            return False
+        for i in range(len(changes)):  # a hand on the arm is at one pose, a slip at all
+            rest = _ratios(changes[:i] + changes[i + 1 :])
+            if rest is None or rest[0][j] < WITHOUT_ONE * THRESHOLD or rest[1][j] * values[j] < 0.0:
+                return False
+        return self._ahead_of_steps(length, j) > BEFORE_STEPS * THRESHOLD
+
+    def _ahead_of_steps(self, length: int, joint: int) -> float:
+        """Return by how much of chi-square a slip beats what is free, at any other moment.
+
+        A sensor that was zeroed anew two rests before a moment looks like much at that moment.
+        """
+        count = len(self._rests)
+        free = self._left(None)
+        return min(map(free, range(2, count - 1))) - self._left(joint)(count - length)
+
+    def _left(self, joint: int | None) -> Callable[[int], float]:
+        """Return what gives chi-square of all rests for a step of what is free at a moment.
+
+        Each pose's own mean is fitted too, and where one is given the slip of a joint (from 0). A
+        moment is the number of the first rest after it.
+        """
+        rests = list(self._rests)
+        number = np.array([rest.place for rest in rests])
+        readings = np.array([rest.readings for rest in rests])
+        seen = np.isfinite(readings).all(axis=0)
+        assert self._sigma is not None
+        scale = 1.0 / self._sigma[seen]
+        places = [self._places[p] for p in number]
+        columns = np.array([place.free[seen] * scale[:, None] for place in places])
+        if joint is not None:
+            slip = np.array([place.slip[seen, joint] * scale for place in places])
+            columns = np.concatenate([columns, slip[:, :, None]], axis=2)
+        same = (number[:, None] == number).astype(float)
+        same /= same.sum(axis=1, keepdims=True)
+        b = readings[:, seen] * scale
+        b = (b - same @ b).ravel()
+
+        def left(moment: int) -> float:
+            stepped = np.where(np.arange(len(rests))[:, None, None] >= moment, columns, 0.0)
+            A = (stepped - np.einsum("ij,jkl->ikl", same, stepped)).reshape(len(b), -1)
+            return float(np.sum((b - A @ np.linalg.lstsq(A, b, rcond=1e-6)[0]) ** 2))
+
+        return left
+
+    def _changes(self, length: int) -> list[_Change]:
+        """Return how the last rests differ from those before, pose by pose.
+
+        Empty where too few poses were seen before and after.
+        """
+        rests = list(self._rests)
+        if self._sigma is None or len(rests) <= length:
+            return []
+        old, new = _by_place(rests[:-length]), _by_place(rests[-length:])
+        common = [p for p in new if len(old.get(p, ())) >= 2]
+        if self._distinct(common) < FEWEST_PLACES:
+            return []
+        found = []
+        for p in common:
+            before, after, place = old[p], new[p], self._places[p]
+            change = _middle(after) - _middle(before)
+            # pi / 2: the variance of a median beside that of a mean
+            share = np.pi / 2.0 / len(before) + (np.pi / 2.0 if len(after) > 2 else 1.0) / len(
+                after
+            )
+            scale = 1.0 / (self._sigma * np.sqrt(share))
+            seen = np.isfinite(change)
+            slip, free = (scale[:, None] * part for part in (place.slip, place.free))
+            found.append(_Change((change * scale)[seen], slip[seen], free[seen]))
+        return found
+
+    def _distinct(self, places: list[int]) -> int:
+        """Return how many of the poses differ from each other."""
+        kept: list[Array] = []
+        for p in places:
+            q = self._places[p].q
+            if all(np.abs(q - other).max() > TIPS for other in kept):
+                kept.append(q)
+        return len(kept)
+
+
+def _ratios(changes: list[_Change]) -> tuple[Array, Array, Array, Array] | None:
+    """Return of each joint's column alone: ratio, value, 1 sigma, chi-square left per number.
+
+    What is free is projected out first. None where that leaves nothing to compare.
+    """
+    if not changes:
+        return None
+    b, slip, free = (np.concatenate(part) for part in zip(*changes, strict=True))
+    U, s, _ = np.linalg.svd(free / np.maximum(np.linalg.norm(free, axis=0), 1e-12), False)
+    U = U[:, s > 1e-6 * s[0]]
+    freedom = len(b) - U.shape[1] - 1
+    if freedom < 1:
+        return None
+    own = np.linalg.norm(slip, axis=0)
+    b, slip = b - U @ (U.T @ b), slip - U @ (U.T @ slip)
+    size = np.linalg.norm(slip, axis=0)
+    seen = size > np.maximum(1e-3 * own, 1e-9)
+    size = np.where(seen, size, 1.0)
+    along = np.where(seen, (slip / size).T @ b, 0.0)
+    return along**2, along / size, 1.0 / size, (float(b @ b) - along**2) / freedom
+
+
+def _middle(values: Array | list[Array]) -> Array:
+    """Return the median along the first axis; NaN where there are any. np.median takes longer."""
+    ordered = np.sort(values, axis=0)  # NaN last
+    half = 0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
+    return np.asarray(np.where(np.isnan(ordered[-1]), np.nan, half))
+
+
+def _by_place(rests: list[_Rest]) -> dict[int, list[Array]]:
+    found: dict[int, list[Array]] = {}
+    for rest in rests:
+        found.setdefault(rest.place, []).append(rest.readings)
+    return found
+
+
+def _first_finite(first: Array, second: Array) -> Array:
+    return first if np.isfinite(first).all() else second
+
+
+def _force(size: float, since: float, words: str) -> Force:
+    return Force(size, since, f"an unexpected force of {size:.1f} N {words}")

@@ -1,0 +1,322 @@
+"""A user's MJCF while it is changed: its MjSpec, what it compiled to as it came, and its text.
+
+MjSpec can neither put a body between two others nor write more than six digits, so both are done
+in the text that it writes.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from gapbridge.bridge.patch.changes import Axes
+from gapbridge.core.errors import InputError
+from gapbridge.core.rotation import transform
+
+Array = NDArray[np.float64]
+ARMATURE = 1e-3  # kg m2 of a further joint, which MuJoCo needs to integrate stiff springs
+DAMPING = 0.3  # ratio of a further joint's damping to the critical one
+FOLDERS = ("meshdir", "texturedir", "assetdir")  # of <compiler>, relative to the file
+PLACED = ("pos", "quat", "axisangle", "xyaxes", "zaxis", "euler")
+WRAPPER_MASS = 1e-6  # kg: MuJoCo asks for more than none of a body that moves
+PLAY_SOLREF = (0.004, 1.0)
+
+
+@dataclass(frozen=True)
+class Hinge:
+    """A further joint; point and axis in the frame of the body that it carries."""
+
+    name: str
+    point: Array  # (3,) m
+    axis: Array  # (3,) unit vector
+    stiffness: tuple[float, ...] = ()  # Nm/rad, Nm/rad2, ...: a polynomial in the angle
+    inertia: float = 0.0  # kg m2 that swings on the spring, for its damping
+    half_range: float = 0.0  # rad to each side, 0 where it is not limited
+
+    def element(self, timestep: float) -> ElementTree.Element:
+        """Return the <joint>, every attribute written: a model's classes give others.
+
+        A spring too stiff for the time step is damped as much as its integration needs.
+        """
+        stiffness = self.stiffness or (0.0,)
+        damping = max(2 * DAMPING * np.sqrt(self.inertia * stiffness[0]), timestep * stiffness[0])
+        half = self.half_range
+        joint = ElementTree.Element(
+            "joint", name=self.name, type="hinge", pos=numbers(self.point),
+            axis=numbers(self.axis), stiffness=numbers(stiffness), damping=numbers(damping),
+            armature=numbers(ARMATURE), frictionloss="0", ref="0", springref="0", margin="0",
+            limited="true" if half else "false", actuatorfrclimited="false",
+        )  # fmt: skip
+        if half:
+            joint.set("range", numbers([-half, half]))
+            joint.set("solreflimit", numbers(PLAY_SOLREF))
+        return joint
+
+
+class Scene:
+    """A model: joints at angle zero, frames in world as the model came."""
+
+    def __init__(self, path: Path) -> None:
+        """Read and compile a file. Raises InputError where MuJoCo is missing or refuses it."""
+        try:
+            import mujoco
+        except ImportError:
+            raise InputError(
+                f"{path}: found an MJCF model, expected MuJoCo to be installed: "
+                "pip install 'gapbridge[mujoco]'"
+            ) from None
+        self.path = path
+        self.mujoco = mujoco
+        try:
+            self.spec: Any = mujoco.MjSpec.from_file(str(path))
+            for joint in self.spec.joints:
+                joint.parent.name = joint.parent.name or f"{joint.name}_body"
+            self.compiled: Any = self.spec.compile()
+        except (ValueError, OSError) as error:
+            text = " ".join(str(error).split())
+            raise InputError(f"{path}: found no MJCF that compiles ({text})") from None
+        self.data: Any = mujoco.MjData(self.compiled)
+        for j in range(self.compiled.njnt):  # joints at their angle zero, ref is no angle
+            self.data.qpos[self.compiled.jnt_qposadr[j]] = 0
+        mujoco.mj_kinematics(self.compiled, self.data)
+        mujoco.mj_comPos(self.compiled, self.data)
+        self._qpos = [np.array(key.qpos) for key in self.spec.keys]
+        self._placed: dict[tuple[str, str], Array] = {}  # tag and name -> frame in its parent's
+        self._behind: dict[str, list[Hinge]] = {}  # by joint
+        self._before: dict[str, tuple[str, list[Hinge]]] = {}  # by body: the body put before it
+        self._explicit: set[str] = set()
+        self._rubbing: list[tuple[str, str, float]] = []
+
+    def hinges(self) -> list[str]:
+        """Return the names of all hinges."""
+        hinge = self.mujoco.mjtJoint.mjJNT_HINGE
+        return [j.name for j in self.spec.joints if j.type == hinge]
+
+    def axes(self, names: Sequence[str]) -> Axes:
+        """Return the lines of joints' axes in world."""
+        ids = [self.compiled.joint(name).id for name in names]
+        return Axes(self.data.xanchor[ids].copy(), self.data.xaxis[ids].copy())
+
+    def body_of(self, joint: str) -> Any:
+        """Return a joint's body."""
+        return self.spec.joint(joint).parent
+
+    def in_body(self, body: Any, vector: Array) -> Array:
+        """Return a vector (3,) of world in a body's axes."""
+        return np.asarray(self.frame(body)[:3, :3].T @ vector)
+
+    def point_in(self, body: Any, point: Array) -> Array:
+        """Return a point (3,) of world in a body's frame."""
+        frame = self.frame(body)
+        return np.asarray(frame[:3, :3].T @ (point - frame[:3, 3]))
+
+    def anchor(self, joint: str) -> Array:
+        """Return a joint's anchor (3,) in its body's frame."""
+        return np.asarray(self.compiled.joint(joint).pos)
+
+    def frame(self, body: Any) -> Array:
+        """Return a body's frame (4, 4) in world."""
+        return transform(self.data.xmat[body.id].reshape(3, 3), self.data.xpos[body.id])
+
+    def move(self, body: Any, motion: Array) -> None:
+        """Move a body and all beyond by a motion (4, 4) in world."""
+        parent = self.frame(body.parent)
+        local = np.linalg.inv(parent) @ motion @ self.frame(body)
+        self.place("body", body, local)
+
+    def place(self, tag: str, element: Any, in_parent: Array) -> None:
+        """Set the frame (4, 4) of a body or site in its parent body's, when it is written."""
+        self._placed[tag, element.name] = in_parent
+
+    def inertial(self, body: Any) -> Any:
+        """Return a body whose mass, centre and inertia can be changed: its own, written out."""
+        if body.name not in self._explicit:
+            compiled = self.compiled.body(body.id)
+            body.explicitinertial = True
+            body.mass = float(compiled.mass[0])
+            body.ipos, body.iquat = compiled.ipos, compiled.iquat
+            body.inertia, body.fullinertia = compiled.inertia, np.full(6, np.nan)
+            body.ialt.type = self.mujoco.mjtOrientation.mjORIENTATION_QUAT
+            self._explicit.add(body.name)
+        return body
+
+    def inertia_about(self, joint: str, axis: Array, anchor: Array | None = None) -> float:
+        """Return the inertia (kg m2) of all beyond a joint about an axis (world) at its anchor."""
+        j = self.compiled.joint(joint).id
+        body = self.compiled.jnt_bodyid[j]
+        anchor = self.data.xanchor[j] if anchor is None else anchor
+        total = 0.0
+        for k in range(body, self.compiled.nbody):
+            up = k
+            while up > body:
+                up = self.compiled.body_parentid[up]
+            if up == body:
+                away = np.cross(axis, self.data.xipos[k] - anchor)
+                total += self.compiled.body_mass[k] * float(away @ away)
+        return total + ARMATURE
+
+    def put_behind(self, joint: str, hinge: Hinge) -> None:
+        """Put a hinge behind a joint and those put there before, in the joint's body."""
+        self._behind.setdefault(joint, []).append(hinge)
+
+    def rub_behind(self, joint: str, further: str, friction: float) -> None:
+        """Let what turns by a joint and a further one behind it rub against what carries both.
+
+        A tendon over both with ``friction`` (Nm).
+        """
+        self._rubbing.append((joint, further, friction))
+
+    def put_before(self, body: Any, name: str, hinges: Sequence[Hinge]) -> None:
+        """Put a body with hinges between a body and its parent."""
+        self._before[body.name] = (name, [*self._before.get(body.name, (name, []))[1], *hinges])
+
+    @property
+    def further(self) -> int:
+        """Return how many joints were put in."""
+        return sum(map(len, self._behind.values())) + sum(len(h) for _, h in self._before.values())
+
+    def _keyframes(self, root: ElementTree.Element) -> None:
+        """Write the keyframes' qpos anew, further joints at zero."""
+        size = {0: 7, 1: 4, 2: 1, 3: 1}  # of qpos: free, ball, slide, hinge
+        for key, element in zip(self.spec.keys, root.iterfind("./keyframe/key"), strict=True):
+            given = self._qpos[key.id]
+            if not len(given):
+                continue
+            parts: list[Array] = []
+            for j in range(self.compiled.njnt):
+                joint = self.compiled.joint(j)
+                body = self.compiled.body(joint.bodyid[0])
+                if j == body.jntadr[0]:
+                    parts.append(np.zeros(len(self._before.get(body.name, ("", []))[1])))
+                begin = joint.qposadr[0]
+                parts.append(given[begin : begin + size[int(joint.type[0])]])
+                parts.append(np.zeros(len(self._behind.get(joint.name, []))))
+            element.set("qpos", numbers(np.concatenate(parts)))
+
+    def text(self, comment: Sequence[str], folder: Path | None) -> str:
+        """Return the changed model as XML, as it has to read in ``folder``."""
+        self.spec.comment = ""
+        self.spec.compile()
+        root = ElementTree.fromstring(self.spec.to_xml())
+        timestep = float(self.spec.option.timestep)
+        text = "\n".join(comment).replace("--", "- -")
+        root.insert(0, ElementTree.Comment(f" {text} "))
+        for joint, hinges in self._behind.items():
+            body, own = _in_body(root, _named(root, "joint", joint))
+            place = list(body).index(own) + 1
+            for k, hinge in enumerate(hinges):
+                body.insert(place + k, hinge.element(timestep))
+        for name, (wrapper, hinges) in self._before.items():
+            _put_before(root, name, wrapper, [hinge.element(timestep) for hinge in hinges])
+        for (tag, name), frame in self._placed.items():
+            carrier = self._before[name][0] if tag == "body" and name in self._before else name
+            _write_frame(root, tag, carrier, frame)
+        for joints in self._rubbing:
+            _rub(root, *joints)
+        if self.further:
+            self._keyframes(root)
+        if folder is not None and folder.resolve() != self.path.parent.resolve():
+            _rebase(root, self.path.parent.resolve(), folder.resolve())
+        ElementTree.indent(root)
+        return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def numbers(values: Any) -> str:
+    """Return numbers as an attribute, all digits."""
+    return " ".join(f"{v:.17g}" for v in np.atleast_1d(values))
+
+
+def _named(root: ElementTree.Element, tag: str, name: str) -> ElementTree.Element:
+    return next(e for e in root.iter(tag) if e.get("name") == name)
+
+
+def _in_body(
+    root: ElementTree.Element, element: ElementTree.Element
+) -> tuple[ElementTree.Element, ElementTree.Element]:
+    """Return the body that an element is in, and its child with the element in it."""
+    parents = {child: parent for parent in root.iter() for child in parent}
+    while parents[element].tag == "frame":
+        element = parents[element]
+    return parents[element], element
+
+
+def _write_frame(root: ElementTree.Element, tag: str, name: str, in_body: Array) -> None:
+    """Write the frame (4, 4) of a body or site in its parent body's: position and quaternion."""
+    element = _named(root, tag, name)
+    parents = {child: parent for parent in root.iter() for child in parent}
+    around, frame = parents[element], in_body
+    inverse = np.eye(4)
+    while around.tag == "frame":
+        inverse = inverse @ np.linalg.inv(_frame_of(around))
+        around = parents[around]
+    frame = inverse @ in_body
+    for key in PLACED:
+        element.attrib.pop(key, None)
+    quat = Rotation.from_matrix(frame[:3, :3]).as_quat()[[3, 0, 1, 2]]
+    element.set("pos", numbers(frame[:3, 3]))
+    element.set("quat", numbers(quat))
+
+
+def _frame_of(element: ElementTree.Element) -> Array:
+    """Return the frame (4, 4) of an element as MuJoCo's writer has it: pos and quat."""
+    quat = np.array(element.get("quat", "1 0 0 0").split(), dtype=float)
+    pos = np.array(element.get("pos", "0 0 0").split(), dtype=float)
+    return transform(Rotation.from_quat(quat[[1, 2, 3, 0]]).as_matrix(), pos)
+
+
+def _put_before(
+    root: ElementTree.Element, name: str, wrapper: str, hinges: Sequence[ElementTree.Element]
+) -> None:
+    body = _named(root, "body", name)
+    parent = next(e for e in root.iter() if body in list(e))
+    new = ElementTree.Element("body", name=wrapper)
+    for key in (*PLACED, "childclass"):
+        if key in body.attrib:
+            new.set(key, body.attrib[key])
+            if key in PLACED:
+                del body.attrib[key]
+    point = np.array(hinges[0].attrib["pos"].split(), dtype=float)
+    inertial = {"pos": point, "mass": WRAPPER_MASS, "diaginertia": [WRAPPER_MASS] * 3}
+    ElementTree.SubElement(new, "inertial", {k: numbers(v) for k, v in inertial.items()})
+    new.extend(hinges)
+    place = list(parent).index(body)
+    parent.remove(body)
+    new.append(body)
+    parent.insert(place, new)
+
+
+def _rub(root: ElementTree.Element, joint: str, further: str, friction: float) -> None:
+    tendons = root.find("tendon")
+    if tendons is None:
+        tendons = ElementTree.SubElement(root, "tendon")
+    fixed = ElementTree.SubElement(
+        tendons, "fixed", name=f"{further}_friction", frictionloss=numbers(friction),
+        limited="false", stiffness="0", damping="0",
+    )  # fmt: skip
+    for name in (joint, further):
+        ElementTree.SubElement(fixed, "joint", joint=name, coef="1")
+
+
+def _rebase(root: ElementTree.Element, old: Path, new: Path) -> None:
+    """Write the folders of meshes and textures so that they hold from another folder."""
+    files = [e for e in root.iterfind("./asset/*") if e.get("file")]
+    if not files:
+        return
+    compiler = root.find("compiler")
+    if compiler is None:
+        compiler = ElementTree.Element("compiler")
+        root.insert(0, compiler)
+    given = {key: compiler.get(key) for key in FOLDERS}
+    kept = [key for key in FOLDERS if given[key] is not None] or ["assetdir"]
+    for key in kept:
+        folder = Path(given[key] or "")
+        if not folder.is_absolute():
+            compiler.set(key, os.path.relpath(old / folder, new))

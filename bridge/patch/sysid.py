@@ -1,0 +1,232 @@
+"""The cell's numbers as bounds for MuJoCo's own system identification (``mujoco.sysid``).
+
+What was accused is free within three standard deviations, all else the cell has is frozen. How a
+number enters the patched model is measured: it is patched with the bounds too, and what changes in
+the model is interpolated between (a parabola through both bounds and the value).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapbridge.bridge.cell import Cell
+from gapbridge.bridge.patch.changes import changes_of
+from gapbridge.bridge.patch.mjcf import Mjcf
+from gapbridge.bridge.patch.model_format import PatchOptions
+from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.model import Model
+
+Array = NDArray[np.float64]
+SIGMAS = 3.0  # from the value to each bound
+MODELS = Mjcf.suffixes
+SUFFIXES = (".py", ".yaml", ".yml")
+ATTRIBUTES = {  # of a MjSpec's elements: what a patch can change
+    "body": ("pos", "quat", "mass", "ipos", "inertia"),
+    "joint": ("stiffness", "damping", "frictionloss", "armature", "range"),
+    "site": ("pos", "quat"),
+    "actuator": ("delay", "nsample", "dynprm", "gainprm", "biasprm"),
+}
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """One number of the cell: SI units, sign of docs/conventions.md."""
+
+    name: str
+    value: float
+    lower: float
+    upper: float
+    free: bool
+
+    def state(self) -> dict[str, Any]:
+        """Return it as ``mujoco.sysid.Parameter`` keeps its state."""
+        return {
+            "name": self.name, "nominal": [self.value], "value": [self.value],
+            "min_value": [self.lower], "max_value": [self.upper], "frozen": not self.free,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Number:
+    """Where one number stands in a model: the terms of one effect at one site are one."""
+
+    bounds: Bounds
+    terms: tuple[int, ...]  # indices into the model's terms; the last one is varied
+    place: int  # in the term's values
+
+    def varied(self, model: Model, value: float) -> Model:
+        """Return the model with another value."""
+        last = self.terms[-1]
+        values = np.array(model.terms[last].values)
+        values[self.place] += value - self.bounds.value
+        terms = list(model.terms)
+        terms[last] = terms[last].with_values(values)
+        return replace(model, terms=tuple(terms))
+
+
+def parameters_text(path: Path, cell: Cell, options: PatchOptions, suffix: str) -> str:
+    """Return the bounds of a cell's numbers for the model at ``path``.
+
+    ``suffix`` .yaml: as ``ParameterDict.load_from_disk`` reads them; .py: a module whose
+    ``parameters()`` gives them with modifiers for the patched model. Raises InputError as the patch
+    itself does.
+    """
+    numbers = list(_numbers(cell))
+    if suffix != ".py":
+        import yaml
+
+        states = {n.bounds.name: n.bounds.state() for n in numbers}
+        return str(yaml.safe_dump(states, sort_keys=False))
+    plain = replace(options, folder=None)
+    at_value = _attributes(path, cell.model, plain)
+    changes: dict[str, list[list[Any]]] = {}
+    for number in numbers:
+        bounds = number.bounds
+        if bounds.free:
+            both = [
+                _attributes(path, number.varied(cell.model, value), plain)
+                for value in (bounds.lower, bounds.upper)
+            ]
+            changes[bounds.name] = _between(at_value, *both)
+    return _module(path, cell, numbers, changes)
+
+
+def _numbers(cell: Cell) -> Iterator[_Number]:
+    """Yield all numbers of the cell's effects that a simulator's model may hold."""
+    model, sigma = cell.model, _sigmas(cell)
+    sites: dict[tuple[str, Any], list[int]] = {}
+    for i, term in enumerate(model.terms):
+        if not term.stand_in and CATALOGUE[term.effect].of_the_arm:
+            sites.setdefault((term.effect, term.site), []).append(i)
+    for (effect, site), places in sites.items():
+        for k, parameter in enumerate(CATALOGUE[effect].parameters(model.arm, site)):
+            name = CATALOGUE[effect].label(site, parameter)
+            value = sum(model.terms[i].values[k] for i in places)
+            std = sigma.get(name)
+            reach = 0.0 if std is None else SIGMAS * std
+            lower = max(value - reach, parameter.lower)
+            upper = min(value + reach, parameter.upper)
+            free = reach > 0 and lower < upper
+            yield _Number(Bounds(name, value, lower, upper, free), tuple(places), k)
+
+
+def _sigmas(cell: Cell) -> dict[str, float]:
+    """Return the standard deviation of each accused or fitted number by name."""
+    spread = cell.spread
+    found = dict(zip(spread.names, np.sqrt(np.maximum(np.diag(spread.covariance), 0)), strict=True))
+    for cause in cell.accused:
+        found |= {p.name: p.std for p in cause.parameters if p.std}
+    return {name: float(value) for name, value in found.items() if value > 0}
+
+
+def _attributes(path: Path, model: Model, options: PatchOptions) -> dict[tuple[str, ...], Array]:
+    """Return all numbers of the patched model that a patch can change, by element."""
+    import mujoco
+
+    text = Mjcf().patch(path, changes_of(model), options, ()).text
+    spec = mujoco.MjSpec.from_string(text)
+    elements = {
+        "body": spec.bodies, "joint": spec.joints, "site": spec.sites, "actuator": spec.actuators,
+    }  # fmt: skip
+    found: dict[tuple[str, ...], Array] = {
+        (kind, element.name, attribute): np.atleast_1d(getattr(element, attribute)).astype(float)
+        for kind, listed in elements.items()
+        for element in listed
+        for attribute in ATTRIBUTES[kind]
+        if element.name
+    }
+    found["option", "", "gravity"] = np.array(spec.option.gravity)
+    return found
+
+
+def _between(
+    middle: Mapping[tuple[str, ...], Array], lower: Mapping[tuple[str, ...], Array],
+    upper: Mapping[tuple[str, ...], Array],
+) -> list[list[Any]]:  # fmt: skip
+    """Return what changes towards the bounds: kind, name, attribute, at the lower, at the upper."""
+    found = []
+    for key, value in middle.items():
+        low, high = lower.get(key, value), upper.get(key, value)
+        if not (np.array_equal(low, value, True) and np.array_equal(high, value, True)):
+            steps = [np.nan_to_num(bound - value).tolist() for bound in (low, high)]
+            found.append([*key, *steps])
+    return found
+
+
+def _module(
+    path: Path, cell: Cell, numbers: list[_Number], changes: Mapping[str, list[list[Any]]]
+) -> str:
+    bounds = "\n".join(
+        f"    {n.bounds.name!r}: ({n.bounds.value!r}, {n.bounds.lower!r}, {n.bounds.upper!r}, "
+        f"{n.bounds.free}),"
+        for n in numbers
+    )
+    moved = "\n".join(
+        f"    {name!r}: [\n" + "".join(f"        {tuple(one)!r},\n" for one in listed) + "    ],"
+        for name, listed in changes.items()
+    )
+    model, origin = json.dumps(path.name), json.dumps(str(cell.path.name))
+    return TEMPLATE.format(model=model, cell=origin, bounds=bounds, changes=moved)
+
+
+TEMPLATE = '''"""Bounds for MuJoCo's sysid, of {model} patched with {cell}; by gapbridge.
+
+    from mujoco import sysid
+    bounds = parameters()
+    sysid.apply_param_modifiers(bounds, mujoco.MjSpec.from_file(<the patched model>))
+
+Free: what a diagnosis or calibration has found, within three standard deviations. SI units.
+"""
+
+import numpy as np
+
+BOUNDS = {{  # value, lower, upper, free
+{bounds}
+}}
+CHANGES = {{  # kind, name, attribute of the patched model; by how much at lower, at upper
+{changes}
+}}
+
+
+def modifier(name):
+    """Return what writes a parameter into a spec of the patched model."""
+    value, lower, upper, _ = BOUNDS[name]
+    a, b = lower - value, upper - value
+
+    def modify(spec, parameter):
+        x = float(np.ravel(parameter.value)[0]) - value
+        for kind, element, attribute, low, high in CHANGES.get(name, ()):
+            own = getattr(spec, kind) if kind == "option" else getattr(spec, kind)(element)
+            change = np.zeros(len(low))  # a parabola through 0 at x = 0, low at a, high at b
+            if a:
+                change = change + np.array(low) * (x * (x - b) / (a * (a - b)) if b else x / a)
+            if b:
+                change = change + np.array(high) * (x * (x - a) / (b * (b - a)) if a else x / b)
+            given = getattr(own, attribute)
+            if attribute == "nsample":
+                setattr(own, attribute, int(given + max(0, *low, *high)))
+            elif np.ndim(given) == 0:
+                setattr(own, attribute, float(given) + float(change[0]))
+            else:
+                setattr(own, attribute, np.array(given) + change)
+
+    return modify
+
+
+def parameters():
+    """Return the mujoco.sysid.ParameterDict."""
+    from mujoco import sysid
+
+    found = sysid.ParameterDict()
+    for name, (value, lower, upper, free) in BOUNDS.items():
+        found.add(sysid.Parameter(name, value, lower, upper, frozen=not free,
+                                  modifier=modifier(name) if free else None))
+    return found
+'''

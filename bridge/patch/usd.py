@@ -1,0 +1,466 @@
+"""USD: a stronger layer of ``over`` prims above the user's own stage, which stays as it is.
+
+Attributes are those of UsdPhysics; where it has none, PhysX's and Newton's stand side by side. A
+flexible joint or play is a further body of no weight and a further joint before the joint's own
+body. Angles of drives, limits and damping are in degrees there, armature and friction are not.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapbridge.bridge.patch.changes import TINY, Axes, ModelChanges, base_in_world
+from gapbridge.bridge.patch.model_format import (
+    ModelFormat,
+    Patched,
+    PatchOptions,
+    named_one,
+    pick_joints,
+)
+from gapbridge.core.effects.simulator import Kind
+from gapbridge.core.errors import InputError
+from gapbridge.core.rotation import transform
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+Array = NDArray[np.float64]
+PER_DEGREE = np.pi / 180  # of what a drive gives per rad
+AT_ZERO = 1e-5  # m and of rotations: by which a body may be off and still stand at zero angles
+SMALL = 1e-4  # kg, kg m2 of a body between two joints
+INSTEAD = {
+    Kind.LAG: "lag of the servo: in the controller, or a drive whose damping / stiffness is that",
+    Kind.PAYLOAD: "load: change physics:mass of the prim that models it",
+    Kind.PAYLOAD_COG: "load: move physics:centerOfMass of the prim that models it",
+    Kind.SENSOR_TURN: "sensor's frame: turn the Xform of the sensor",
+    Kind.LINK_MOMENT: "a link's centre of gravity: physics:centerOfMass, where its mass is known",
+}
+
+
+class Usd(ModelFormat):
+    """Universal Scene Description, with UsdPhysics joints."""
+
+    suffixes = (".usd", ".usda", ".usdc", ".usdz")
+
+    def patch(self, path: Path, changes: ModelChanges, options: PatchOptions,
+              notes: Sequence[str]) -> Patched:  # fmt: skip
+        """Return a layer (.usda) with the model as its sublayer and the changes as overs."""
+        stage = _Stage(path, options.folder)
+        names = pick_joints(path, list(stage.joints), changes, options)
+        world = base_in_world(changes.axes(), stage.axes(names), str(path), names)
+        done = _Layer(stage, changes, options, world, names)
+        for joint, name in enumerate(names, start=1):
+            done.frame(name, joint)
+            done.friction(name, joint)
+            done.drive(name, joint)
+            done.inertial(name, joint)
+            done.springs(name, joint)
+        if done.changed and not stage.place_again():
+            done.missing.append("rest pose of the bodies: the stage has the arm elsewhere than at "
+                                "zero angles; simulators move them to the joints")  # fmt: skip
+        done.tool()
+        done.gravity()
+        missing = done.not_held()
+        comment = ["Patched by gapbridge.", *done.changed, *notes,
+                   *(f"not in this file: {line}" for line in missing)]  # fmt: skip
+        return Patched(stage.text(comment), tuple(done.changed), tuple(missing))
+
+
+class _Stage:
+    """A user's stage under a new, stronger layer; lengths in m, whatever the stage's unit."""
+
+    def __init__(self, path: Path, folder: Path | None) -> None:
+        try:
+            from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics
+        except ImportError:
+            raise InputError(
+                f"{path}: found a USD model, expected USD's Python package to be installed: "
+                "pip install 'gapbridge[usd]'"
+            ) from None
+        self.Gf, self.Sdf, self.UsdGeom, self.UsdPhysics = Gf, Sdf, UsdGeom, UsdPhysics
+        self.path, self.layer = path, Sdf.Layer.CreateAnonymous(".usda")
+        self.layer.subLayerPaths.append(str(path.resolve()))
+        try:
+            self.stage: Any = Usd.Stage.Open(self.layer)
+            below = Usd.Stage.Open(str(path))
+        except Tf.ErrorException as error:
+            text = " ".join(str(error).split())
+            raise InputError(f"{path}: found no USD that opens ({text})") from None
+        self.default = below.GetDefaultPrim()
+        self.folder = folder or path.parent
+        self.unit = UsdGeom.GetStageMetersPerUnit(below)
+        self.kilogram = UsdPhysics.GetStageKilogramsPerUnit(below)
+        self.joints: dict[str, Any] = {}
+        for prim in self.stage.Traverse():
+            if prim.IsA(UsdPhysics.RevoluteJoint):
+                self.joints[prim.GetName()] = UsdPhysics.RevoluteJoint(prim)
+        self._carried = {name: self.body(joint, 1) for name, joint in self.joints.items()}
+        self.frames = self._at_zero()
+
+    def _at_zero(self) -> dict[str, Array]:
+        """Return where bodies (4, 4) stand at zero angles: by the joints, from the first ones."""
+        frames: dict[str, Array] = {}
+        left = list(self._every_joint())
+        carried = {self.body(joint, 1) for joint in left}
+        for joint in left:
+            root = self.body(joint, 0)
+            if root not in carried:
+                frames[root] = self.authored(root)
+        while ready := [joint for joint in left if self.body(joint, 0) in frames]:
+            for joint in ready:
+                parent = frames[self.body(joint, 0)]
+                local = self.local(joint, 0) @ np.linalg.inv(self.local(joint, 1))
+                frames.setdefault(self.body(joint, 1), parent @ local)
+            left = [joint for joint in left if joint not in ready]
+        return frames  # a closed chain is in none: its joints are none of an arm's
+
+    def place_again(self) -> bool:
+        """Move the bodies to where the changed joints have them; False: they were elsewhere."""
+        before = {path: self.authored(path) for path in self.frames}
+        for path, frame in self.frames.items():
+            if not np.allclose(before[path], frame, rtol=0, atol=AT_ZERO):
+                return False
+        for path, frame in self._at_zero().items():  # parents come first
+            now = self.authored(path)
+            if path and not np.allclose(now, frame, rtol=0, atol=TINY):
+                self.move(path, frame @ np.linalg.inv(now))
+        return True
+
+    def _every_joint(self) -> Iterator[Any]:
+        for prim in self.stage.Traverse():
+            if prim.IsA(self.UsdPhysics.Joint):
+                joint = self.UsdPhysics.Joint(prim)
+                if self.body(joint, 1):
+                    yield joint
+
+    def body(self, joint: Any, side: int) -> str:
+        """Return the path of one of a joint's bodies, '' for the world."""
+        relation = joint.GetBody0Rel() if side == 0 else joint.GetBody1Rel()
+        targets = relation.GetTargets()
+        return str(targets[0]) if targets else ""
+
+    def authored(self, path: str) -> Array:
+        """Return a prim's frame (4, 4) in world as the stage has it, m."""
+        if not path:
+            return np.eye(4)
+        prim = self.stage.GetPrimAtPath(path)
+        cache = self.UsdGeom.XformCache()
+        matrix = np.array(cache.GetLocalToWorldTransform(prim)).T
+        matrix[:3, :3] /= np.linalg.norm(matrix[:3, :3], axis=0)
+        matrix[:3, 3] *= self.unit
+        return matrix
+
+    def local(self, joint: Any, side: int) -> Array:
+        """Return a joint's frame (4, 4) in one of its bodies."""
+        rotation = joint.GetLocalRot0Attr() if side == 0 else joint.GetLocalRot1Attr()
+        position = joint.GetLocalPos0Attr() if side == 0 else joint.GetLocalPos1Attr()
+        quat, at = rotation.Get(), position.Get()
+        R = np.eye(3) if quat is None else _matrix(quat.GetReal(), quat.GetImaginary())
+        scale = self._scale(self.body(joint, side))
+        p = np.zeros(3) if at is None else np.array(at, dtype=float) * scale * self.unit
+        return transform(R, p)
+
+    def last_body(self, joint: str) -> str:
+        """Return the body that a joint carried as the stage came."""
+        return self._carried[joint]
+
+    def _scale(self, path: str) -> Array:
+        """Return the scale (3,) of a prim's axes in world, in which joints' places are given."""
+        if not path:
+            return np.ones(3)
+        matrix = np.array(
+            self.UsdGeom.XformCache().GetLocalToWorldTransform(self.stage.GetPrimAtPath(path))
+        )
+        return np.asarray(np.linalg.norm(matrix[:3, :3], axis=1))
+
+    def axes(self, names: Sequence[str]) -> Axes:
+        """Return the lines of joints' axes at zero angles."""
+        point, direction = [], []
+        for name in names:
+            frame = self.in_world(self.joints[name])
+            point.append(frame[:3, 3])
+            direction.append(frame[:3, self.axis(self.joints[name])])
+        return Axes(np.array(point), np.array(direction))
+
+    def axis(self, joint: Any) -> int:
+        """Return which axis of its frame a joint turns about."""
+        return "XYZ".index(str(joint.GetAxisAttr().Get() or "X"))
+
+    def in_world(self, joint: Any) -> Array:
+        """Return a joint's frame (4, 4) in world at zero angle. Raises InputError if unknown."""
+        parent = self.frames.get(self.body(joint, 0))
+        if parent is None:
+            raise InputError(
+                f"{self.path}: joint {joint.GetPrim().GetName()}: found a closed chain, expected "
+                "a tree"
+            )
+        return np.asarray(parent @ self.local(joint, 0))
+
+    def set_local(self, joint: Any, side: int, frame: Array) -> None:
+        """Write a joint's frame (4, 4) in one of its bodies."""
+        w, x, y, z = _quat(frame[:3, :3])
+        rotation = joint.CreateLocalRot0Attr() if side == 0 else joint.CreateLocalRot1Attr()
+        position = joint.CreateLocalPos0Attr() if side == 0 else joint.CreateLocalPos1Attr()
+        at = frame[:3, 3] / self.unit / self._scale(self.body(joint, side))
+        rotation.Set(self.Gf.Quatf(w, x, y, z))
+        position.Set(self.Gf.Vec3f(*(float(v) for v in at)))
+
+    def move(self, path: str, motion: Array) -> None:
+        """Move a prim by a motion (4, 4) in world, by one matrix in place of its own steps."""
+        prim = self.UsdGeom.Xformable(self.stage.GetPrimAtPath(path))
+        cache = self.UsdGeom.XformCache()
+        own = np.array(cache.GetLocalToWorldTransform(prim.GetPrim())).T
+        parent = np.array(cache.GetParentToWorldTransform(prim.GetPrim())).T
+        step = motion.copy()
+        step[:3, 3] /= self.unit
+        local = np.linalg.inv(parent) @ step @ own
+        prim.ClearXformOpOrder()
+        prim.AddTransformOp(opSuffix="patched").Set(self.Gf.Matrix4d(local.T.tolist()))
+
+    def set(self, prim: Any, name: str, kind: str, value: Any) -> None:
+        """Write an attribute, which is made where the prim has none."""
+        attribute = prim.GetAttribute(name) or prim.CreateAttribute(
+            name, getattr(self.Sdf.ValueTypeNames, kind)
+        )
+        attribute.Set(value)
+
+    def text(self, comment: Sequence[str]) -> str:
+        """Return the layer's text, the model's path as it reads from where the layer will be."""
+        below = Path(os.path.relpath(self.path.resolve(), self.folder.resolve())).as_posix()
+        self.layer.subLayerPaths[0] = below if below.startswith(".") else f"./{below}"
+        self.layer.comment = "\n".join(comment)
+        if self.default:
+            self.layer.defaultPrim = self.default.GetName()
+        return str(self.layer.ExportToString())
+
+
+class _Layer:
+    """The changes as they are written into a stage's stronger layer."""
+
+    def __init__(self, stage: _Stage, changes: ModelChanges, options: PatchOptions, world: Array,
+                 names: Sequence[str]) -> None:  # fmt: skip
+        self.stage, self.changes, self.options, self.world = stage, changes, options, world
+        self.names = names
+        self.changed: list[str] = []
+        self.missing: list[str] = []
+
+    def frame(self, name: str, joint: int) -> None:
+        """Move a joint in its parent."""
+        own = self.stage.joints[name]
+        if not np.allclose(self.changes.shift[joint - 1], np.eye(4), rtol=0, atol=TINY):
+            motion = self.changes.moved(joint - 1, self.world)
+            parent = self.stage.frames[self.stage.body(own, 0)]
+            local = np.linalg.inv(parent) @ motion @ self.stage.in_world(own)
+            self.stage.set_local(own, 0, local)
+            self.changed.append(f"joint {name}: physics:localPos0, localRot0")
+
+    def friction(self, name: str, joint: int) -> None:
+        """Add friction, damping and armature, as PhysX and as Newton name them."""
+        prim = self.stage.joints[name].GetPrim()
+        for kind, ours in (
+            (Kind.FRICTION, (("newton:friction", 1.0),
+                             ("physxJointAxis:angular:dynamicFrictionEffort", 1.0),
+                             ("physxJointAxis:angular:staticFrictionEffort", 1.0))),
+            (Kind.DAMPING, (("newton:damping", PER_DEGREE),
+                            ("physxJointAxis:angular:viscousFrictionCoefficient", PER_DEGREE))),
+            (Kind.ARMATURE, (("newton:armature", 1.0),
+                             ("physxJointAxis:angular:armature", 1.0))),
+        ):  # fmt: skip
+            added = self.changes.of_joint(kind, joint)
+            if not added:
+                continue
+            for attribute, factor in ours:
+                value = self._had(prim, attribute) + added * factor / self._effort(kind)
+                self.stage.set(prim, attribute, "Float", value)
+                self.changed.append(f"joint {name}: {attribute} {value:.6g}")
+
+    def _had(self, prim: Any, attribute: str) -> float:
+        found = prim.GetAttribute(attribute)
+        return float(found.Get() or 0.0) if found else 0.0
+
+    def _effort(self, kind: Kind) -> float:
+        """Return Nm (or kg m2) per the stage's own unit."""
+        return float(self.stage.kilogram * self.stage.unit**2)
+
+    def drive(self, name: str, joint: int) -> None:
+        """Set delay and gain of a joint's drive."""
+        prim = self.stage.joints[name].GetPrim()
+        delay = self.changes.of_joint(Kind.DELAY, joint)
+        droop = self.changes.of_joint(Kind.SERVO_COMPLIANCE, joint)
+        if delay:
+            self.missing.append(f"delay of {name}, {delay:.6g} s: give it to the actuator in its "
+                                "own steps (newton:delaySteps, DelayedPDActuatorCfg)")  # fmt: skip
+        if not droop:
+            return
+        drive = self.stage.UsdPhysics.DriveAPI(prim, "angular")
+        given = drive.GetStiffnessAttr().Get() if drive.GetStiffnessAttr() else None
+        per = PER_DEGREE / self._effort(Kind.DAMPING)
+        had = per / float(given) if given and self.options.on_top else 0.0
+        stiffness = per / (droop + had)
+        drive = self.stage.UsdPhysics.DriveAPI.Apply(prim, "angular")
+        drive.CreateStiffnessAttr().Set(stiffness)
+        self.changed.append(f"joint {name}: drive's stiffness {stiffness:.6g}")
+
+    def inertial(self, name: str, joint: int) -> None:
+        """Scale mass and inertia of a joint's body, and move its centre of gravity."""
+        scale = 1 + self.changes.of_joint(Kind.LINK_SCALE, joint)
+        moment = self.changes.vector(Kind.LINK_MOMENT, joint)
+        if scale == 1 and not moment.any():
+            return
+        path = self.stage.body(self.stage.joints[name], 1)
+        body = self.stage.UsdPhysics.MassAPI(self.stage.stage.GetPrimAtPath(path))
+        mass = body.GetMassAttr().Get() if body.GetMassAttr() else None
+        if not mass:
+            self.missing.append(f"inertia of {path}: it has no physics:mass that could be scaled")
+            return
+        if scale != 1:
+            body.CreateMassAttr().Set(mass * scale)
+            inertia = body.GetDiagonalInertiaAttr().Get()
+            if inertia:
+                body.CreateDiagonalInertiaAttr().Set(inertia * scale)
+            self.changed.append(f"{path}: mass and inertia times {scale:.6g}")
+        if moment.any():
+            frame = self.stage.frames[path]
+            turned = (self.world @ self.changes.joint_in_base[joint - 1])[:3, :3] @ moment
+            shift = frame[:3, :3].T @ turned / (mass * scale * self.stage.kilogram)
+            given = body.GetCenterOfMassAttr().Get()
+            at = np.array(given or (0, 0, 0), dtype=float)
+            at = np.where(np.isfinite(at), at, 0.0) + shift / self.stage.unit
+            body.CreateCenterOfMassAttr().Set(self.stage.Gf.Vec3f(*(float(v) for v in at)))
+            self.changed.append(f"{path}: physics:centerOfMass")
+
+    def springs(self, name: str, joint: int) -> None:
+        """Put play and springs between a joint and its body: a small body and a joint each."""
+        frame = (self.world @ self.changes.joint_in_base[joint - 1])[:3, :3]
+        flexibility = self.changes.springs.joint[joint - 1]
+        softening = self.changes.springs.softening[joint - 1]
+        play = self.changes.of_joint(Kind.PLAY, joint)
+        if play:
+            self._behind(name, "backlash", frame[:, 2], half=play / 2)
+        for k, label in ((2, "axial_compliance"), (0, "radial_x"), (1, "radial_y")):
+            if flexibility[k] > 0:
+                self._behind(name, label, frame[:, k], stiffness=1 / float(flexibility[k]))
+        if softening > 0:
+            self.missing.append(f"stiffening of {name}: its spring is the linear one; a drive's "
+                                "stiffness by angle needs code")  # fmt: skip
+
+    def _behind(
+        self, name: str, label: str, axis: Array, stiffness: float = 0.0, half: float = 0.0
+    ) -> None:
+        stage, own = self.stage, self.stage.joints[name]
+        carried = stage.body(own, 1)
+        path = f"{own.GetPath().GetParentPath()}/{name}_{label}"
+        between = stage.UsdGeom.Xform.Define(stage.stage, f"{path}_body")
+        stage.UsdPhysics.RigidBodyAPI.Apply(between.GetPrim())
+        mass = stage.UsdPhysics.MassAPI.Apply(between.GetPrim())
+        mass.CreateMassAttr().Set(SMALL / stage.kilogram)
+        mass.CreateDiagonalInertiaAttr().Set(stage.Gf.Vec3f(SMALL / self._effort(Kind.DAMPING)))
+        spot = stage.frames[carried] @ stage.local(own, 1)
+        stage.frames[f"{path}_body"] = spot
+        self._place(between, spot)
+        spring = stage.UsdPhysics.RevoluteJoint.Define(stage.stage, path)
+        spring.CreateAxisAttr().Set("Z")
+        spring.CreateBody0Rel().SetTargets([f"{path}_body"])
+        spring.CreateBody1Rel().SetTargets([carried])
+        turned = transform(_with_z(axis), spot[:3, 3])
+        stage.set_local(spring, 0, np.linalg.inv(spot) @ turned)
+        stage.set_local(spring, 1, np.linalg.inv(stage.frames[carried]) @ turned)
+        own.GetBody1Rel().SetTargets([f"{path}_body"])
+        stage.set_local(own, 1, np.eye(4))
+        if half:
+            spring.CreateLowerLimitAttr().Set(float(-np.degrees(half)))
+            spring.CreateUpperLimitAttr().Set(float(np.degrees(half)))
+            self.changed.append(f"joint {name}_{label}: +-{half:.6g} rad")
+            return
+        drive = stage.UsdPhysics.DriveAPI.Apply(spring.GetPrim(), "angular")
+        drive.CreateTypeAttr().Set("force")
+        value = stiffness * PER_DEGREE / self._effort(Kind.DAMPING)
+        drive.CreateStiffnessAttr().Set(value)
+        drive.CreateDampingAttr().Set(0.01 * value)
+        drive.CreateTargetPositionAttr().Set(0.0)
+        self.changed.append(f"joint {name}_{label}: drive's stiffness {value:.6g} per degree")
+
+    def _place(self, xform: Any, frame: Array) -> None:
+        """Place a prim that was defined here at a frame (4, 4) in world."""
+        cache = self.stage.UsdGeom.XformCache()
+        parent = np.array(cache.GetParentToWorldTransform(xform.GetPrim())).T
+        scaled = frame.copy()
+        scaled[:3, 3] /= self.stage.unit
+        matrix = np.linalg.inv(parent) @ scaled
+        xform.AddTransformOp().Set(self.stage.Gf.Matrix4d(matrix.T.tolist()))
+
+    def tool(self) -> None:
+        """Move the TCP's Xform, which is given by its path or name."""
+        if np.allclose(self.changes.tcp_shift, np.eye(4), rtol=0, atol=TINY):
+            return
+        if not self.options.tcp:
+            self.missing.append("tool: name the Xform of the TCP with --tcp")
+            return
+        stage = self.stage.stage
+        paths = {p.GetName(): str(p.GetPath()) for p in stage.Traverse()
+                 if p.IsA(self.stage.UsdGeom.Xformable)}  # fmt: skip
+        wanted = self.options.tcp
+        if wanted not in paths.values():
+            wanted = paths[named_one(self.stage.path, "--tcp", wanted, list(paths))]
+        frame = self.world @ self.changes.tcp_in_base
+        motion = frame @ self.changes.tcp_shift @ np.linalg.inv(frame)
+        last = self.stage.last_body(self.names[-1])
+        stands = self.stage.authored(last) @ np.linalg.inv(self.stage.frames[last])
+        self.stage.move(wanted, stands @ motion @ np.linalg.inv(stands))
+        self.changed.append(f"{wanted}: TCP")
+
+    def gravity(self) -> None:
+        """Turn the scene's gravity."""
+        gravity = self.changes.gravity
+        if gravity is None:
+            return
+        scenes = [p for p in self.stage.stage.Traverse() if p.IsA(self.stage.UsdPhysics.Scene)]
+        if not scenes:
+            self.missing.append("direction of gravity: physics:gravityDirection of the scene")
+            return
+        scene = self.stage.UsdPhysics.Scene(scenes[0])
+        in_world, size = self.world[:3, :3] @ gravity, float(np.linalg.norm(gravity))
+        unit = in_world / size
+        scene.CreateGravityDirectionAttr().Set(self.stage.Gf.Vec3f(*(float(v) for v in unit)))
+        scene.CreateGravityMagnitudeAttr().Set(size / self.stage.unit)
+        self.changed.append(f"{scenes[0].GetPath()}: gravity")
+
+    def not_held(self) -> list[str]:
+        """Return what is not in the layer, with what people do instead."""
+        kinds = {setting.kind for setting in self.changes.settings}
+        lines = self.missing + [text for kind, text in INSTEAD.items()
+                                if kind in kinds and kind is not Kind.LINK_MOMENT]  # fmt: skip
+        if self.changes.springs.link.any():
+            lines.append("flexible links: MJCF with springs across the links")
+        if self.changes.springs.base.any():
+            lines.append("flexible base: driven joints between the base and the world")
+        lines += [f"{name}: {text}" for name, text in self.changes.not_held]
+        return [*lines, *self.changes.left_out]
+
+
+def _matrix(w: float, xyz: Any) -> Array:
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_quat([*xyz, w]).as_matrix())
+
+
+def _quat(R: Array) -> tuple[float, float, float, float]:
+    """Return w, x, y, z."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(R).as_quat()
+    return float(w), float(x), float(y), float(z)
+
+
+def _with_z(axis: Array) -> Array:
+    """Return a rotation (3, 3) whose z is a unit vector."""
+    other = np.eye(3)[np.argmin(np.abs(axis))]
+    x = np.cross(other, axis)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(axis, x), axis])

@@ -1,0 +1,44 @@
+"""What a verification says on the terminal of what has moved."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gapbridge.bridge.calibration.jobs.verify import VerifyJob
+from gapbridge.core.calibration.result import Errors, Estimate
+from gapbridge.core.calibration.verify import Suspect, Verification
+
+
+class Heard:
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def say(self, line: str = "", style: str = "") -> None:
+        self.lines.append(line)
+
+
+def suspect(joint: int, value: float) -> Suspect:
+    name = f"joint_offset_{joint}"
+    return Suspect(name, (Estimate(name, value, 2e-4, "rad"),), 0.4, 30.0)
+
+
+def said(*others: Suspect) -> list[str]:
+    found = Verification(
+        holds=False, verdict="the zero of joint 4 moved by 10 mrad",
+        errors=Errors(np.full((5, 3), 1e-3), np.arange(5)), promised=np.full(5, 1e-4), ratio=9.0,
+        chance=1e-9, moved=suspect(4, 0.01), suspects=others, stations=(), notes=(),
+    )  # fmt: skip
+    job = VerifyJob.__new__(VerifyJob)
+    job.prompt = heard = Heard()  # type: ignore[assignment]
+    job._tell(found)
+    return heard.lines
+
+
+def test_other_joints_that_explain_as_much_are_named_with_their_size() -> None:
+    lines = said(suspect(3, -0.02))
+    (line,) = [line for line in lines if "cannot tell" in line]
+    assert "the zero of joint 3 moved by 20 mrad" in line
+
+
+def test_where_the_readings_decide_nothing_else_is_named() -> None:
+    assert not any("cannot tell" in line for line in said())

@@ -1,0 +1,199 @@
+"""``gapbridge patch`` as users call it: ties, stand-ins, bounds, other folders, models' classes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.patch.arms import UR_JOINTS, mjcf, urdf
+from gapbridge.core.arm import builtin_arm
+
+mujoco = pytest.importorskip("mujoco")
+
+ARM = builtin_arm("ur10e")
+CELL = """
+robot: {model: ur10e}
+tool: {tcp: {xyz: [0, 0, 0.1], rpy: [0, 0, 0]}}
+metrology: {registered: true, sigma: 2.0e-5}
+compliance: {axial: [0, 2.0e-5, 0, 0, 0, 0], radial: [0, 0, 0, 0, 0, 0]}
+effects:
+  - {effect: joint_offset, joint: 3, parameters: {value: 0.004}}
+  - {effect: coulomb_friction, joint: 1, parameters: {value: 5.0}}
+  - {effect: latency, joint: 4, parameters: {value: 0.02}}
+  - {effect: viscous_friction, joint: 2, parameters: {value: 3.0}, stand_in: true}
+provenance:
+  causes:
+    - {effect: axial_compliance, joints: [2], channel: position, parameters: [{name: axial_compliance_2, value: 2.0e-5, std: 1.0e-6, unit: rad/Nm}], indistinguishable_from: [link_flexibility]}
+    - {effect: joint_offset, joints: [3], channel: position, parameters: [{name: joint_offset_3, value: 0.004, std: 1.0e-4, unit: rad}]}
+    - {effect: latency, joints: [4], channel: tracking, parameters: [{name: latency_4, value: 0.02, std: 0.001, unit: s}], indistinguishable_from: [tracking_lag]}
+"""  # noqa: E501
+CLASSES = '<default><joint damping="7" range="-1 1" frictionloss="2" armature="3"/></default>'
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "cell.yaml").write_text(CELL)
+    (tmp_path / "arm.xml").write_text(mjcf(ARM, UR_JOINTS, kp=1e4))
+    (tmp_path / "arm.urdf").write_text(urdf(ARM, UR_JOINTS))
+    return tmp_path
+
+
+def patch(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "gapbridge", "patch", *arguments, "--cell", "cell.yaml"],
+        capture_output=True, text=True, timeout=120, check=False, cwd=folder,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("model", ["arm.xml", "arm.urdf"])
+def test_a_tie_is_a_comment_with_both_candidates(folder: Path, model: str) -> None:
+    done = patch(folder, model, "--out", f"out{Path(model).suffix}")
+    assert done.returncode == 0, done.stderr
+    text = (folder / f"out{Path(model).suffix}").read_text()
+    comment = text[text.index("<!--") : text.index("-->", text.index("Patched"))]
+    tied = [line for line in comment.splitlines() if "tie:" in line]
+    assert len(tied) == 2
+    assert "axial_compliance_2 = 2e-05" in tied[0]
+    assert "link_flexibility" in tied[0]
+    assert "latency_4" in tied[1]
+    assert "tracking_lag" in tied[1]
+    assert done.stdout.count("tie:") == 2
+
+
+def test_what_was_not_accused_is_never_written(folder: Path) -> None:
+    done = patch(folder, "arm.xml", "--out", "out.xml")
+    assert "not held: viscous_friction of joint 2: a stand-in, not accused" in done.stdout
+    compiled = mujoco.MjModel.from_xml_path(str(folder / "out.xml"))
+    assert np.ravel(compiled.dof_damping[compiled.joint(UR_JOINTS[1]).dofadr[0]])[0] == 0
+
+
+def loaded(path: Path) -> ModuleType:
+    from importlib.util import module_from_spec, spec_from_file_location
+
+    spec = spec_from_file_location("bounds", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+class Number:
+    """What ``mujoco.sysid.Parameter`` gives a modifier."""
+
+    def __init__(self, value: float) -> None:
+        self.value = np.array([value])
+
+
+def test_bounds_free_what_was_accused_alone(folder: Path) -> None:
+    import yaml
+
+    done = patch(folder, "arm.xml", "--out", "out.xml", "--parameters", "bounds.yaml")
+    assert done.returncode == 0, done.stderr
+    found = yaml.safe_load((folder / "bounds.yaml").read_text())
+    free = {name for name, state in found.items() if not state["frozen"]}
+    assert free == {"axial_compliance_2", "joint_offset_3", "latency_4"}
+    assert found["coulomb_friction_1"]["frozen"]
+    assert not any("viscous" in name for name in found)
+    own = found["axial_compliance_2"]
+    assert own["min_value"] == pytest.approx([1.7e-5])
+    assert own["max_value"] == pytest.approx([2.3e-5])
+    assert own["nominal"] == pytest.approx([2e-5])
+
+
+def test_modifiers_bring_the_patched_model_to_any_value_within_bounds(folder: Path) -> None:
+    done = patch(folder, "arm.xml", "--out", "out.xml", "--parameters", "bounds.py")
+    assert done.returncode == 0, done.stderr
+    module = loaded(folder / "bounds.py")
+
+    def model(**values: float) -> Any:
+        spec = mujoco.MjSpec.from_file(str(folder / "out.xml"))
+        for name, value in values.items():
+            module.modifier(name)(spec, Number(value))
+        return spec.compile()
+
+    as_it_is = model(axial_compliance_2=2e-5, joint_offset_3=0.004, latency_4=0.02)
+    written = mujoco.MjModel.from_xml_path(str(folder / "out.xml"))
+    assert np.allclose(as_it_is.jnt_stiffness, written.jnt_stiffness)
+    assert np.allclose(as_it_is.body_quat, written.body_quat)
+    soft = model(axial_compliance_2=2.2e-5)
+    spring = soft.joint(f"{UR_JOINTS[1]}_axial_compliance").id
+    assert np.ravel(soft.jnt_stiffness[spring])[0] == pytest.approx(1 / 2.2e-5, rel=2e-3)
+    turned = model(joint_offset_3=0.0043)
+    wanted = CELL.replace("value: 0.004}}", "value: 0.0043}}")
+    (folder / "cell.yaml").write_text(wanted)
+    patch(folder, "arm.xml", "--out", "other.xml")
+    other = mujoco.MjModel.from_xml_path(str(folder / "other.xml"))
+    assert np.allclose(turned.body_quat, other.body_quat, atol=1e-7)
+    late = model(latency_4=0.023)
+    drive = late.actuator(f"drive_{UR_JOINTS[3]}").id
+    assert late.actuator_delay[drive] == pytest.approx(0.023)
+
+
+def test_mujocos_own_sysid_reads_the_bounds(folder: Path) -> None:
+    sysid = pytest.importorskip("mujoco.sysid")
+    if not hasattr(sysid, "ParameterDict"):
+        pytest.skip("mujoco[sysid] is not installed")
+    patch(folder, "arm.xml", "--out", "out.xml", "--parameters", "bounds.py")
+    patch(folder, "arm.xml", "--out", "out.xml", "--parameters", "bounds.yaml")
+    parameters = loaded(folder / "bounds.py").parameters()
+    read = sysid.ParameterDict.load_from_disk(folder / "bounds.yaml")
+    assert parameters.size == read.size == 3
+    assert np.allclose(parameters.get_bounds(), read.get_bounds())
+    spec = mujoco.MjSpec.from_file(str(folder / "out.xml"))
+    sysid.apply_param_modifiers(parameters, spec)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "output"),
+    [
+        (["arm.urdf", "--out", "out.urdf", "--parameters", "bounds.py"], "expected an MJCF"),
+        (["arm.xml", "--out", "out.xml", "--parameters", "bounds.txt"], "expected .py or"),
+        (["arm.xml", "--out", "out.xml", "--parameters", "arm.xml"], "expected .py or"),
+    ],
+)
+def test_bounds_that_cannot_be_written_are_one_line(
+    folder: Path, arguments: list[str], output: str
+) -> None:
+    done = patch(folder, *arguments)
+    assert done.returncode == 2
+    assert output in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not (folder / arguments[2]).exists()
+
+
+def test_further_joints_take_nothing_from_a_models_classes(folder: Path) -> None:
+    text = (folder / "arm.xml").read_text().replace("<worldbody>", f"{CLASSES}<worldbody>")
+    (folder / "arm.xml").write_text(text)
+    done = patch(folder, "arm.xml", "--out", "out.xml")
+    assert done.returncode == 0, done.stderr
+    compiled = mujoco.MjModel.from_xml_path(str(folder / "out.xml"))
+    spring = compiled.joint(f"{UR_JOINTS[1]}_axial_compliance")
+    assert compiled.jnt_limited[spring.id] == 0
+    assert compiled.dof_frictionloss[spring.dofadr[0]] == 0
+    own = compiled.joint(UR_JOINTS[1])
+    assert compiled.jnt_limited[own.id] == 1
+    assert compiled.dof_frictionloss[own.dofadr[0]] == 2
+
+
+def test_meshes_are_found_from_another_folder(folder: Path) -> None:
+    (folder / "meshes").mkdir()
+    (folder / "meshes" / "box.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    )
+    text = (folder / "arm.xml").read_text().replace(
+        '<compiler angle="radian"/>',
+        '<compiler angle="radian" meshdir="meshes"/>'
+        '<asset><mesh name="box" file="box.obj"/></asset>',
+    )  # fmt: skip
+    (folder / "arm.xml").write_text(text)
+    (folder / "deep" / "er").mkdir(parents=True)
+    done = patch(folder, "arm.xml", "--out", "deep/er/out.xml")
+    assert done.returncode == 0, done.stderr
+    assert mujoco.MjModel.from_xml_path(str(folder / "deep" / "er" / "out.xml")).nmesh == 1

@@ -1,0 +1,194 @@
+"""The layer that is written over a USD stage, as pxr composes it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.patch.arms import BASE_AT, BASE_TURN, UR_JOINTS, frame_turns
+from gapbridge.bridge.patch import PatchOptions, changes_of, format_of
+from gapbridge.core.arm import Arm, builtin_arm
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.errors import InputError
+from gapbridge.core.model import Model
+
+pxr = pytest.importorskip("pxr")
+from pxr import Gf, Usd, UsdGeom, UsdPhysics  # noqa: E402
+
+ARM = builtin_arm("ur10e")
+TOOL = np.eye(4)
+TOOL[2, 3] = 0.1
+NOMINAL = Model(ARM, TOOL)
+SINGLE = 2e-6  # m: joints' places are single precision there
+SOME_Q = np.random.default_rng(5).uniform(-2, 2, (6, 6))
+CENTIMETRES = 0.01
+GEOMETRY = (
+    Term("joint_offset", Site(3), (0.004,)),
+    Term("link_geometry", Site(2), (2e-3, 1e-3, 3e-3, 2e-3)),
+    Term("link_geometry", Site(4), (-1e-3, 2e-3, 1e-3)),
+    Term("tool_frame", Site(), (1e-3, 2e-3, -1e-3, 0.0, 0.0, 0.0)),
+)
+
+
+def write_stage(path: Path, arm: Arm, unit: float, nested: bool) -> None:
+    """Write an arm as a stage: bodies beside each other or one in the other, at zero angles."""
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageMetersPerUnit(stage, unit)
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/arm").GetPrim())
+    UsdPhysics.Scene.Define(stage, "/scene")
+    turns = frame_turns(arm.n)
+    base = np.eye(4)
+    base[:3, :3], base[:3, 3] = BASE_TURN.as_matrix(), BASE_AT
+    place(stage, "/arm/base", base, unit)
+    parent, parent_path, joint_in_parent = base, "/arm/base", arm.link_in_link[0]
+    for i, name in enumerate(UR_JOINTS):
+        turned = np.eye(4)
+        turned[:3, :3] = turns[i].as_matrix()
+        world = parent @ joint_in_parent @ turned
+        link = f"{parent_path}/link_{i + 1}" if nested else f"/arm/link_{i + 1}"
+        body = place(stage, link, world, unit)
+        UsdPhysics.MassAPI.Apply(body.GetPrim()).CreateMassAttr().Set(float(arm.mass[i]))
+        joint = UsdPhysics.RevoluteJoint.Define(stage, f"/arm/{name}")
+        joint.CreateAxisAttr().Set("Z")
+        joint.CreateBody0Rel().SetTargets([parent_path])
+        joint.CreateBody1Rel().SetTargets([link])
+        local(joint, 0, joint_in_parent, unit)
+        local(joint, 1, np.linalg.inv(turned), unit)
+        parent, parent_path = world, link
+        joint_in_parent = np.linalg.inv(turned) @ arm.link_in_link[i + 1]
+    place(stage, f"{parent_path}/tcp", parent @ joint_in_parent @ TOOL, unit)
+    stage.Save()
+
+
+def place(stage: Any, path: str, world: np.ndarray, unit: float) -> Any:
+    xform = UsdGeom.Xform.Define(stage, path)
+    above = np.array(UsdGeom.XformCache().GetParentToWorldTransform(xform.GetPrim())).T
+    scaled = world.copy()
+    scaled[:3, 3] /= unit
+    xform.AddTransformOp().Set(Gf.Matrix4d((np.linalg.inv(above) @ scaled).T.tolist()))
+    return xform
+
+
+def local(joint: Any, side: int, frame: np.ndarray, unit: float) -> None:
+    x, y, z, w = Rotation.from_matrix(frame[:3, :3]).as_quat()
+    rotation = joint.CreateLocalRot0Attr() if side == 0 else joint.CreateLocalRot1Attr()
+    position = joint.CreateLocalPos0Attr() if side == 0 else joint.CreateLocalPos1Attr()
+    rotation.Set(Gf.Quatf(w, x, y, z))
+    position.Set(Gf.Vec3f(*(frame[:3, 3] / unit)))
+
+
+def joint_frame(joint: Any, side: int, unit: float) -> np.ndarray:
+    rotation = joint.GetLocalRot0Attr() if side == 0 else joint.GetLocalRot1Attr()
+    position = joint.GetLocalPos0Attr() if side == 0 else joint.GetLocalPos1Attr()
+    quat, found = rotation.Get(), np.eye(4)
+    found[:3, :3] = Rotation.from_quat([*quat.GetImaginary(), quat.GetReal()]).as_matrix()
+    found[:3, 3] = np.array(position.Get()) * unit
+    return found
+
+
+def tcp_in_base(stage: Any, q: np.ndarray, unit: float) -> np.ndarray:
+    """Return the TCP in base: joints by their frames, the tool by its place in the last body."""
+    frame, angles = np.eye(4), dict(zip(UR_JOINTS, q, strict=True))
+    last = ""
+    for name in UR_JOINTS:
+        joint = UsdPhysics.RevoluteJoint(stage.GetPrimAtPath(f"/arm/{name}"))
+        turn = np.eye(4)
+        turn[:3, :3] = Rotation.from_rotvec([0, 0, angles[name]]).as_matrix()
+        frame = frame @ joint_frame(joint, 0, unit) @ turn
+        frame = frame @ np.linalg.inv(joint_frame(joint, 1, unit))
+        last = str(joint.GetBody1Rel().GetTargets()[0])
+    cache = UsdGeom.XformCache()
+    tool = stage.GetPrimAtPath(f"{last}/tcp")
+    inside = cache.GetLocalToWorldTransform(tool) * cache.GetLocalToWorldTransform(
+        stage.GetPrimAtPath(last)).GetInverse()  # fmt: skip
+    matrix = np.array(inside).T
+    matrix[:3, 3] *= unit
+    return (frame @ matrix)[:3, 3]
+
+
+def patched(folder: Path, model: Model, unit: float = 1.0, nested: bool = False) -> Any:
+    write_stage(folder / "a.usda", ARM, unit, nested)
+    options = PatchOptions(tcp="tcp", folder=folder)
+    found = format_of(folder / "a.usda").patch(folder / "a.usda", changes_of(model), options,
+                                               ["a note"])  # fmt: skip
+    (folder / "b.usda").write_text(found.text)
+    return Usd.Stage.Open(str(folder / "b.usda")), found
+
+
+@pytest.mark.parametrize("unit", [1.0, CENTIMETRES])
+@pytest.mark.parametrize("nested", [False, True])
+def test_a_patched_stage_is_where_predict_is(tmp_path: Path, unit: float, nested: bool) -> None:
+    model = NOMINAL.with_terms(GEOMETRY)
+    before = tmp_path / "a.usda"
+    stage, found = patched(tmp_path, model, unit, nested)
+    given = before.read_text()
+    for q in SOME_Q:
+        expected = model.predict(q[None]).position[0]
+        assert np.allclose(tcp_in_base(stage, q, unit), expected, rtol=0, atol=SINGLE)
+        nominal = NOMINAL.predict(q[None]).position[0]
+        below = Usd.Stage.Open(str(before))
+        assert np.allclose(tcp_in_base(below, q, unit), nominal, rtol=0, atol=SINGLE)
+    assert before.read_text() == given
+    assert not found.not_held
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_bodies_stand_where_the_joints_have_them(tmp_path: Path, nested: bool) -> None:
+    model = NOMINAL.with_terms(GEOMETRY)
+    stage, _ = patched(tmp_path, model, nested=nested)
+    tool = next(p for p in stage.Traverse() if p.GetName() == "tcp")
+    at = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(tool).ExtractTranslation())
+    expected = model.predict(np.zeros((1, 6))).position[0]
+    assert np.allclose(BASE_TURN.inv().apply(at - BASE_AT), expected, rtol=0, atol=1e-5)
+
+
+def test_the_layer_holds_overs_alone_where_nothing_is_added(tmp_path: Path) -> None:
+    model = NOMINAL.with_terms([*GEOMETRY, Term("coulomb_friction", Site(2), (4.0,))])
+    _, found = patched(tmp_path, model)
+    assert "over " in found.text
+    assert "def " not in found.text
+    assert "@./a.usda@" in found.text
+    assert "a note" in found.text
+
+
+def test_units_of_friction_damping_and_drives(tmp_path: Path) -> None:
+    model = NOMINAL.with_terms([
+        Term("coulomb_friction", Site(1), (3.0,)), Term("viscous_friction", Site(2), (5.0,)),
+        Term("rotor_inertia", Site(3), (0.4,)), Term("servo_droop", Site(4), (1e-4,)),
+        Term("axial_compliance", Site(2), (2e-5,)), Term("backlash", Site(6), (0.002,)),
+        Term("link_inertia", Site(2), (0.1,)), Term("latency", Site(4), (0.02,)),
+    ])  # fmt: skip
+    stage, found = patched(tmp_path, model)
+
+    def of(joint: int, name: str) -> float:
+        prim = stage.GetPrimAtPath(f"/arm/{UR_JOINTS[joint - 1]}")
+        return float(prim.GetAttribute(name).Get())
+
+    assert of(1, "newton:friction") == pytest.approx(3.0)
+    assert of(2, "newton:damping") == pytest.approx(5.0 * np.pi / 180)  # Nm s/deg
+    assert of(3, "physxJointAxis:angular:armature") == pytest.approx(0.4)
+    assert of(4, "drive:angular:physics:stiffness") == pytest.approx(1e4 * np.pi / 180)
+    spring = stage.GetPrimAtPath(f"/arm/{UR_JOINTS[1]}_axial_compliance")
+    stiffness = spring.GetAttribute("drive:angular:physics:stiffness").Get()
+    assert stiffness == pytest.approx(5e4 * np.pi / 180)
+    play = UsdPhysics.RevoluteJoint(stage.GetPrimAtPath(f"/arm/{UR_JOINTS[5]}_backlash"))
+    assert play.GetUpperLimitAttr().Get() == pytest.approx(np.degrees(0.001))
+    assert str(play.GetBody1Rel().GetTargets()[0]) == "/arm/link_6"
+    own = UsdPhysics.RevoluteJoint(stage.GetPrimAtPath(f"/arm/{UR_JOINTS[5]}"))
+    assert own.GetBody1Rel().GetTargets() == play.GetBody0Rel().GetTargets()
+    mass = UsdPhysics.MassAPI(stage.GetPrimAtPath("/arm/link_2")).GetMassAttr().Get()
+    assert mass == pytest.approx(1.1 * ARM.mass[1], rel=1e-5)
+    assert any("delay" in line for line in found.not_held)
+
+
+def test_what_is_no_usd_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "a.usda").write_text("nothing")
+    with pytest.raises(InputError, match="found no USD that opens") as error:
+        format_of(tmp_path / "a.usda").patch(
+            tmp_path / "a.usda", changes_of(NOMINAL), PatchOptions(), []
+        )
+    assert "\n" not in str(error.value)
