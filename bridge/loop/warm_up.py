@@ -10,7 +10,7 @@ import numpy as np
 
 from gapbridge.bridge.loop.setpoint_stream import NominalStream
 from gapbridge.core.arm import builtin_arm
-from gapbridge.core.compensation import correct
+from gapbridge.core.compensation import Compensator, correct
 from gapbridge.core.estimation.pose_jacobian import pose_columns
 from gapbridge.core.kernels.factor import factor_blocks
 from gapbridge.core.limits import Limiter, Limits
@@ -25,12 +25,13 @@ def warm_up() -> None:
     model = Model(builtin_arm("ur10e")).with_compliance([1e-6] * n, [1e-6] * n)
     q = np.array([[0.0, -1.5, 1.8, -1.87, -1.57, 0.0]])
     for rows in (q, np.repeat(q, 4, axis=0)):  # one by one, and in blocks
-        model.predict(rows)
+        model.predict(rows).rotation_vector  # noqa: B018 (compiled when asked for)
         model.linear_form(rows)
     pose_columns(model, q, None, [(0, 0)], np.array([1e-9]))
     gap, factor = np.zeros((1, 3)), np.zeros((2 * n + 1, 2 * n + 1))
     factor_blocks(model.chain(), model.rows(q), gap, gap, 0, 0, 1, factor)
-    corrected = correct(model, q)
+    corrected = correct(model, q)  # many rows, and one in the loop
+    Compensator(model).correct(q[0])
     Nominal(model)
     plausible(q[0], q[0], q[0], 0.0)
     NominalStream(np.ones(n))
