@@ -8,12 +8,16 @@ only sleeps, was woken later than a state may be old. How late is in the skip's 
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+# Two processes share the cores: threads of linear algebra within each only wait for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 HERE = Path(__file__).parent
 if str(HERE) not in sys.path:

@@ -201,6 +201,15 @@ def require_excitation(model: Model, data: Data, metrology: Metrology, usual: fl
             f"nothing in the log excites the compliance: {reason}; expected poses under different "
             "payloads (payload) or pulls (actual_TCP_force)"
         )
+    if len(form) - data.nuisances <= 2 * n:
+        size = np.linalg.svd(form, compute_uv=False) * usual
+        determined = int((size > 3 * metrology.sigma).sum())
+        if len(form) - data.nuisances <= determined:
+            raise ExcitationError(
+                f"found {len(data.q)} row(s) with measured positions for {determined} "
+                "flexibilities that they bend: nothing is left by which a fit could be judged; "
+                "expected more poses"
+            )
 
 
 def _any_payload(model: Model, data: Data) -> bool:

@@ -137,7 +137,8 @@ class WholeJob(Job):
         tell_calibration(prompt, found)
         metrology = metrology_of(self.cell, options.instrument, self.session.places)
         write_log(found.readings, metrology.registered, folder / "readings.csv")
-        baseline = document_of(found, sigma=metrology.sigma)
+        origin = provenance({"log": [folder / "readings.csv"], "cell": [self.cell.path]})
+        baseline = document_of(found, sigma=metrology.sigma) | {"provenance": origin}
         write_document(folder / "promise.json", baseline)
         from gapbridge.bridge.calibration.jobs.facts import (
             session_facts,  # pictures take their time
@@ -155,7 +156,6 @@ class WholeJob(Job):
             return
         log = read_log(folder / "readings.csv", self.cell.arm.n)
         spread = Spread(tuple(e.name for e in found.estimates), found.whole_covariance)
-        origin = provenance({"log": [folder / "readings.csv"], "cell": [self.cell.path]})
         intervals = self.cell.intervals | {e.name: e.interval for e in found.estimates if e.shown}
         sections = {"provenance": fitted_on(origin, range_of(log), spread, intervals)}
         target = self.hand_over(found.model, "the calibrated cell", sections)

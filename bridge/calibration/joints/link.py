@@ -119,12 +119,14 @@ class LinkedJoints(JointSource):
         """Wait until the arm rests at the pose, then have the daemon observe."""
         run = self._require()
         until = time.monotonic() + SLOWEST * length + PATIENCE
-        begun = False
+        begun, said = False, 0
         while True:
             state = run.daemon.state
-            begun |= state == State.COMPENSATING
+            if not begun and state == State.COMPENSATING:
+                begun, said = True, len(run.messages())
             if begun and not state.writes:
-                raise RunError(f"the move broke off: {run.message() or state.name.lower()}")
+                why = "; ".join(run.messages(said)) or state.name.lower()
+                raise RunError(f"the move broke off: {why}")
             now = self.now()
             there = now is not None and np.abs(now - pose.q).max() < NEAR / 10
             if begun and there and run.daemon.page.ended and self._rests():

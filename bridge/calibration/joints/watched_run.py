@@ -47,6 +47,10 @@ class WatchedRun:
         """Return what the daemon said last."""
         return self._messages[-1] if self._messages else ""
 
+    def messages(self, since: int = 0) -> list[str]:
+        """Return what the daemon said, from the message of that number on."""
+        return self._messages[since:]
+
     def check(self) -> None:
         """Raise what ended the run."""
         if self._thread.is_alive():

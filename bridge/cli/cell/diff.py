@@ -13,6 +13,7 @@ from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.difference import FIELDS, Change, Moved, Part, changes, moved, parts
 from gapbridge.bridge.cell.opened_log import open_log
 from gapbridge.bridge.cli.options import open_cell
+from gapbridge.bridge.document.provenance import provenance
 from gapbridge.bridge.report.labels import effect_title, unit_of
 from gapbridge.core.arm import Arm
 from gapbridge.core.effects import Reported, Term, effect_named
@@ -49,6 +50,7 @@ def diff(before: Path, after: Path, log: Path | None, seed: int, as_json: bool) 
             "changes": [vars(change) for change in found],
             "parts": [_part_json(part, one, other) for part in several],
             "moved": None if shift is None else shift.to_json(),
+            "provenance": provenance({"cell": [before, after], "log": [log] if log else []}),
         }
         click.echo(json.dumps(reported, indent=1))
         return

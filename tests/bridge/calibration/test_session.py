@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +63,8 @@ def test_a_session_ends_with_a_cell_that_knows_the_arm(clean: tuple[Path, Played
     assert axial[1] == pytest.approx(AXIAL[1], rel=0.15)
     for name in ("calibration.html", "calibration.pdf", "readings.csv", "promise.json"):
         assert (folder / "s" / name).stat().st_size > 500
-    assert (folder / "new.promise.json").exists()
+    promise = json.loads((folder / "new.promise.json").read_text())
+    assert [file["role"] for file in promise["provenance"]["files"]] == ["log", "cell"]
     assert "\ncompliance:" not in (folder / "cell.yaml").read_text()
 
 
@@ -136,7 +138,6 @@ def _kept(folder: Path) -> list[dict[str, object]]:
 
 
 def _same_within_intervals(one: Path, other: Path) -> None:
-    import json
 
     from gapbridge.core.calibration.accuracy_baseline import baseline_in
 

@@ -46,6 +46,9 @@ def test_an_effect_and_a_flexibility_are_named(tmp_path: Path) -> None:
     assert alone[0] > alone[1] > 1e-5
     assert 1e-4 < reported["moved"]["rms"] < reported["moved"]["largest"] < 0.02
     assert reported["moved"]["poses"] == 200
+    origin = reported["provenance"]
+    assert (origin["command"], len(origin["files"])) == ("diff", 2)
+    assert all(len(file["sha256"]) == 64 for file in origin["files"])
 
 
 def test_over_a_log_only_its_poses_count(tmp_path: Path) -> None:

@@ -109,6 +109,23 @@ def test_a_shrink_is_one_less_the_ratio_of_its_gaps_and_repeats(selection):
     assert other.shrink == pytest.approx(reported.shrink, abs=0.05)
 
 
+@pytest.mark.parametrize("twins", [False, True])
+def test_the_interval_of_a_shrink_is_that_of_poses_drawn_anew(selection, twins):
+    """95 % over draws of whole conditions, done here the slow way."""
+    held = HeldOut(paired(selection) if twins else selection)
+    chosen = selection.found.chosen
+    after, before = held.squares(chosen), held.squares(())
+    count = 1 + twins
+    rng, drawn = np.random.default_rng(5), []
+    for _ in range(4000):
+        groups = rng.integers(0, len(after) // count, len(after) // count)
+        rows = (count * groups[:, None] + np.arange(count)).ravel()
+        drawn.append(1 - np.sqrt(after[rows].sum() / before[rows].sum()))
+    low, high = held.shrink(chosen, ()).interval
+    expected = np.quantile(drawn, [0.025, 0.975])
+    assert (low, high) == pytest.approx(tuple(expected), abs=0.15 * float(np.ptp(expected)))
+
+
 def test_the_reported_figure_is_the_held_out_one():
     (channel,) = small.diagnosed("backlash").channels
     chosen = channel.selection.found.chosen

@@ -277,6 +277,15 @@ def test_too_few_rows_and_missing_columns_are_reported():
         identify_compliance(model_of(6), log_of(6, columns))
 
 
+def test_a_fit_that_leaves_nothing_to_judge_it_by_is_declined():
+    """One pose in base bends three flexibilities as it likes; its spread would be zero."""
+    _, columns = truth(6, 4, 10)
+    for rows in (1, 2):
+        few = {k: v[:rows] for k, v in columns.items()}
+        with pytest.raises(ExcitationError, match=rf"found {rows} row\(s\).*expected more poses"):
+            identify_compliance(model_of(6), log_of(6, few), KNOWN)
+
+
 @pytest.mark.parametrize("name", ["ur10e", "seven"])
 @pytest.mark.parametrize("links", [STIFF, paper.TUBE])
 def test_the_papers_experiment_holds_against_finite_elements(name, links):

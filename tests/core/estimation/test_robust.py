@@ -66,6 +66,18 @@ def test_outliers_are_found_as_wholes_and_change_nothing(seed: int, share: float
     assert np.abs(np.linalg.lstsq(A, b, rcond=None)[0] - alone).max() > 2e-3
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_a_third_of_gross_outliers_to_one_side_are_seen(seed: int) -> None:
+    A, b, truth, row = drawn(seed, numbers=2)
+    bad = np.random.default_rng(seed).choice(ROWS, ROWS // 3, replace=False)
+    A[:, 0] = 1.0
+    b = A @ truth + np.random.default_rng(seed + 50).normal(0.0, 1e-3, len(b))
+    b[np.isin(row, bad)] += 0.02
+    found = weighed(A, b, one_unit(b), row)
+    assert set(bad) == set(found.outliers.tolist())
+    assert np.abs(found.values - truth).max() < 1e-3
+
+
 def test_cells_of_two_units_have_each_their_own_noise() -> None:
     rng = np.random.default_rng(3)
     A, b, truth, row = drawn(3, rows=200)
