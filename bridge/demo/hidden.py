@@ -1,13 +1,14 @@
-"""What is hidden in the demo's arm beside its flexibilities: an effect that no fit knows."""
+"""What is hidden in the demo's arm beside its flexibilities: effects that no fit knows."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+GIVES = 5.0e-3  # rad: what servos that give way come to at most
 SHIFTS = (1.0e-3, 2.5e-3)  # m, of a tool that hit something
 TRUE_ANYWAY = ("axial_compliance", "radial_compliance")  # the arm bends, and a fit is not exact
 SIGMAS = 4.0  # of its own, within which a found value holds the truth
@@ -25,14 +26,14 @@ class Accused:
 
 @dataclass(frozen=True)
 class Hidden:
-    """An effect of the arm that the demo's cell does not know.
+    """Effects of the arm that the demo's cell does not know.
 
-    effect: as the diagnosis names it; about: what happened, for people.
+    effects: as the diagnosis names them; about: what happened, for people.
     truth: its true numbers by the names of the diagnosis, SI.
     simulation: the same as keys of a cell's section ``simulation``, fields of PlantSettings.
     """
 
-    effect: str
+    effects: tuple[str, ...]
     about: str
     truth: Mapping[str, float]
     simulation: Mapping[str, tuple[float, ...]]
@@ -43,6 +44,13 @@ class Hidden:
         rng = np.random.default_rng((seed, 29))
         return DRAWS[among[int(rng.integers(len(among)))]](rng)
 
+    def beside(self, other: Hidden) -> Hidden:
+        """Return what is hidden where both are."""
+        return Hidden(
+            self.effects + other.effects, f"{self.about}, and {other.about}",
+            {**self.truth, **other.truth}, {**self.simulation, **other.simulation},
+        )  # fmt: skip
+
     def denials(self, accused: Iterable[Accused]) -> list[str]:
         """Return a line for each accusation that the truth does not hold, and for what is missing.
 
@@ -52,11 +60,11 @@ class Hidden:
         lines = [
             f"{cause.effect} is accused, and this arm has none"
             for cause in accused
-            if cause.effect not in (self.effect, *TRUE_ANYWAY)
+            if cause.effect not in (*self.effects, *TRUE_ANYWAY)
         ]
-        own = [p for cause in accused if cause.effect == self.effect for p in cause.parameters]
-        if not own:
-            return [*lines, f"{self.effect} is in the arm, and not named"]
+        named = {cause.effect for cause in accused}
+        lines += [f"{e} is in the arm, and not named" for e in self.effects if e not in named]
+        own = [p for cause in accused if cause.effect in self.effects for p in cause.parameters]
         for name, value, std, _ in own:
             true = self.truth.get(name, 0.0)
             if abs(value - true) > SIGMAS * std + FLOOR:
@@ -70,7 +78,21 @@ def _bent_tool(rng: np.random.Generator) -> Hidden:
     way = rng.normal(size=3)
     shift = tuple(float(v) for v in way / np.linalg.norm(way) * rng.uniform(*SHIFTS))
     truth = {f"tool_frame_{axis}": v for axis, v in zip("xyz", shift, strict=True)}
-    return Hidden("tool_frame", "the tool was bent, too", truth, {"tool_shift": shift})
+    return Hidden(("tool_frame",), "the tool was bent, too", truth, {"tool_shift": shift})
+
+
+def soft_servos(seed: int, held: Sequence[float]) -> Hidden:
+    """Return servos that give way by some 5 mrad, and less, where they hold ``held`` (n,), Nm.
+
+    A joint with less than a newton metre has a servo that stands.
+    """
+    rng = np.random.default_rng((seed, 31))
+    share = rng.uniform(0.7, 1.0, len(held))
+    droop = tuple(
+        float(GIVES * s / h) if h > 1.0 else 0.0 for s, h in zip(share, held, strict=True)
+    )
+    truth = {f"servo_droop_{i + 1}": v for i, v in enumerate(droop) if v}
+    return Hidden(("servo_droop",), "its servos give way", truth, {"droop": droop})
 
 
 DRAWS: dict[str, Callable[[np.random.Generator], Hidden]] = {"bent_tool": _bent_tool}

@@ -106,7 +106,7 @@ def _job(
         loads=tuple(seen.loads), setpoints_written=session.written, loop=session.figures(),
         duration=time.monotonic() - begun, resolution=link.resolution(),
         test_loads=scene.test_loads, explained=joined(explained),
-        hidden=link.hidden, accused=accused,
+        hidden=link.hidden, accused=accused, corrected=corrected.model,
     )  # fmt: skip
     return result, diagnosis
 

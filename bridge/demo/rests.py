@@ -52,18 +52,40 @@ def rests(
     the arm carried, where the controller does not report it. Raises RunError where a visit is
     missing or the tracker saw too little of it.
     """
-    if "timestamp" not in recording:  # a machine that stalls: the run is repeated
-        raise RunError("the recording holds no state of the arm, expected one of each cycle")
+    found, lacking = rests_so_far(recording, readings, visited, load, settling)
+    if found is None or lacking:
+        raise RunError(lacking)
+    return found
+
+
+def rests_so_far(
+    recording: Mapping[str, Array],
+    readings: Array,
+    visited: Array,
+    load: Load | None = None,
+    settling: float = SETTLING,
+) -> tuple[Rests | None, str]:
+    """Return the rests up to the first that is missing (None: all are), and why; see ``rests``."""
+    if "timestamp" not in recording:
+        return None, "the recording holds no state of the arm, expected one of each cycle"
     if load is not None and "payload" not in recording:
         recording = {**recording, **_told(load, len(recording["timestamp"]))}
     spans = _spans(recording, settling)
     rows: list[tuple[Array, ...]] = []
+    lacking = ""
     for number, pose in enumerate(visited):
         span = _next_span(recording, spans, pose)
         if span is None:
-            raise RunError(f"visit {number + 1} of {len(visited)}: the arm never rested there")
-        rows.append(_rest(recording, readings, span, pose, number, settling))
-    return Rests(*(np.array(column) for column in zip(*rows, strict=True)))
+            lacking = f"visit {number + 1} of {len(visited)}: the arm never rested there"
+            break
+        try:
+            rows.append(_rest(recording, readings, span, pose, number, settling))
+        except RunError as error:
+            lacking = str(error)
+            break
+    if not rows:
+        return None, lacking
+    return Rests(*(np.array(column) for column in zip(*rows, strict=True))), lacking
 
 
 def _told(load: Load, count: int) -> dict[str, Array]:

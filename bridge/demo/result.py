@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 from gapbridge.bridge.demo.hidden import Accused, Hidden
 from gapbridge.bridge.demo.poses import TEST_LOADS, Load
 from gapbridge.bridge.demo.rests import Rests
+from gapbridge.core.compensation import correct
+from gapbridge.core.effects import settling
 from gapbridge.core.estimation.identification import Identification
+from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
@@ -54,6 +57,7 @@ class Result:
     test_loads: tuple[Load, ...] = TEST_LOADS
     explained: Rests | None = None  # the same visits, corrected by what the diagnosis named too
     hidden: Hidden | None = None  # the truth beside the flexibilities
+    corrected: Model | None = None  # with what the diagnosis named
     accused: tuple[Accused, ...] = ()  # by the diagnosis, with the fitted flexibilities
 
     @property
@@ -70,6 +74,22 @@ class Result:
     def error_with(self) -> Array:
         """Return the same, corrected by all that was found."""
         return tcp_error(self.model, self.explained or self.compensated)
+
+    @property
+    def joint_errors(self) -> tuple[Array, Array] | None:
+        """Return how far joints rest from where they are wanted (M, n), rad: before and after.
+
+        None where no servo gives way. Wanted is what corrects the arm behind the servos.
+        """
+        servos = () if self.corrected is None else settling(self.corrected.terms)
+        if self.corrected is None or self.explained is None or not servos:
+            return None
+        kept = tuple(t for t in self.corrected.terms if t not in servos)
+        rests = self.explained
+        loads = Loads(rests.payload, rests.payload_cog, rests.force)
+        wanted = correct(replace(self.corrected, terms=kept), rests.nominal_q, loads).q
+        before = self.without.actual_q - self.without.nominal_q
+        return before, rests.actual_q - wanted
 
     @property
     def series(self) -> tuple[tuple[str, Array], ...]:
@@ -103,6 +123,7 @@ class Result:
                 for cause in self.accused
                 for name, value, std, unit in cause.parameters
             },
+            "joint_error_mrad": self._joint_figures(),
             "repeatability_mm": self.repeatability * 1e3,
             "resolution_mm": self.resolution.written * 1e3,
             "reading_resolution_mm": self.resolution.read * 1e3,
@@ -115,6 +136,12 @@ class Result:
             },
             "duration_s": self.duration,
         }
+
+    def _joint_figures(self) -> dict[str, dict[str, float]] | None:
+        errors = self.joint_errors
+        if errors is None:
+            return None
+        return {k: millimetres(np.abs(e)) for k, e in zip(("without", "with"), errors, strict=True)}
 
 
 def reach(model: Model) -> float:
@@ -145,7 +172,7 @@ def repeatability(runs: list[Rests], labels: tuple[str, ...]) -> float:
 
 
 def millimetres(error: Array) -> dict[str, float]:
-    """Return rms and largest of distances (m) in mm."""
+    """Return rms and largest of distances (m) in mm, or of angles (rad) in mrad."""
     return {"rms": float(np.sqrt(np.mean(error**2))) * 1e3, "max": float(error.max()) * 1e3}
 
 

@@ -47,6 +47,13 @@ def show(result: Result, console: Console | None = None) -> None:
         f"with compensation: {ratio:.0f} times smaller; the arm repeats to "
         f"{figures['repeatability_mm']:.3f} mm"
     )
+    if (joints := figures["joint_error_mrad"]) is not None:
+        plain, live = joints["without"], joints["with"]
+        console.print(
+            f"joints rest {plain['rms']:.3f} mrad rms from where they are wanted without (at most "
+            f"{plain['max']:.3f}), {live['rms']:.4f} mrad with (at most {live['max']:.4f}): "
+            f"{plain['rms'] / live['rms']:.0f} times less"
+        )
     for line in truth_lines(result):
         console.print(line, highlight=False)
     if result.resolution.written:

@@ -49,13 +49,18 @@ def measured(link: DemoLink, plant: Plant) -> Rests:
     planned = plan(link.cell.model, link.home, link.seed, scene)
     for load, poses in zip(scene.calibration_loads, planned.calibration, strict=True):
         plant.load = Load(load.mass, load.cog, load.wrench[:3], load.wrench[3:])
-        frames = []
+        frames, read = [], []
         for q in poses:
             plant.q, plant.scatter = tuple(q), plant._draw_scatter()
+            for _ in range(8):
+                plant.q = tuple(plant._given_way(q))
             frames.append(plant.true_tcp())
+            count = np.radians(0.001) if link.name == "can" else 1e-9  # rad, of what is read
+            read.append(np.round(np.array(plant.q) / count) * count)
         rows = load.rows(len(poses))
         parts.append(Rests(
-            np.zeros(len(poses)), poses, poses, rows.payload_mass, rows.payload_cog, rows.wrench,
+            np.zeros(len(poses)), poses, np.array(read), rows.payload_mass, rows.payload_cog,
+            rows.wrench,
             np.array([f.origin for f in frames]) + rng.normal(0, TRACKER, (len(poses), 3)),
             np.array([rotation_vector(np.reshape(f.rotation, (3, 3))) for f in frames]),
         ))  # fmt: skip

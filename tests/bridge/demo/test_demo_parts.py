@@ -17,7 +17,7 @@ from gapbridge.bridge.demo.picture import picture
 from gapbridge.bridge.demo.poses import CALIBRATION_LOADS, TEST_LOADS, candidates, plan
 from gapbridge.bridge.demo.rests import Rests, joined, rests, write_log
 from gapbridge.bridge.demo.result import LoopFigures, Result, repeatability
-from gapbridge.bridge.demo.session import Session
+from gapbridge.bridge.demo.session import Ended, Session
 from gapbridge.bridge.demo.terminal import bar, show
 from gapbridge.bridge.demo.trajectory import ACCELERATION, PERIOD, SPEED, visits, write_trajectory
 from gapbridge.bridge.document.svg import svg_file
@@ -29,6 +29,7 @@ from gapbridge.core.log.log import read_log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 from gapbridge.core.rotation import rotation_vector, transform
+from gapbridge.drivers.clock import Clock
 
 HOME = np.array([0.0, -1.5, 1.8, -1.87, -1.57, 0.0])
 MODEL = Model(builtin_arm("ur10e"), transform(np.eye(3), np.array([0, 0, 0.18])))
@@ -193,20 +194,51 @@ def test_bars_grow_with_their_share() -> None:
     assert bar(0.0, 10) != ""
 
 
+MISSED = "compensating -> holding (deadlines missed): 28 of 500 cycles missed"
+
+
+class FastClock(Clock):
+    """Time that passes at once."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now = 0.0
+        self.monotonic = lambda: self.now
+        self.sleep = self._sleep
+
+    def _sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+
 class Slow(Session):
     """A machine that keeps a quarter of the rate only."""
 
     def __init__(self, kept: float, emit) -> None:
-        super().__init__(None, Path(), emit)
+        super().__init__(None, Path(), emit, FastClock())
         self.rates: list[float] = []
         self.kept = kept
 
     def _run(self, cell, load, poses, longest):
         link = self._settings(cell).link
         self.rates.append(link.rate)
-        if link.rate > self.kept:
-            raise RunError("compensating -> holding (deadlines missed): 28 of 500 cycles missed")
-        return "measured"
+        return Ended(None, MISSED, False) if link.rate > self.kept else Ended(poses, "", False)
+
+
+class Scripted(Session):
+    """A machine whose runs end as they are told: visits done, why it broke off, a stall seen."""
+
+    def __init__(self, *script: tuple[int, str, bool]) -> None:
+        self.reported: list[str] = []
+        super().__init__(None, Path(), self.reported.append, FastClock())
+        self.script = list(script)
+        self.asked: list[int] = []
+
+    def _run(self, cell, load, poses, longest):
+        self.asked.append(len(poses))
+        done, broke, stalled = self.script.pop(0)
+        zero = np.zeros((done, 6))
+        found = Rests(zero[:, 0], poses[:done], zero, zero[:, 0], zero[:, :3], zero, zero, zero)
+        return Ended(found if done else None, broke, stalled)
 
 
 class Hall:
@@ -238,7 +270,7 @@ def test_a_machine_that_misses_deadlines_goes_on_at_a_lower_rate(kept, rates):
     session._link = Hall()
     for expected in (rates, rates[-1:]):  # the second visit begins where the first ended
         session.rates.clear()
-        assert session.visit(cell, TEST_LOADS[0], HOME[None]) == "measured"
+        assert len(session.visit(cell, TEST_LOADS[0], HOME[None])) == 1
         assert session.rates == expected
     assert len(reported) == len(rates) - 1
 
@@ -251,13 +283,39 @@ def test_a_machine_that_cannot_keep_a_fourth_of_the_rate_is_reported():
         session.visit(cell, TEST_LOADS[0], HOME[None])
 
 
+def five_visits(session: Scripted) -> Rests:
+    session._link = Hall()
+    cell = load_cell(Path(__file__).parents[3] / "config" / "ur10e_simulated.yaml")
+    return session.visit(cell, TEST_LOADS[0], HOME + np.arange(5)[:, None] * 0.1)
+
+
+def test_a_run_that_a_stall_ended_goes_on_with_the_visits_that_are_left():
+    session = Scripted(
+        (2, "state stale", False), (1, "?", True), (0, "silence", False), (2, "", False)
+    )
+    found = five_visits(session)
+    assert session.asked == [5, 3, 2, 2]
+    np.testing.assert_array_equal(found.nominal_q[:, 0], HOME[0] + np.arange(5) * 0.1)
+    assert [line.split(";")[1][:21] for line in session.reported] == [
+        " 2 of 5 visits are do", " 3 of 5 visits are do", " 3 of 5 visits are do",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("broke", ["offset saturated", "correction no number", "zero moved", ""])
+def test_a_run_that_no_stall_ended_is_a_failure_at_once(broke):
+    session = Scripted((3, broke, False))
+    with pytest.raises(RunError, match=broke or "before its last visit"):
+        five_visits(session)
+    assert session.asked == [5]
+
+
 def accused(*parameters: tuple[str, float, float], effect: str = "tool_frame") -> Accused:
     return Accused(effect, (), tuple((name, value, std, "m") for name, value, std in parameters))
 
 
 def bent(**shift: float) -> Hidden:
     truth = {f"tool_frame_{axis}": value for axis, value in shift.items()}
-    return Hidden("tool_frame", "bent", truth, {"tool_shift": tuple(shift.values())})
+    return Hidden(("tool_frame",), "bent", truth, {"tool_shift": tuple(shift.values())})
 
 
 def test_a_bent_tool_is_drawn_from_the_seed() -> None:
