@@ -20,14 +20,14 @@ class Published:
 
 
 SPLIT = {
-    "ipa_ur10_a": TUNE, "ipa_ur10_b": TUNE, "ur10_c": HELD_BACK, "ur10_d": HELD_BACK,
+    "ipa_ur10_a": TUNE, "ipa_ur10_b": TUNE, "ur10_c": TUNE, "ur10_d": TUNE,
     "tsinghua_ur5_grid": TUNE, "tsinghua_ur5_random": HELD_BACK,
     "barrett_wam_grid": TUNE, "barrett_wam_random": HELD_BACK,
     "iiwa_three_loads": TUNE, "iiwa_0kg": TUNE, "iiwa_month_before": HELD_BACK,
     "motoman_cube": TUNE, "motoman_wide": HELD_BACK, "irb120": HELD_BACK,
     "force_sensor_100": TUNE,
-    "ur10e_12harmonics": TUNE, "ur10e_50s": TUNE, "ur10e_8harmonics": HELD_BACK,
-    "ur10e_point_to_point": HELD_BACK, "rad_ur3e_rtde": TUNE, "panda": HELD_BACK,
+    "ur10e_12harmonics": TUNE, "ur10e_50s": TUNE, "ur10e_8harmonics": TUNE,
+    "ur10e_point_to_point": HELD_BACK, "rad_ur3e_rtde": TUNE, "panda": TUNE,
 }  # fmt: skip
 PUBLISHED = {
     "tsinghua_ur5_grid > tsinghua_ur5_random": Published(0.1549e-3, "hybrid MDH and ASTGCN"),
