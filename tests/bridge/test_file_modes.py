@@ -12,7 +12,7 @@ import pytest
 from gapbridge.bridge.calibration.session.journal import Journal as SessionJournal
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.saving import save_cell
-from gapbridge.bridge.document.output_file import write_text
+from gapbridge.bridge.document.output_file import replacing, write_text
 from gapbridge.bridge.fleet.folder import require_folder as require_fleet_folder
 from gapbridge.bridge.fleet.journal import Journal as FleetJournal
 from gapbridge.bridge.ipc.shared_memory import slices_of
@@ -66,6 +66,30 @@ def test_a_new_file_is_0640(tmp_path: Path, make: Callable[[Path], None]) -> Non
 def test_a_new_folder_is_0750(tmp_path: Path, make: Callable[[Path], object]) -> None:
     make(tmp_path / "folder")
     assert mode(tmp_path / "folder") == 0o750
+
+
+def test_what_breaks_off_leaves_the_old_file_and_nothing_beside_it(tmp_path: Path) -> None:
+    path = tmp_path / "cell.yaml"
+    path.write_text("old")
+
+    def half() -> None:
+        with replacing(path) as file:
+            file.write(CELL)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        half()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_that_is_replaced_through_a_link_leaves_the_link(tmp_path: Path) -> None:
+    path, link = tmp_path / "cell.yaml", tmp_path / "current.yaml"
+    path.write_text("old")
+    link.symlink_to(path)
+    write_text(link, CELL)
+    assert link.is_symlink()
+    assert path.read_text() == CELL
 
 
 @pytest.mark.parametrize("kept", [0o600, 0o644])

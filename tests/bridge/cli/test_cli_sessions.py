@@ -99,6 +99,8 @@ def test_provenance_stands_in_the_json_and_in_the_cell(answered) -> None:
     assert covariance.shape == (len(parameters),) * 2
     assert (np.diag(covariance) > 0).all()
     intervals = written.pop("intervals")
+    causes = [c for channel in reported["channels"] for c in channel["causes"]]
+    assert [c["effect"] for c in written.pop("causes")] == [c["effect"] for c in causes]
     assert written == origin
     applied = [
         p for c in reported["channels"] for cause in c["causes"] for p in cause["parameters"]

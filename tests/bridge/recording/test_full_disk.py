@@ -12,6 +12,7 @@ from recorded import Desk, publish
 from test_recorder import numbers
 
 from gapbridge.bridge.recording import recorder as recorder_module
+from gapbridge.core.log.mcap_reading import read_documents
 
 
 @pytest.fixture
@@ -41,18 +42,22 @@ def test_a_write_that_fails_in_its_middle_loses_nothing_that_the_ring_holds(
     recorder = desk.recorder()
     publish(desk.page, 100)
     recorder.step(flush=True)
-    allow(desk.files[0].stat().st_size + 5000)  # amidst the next chunk
+    whole = desk.files[0].stat().st_size
+    allow(whole + 5000)  # amidst the next chunk
     publish(desk.page, 200)
+    recorder.take({"time": 5.0, "kind": "note", "detail": "while the disk was full"})
     recorder.step(flush=True)
     assert recorder.pauses == 1
     assert recorder.path is None
     assert "paused" in desk.events[-1]
+    assert desk.files[0].stat().st_size == whole
     assert numbers(desk.stem) == list(range(100))
     allow(resource.RLIM_INFINITY)
     publish(desk.page, 50)
     recorder.step(flush=True)
     recorder.close()
     assert numbers(desk.stem) == list(range(350))
+    assert "while the disk was full" in [e.get("detail") for e in read_documents(desk.stem)]
     assert recorder.lost == 0
 
 

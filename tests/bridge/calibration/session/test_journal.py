@@ -130,6 +130,16 @@ def test_a_damaged_line_in_the_middle_is_named(tmp_path: Path) -> None:
         Journal(tmp_path).open()
 
 
+@pytest.mark.parametrize("line", ["[1]", '{"kind": 3}', '{"time": 1.0}', "{"])
+def test_a_line_that_is_no_entry_is_refused_with_its_number(tmp_path: Path, line: str) -> None:
+    with Journal(tmp_path) as journal:
+        journal.add("note", text="before")
+    with (tmp_path / FILE).open("a") as file:
+        file.write(line + "\n" + '{"kind": "note"}\n')
+    with pytest.raises(InputError, match="row 2: found"):
+        Journal(tmp_path).open()
+
+
 def test_two_terminals_do_not_share_a_session(tmp_path: Path) -> None:
     with Journal(tmp_path), pytest.raises(InputError, match="going on in another terminal"):
         Journal(tmp_path).open()
