@@ -1,0 +1,132 @@
+"""What the writers make of a robot's answers, in a time of the test's own and without a wire."""
+
+from __future__ import annotations
+
+import types
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gapbridge.core.errors import ForeignCommandError, IneffectiveWriteError, WriteError
+from gapbridge.core.setpoint import Setpoint
+from gapbridge.drivers.modbus import encode
+from gapbridge.drivers.modbus.decode import Sample
+from gapbridge.drivers.modbus.profile import read_profile
+from gapbridge.drivers.modbus.settings import SHIPPED
+from gapbridge.drivers.modbus.write import MailboxWriter, TargetWriter, make_writer
+
+NOTHING = np.zeros(6)
+
+
+class ByHand:
+    """A clock that goes on where it is told to, and where somebody sleeps."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+
+class Wire:
+    """What a writer writes, and a mailbox program that answers what it is set to."""
+
+    name = "the test's wire"
+
+    def __init__(self) -> None:
+        self.written: list[tuple[str, int, list[int]]] = []
+        self.number = 7  # the last one that the robot's program has applied
+        self.answers = True
+
+    def write(self, table: str, address: int, words: list[int], single: bool = False) -> None:
+        self.written.append((table, address, list(words)))
+
+    def sample(self, says: int = encode.RUNNING, *, busy: bool = False, q: Any = NOTHING) -> Sample:
+        motion = (("busy", "moving"),) if busy else ()
+        return Sample({"echo": NOTHING, "position": q}, None, (), motion, (self.number, says))
+
+
+def opened(name: str) -> tuple[Any, Wire, ByHand]:
+    """Return the armed writer of a shipped profile, its wire and its clock."""
+    wire, clock = Wire(), ByHand()
+    profile = read_profile(SHIPPED / f"{name}.yaml")
+    if profile.function_23:
+        profile = profile.model_copy(update={"function_23": False})
+    writer = make_writer(profile, wire, lambda: (0.01, 0.02), 1.0, clock)  # type: ignore[arg-type]
+
+    def look() -> Sample:
+        if isinstance(writer, MailboxWriter) and wire.written:
+            wire.number = writer._sequence
+        return wire.sample()
+
+    writer.arm(types.SimpleNamespace(), look)
+    return writer, wire, clock
+
+
+def offset(x: float) -> Setpoint:
+    return Setpoint(NOTHING, NOTHING, np.array([x, 0.0, 0.0, 0.0, 0.0, 0.0]), 0.0, 0.0)
+
+
+def test_an_offset_that_does_not_come_back_ends_the_writing_in_time() -> None:
+    writer, wire, clock = opened("ur")
+    writer.write(offset(1e-4), wire.sample())
+    begun, allowed = clock.now, writer._box.echo
+    reason: list[IneffectiveWriteError] = []
+    while not reason and clock.now < begun + 2 * allowed:
+        clock.now += 0.01
+        try:
+            writer.write(offset(1e-4), wire.sample())  # the number before it, still
+        except IneffectiveWriteError as error:
+            reason.append(error)
+    assert reason
+    assert "offsets do not arrive" in str(reason[0])
+    assert allowed < clock.now - begun < allowed + 0.02
+
+
+def test_offsets_that_come_back_late_but_in_time_go_on() -> None:
+    writer, wire, clock = opened("ur")
+    sent = [wire.number] * 3
+    for k in range(400):
+        writer.write(offset(1e-6 * k), wire.sample())
+        sent.append(writer._sequence)
+        clock.now += 0.01
+        wire.number = sent[-3]  # two cycles behind
+
+
+@pytest.mark.parametrize("ahead", [1, 5, 1000])
+def test_a_number_that_was_not_sent_from_here_is_another_writers(ahead: int) -> None:
+    writer, wire, _ = opened("ur")
+    writer.write(offset(1e-4), wire.sample())
+    wire.number = (writer._sequence - 1 + ahead) % (encode.SEQUENCES - 1) + 1
+    with pytest.raises(ForeignCommandError, match="somebody else writes the mailbox"):
+        writer.write(offset(2e-4), wire.sample())
+
+
+@pytest.mark.parametrize("says", [encode.ABSENT, encode.EXPIRED])
+def test_a_program_that_does_not_run_ends_the_writing(says: int) -> None:
+    writer, wire, _ = opened("ur")
+    with pytest.raises(WriteError, match="offsets do not arrive"):
+        writer.write(offset(1e-4), wire.sample(says))
+    with pytest.raises(WriteError, match="expected arm"):
+        writer.write(offset(1e-4), wire.sample())
+
+
+def test_a_target_waits_while_the_robot_is_busy_and_the_newest_goes_out_after() -> None:
+    profiles = [p.stem for p in sorted(SHIPPED.glob("*.yaml"))
+                if read_profile(p).write.mode == "target_trigger"]  # fmt: skip
+    assert profiles
+    for name in profiles:
+        writer, wire, _ = opened(name)
+        assert isinstance(writer, TargetWriter)
+        before = len(wire.written)
+        for k in range(3):
+            q = np.full(6, 0.01 * (k + 1))
+            writer.write(Setpoint(q, q, NOTHING, 0.0, 0.0), wire.sample(busy=True, q=q))
+        assert len(wire.written) == before, name
+        writer.write(Setpoint(q, q, NOTHING, 0.0, 0.0), wire.sample(q=q))
+        assert len(wire.written) > before
+        np.testing.assert_allclose(writer.target(), q, atol=abs(writer._size))
