@@ -12,8 +12,9 @@ import pytest
 from watched_feed import Feed, self_signed
 
 from gapbridge.bridge.cell import load_cell
-from gapbridge.bridge.served.credentials import check_credentials, read_token
+from gapbridge.bridge.served.credentials import check_credentials, read_token, tls_context
 from gapbridge.bridge.served.protocol import HEADER_TIME, LARGEST_HEAD, MOST_CONNECTIONS
+from gapbridge.bridge.served.settings import ServedSettings
 from gapbridge.core.errors import CellError, InputError
 
 TOKEN = "7d1f0c3a9b8e4f62a5d07c1e93b8462f"
@@ -151,6 +152,12 @@ def test_a_certificate_that_cannot_be_used_is_refused(tmp_path, token_file):
     certificate.unlink()
     with pytest.raises(InputError, match=r"web.certificate: .*found no file"):
         check_credentials(load_cell(path).web, "web")
+
+
+def test_nothing_older_than_tls_1_2_is_spoken(tmp_path):
+    certificate, key = self_signed(tmp_path)
+    context = tls_context(ServedSettings(certificate=certificate, key=key), "web")
+    assert context.minimum_version == ssl.TLSVersion.TLSv1_2
 
 
 def test_the_processes_listen_where_they_are_configured_and_nowhere_else(plain, guarded, metrics):
