@@ -158,13 +158,13 @@ class Limiter:
             self._block, nominal_q, corrected_q, offset_in_base, ramp, actual_q, dt
         )
         if code != _FINE:
-            raise LimitError(self._reason(code, nominal_q, actual_q, dt))
+            raise LimitError(self._reason(code, clamped, nominal_q, actual_q, dt))
         if clamped:
             for bit in range(len(CLAMPS)):
                 self.counts[bit] += clamped >> bit & 1
         return Limited(*self._out, clamped)
 
-    def _reason(self, code: int, nominal_q: Array, actual_q: Array, dt: float) -> str:
+    def _reason(self, code: int, joint: int, nominal_q: Array, actual_q: Array, dt: float) -> str:
         if code == _BAD_GAP:
             return f"setpoint: found a gap of {dt:g} s to the last one, expected a positive one"
         if code == _NOMINAL_OUTSIDE:
@@ -182,10 +182,10 @@ class Limiter:
                 f"velocity limit of {self.limits.velocity[joint]:.3g} rad/s allows"
             )
         if code == _FAR:
-            joint = int(np.argmax(np.abs(self._q - actual_q)))
+            away = abs(self._q[joint] - actual_q[joint])
             return (
-                f"setpoint: joint {joint + 1} is {abs(self._q[joint] - actual_q[joint]):.4f} rad "
-                f"from its command, expected at most {self.limits.following:g} (limits.following)"
+                f"setpoint: joint {joint + 1} is {away:.4f} rad behind its last command, and would "
+                f"be more than {self.limits.following:g} rad behind this one (limits.following)"
             )
         if not self.started:
             return "setpoint: found no start of the stream, expected start() before limit()"
@@ -269,7 +269,10 @@ def _whole(numbers, bounds, nominal, corrected, offset, ramp):  # type: ignore[n
 
 @njit(**JIT)
 def _limit(block, nominal, corrected, offset, ramp, actual, dt):  # type: ignore[no-untyped-def]
-    """Advance what the block keeps by one setpoint; returns (reason, clamped bits)."""
+    """Advance what the block keeps by one setpoint; returns (reason, clamped bits).
+
+    With _FAR the second is the joint.
+    """
     q, before, delta, applied = _kept_of(block)
     n = q.shape[0]
     numbers, bounds = block[:NUMBERS], block[NUMBERS : NUMBERS + 3 * n].reshape((3, n))
@@ -300,7 +303,7 @@ def _limit(block, nominal, corrected, offset, ramp, actual, dt):  # type: ignore
             clamped |= 1 << VELOCITY
     for i in range(n):
         if abs(q[i] + pace * (goal[i] - q[i]) - actual[i]) > numbers[5]:
-            return _FAR, 0
+            return _FAR, i
     for i in range(n):
         q[i] = goal[i] if pace == 1.0 else q[i] + pace * (goal[i] - q[i])
         delta[i] += part * (share * (corrected[i] - nominal[i]) - delta[i])

@@ -33,9 +33,10 @@ PAUSE = 5.0  # s after a run in which a stalled machine came no farther
 STALL = 0.05  # s that a timer of this process comes late: the machine stood still
 STALLED = (
     Cause.OVERRUN, Cause.STALE, Cause.RESYNC, Cause.SILENCE, Cause.LINK_LOST, Cause.INEFFECTIVE,
-    Cause.WRITE_FAILED, Cause.SOURCE_DRY,
+    Cause.WRITE_FAILED, Cause.SOURCE_DRY, "limits.following",
 )  # fmt: skip
-"""Why a run ends on a machine that stands still, and on no other in the demo: all are deadlines."""
+"""Why a run ends on a machine that stands still: deadlines, and an arm that was left behind."""
+FRUITLESS = 4  # runs in a row without a visit, and no timer late: that is no machine standing still
 
 
 class Ended(NamedTuple):
@@ -95,7 +96,7 @@ class Session:
         cell = self._link.declared(cell, load)
         latest = self._clock.monotonic() + PATIENCE
         parts: list[Rests] = []
-        left = poses
+        left, fruitless = poses, 0
         longest = self._link.prepare(self._folder, left)
         bench = self._link.bench()
         try:
@@ -105,9 +106,10 @@ class Session:
                 if ended.found is not None:
                     parts.append(ended.found)
                     left = left[len(ended.found) :]
+                fruitless = 0 if ended.found is not None or ended.stalled else fruitless + 1
                 if not len(left):
                     return parts[0] if len(parts) == 1 else joined(parts)
-                self._require_stall(ended, latest)
+                self._require_stall(ended, fruitless, latest)
                 self._tell(
                     f"  this machine stood still ({ended.broke}); {len(poses) - len(left)} of "
                     f"{len(poses)} visits are done, going on{self._slow(ended.broke)}"
@@ -118,9 +120,10 @@ class Session:
         finally:
             bench.close()
 
-    def _require_stall(self, ended: Ended, latest: float) -> None:
+    def _require_stall(self, ended: Ended, fruitless: int, latest: float) -> None:
         """Raise RunError where a run has not broken off for a stalled machine, or too late."""
-        if not (ended.stalled or any(cause in ended.broke for cause in STALLED)):
+        known = fruitless < FRUITLESS and any(cause in ended.broke for cause in STALLED)
+        if not (ended.stalled or known):
             raise RunError(ended.broke or "the run ended before its last visit")
         if self._clock.monotonic() > latest:
             raise RunError(f"this machine stalled for {PATIENCE:g} s and more: {ended.broke}")

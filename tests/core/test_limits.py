@@ -221,8 +221,17 @@ def test_a_nominal_that_jumps_is_refused_and_nothing_moves() -> None:
 def test_a_command_far_from_the_actual_joints_is_refused() -> None:
     limiter = started(np.zeros(N))
     actual = np.array([0.0, 0.0, 0.0, 0.0, 0.4, 0.0])
-    with pytest.raises(LimitError, match=r"joint 5 is 0\.4000 rad from its command"):
+    with pytest.raises(LimitError, match=r"joint 5 is 0\.4000 rad behind its last command"):
         limiter.limit(np.zeros(N), np.zeros(N), np.zeros(6), 1.0, actual, DT)
+
+
+def test_a_step_that_would_leave_the_arm_too_far_behind_names_its_joint() -> None:
+    limiter = started(np.zeros(N))
+    actual = np.array([-0.06, 0.0, 0.0, -0.099, 0.0, 0.0])  # each within 0.1 of the last command
+    goal = np.array([0.0, 0.0, 0.0, 1.5 * DT, 0.0, 0.0])
+    expected = r"joint 4 is 0\.0990 rad behind its last command, and would be more than 0\.1 rad"
+    with pytest.raises(LimitError, match=expected):
+        limiter.limit(goal, goal, np.zeros(6), 1.0, actual, DT)
 
 
 def test_a_long_gap_does_not_allow_a_long_step() -> None:

@@ -301,6 +301,16 @@ def test_a_run_that_a_stall_ended_goes_on_with_the_visits_that_are_left():
     ]  # fmt: skip
 
 
+def test_runs_that_come_no_farther_on_a_machine_that_keeps_time_are_a_failure():
+    behind = "setpoint refused: joint 4 is 0.0833 rad behind (limits.following)"
+    session = Scripted((1, behind, False), *[(0, behind, False)] * 9)
+    with pytest.raises(RunError, match="behind"):
+        five_visits(session)
+    assert session.asked == [5, 4, 4, 4, 4]
+    session = Scripted((1, behind, False), *[(0, behind, True)] * 9, (4, "", False))
+    assert len(five_visits(session)) == 5
+
+
 @pytest.mark.parametrize("broke", ["offset saturated", "correction no number", "zero moved", ""])
 def test_a_run_that_no_stall_ended_is_a_failure_at_once(broke):
     session = Scripted((3, broke, False))
