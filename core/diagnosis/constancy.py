@@ -65,7 +65,7 @@ def _variation(
     """
     space, observation = selection.working, selection.observation
     own = exact_columns(observation, space.candidates[c], _others(selection, c))
-    constant = selection.rows_of(own)
+    constant = selection.rows_of(_by_session(own, observation.quantities.get("session")))
     rest = np.hstack([space.columns([o for o in accused if o != c]), beside])
     basis = basis_of(_unit(np.hstack([constant, rest])))
     left = space.y - basis @ (basis.T @ space.y)
@@ -93,14 +93,27 @@ def _variation(
     return name, share
 
 
+def _by_session(own: Array, session: Array | None) -> Array:
+    """Return the columns (N, k, d) with a number for each session: what changed is no variation."""
+    if session is None:
+        return own
+    each = (session[:, None] == np.unique(session)).astype(float)
+    return np.asarray((own[:, :, :, None] * each[:, None, None, :]).reshape(*own.shape[:2], -1))
+
+
 def _others(selection: Selection, c: int) -> list[Term]:
     return [t for o, t in zip(selection.term_index, selection.terms, strict=True) if o != c]
 
 
 def _quantities(selection: Selection, candidate: Candidate) -> dict[str, Array]:
-    """Return what a number may go by: the columns of the log, and the load that its joint holds."""
+    """Return what a number may go by: the columns of the log, and the load that its joint holds.
+
+    Not by session, nor by time where there are several: what changed between them is reported so.
+    """
     observation, joint = selection.observation, candidate.site.joint
     found = dict(observation.quantities)
+    if "session" in found:
+        found = {name: z for name, z in found.items() if name not in ("session", "timestamp")}
     if observation.axial_moment is not None and joint is not None:
         found["load"] = np.abs(observation.axial_moment[:, joint - 1])
     return {name: z for name, z in found.items() if len(np.unique(z)) > 2}
