@@ -28,6 +28,7 @@ from lateness import HOPELESS, LIMIT, Witness  # noqa: E402
 REALTIME = (
     "bridge/cli/test_cli_check.py",
     "bridge/daemon/test_configuration_that_runs.py",
+    "bridge/daemon/test_control.py",
     "bridge/daemon/test_daemon_checks.py",
     "bridge/daemon/test_daemon_faults.py",
     "bridge/daemon/test_daemon_writing.py",

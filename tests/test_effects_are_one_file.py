@@ -16,8 +16,14 @@ SHARED = {"payload", "payload_cog", "joint_offset", "latency"}
 # names of joints that a simulator's model is given (they stand in the user's file and in docs), and
 # what the demo has put into its plant, by the name that a diagnosis must find
 LABELS = {
-    "bridge/patch/mjcf.py": {"backlash", "axial_compliance"},
-    "bridge/demo/hidden.py": {"tool_frame", "axial_compliance", "radial_compliance"},
+    "bridge/patch/mjcf.py": {"backlash", "axial_compliance", "base_compliance"},
+    "bridge/patch/usd.py": {"backlash", "axial_compliance"},
+    "bridge/demo/hidden.py": {
+        "tool_frame",
+        "axial_compliance",
+        "radial_compliance",
+        "servo_droop",
+    },
 }
 ASKED = {"effect", "family", "identifier"}  # attributes whose text is an identifier
 TAKING = {"Term", "effect_named", "joints"}  # calls whose first argument is one

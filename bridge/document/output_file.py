@@ -156,7 +156,7 @@ def _parquet_to(
 
 def _text_to(binary: IO[bytes]) -> Callable[[Sequence[str], Array], None]:
     def append(columns: Sequence[str], table: Array) -> None:
-        if not binary.tell():
+        if binary.seek(0, os.SEEK_END) == 0:
             binary.write((",".join(columns) + "\n").encode())
         if table.size <= LONG:
             np.savetxt(binary, table, fmt="%.17g", delimiter=",")
