@@ -2,13 +2,15 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from gapbridge.core.rotation import (
+    left_jacobian,
     one_rotation_matrix,
+    roll_pitch_yaw,
     rotation_matrix,
     rotation_vector,
     rpy_matrix,
@@ -104,3 +106,25 @@ def test_one_matrix_in_plain_numbers_is_that_of_many(size):
         np.testing.assert_allclose(
             one_rotation_matrix(vector), rotation_matrix(vector), rtol=0, atol=1e-14
         )
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=60, deadline=None)
+def test_the_left_jacobian_is_what_one_more_radian_turns(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    vector = rng.normal(size=3)
+    vector *= rng.choice([1e-5, 1e-2, 1.0, 3.0]) / np.linalg.norm(vector)
+    before = Rotation.from_rotvec(vector)
+    for k, step in enumerate(1e-6 * np.eye(3)):
+        ahead, behind = (Rotation.from_rotvec(vector + way * step) for way in (1, -1))
+        turn = ((ahead * before.inv()).as_rotvec() - (behind * before.inv()).as_rotvec()) / 2e-6
+        np.testing.assert_allclose(left_jacobian(vector)[:, k], turn, atol=1e-7)
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=60, deadline=None)
+def test_roll_pitch_and_yaw_are_about_fixed_axes(seed: int) -> None:
+    rotation = Rotation.random(random_state=seed)
+    found = roll_pitch_yaw(rotation.as_matrix())
+    np.testing.assert_allclose(found, rotation.as_euler("xyz"), atol=1e-9)
+    np.testing.assert_allclose(rpy_matrix(found), rotation.as_matrix(), atol=1e-12)
