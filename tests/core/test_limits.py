@@ -83,6 +83,22 @@ def test_nothing_leaves_that_is_outside_envelope_rates_or_joint_limits(rows: lis
         assert_allowed(limiter, before, dt)
 
 
+@pytest.mark.parametrize("first", [0, 3])
+@pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.6, 0.0, 0.8)])
+def test_a_lasting_offset_comes_to_its_envelope_and_no_farther(
+    first: int, direction: tuple[float, float, float]
+) -> None:
+    limiter = started(np.zeros(N))
+    most = limiter.limits.offset if first == 0 else limiter.limits.offset_rotation
+    offset = np.zeros(6)
+    offset[first : first + 3] = 5.0 * most * np.array(direction)
+    _, out = run(limiter, np.zeros(N), np.zeros(N), offset, cycles=2000)
+    expected = np.zeros(6)
+    expected[first : first + 3] = most * np.array(direction)
+    np.testing.assert_allclose(out, expected, rtol=1e-6, atol=1e-12)
+    assert np.linalg.norm(out) <= most
+
+
 @settings(max_examples=300, deadline=None)
 @given(st.lists(outlier, min_size=1, max_size=6))
 def test_no_nan_no_infinity_and_no_huge_number_ever_leaves(rows: list[Any]) -> None:
