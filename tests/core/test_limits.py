@@ -99,6 +99,19 @@ def test_a_lasting_offset_comes_to_its_envelope_and_no_farther(
     assert np.linalg.norm(out) <= most
 
 
+def test_an_offset_that_cannot_fade_in_time_does_not_lead_out_of_the_joint_limits() -> None:
+    limiter = Limiter(limits(offset_rate=1e-6, following=1.0), N)
+    nominal, delta = np.full(N, 1.95), np.full(N, 0.04)
+    limiter.start(nominal + delta, delta, np.array([0.004, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    for _ in range(100):
+        nominal = np.minimum(nominal + 0.001, 2.0)
+        out = limiter.limit(nominal, nominal, np.zeros(6), 1.0, nominal, DT)
+        assert (out.q <= 2.0).all()
+        assert out.offset_in_base[0] > 0.0039  # the offset itself still fades at its rate
+    assert (out.q == 2.0).all()
+    assert out.clamped
+
+
 @settings(max_examples=300, deadline=None)
 @given(st.lists(outlier, min_size=1, max_size=6))
 def test_no_nan_no_infinity_and_no_huge_number_ever_leaves(rows: list[Any]) -> None:
