@@ -312,10 +312,10 @@ class SlipWatch:
         wrench, at_tcp = mean[n : n + 6], mean[n + 6 : n + 12]
         predicted = place.predicted + place.slip @ (mean[:n] - place.q)
         if np.isfinite(wrench).all():
-            felt = wrench - predicted[:6]
+            at_flange = wrench - predicted[:6]
         else:  # the controller's own, its payload taken off: the flange feels what is left of it
-            felt = self._at_flange(mean[:n], at_tcp)
-        return np.concatenate([felt, mean[n + 12 : 2 * n + 12] - predicted[6:]])
+            at_flange = self._at_flange(mean[:n], at_tcp)
+        return np.concatenate([at_flange, mean[n + 12 : 2 * n + 12] - predicted[6:]])
 
     def _at_flange(self, q: Array, at_tcp: Array) -> Array:
         """Return a wrench (6,) at the TCP, base axes, as one at the flange in its own axes."""

@@ -89,12 +89,15 @@ def test_an_offset_that_does_not_come_back_ends_the_writing_in_time() -> None:
 
 def test_offsets_that_come_back_late_but_in_time_go_on() -> None:
     writer, wire, clock = opened("ur")
-    sent = [wire.number] * 3
+    sent, before = [wire.number] * 3, len(wire.written)
     for k in range(400):
         writer.write(offset(1e-6 * k), wire.sample())
         sent.append(writer._sequence)
         clock.now += 0.01
         wire.number = sent[-3]  # two cycles behind
+    assert len(wire.written) == before + 400  # 4 s, far beyond what one echo may take
+    assert len(set(sent)) == 400
+    assert clock.now > 100.0 + 3 * writer._box.echo
 
 
 @pytest.mark.parametrize("ahead", [1, 5, 1000])
