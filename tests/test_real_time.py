@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import subprocess
@@ -64,18 +65,22 @@ def test_nothing_gives_a_test_another_chance() -> None:
             assert not re.search(r"\bflaky\b|\breruns\b", path.read_text(encoding="utf-8")), path
 
 
-def test_the_witness_measures_how_late_it_was_woken() -> None:
+def test_a_core_that_stands_still_is_noticed_while_others_run() -> None:
     witness = Witness()
     witness.start()
     try:
         time.sleep(0.5)
         assert witness._process is not None
-        begun = time.time()
-        witness._process.send_signal(signal.SIGSTOP)
-        time.sleep(0.2)
-        witness._process.send_signal(signal.SIGCONT)
-        time.sleep(0.2)
-        assert 0.15 < witness.worst(begun, time.time()) < 2.0
+        first = witness._process.pid
+        below = Path(f"/proc/{first}/task/{first}/children").read_text(encoding="utf-8").split()
+        assert len(below) == len(os.sched_getaffinity(0)) - 1
+        for watcher in (first, *map(int, below)):
+            begun = time.time()
+            os.kill(watcher, signal.SIGSTOP)
+            time.sleep(0.2)
+            os.kill(watcher, signal.SIGCONT)
+            time.sleep(0.2)
+            assert 0.15 < witness.worst(begun, time.time()) < 2.0
         assert witness.worst(time.time() + 10.0, time.time() + 11.0) == 0.0
     finally:
         witness.stop()

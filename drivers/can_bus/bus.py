@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel, Field, field_validator
 
 from gapbridge.core.errors import LinkError
+from gapbridge.drivers.can_bus.slcan import BufferedPort
 
 if TYPE_CHECKING:
     import can
@@ -79,7 +80,7 @@ def _opened(settings: BusSettings, filters: Any, arguments: dict[str, Any]) -> A
     import can
 
     try:
-        bus = can.Bus(can_filters=filters, **arguments)
+        bus: Any = can.Bus(can_filters=filters, **arguments)
     except (
         can.CanError,
         OSError,
@@ -89,16 +90,17 @@ def _opened(settings: BusSettings, filters: Any, arguments: dict[str, Any]) -> A
         NotImplementedError,
     ) as error:
         raise LinkError(f"{settings.where()}: cannot be opened: {first_line(error)}") from None
-    return _without_delay(bus)
+    if settings.interface == "slcan":
+        _without_delay(bus)
+        bus.serialPortOrig = BufferedPort(bus.serialPortOrig)
+    return bus
 
 
-def _without_delay(bus: Any) -> Any:
+def _without_delay(bus: Any) -> None:
     """Switch off Nagle's delay where a serial adapter is reached over TCP (44 ms otherwise)."""
-    port = getattr(bus, "serialPortOrig", None)
-    link = getattr(port, "_socket", None)
+    link = getattr(bus.serialPortOrig, "_socket", None)
     if isinstance(link, socket.socket):
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    return bus
 
 
 def _open_socketcand(settings: BusSettings, filters: Any) -> Any:

@@ -6,7 +6,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import canopen
 from canopen.network import MessageListener
@@ -26,8 +26,18 @@ from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
 SYNC = 0x80
 HEARTBEAT = 0x700
 BLOCKED, EMERGENCY, FOLLOWING_ERROR, HEARTBEAT_ERROR = 0x7121, 0x5441, 0x8611, 0x8130
-OFF_BY = 0.05  # rad that a TPDO held back is off: who takes it for a new one is found out
+OFF_BY = 0.05  # rad that a TPDO of a SYNC before is off: who takes it for a new one is found out
 PAUSE = 0.02  # s
+
+
+class HeldPdo(NamedTuple):
+    """A TPDO that is held back."""
+
+    due: float  # s, monotonic
+    sync: int  # the SYNC that it answers
+    cob_id: int
+    data: bytes
+    off: bytes  # the data by which it goes where another SYNC has come meanwhile
 
 
 class _Network(canopen.Network):
@@ -80,7 +90,8 @@ class CanopenServer(ProtocolServer):
         self._network: Any = None
         self._controller = controller
         self._late: dict[int, tuple[int, float]] = {}  # node -> SYNCs still, s of delay
-        self._held: list[tuple[float, int, bytes]] = []  # s (monotonic), COB-ID, data
+        self._held: list[HeldPdo] = []
+        self._syncs = 0  # that were answered
         self._beaten: dict[int, float] = {}  # node -> s, of its last heartbeat
         self._was_able = True
         self.drives = tuple(self._drive(joint) for joint in range(controller.n))
@@ -170,6 +181,7 @@ class CanopenServer(ProtocolServer):
 
     def _answer_sync(self) -> None:
         """Send every drive's TPDOs, then let the setpoints that came before this SYNC count."""
+        self._syncs += 1
         for drive in self.drives:
             if not drive.operational:
                 continue
@@ -187,16 +199,21 @@ class CanopenServer(ProtocolServer):
         count, delay = self._late.pop(drive.node)
         if count > 1:
             self._late[drive.node] = (count - 1, delay)
+        due, right = time.monotonic() + delay, drive.samples()
         drive.q += OFF_BY
-        due = time.monotonic() + delay
-        self._held += [(due, cob_id, data) for cob_id, data in drive.samples()]
+        wrong = drive.samples()
         drive.q -= OFF_BY
+        self._held += [
+            HeldPdo(due, self._syncs, cob_id, data, off)
+            for (cob_id, data), (_, off) in zip(right, wrong, strict=True)
+        ]
 
     def _send_held(self, now: float) -> None:
-        due = [frame for frame in self._held if frame[0] <= now]
-        self._held = [frame for frame in self._held if frame[0] > now]
-        for _, cob_id, data in due:
-            self._network.send_message(cob_id, data)
+        due = [held for held in self._held if held.due <= now]
+        self._held = [held for held in self._held if held.due > now]
+        for held in due:
+            data = held.data if held.sync == self._syncs else held.off
+            self._network.send_message(held.cob_id, data)
 
     def hold_back(self, node: int, delay: float, count: int = 1) -> None:
         """Have a node's TPDOs come ``delay`` s late, at the next ``count`` SYNCs."""

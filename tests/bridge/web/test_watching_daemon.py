@@ -84,6 +84,5 @@ def test_page_and_metrics_die_and_come_back_and_the_loop_never_notices(daemon: W
     assert after["status"]["loop"]["pid"] == loop
     assert after["status"]["loop"]["restarts"] == 0
     assert after["session"] == before["session"]
-    assert listening(daemon.process.pid) == {
-        ("127.0.0.1", daemon.web), ("127.0.0.1", daemon.metrics),
-    }  # fmt: skip
+    expected = {("127.0.0.1", daemon.web), ("127.0.0.1", daemon.metrics)}
+    wait_for(lambda: listening(daemon.process.pid) == expected, 30.0, "both listening again")

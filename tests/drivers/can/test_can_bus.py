@@ -57,6 +57,32 @@ def test_a_serial_adapter_and_a_socketcand_client_share_the_bus(hub):
     close_bus(tcp)
 
 
+def test_a_serial_adapters_backlog_is_read_in_pieces_once_and_in_order(hub):
+    serial = open_bus(BusSettings(interface="slcan", channel=hub.add_terminal()))
+    (tcp,) = joined(hub, 1)
+    reads, port = [], serial.serialPortOrig._port
+    read = port.read
+    port.read = lambda size=1: reads.append(read(size)) or reads[-1]
+    for i in range(300):
+        tcp.send(can.Message(arbitration_id=i, data=i.to_bytes(2, "big"), is_extended_id=False))
+    got = frames_of(serial, 300)
+    assert [(i, int.from_bytes(data, "big")) for i, data, _ in got] == [(i, i) for i in range(300)]
+    assert serial.recv(0.0) is None
+    assert max(map(len, reads)) > 27  # python-can alone: one byte a read
+    serial.send(can.Message(arbitration_id=0x155, data=[1]), timeout=0.5)
+    assert serial.serialPortOrig.write_timeout == port.write_timeout == 0.5
+    tcp.send(can.Message(arbitration_id=7, data=[1], is_extended_id=False))
+    until = time.monotonic() + 5.0
+    while port.in_waiting < len("t007101\r"):
+        assert time.monotonic() < until
+        time.sleep(0.002)
+    serial.serialPortOrig.reset_input_buffer()
+    assert serial.serialPortOrig.in_waiting == 0
+    assert serial.recv(0.05) is None
+    close_bus(serial)
+    close_bus(tcp)
+
+
 def test_thousands_of_frames_arrive_once_and_in_order(hub):
     sender, receiver = joined(hub, 2)
     for i in range(3000):
