@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -62,6 +63,7 @@ REALTIME = (
 """Files and folders whose tests run real processes, buses or servers against the clock."""
 
 WITNESS = Witness()
+MADE: dict[pytest.FixtureDef[Any], tuple[float, float]] = {}  # s since 1970: begun, ended
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -72,6 +74,22 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         item.add_marker(pytest.mark.xdist_group(place))
         if place.startswith(REALTIME):
             item.add_marker(pytest.mark.realtime)
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_fixture_setup(fixturedef: pytest.FixtureDef[Any]) -> Iterator[None]:
+    """Note when a fixture was made: what several tests judge may have run in it."""
+    begun = time.time()
+    yield
+    MADE[fixturedef] = (begun, time.time())
+
+
+def worst_of(item: pytest.Item, begun: float, ended: float) -> float:
+    """Return how late the machine was during a phase of a test, or while its fixtures were made."""
+    info = item._fixtureinfo  # type: ignore[attr-defined]
+    used = [found[-1] for found in info.name2fixturedefs.values()]
+    spans = [(begun, ended), *(MADE[fixture] for fixture in used if fixture in MADE)]
+    return max(WITNESS.worst(*span) for span in spans)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
@@ -91,7 +109,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     report = outcome.get_result()  # type: ignore[attr-defined]
     if not report.failed or item.get_closest_marker("realtime") is None:
         return
-    late = WITNESS.worst(call.start, call.stop)
+    late = worst_of(item, call.start, call.stop)
     if late > LIMIT:
         words = str(call.excinfo.value).splitlines() if call.excinfo is not None else []
         reason = (

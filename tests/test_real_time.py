@@ -34,6 +34,22 @@ def test_that_fails_while_the_machine_is_late():
 def test_that_passes_while_the_machine_is_late():
     stop()
 
+@pytest.fixture(scope="module")
+def made_late():
+    stop()
+
+@pytest.mark.realtime
+def test_first_that_is_given_what_was_made_late(made_late):
+    assert False, "made late"
+
+@pytest.mark.realtime
+def test_second_that_is_given_what_was_made_late(made_late):
+    assert False, "made late"
+
+@pytest.mark.realtime
+def test_that_is_given_nothing():
+    assert False, "not late"
+
 def test_that_fails_without_a_clock():
     stop()
     assert False, "wrong"
@@ -53,6 +69,8 @@ def test_a_failure_counts_unless_the_machine_was_late_and_the_test_in_real_time(
     )  # fmt: skip
     found = ran.stdout
     assert re.search(r"SKIPPED.*woke a process 1[0-9]{2} ms late meanwhile.*late", found), found
+    assert len(re.findall(r"SKIPPED.*made late", found)) == 2, found
+    assert "FAILED test_it.py::test_that_is_given_nothing" in found
     assert "PASSED test_it.py::test_that_passes_while_the_machine_is_late" in found
     assert "FAILED test_it.py::test_that_fails_without_a_clock" in found
 
