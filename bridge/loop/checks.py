@@ -40,27 +40,28 @@ DEGRADED, LATE, RESYNC, RAMPING_OUT, UNSOLVED, NOTHING = 1, 2, 4, 8, 16, 32
 
 
 class FrozenWatch:
-    """Watches the joints; an arm at rest under a command at rest is not frozen."""
+    """Watches the joints; an arm at rest under a command at rest is not frozen.
+
+    Nor is one that begins to move: velocity and command lead joints that are reported in counts.
+    """
 
     def __init__(self) -> None:
         self._q: Vector | None = None
-        self._since = 0.0  # s, controller clock
         self._target: Vector | None = None  # commanded when the joints were last seen to move
-        self._turning = 0.0  # s, controller clock: since when the velocity says so
+        self._since = 0.0  # s, controller clock: since when they should have moved
 
     def update(self, state: RobotState, commanded: Vector) -> str | None:
         """Return in words that the values are frozen, None where they are not."""
         q, now = state.actual_q, state.timestamp
         if self._q is None or now < self._since or not np.array_equal(q, self._q):
-            self._q, self._since, self._turning = q.copy(), now, now
-            self._target = commanded.copy()
-            return None
-        if now - self._since < STILL:
+            self._q, self._target, self._since = q.copy(), commanded.copy(), now
             return None
         assert self._target is not None
         away = float(np.abs(commanded - self._target).max())
         turning = float(np.abs(state.actual_qd).max())
         if away < AWAY and turning < TURNING:
+            self._since = now
+        if now - self._since < STILL:
             return None
         return (
             f"joints are the same to the last bit for {now - self._since:.2f} s, while the command "

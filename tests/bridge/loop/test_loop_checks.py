@@ -100,7 +100,19 @@ def test_values_that_stand_still_under_a_moving_command_are_frozen_after_a_secon
     watch = FrozenWatch()
     events = [watch.update(state(k * T), Q + 1e-5 * k) for k in range(1000)]
     first = next(k for k, phrase in enumerate(events) if phrase)
-    assert 500 <= first <= 505
+    assert 695 <= first <= 705  # 2 mrad away after 0.4 s
+
+
+@pytest.mark.parametrize("ahead", [0.05, 0.9])
+def test_an_arm_that_begins_to_move_after_a_rest_is_not_frozen(ahead: float) -> None:
+    # velocity and command are ahead of joints in counts, and of an arm that has to be set going
+    watch, rest = FrozenWatch(), 2.0
+    for k in range(2000):
+        t = k * T
+        speed = 0.024 if t > rest else 0.0
+        q = Q + 0.001 * np.floor(1e3 * max(0.024 * (t - rest - ahead), 0.0))
+        command = Q + 0.5 * max(t - rest, 0.0)
+        assert watch.update(state(t, q, actual_qd=np.full(6, speed)), command) is None, t
 
 
 def test_an_arm_at_rest_or_one_that_moves_is_not_frozen() -> None:
