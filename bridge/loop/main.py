@@ -29,7 +29,7 @@ from gapbridge.bridge.ipc.command_page import Commands
 from gapbridge.bridge.ipc.sealed_memory import all_bytes
 from gapbridge.bridge.ipc.shared_memory import Phase, SharedMemory
 from gapbridge.bridge.loop.loop import Exit, Loop
-from gapbridge.bridge.loop.realtime import become_realtime
+from gapbridge.bridge.loop.realtime import become_ordinary, become_realtime
 from gapbridge.bridge.loop.replay import ReplayedLoop
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream, gate_bounds
 from gapbridge.bridge.setpoint_source import make_source
@@ -68,6 +68,7 @@ def main() -> None:
         traceback.print_exc()
         tell({"kind": "failure", "detail": f"the loop failed: {type(error).__name__}: {error}"})
     sys.stderr.flush()
+    become_ordinary()
     os._exit(code)
 
 

@@ -34,9 +34,6 @@ def become_realtime(cycle: float) -> list[str]:
     with contextlib.suppress(OSError, AttributeError):
         if ctypes.CDLL(None).prctl(TIMER_SLACK, SLACK, 0, 0, 0) == 0:
             granted.append("timer slack")
-    with contextlib.suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-        granted.append("real-time priority")
     if _may_lock():
         with contextlib.suppress(OSError, AttributeError):
             if ctypes.CDLL(None).mlockall(LOCK_ALL) == 0:
@@ -46,7 +43,17 @@ def become_realtime(cycle: float) -> list[str]:
     gc.collect()
     gc.freeze()
     gc.disable()
+    # last: locking memory takes some 100 ms, for which nothing else would run on this processor
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        granted.append("real-time priority")
     return granted
+
+
+def become_ordinary() -> None:
+    """Give real-time priority back: ending a process frees its memory, which takes its time."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def _keep_awake() -> bool:

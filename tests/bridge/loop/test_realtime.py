@@ -63,3 +63,21 @@ def test_where_the_kernel_could_not_do_it_nothing_is_claimed(
 )
 def test_the_kernel_takes_the_request(driver: Path) -> None:
     assert "processors awake" in granted(Path(realtime.LATENCY), driver, 0.002)
+
+
+ORDER = """\
+import gc, os
+from gapbridge.bridge.loop import realtime
+def noted(pid, policy, parameters):
+    name = "FIFO" if policy == os.SCHED_FIFO else "ordinary"
+    print(name, parameters.sched_priority, "collecting" if gc.isenabled() else "collected")
+os.sched_setscheduler = noted
+assert "real-time priority" in realtime.become_realtime(0.002)
+realtime.become_ordinary()
+"""
+
+
+def test_real_time_priority_comes_after_what_takes_long_and_goes_before_the_end() -> None:
+    command = [sys.executable, "-c", ORDER]
+    found = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
+    assert found.splitlines() == [f"FIFO {realtime.PRIORITY} collected", "ordinary 0 collected"]
