@@ -76,7 +76,7 @@ def draw_tracking_cell(rng: Generator, seconds: float = 30.0) -> MovingCell:
             for effect in TRACKING
         )
         wanted = stood = motion.lagged(time, delay, lag)
-        for _ in range(8 if droop.any() else 0):  # the weight is felt where the arm stands
+        for _ in range(8 if droop.any() else 0):  # the weight droops where the arm stands
             stood = wanted - droop * _held(bench, stood)
         return resting(stood, np.abs(band))
 

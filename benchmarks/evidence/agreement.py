@@ -70,16 +70,16 @@ def rigid_arms(count: int, rng: np.random.Generator) -> None:
     """Print how frames, Jacobians and moments compare with Pinocchio's."""
     frames, jacobians, moments = [], [], []
     for name in ARMS:
-        peer = rigid.from_dh(dh_rows(name))
+        oracle = rigid.from_dh(dh_rows(name))
         for _ in range(count):
             case = equilibrium.random_case(rng, dh_rows(name), ARMS[name][0], 0.0)
             model, loads = model_of(case)
             pose, form = model.rigid_pose(case.q[None]), model.linear_form(case.q[None], loads)
-            flange = rigid.flange_pose(peer, case.q)
+            flange = rigid.flange_pose(oracle, case.q)
             frames.append(np.abs(pose.position[0] - flange.act(case.tool_position)).max())
-            J = rigid.tool_jacobian(peer, case.q, case.tool_position)
+            J = rigid.tool_jacobian(oracle, case.q, case.tool_position)
             jacobians.append(np.abs(form.jacobian[0] - J).max())
-            M = rigid.joint_moments(peer, case.q, case.gravity, case.tool_position, case.wrench,
+            M = rigid.joint_moments(oracle, case.q, case.gravity, case.tool_position, case.wrench,
                                     case.payload, case.payload_cog)  # fmt: skip
             moments.append(np.abs(form.moment[0] - M).max())
     print(

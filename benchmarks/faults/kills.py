@@ -67,7 +67,9 @@ class Scene:
         more = LIMITS.replace("folder: null", "folder: recordings")
         more += f"web: {{port: {ports[0]}}}\nmetrics: {{port: {ports[1]}}}\n"
         self.cell, controller_cell = self.link.write_cells(folder, self.host, self.host, more)
-        self.controller = ControllerProcess(controller_cell, self.host, 30100, folder / "peer.log")
+        self.controller = ControllerProcess(
+            controller_cell, self.host, 30100, folder / "controller.log"
+        )
         self.controller.start()
         self.folder = folder / "recordings"
         self.begin()

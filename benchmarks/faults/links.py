@@ -111,14 +111,14 @@ class Link(ABC):
         """
 
     def write_cells(self, folder: Path, front: str, back: str, more: str) -> tuple[Path, Path]:
-        """Write the daemon's cell, whose controller is at ``front``, and the peer's.
+        """Write the daemon's cell, whose controller is at ``front``, and the controller's.
 
         ``more``: further sections of the daemon's, in place of limits and recording where given.
         """
         folder.mkdir(parents=True, exist_ok=True)
         shutil.copy(CONFIG / "piper.urdf", folder / "piper.urdf")
         cells = []
-        for name, host in (("daemon", front), ("peer", back)):
+        for name, host in (("daemon", front), ("controller", back)):
             path = folder / f"{name}.yaml"
             extra = (more or LIMITS) if name == "daemon" else ""
             path.write_text(self.base + self.section(host) + extra, encoding="utf-8")

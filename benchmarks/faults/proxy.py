@@ -42,7 +42,7 @@ class Port:
 
 @dataclass(eq=False)
 class Connection:
-    """One client and the peer's end that belongs to it."""
+    """One client and the controller's end that belongs to it."""
 
     number: int
     port: Port
@@ -285,6 +285,6 @@ class Proxy:
 
 
 def _comes_last(ready: tuple[selectors.SelectorKey, int]) -> bool:
-    """Return whether a socket that is ready is the peer's."""
+    """Return whether a socket that is ready is the controller's."""
     data = ready[0].data
     return isinstance(data, tuple) and data[1] == DOWN

@@ -1,4 +1,4 @@
-"""A daemon, its peer, and between the two of them a proxy and a tap."""
+"""A daemon, its controller, and between the two of them a proxy and a tap."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ class Rig:
         self.link, self._changed = link, changed
         self.front, self.back = own_address(), own_address()
         self.cell, controller_cell = link.write_cells(folder, self.front, self.back, more)
-        self.controller = ControllerProcess(controller_cell, self.back, 30100, folder / "peer.log")
+        self.controller = ControllerProcess(
+            controller_cell, self.back, 30100, folder / "controller.log"
+        )
         self.checker = Checker(link.bounds(self.cell))
         self._runs: list[Running] = []
         self.decoder = link.decoder()

@@ -23,7 +23,7 @@ LONGEST = 4  # faults of a sequence
 LONGEST_WAIT = 0.25  # s between two of them
 KEPT = "sequences.json"
 TOGETHER = 40  # sequences on one rig
-SEVERE = 0.04  # share of faults that end the loop's process or the peer: they take seconds
+SEVERE = 0.04  # share of faults that end the loop's process or the controller: they take seconds
 
 
 @dataclass
@@ -143,7 +143,7 @@ def make_sequence(rig: Rig, chosen: Sequence[tuple[Row, float]]) -> int:
     made = 0
     for row, wait in chosen:
         assert row.inject is not None
-        with contextlib.suppress(OSError):  # a peer that stands still does not obey
+        with contextlib.suppress(OSError):  # a controller that stands still does not obey
             row.inject(rig)
             made += 1
         rig.pass_time(wait)

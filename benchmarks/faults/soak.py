@@ -109,7 +109,7 @@ def soak(
             choice = [row for row in rows if row.slow == (draw.random() < severe)] or rows
             row = draw.choice(choice)
             assert row.inject is not None
-            with contextlib.suppress(OSError):  # a peer that stands still does not obey
+            with contextlib.suppress(OSError):  # a controller that stands still does not obey
                 row.inject(rig)
             made[row.key] = made.get(row.key, 0) + 1
             rig.pass_time(min(row.lasting, 0.5))

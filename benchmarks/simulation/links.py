@@ -158,7 +158,7 @@ class SimulatedLink(ABC):
         self.up.is_cut = self.down.is_cut = False
 
     def forget_client(self) -> None:
-        """Have the controller forget all that a client told it."""
+        """Have the controller forget all that clients sent it."""
         self.controller.let_go()
 
     def heal(self) -> None:

@@ -114,12 +114,12 @@ def diagnose(
     metrology = replace(cell.metrology, remounted=remounted)
     found = diagnose_log(cell.model, log, metrology, withhold=withhold, simulated=simulated)
     origin = _origin(cell, log)
-    told = document(found) | {"provenance": origin}
+    content = document(found) | {"provenance": origin}
     applied = fitted(
         origin, range_of(log), spread_of(found).beside(cell.spread),
         cell.intervals | intervals_applied(found), accused(found, cell.accused),
     )  # fmt: skip
-    return Diagnosed(cell, found.model, str(found.verdict), told, applied)
+    return Diagnosed(cell, found.model, str(found.verdict), content, applied)
 
 
 def _origin(cell: Cell, log: Log) -> dict[str, object]:

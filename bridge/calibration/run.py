@@ -123,12 +123,12 @@ def _begin(job: Job, joints: JointSource) -> Array:
     here = joints.now()
     while here is None:
         try:
-            told = joints.stand(PlannedPose(0, np.full(n, np.nan), 0, np.zeros(n))).q
+            standing = joints.stand(PlannedPose(0, np.full(n, np.nan), 0, np.zeros(n))).q
         except ReadingError as error:
             job.prompt.warn(str(error))
             continue
-        if np.isfinite(told).all():
-            here = told
+        if np.isfinite(standing).all():
+            here = standing
         else:
             job.prompt.warn(
                 "found nothing, expected where the arm stands now: the plan begins there"

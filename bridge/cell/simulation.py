@@ -83,7 +83,7 @@ def serve_cell(
 def served_controller(
     cell: Cell, link: DriverSettings, host: str | None = None, seed: int | None = None
 ) -> ServedController:
-    """Return the peer and the servers of a cell whose link is no UR controller's.
+    """Return the controller and the servers of a cell whose link is no UR controller's.
 
     Its plant is drawn as ``server_settings`` says. Raises CellError.
     """

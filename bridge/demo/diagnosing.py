@@ -36,12 +36,12 @@ class Diagnosing:
         """Wait for the answer in plain sentences. Raises RunError where there is none."""
         assert self._process is not None
         try:
-            told, _ = self._process.communicate(timeout=LONGEST)
+            output, _ = self._process.communicate(timeout=LONGEST)
         except subprocess.TimeoutExpired:
             raise RunError(f"the diagnosis did not end within {LONGEST:g} s") from None
         if self._process.returncode:
-            raise RunError(f"the diagnosis failed: {told.strip()[-300:]}")
-        return told.strip()
+            raise RunError(f"the diagnosis failed: {output.strip()[-300:]}")
+        return output.strip()
 
     def __exit__(self, *_: object) -> None:
         if self._process is not None and self._process.poll() is None:

@@ -84,6 +84,6 @@ def _key(session: Session, cell: Path, work: Work, options: Mapping[str, Any]) -
         for path in (session.log, cell)
         if path.exists()
     ]
-    told = [FORM, f"{work.__module__}:{work.__qualname__}", session.arm, session.name, stamps,
+    parts = [FORM, f"{work.__module__}:{work.__qualname__}", session.arm, session.name, stamps,
             dict(options)]  # fmt: skip
-    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:24]
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:24]

@@ -64,8 +64,8 @@ def _keep_awake() -> bool:
     that knows kinds of sleep, as in many virtual machines, the request would change nothing.
     """
     with contextlib.suppress(OSError):
-        with open(IDLE_DRIVER, encoding="ascii") as told:
-            if told.read().strip() in ("", "none"):
+        with open(IDLE_DRIVER, encoding="ascii") as kinds:
+            if kinds.read().strip() in ("", "none"):
                 return False
         file = os.open(LATENCY, os.O_WRONLY | os.O_CLOEXEC)
         _held.append(file)

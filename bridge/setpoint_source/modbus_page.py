@@ -63,7 +63,7 @@ class PlcPage:
         self.n = n
         is_server = fds is not None
         if fds is None:
-            fds = make_memory("gapbridge-plc", _SIZE), make_memory("gapbridge-told", _SIZE)
+            fds = make_memory("gapbridge-plc", _SIZE), make_memory("gapbridge-answers", _SIZE)
         self._setpoint = Record(fds[0], writes=is_server)
         self._status = Record(fds[1], writes=not is_server)
 

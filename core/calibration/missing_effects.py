@@ -21,7 +21,7 @@ from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.estimation.identification import pose_groups
 
 Array = NDArray[np.float64]
-TOLD = 3  # effects at most
+MOST = 3  # effects at most
 SURE = 6.0  # how much more likely (log) than nothing, the number of effects tried paid for
 SMALL = 0.05  # share of the remainder below which an effect is not worth reporting
 SHOWN = 1e-6  # share of a column that the parameters leave of it, below which it is one of them
@@ -46,7 +46,7 @@ def missing_effects(problem: Problem, rest: ConvergedFit) -> tuple[MissingEffect
     folds = _Folds.of(problem, rest)
     known = np.hstack([rest.system.J, rest.system.F])
     found: list[MissingEffect] = []
-    for _ in range(TOLD):
+    for _ in range(MOST):
         likely = _likely(tried, known, rest.system.left, found)
         gains = [(name, folds.gain(tried[name])) for name in likely]
         held = [MissingEffect(name, gain) for name, gain in gains if gain >= SMALL]

@@ -21,7 +21,7 @@ class LinkCog(JointEffect):
 
     Axes of the URDF link (with ``dh`` those of the row's frame). Comes from cables, covers, and
     drawings without motors. Shows in the weight that the joint and those before it hold; the mass
-    stays, which ``link_inertia`` changes. Part of it is felt by no joint, or cannot be
+    stays, which ``link_inertia`` changes. Part of it loads no joint, or cannot be
     distinguished from
     the next link's: only some combinations are found, the rest stays open. Under one constant load
     the last link's is the same as ``payload_cog``.

@@ -29,7 +29,7 @@ class Weighed:
 
 
 def weights_of(length: Array) -> Array:
-    """Return weights for scaled lengths: 1 up to CALM, falling to 0 at WILD."""
+    """Return weights for scaled lengths: 1 up to INLIER, falling to 0 at OUTLIER."""
     fall = np.clip((length - INLIER) / (OUTLIER - INLIER), 0.0, 1.0)
     return np.asarray((1 - fall**2) ** 2)
 

@@ -39,7 +39,7 @@ class Itinerary:
     def poses(self, found: Candidates) -> tuple[PlannedPose, ...]:
         """Return the planned poses; those at the same joints share a number."""
         numbers: dict[tuple[int, int, bytes], int] = {}
-        told = []
+        poses = []
         readings = found.readings
         approach = readings.loads.approach
         for stop in self.stops:
@@ -47,11 +47,11 @@ class Itinerary:
             side = np.zeros(found.q.shape[1]) if approach is None else approach[row]
             key = (int(readings.load[row]), int(found.stop[row]), side.tobytes())
             number = numbers.setdefault(key, len(numbers))
-            told.append(PlannedPose(
+            poses.append(PlannedPose(
                 number, readings.q[row].copy(), int(readings.load[row]), side.copy(),
                 int(readings.station[row]), int(readings.target[row]), stop.held_out, stop.repeat,
             ))  # fmt: skip
-        return tuple(told)
+        return tuple(poses)
 
 
 def itinerary(found: Candidates, stops: Sequence[Stop], space: Space, repeats: int) -> Itinerary:
@@ -83,9 +83,9 @@ def itinerary(found: Candidates, stops: Sequence[Stop], space: Space, repeats: i
         at = q[order[-1]]
     notes: tuple[str, ...] = ()
     if hit:
-        told = ", ".join(f"{a + 1} to {b + 1}" for a, b in hit[:8])
+        pairs = ", ".join(f"{a + 1} to {b + 1}" for a, b in hit[:8])
         more = f" and {len(hit) - 8} more" if len(hit) > 8 else ""
-        notes = (f"no straight way in joint space, go round: stops {told}{more}",)
+        notes = (f"no straight way in joint space, go round: stops {pairs}{more}",)
     return Itinerary(tuple(way), travel, notes)
 
 

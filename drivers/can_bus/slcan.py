@@ -29,7 +29,7 @@ class BufferedPort:
 
     @write_timeout.setter
     def write_timeout(self, seconds: float | None) -> None:
-        self._port.write_timeout = seconds
+        self._port.apply_settings({"write_timeout": seconds})
 
     @property
     def in_waiting(self) -> int:

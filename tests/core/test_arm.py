@@ -73,12 +73,12 @@ def test_factory_calibration_is_added_to_the_rows():
                "offset": delta["delta_theta"][i]}
         for i, row in enumerate(builtin_rows("ur5e")["dh"])
     ]  # fmt: skip
-    model, peer = Model(builtin_arm("ur5e", delta)), rigid.from_dh(rows)
+    model, oracle = Model(builtin_arm("ur5e", delta)), rigid.from_dh(rows)
     q = rng.uniform(-3, 3, (10, 6))
     poses = model.rigid_pose(q)
     for r in range(10):
         np.testing.assert_allclose(
-            poses.position[r], rigid.flange_pose(peer, q[r]).translation, atol=1e-12
+            poses.position[r], rigid.flange_pose(oracle, q[r]).translation, atol=1e-12
         )
     assert np.abs(poses.position - Model(builtin_arm("ur5e")).rigid_pose(q).position).max() > 1e-3
 

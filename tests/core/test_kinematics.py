@@ -20,22 +20,22 @@ def model_of(name):
 
 @pytest.mark.parametrize("name", ROWS)
 def test_tool_poses_are_pinocchios(name):
-    model, peer = model_of(name), rigid.from_dh(ROWS[name])
+    model, oracle = model_of(name), rigid.from_dh(ROWS[name])
     q = np.random.default_rng(1).uniform(-2 * np.pi, 2 * np.pi, (30, model.arm.n))
     poses = model.rigid_pose(q)
     for r in range(len(q)):
-        flange = rigid.flange_pose(peer, q[r])
+        flange = rigid.flange_pose(oracle, q[r])
         np.testing.assert_allclose(poses.position[r], flange.act(TCP), atol=1e-12)
         np.testing.assert_allclose(poses.rotation[r], flange.rotation, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ROWS)
 def test_the_jacobian_is_pinocchios(name):
-    model, peer = model_of(name), rigid.from_dh(ROWS[name])
+    model, oracle = model_of(name), rigid.from_dh(ROWS[name])
     q = np.random.default_rng(2).uniform(-2 * np.pi, 2 * np.pi, (30, model.arm.n))
     J = model.linear_form(q).jacobian
     for r in range(len(q)):
-        np.testing.assert_allclose(J[r], rigid.tool_jacobian(peer, q[r], TCP), atol=1e-9)
+        np.testing.assert_allclose(J[r], rigid.tool_jacobian(oracle, q[r], TCP), atol=1e-9)
 
 
 def test_the_jacobian_of_a_deflected_arm_is_its_finite_difference_where_bending_stays():

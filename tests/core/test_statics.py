@@ -15,7 +15,7 @@ def test_moments_of_gravity_payload_and_pull_are_pinocchios(name):
     gravity = np.array([1.0, -2.0, -9.4])
     base = model_of(name)
     model = Model(base.arm, base.tool_in_flange, gravity=gravity)
-    peer = rigid.from_dh(ROWS[name])
+    oracle = rigid.from_dh(ROWS[name])
     count = 30
     q = rng.uniform(-np.pi, np.pi, (count, model.arm.n))
     loads = Loads(
@@ -25,7 +25,7 @@ def test_moments_of_gravity_payload_and_pull_are_pinocchios(name):
     moment = model.linear_form(q, loads).moment
     for r in range(count):
         wanted = rigid.joint_moments(
-            peer, q[r], gravity, TCP, loads.wrench[r], loads.payload_mass[r], loads.payload_cog[r]
+            oracle, q[r], gravity, TCP, loads.wrench[r], loads.payload_mass[r], loads.payload_cog[r]
         )
         np.testing.assert_allclose(moment[r], wanted, atol=1e-9)
 

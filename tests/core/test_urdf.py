@@ -65,7 +65,7 @@ def pair(request, tmp_path):
 
 
 def test_frames_jacobian_and_moments_are_pinocchios(pair):
-    arm, peer = pair
+    arm, oracle = pair
     rng = np.random.default_rng(1)
     tcp, gravity = np.array([0.02, 0.03, 0.15]), np.array([0.5, 1.0, -9.7])
     tool = np.eye(4)
@@ -77,19 +77,19 @@ def test_frames_jacobian_and_moments_are_pinocchios(pair):
                   rng.normal(size=(count, 6)) * 20)  # fmt: skip
     form, poses = model.linear_form(q, loads), model.rigid_pose(q)
     for r in range(count):
-        flange = rigid.flange_pose(peer, q[r])
+        flange = rigid.flange_pose(oracle, q[r])
         np.testing.assert_allclose(poses.position[r], flange.act(tcp), atol=1e-9)
         np.testing.assert_allclose(poses.rotation[r], flange.rotation, atol=1e-9)
-        J = rigid.tool_jacobian(peer, q[r], tcp)
+        J = rigid.tool_jacobian(oracle, q[r], tcp)
         np.testing.assert_allclose(form.jacobian[r], J, atol=1e-9)
-        M = rigid.joint_moments(peer, q[r], gravity, tcp, loads.wrench[r],
+        M = rigid.joint_moments(oracle, q[r], gravity, tcp, loads.wrench[r],
                                 loads.payload_mass[r], loads.payload_cog[r])  # fmt: skip
         np.testing.assert_allclose(form.moment[r], M, atol=1e-9)
 
 
 def test_masses_and_inertias_of_what_is_bolted_on_are_pinocchios(pair):
-    arm, peer = pair
-    for i, body in enumerate(list(peer.inertias)[1:]):
+    arm, oracle = pair
+    for i, body in enumerate(list(oracle.inertias)[1:]):
         assert arm.mass[i] == pytest.approx(body.mass, abs=1e-12)
         # the same centre and tensor, seen from frames whose z is the axis
         assert np.linalg.norm(arm.cog[i]) == pytest.approx(np.linalg.norm(body.lever), abs=1e-12)

@@ -1,4 +1,4 @@
-"""The connection ends: reset, closed, the peer dead and back."""
+"""The connection ends: reset, closed, the controller dead and back."""
 
 from __future__ import annotations
 

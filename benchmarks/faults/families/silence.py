@@ -1,4 +1,4 @@
-"""Nothing comes any more, or late: stalls, peers that stand still, cables that are pulled."""
+"""Nothing comes any more, or late: stalls, controllers that stand still, cables that are pulled."""
 
 from __future__ import annotations
 

@@ -66,8 +66,8 @@ class WholeJob(Job):
             f"expected: the predicted TCP known to {millimetres(plan.expected.tcp_std)} (1 sigma "
             f"over workspace and loads; {millimetres(plan.expected.tcp_std_worst)} at worst)"
         )
-        told = ", ".join(f"{n}: {millimetres(s)}" for n, s in plan.bought)
-        prompt.say(f"  what n poses buy: {told}")
+        spreads = ", ".join(f"{n}: {millimetres(s)}" for n, s in plan.bought)
+        prompt.say(f"  what n poses buy: {spreads}")
         weak = _hardly_told(plan)
         if weak:
             prompt.say(f"  these poses hardly determine: {', '.join(weak)}")

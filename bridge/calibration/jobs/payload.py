@@ -58,8 +58,8 @@ class PayloadJob(Job):
     def tell_plan(self, plan: Plan) -> None:
         """Say how many orientations there are, and how well they will determine the load."""
         rows = zip(plan.expected.names, plan.expected.units, plan.expected.std, strict=True)
-        told = ", ".join(f"{n} ±{figure(s)} {u}" for n, u, s in list(rows)[:4])
-        self.prompt.say(f"plan: {len(plan.poses)} orientations; expected {told}")
+        spreads = ", ".join(f"{n} ±{figure(s)} {u}" for n, u, s in list(rows)[:4])
+        self.prompt.say(f"plan: {len(plan.poses)} orientations; expected {spreads}")
 
     def instrument(self, around: Surroundings) -> AnyInstrument:
         """Return the flange's own sensor."""

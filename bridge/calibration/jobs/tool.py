@@ -56,8 +56,8 @@ class ToolJob(Job):
 
     def tell_plan(self, plan: Plan) -> None:
         """Say how many touches there are, and how well they will determine the tip."""
-        told = f"; expected ±{millimetres(plan.bought[-1][1])}" if plan.bought else ""
-        self.prompt.say(f"plan: the tip onto one fixed point {len(plan.poses)} times{told}")
+        expected = f"; expected ±{millimetres(plan.bought[-1][1])}" if plan.bought else ""
+        self.prompt.say(f"plan: the tip onto one fixed point {len(plan.poses)} times{expected}")
 
     def instrument(self, around: Surroundings) -> AnyInstrument:
         """Return the fixed point."""

@@ -88,8 +88,8 @@ def check_begun(begun: Entry, cell: Cell, options: SessionOptions, folder: Path)
         )
 
 
-def _measures(told: dict[str, Any]) -> str:
+def _measures(entry: dict[str, Any]) -> str:
     from pydantic import TypeAdapter
 
     adapter: TypeAdapter[InstrumentSettings] = TypeAdapter(InstrumentSettings)
-    return adapter.validate_python(told).measures
+    return adapter.validate_python(entry).measures

@@ -64,12 +64,12 @@ class Journal:
             self.torn = True
         self.entries = read_entries(self.path)
 
-    def add(self, kind: str, **told: Any) -> Entry:
+    def add(self, kind: str, **fields: Any) -> Entry:
         """Write an entry and have it on disk; returns it.
 
         Raises RunError where that cannot be; the journal then is as it was.
         """
-        entry = {"kind": kind, "time": time.time(), **told}
+        entry = {"kind": kind, "time": time.time(), **fields}
         line = json.dumps(plain(entry), allow_nan=False, separators=(",", ":")) + "\n"
         end = os.fstat(self._fd).st_size
         try:

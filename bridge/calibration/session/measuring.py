@@ -211,17 +211,17 @@ class Measuring:
     def _keep(self, taken: Reading, verdict: Verdict) -> None:
         self.session.add("reading", **{**taken.entry(), "off": verdict.off})
         weighs = self.instrument.needs_wrench
-        told = [f"  kept  {force(taken.raw_wrench) if weighs else point(taken.value)}"]
+        words = [f"  kept  {force(taken.raw_wrench) if weighs else point(taken.value)}"]
         if taken.samples > 1:
-            told.append(f"mean of {taken.samples}, ±{millimetres(taken.scatter)}")
+            words.append(f"mean of {taken.samples}, ±{millimetres(taken.scatter)}")
         if np.isfinite(verdict.off):
-            told.append(
+            words.append(
                 f"{millimetres(verdict.off)} from where it was expected "
                 f"(up to {millimetres(verdict.allowed)})"
             )
         if taken.doubted:
-            told.append("doubtful")
-        self.prompt.say(" · ".join(told), "green" if not taken.doubted else "yellow")
+            words.append("doubtful")
+        self.prompt.say(" · ".join(words), "green" if not taken.doubted else "yellow")
 
     def _doubt(self, verdict: Verdict, same: bool) -> str:
         """Report what looks wrong; returns ``""`` (measure again), ``take`` or ``keep``."""

@@ -36,8 +36,8 @@ def plan_of(entry: dict[str, Any]) -> Plan:
     )  # fmt: skip
 
 
-def _pose(told: dict[str, Any]) -> PlannedPose:
-    return PlannedPose(**{**told, "q": _array(told["q"]), "approach": _array(told["approach"])})
+def _pose(entry: dict[str, Any]) -> PlannedPose:
+    return PlannedPose(**{**entry, "q": _array(entry["q"]), "approach": _array(entry["approach"])})
 
 
 def _array(values: list[Any]) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:

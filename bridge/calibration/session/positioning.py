@@ -218,14 +218,14 @@ class Positioning:
         """Report where the controller believes in another load, or feels a pull."""
         assert self.session.plan is not None
         meant = self.session.plan.loads[pose.load].mass
-        told = stand.payload
+        believed = stand.payload
         if pose.load in self._warned or self._instrument.needs_wrench:  # which is to be found
             return
-        if told is not None and abs(told - meant) > HEAVY * max(1.0, meant):
+        if believed is not None and abs(believed - meant) > HEAVY * max(1.0, meant):
             self._warned.add(pose.load)
             self.prompt.warn(
-                f"the controller believes that {told:g} kg hang on the flange, the plan {meant:g} "
-                "kg: is the right load mounted, and the controller informed?"
+                f"the controller believes that {believed:g} kg hang on the flange, the plan "
+                f"{meant:g} kg: is the right load mounted, and the controller informed?"
             )
             self.prompt.enter("  Enter when it is put right")
         elif stand.wrench is not None and np.linalg.norm(stand.wrench[:3]) > PULL:

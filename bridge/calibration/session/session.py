@@ -82,9 +82,9 @@ class Session:
             session.apply(entry)
         return session
 
-    def add(self, kind: str, **told: Any) -> None:
+    def add(self, kind: str, **fields: Any) -> None:
         """Write an entry, then act on it."""
-        self.apply(self.journal.add(kind, **told))
+        self.apply(self.journal.add(kind, **fields))
 
     def apply(self, entry: Entry) -> None:
         """Act on an entry of the journal; one of a kind that is not known means nothing here."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.demo.hidden import soft_servos
-from gapbridge.bridge.demo.links.peer import PeerLink
+from gapbridge.bridge.demo.links.controller_link import ControllerLink
 from gapbridge.bridge.demo.poses import Load, Scene, Workspace
 from gapbridge.bridge.demo.result import Resolution, reach
 from gapbridge.bridge.demo.trajectory import visits, write_trajectory
@@ -31,7 +31,7 @@ HELD = (0.0, 15.0, 8.9, 1.9, 2.6, 0.0)
 """What the joints hold at most, Nm, at the poses that are measured with 1.5 kg."""
 
 
-class CanLink(PeerLink):
+class CanLink(ControllerLink):
     """A PiPER on a CAN bus between processes, by the socketcand protocol."""
 
     name = "can"
@@ -75,8 +75,8 @@ class CanLink(PeerLink):
         joints = read_profile(link.profile_path, link.installation).joints
         assert joints.resolution is not None
         length = reach(self.cell.model)
-        told = float(np.abs(joints.resolution).max()) * length
-        return Resolution(told, told, "finer than the arm repeats")
+        count = float(np.abs(joints.resolution).max()) * length
+        return Resolution(count, count, "finer than the arm repeats")
 
     def prepare(self, folder: Path, poses: Array) -> float:
         """Write the trajectory that the daemon follows; see DemoLink.prepare."""

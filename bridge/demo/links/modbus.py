@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.bridge.daemon.daemon import Daemon
-from gapbridge.bridge.demo.links.peer import PeerLink
+from gapbridge.bridge.demo.links.controller_link import ControllerLink
 from gapbridge.bridge.demo.own_program import LONGEST_VISIT, OwnProgram
 from gapbridge.bridge.demo.poses import UR10E, Load, Workspace
 from gapbridge.bridge.demo.result import Resolution, reach
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 PORT = 15020  # below 1024 only root may listen; a real controller's is 502
 
 
-class ModbusLink(PeerLink):
+class ModbusLink(ControllerLink):
     """A UR10e whose mailbox takes offsets in micrometres, and whose joints read in milliradians.
 
     The program that moves the arm is the user's own, who knows where it was sent: the fit takes

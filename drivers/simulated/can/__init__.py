@@ -1,1 +1,1 @@
-"""Simulated CAN peers and the hub between processes."""
+"""Simulated CAN arms and the hub between processes."""

@@ -49,7 +49,7 @@ class SimulatedSensor(ABC):
         self.close_wire()
 
     def counts(self, per_newton: float, per_newton_metre: float) -> list[int]:
-        """Return what is felt as int16 counts (6,), held at the end of the range."""
+        """Return the wrench as int16 counts (6,), held at the end of the range."""
         scale = 3 * (per_newton,) + 3 * (per_newton_metre,)
         found = [round(v * k) for v, k in zip(self.reaction(), scale, strict=True)]
         return [int(v) for v in np.clip(found, -32768, 32767)]

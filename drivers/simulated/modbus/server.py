@@ -2,7 +2,7 @@
 
 The server loop lays out an image of all registers each time the controller would renew them; a
 request is answered from one whole image. What clients write is kept in order and acted on in the
-peer's next cycle, as a controller's scan does.
+arm's next cycle, as a controller's scan does.
 """
 
 from __future__ import annotations

@@ -213,7 +213,7 @@ def make_controller(
     period: float,
     declare: bool = True,
 ) -> ArmController:
-    """Return a peer at rest at `start_q` (n, rad) that is cycled every `period` s.
+    """Return a controller whose arm rests at `start_q` (n, rad) that is cycled every `period` s.
 
     With `declare` the controller is given the plant's true TCP and payload.
     """

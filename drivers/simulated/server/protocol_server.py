@@ -31,7 +31,7 @@ class Waitable(Protocol):
 
 
 class ProtocolServer:
-    """One protocol of a peer. Every method is called from the peer's loop, and must not block."""
+    """One protocol of a controller. Its loop calls every method; none may block."""
 
     name = "server"
 
@@ -39,7 +39,7 @@ class ProtocolServer:
         """Open ports. Raises OSError or LinkError where that fails."""
 
     def cycle(self, controller: ArmController) -> None:
-        """Take what clients have sent, command the peer, publish its state; after each cycle."""
+        """Take what clients have sent, command the arm, publish its state; after each cycle."""
 
     def sockets(self) -> Iterable[Waitable]:
         """Return what to wait for between cycles; none where ``cycle`` polls."""
@@ -60,7 +60,7 @@ class ProtocolServer:
 
 
 class ServerLoop:
-    """A peer with its servers and its bench port, cycled at absolute deadlines."""
+    """A controller with its servers and its bench port, cycled at absolute deadlines."""
 
     def __init__(
         self,
@@ -160,7 +160,7 @@ def serve_controller(
     bench_port: int,
     stop: Callable[[], bool] | None = None,
 ) -> None:
-    """Serve a peer in this process until `stop()` is true (never, where it is left out).
+    """Serve a controller in this process until `stop()` is true (never, where it is left out).
 
     Prints ``ready <host>`` to stdout when every port listens. Raises LinkError where one is taken.
     """
@@ -185,7 +185,7 @@ def serve_controller(
 
 
 class ServerThread:
-    """A peer served by a thread of this process while the `with` block lasts."""
+    """A controller served by a thread of this process while the `with` block lasts."""
 
     def __init__(
         self,
@@ -209,7 +209,7 @@ class ServerThread:
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread and close every port; the peer's state stays for another ``start``."""
+        """End the thread and close every port; the state stays for another ``start``."""
         self._ended.set()
         if self._thread is not None:
             self._thread.join(5.0)

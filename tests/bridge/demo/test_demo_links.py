@@ -29,10 +29,10 @@ from gapbridge.drivers.simulated.server.arm_controller import OWN_ACCELERATION, 
 from gapbridge.drivers.simulated.ur.settings import BENCH_PORT
 
 ROOT = Path(__file__).parents[3]
-PEERS = ("can", "modbus")
+OTHERS = ("can", "modbus")
 
 
-@pytest.fixture(params=PEERS)
+@pytest.fixture(params=OTHERS)
 def link(request: pytest.FixtureRequest, tmp_path: Path) -> DemoLink:
     return LINKS[request.param](tmp_path, 3)
 
@@ -78,7 +78,7 @@ def test_another_seed_hides_another_piper_and_the_same_seed_the_same(tmp_path: P
 
 
 def test_what_one_count_comes_to_is_reported(tmp_path: Path) -> None:
-    can, modbus = (LINKS[name](tmp_path, 1) for name in PEERS)
+    can, modbus = (LINKS[name](tmp_path, 1) for name in OTHERS)
     wire = np.radians(0.001)
     assert can.resolution().written == pytest.approx(wire * reach(can.cell.model))
     assert modbus.resolution().written == 1e-6
@@ -139,10 +139,10 @@ class Shown(NamedTuple):
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Shown]:
-    """The demos of all peers, side by side: each mostly waits for its arm."""
+    """The demos of the other links, side by side: each mostly waits for its arm."""
     folder = tmp_path_factory.mktemp("demos")
     running = []
-    for name in PEERS:
+    for name in OTHERS:
         reported = folder / f"{name}.txt"
         command = [sys.executable, "-m", "gapbridge", "demo", "--link", name, "--seed", "3"]
         with reported.open("w") as output:
@@ -156,13 +156,13 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Shown]:
     codes = [demo.wait(600) for demo in running]
     return {
         name: Shown(folder / name, code, (folder / f"{name}.txt").read_text())
-        for name, code in zip(PEERS, codes, strict=True)
+        for name, code in zip(OTHERS, codes, strict=True)
     }
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("name", PEERS)
+@pytest.mark.parametrize("name", OTHERS)
 def test_the_demo_shows_on_every_link_what_it_states(name: str, shown: dict[str, Shown]) -> None:
     out, code, reported = shown[name]
     assert code == 0, reported

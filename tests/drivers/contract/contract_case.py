@@ -74,7 +74,7 @@ class Case(ABC):
 
     @abstractmethod
     def make_servers(self) -> list[ProtocolServer]:
-        """Return the servers of the peer at ``host``."""
+        """Return the servers of the controller at ``host``."""
 
     @abstractmethod
     def driver(self) -> Driver:

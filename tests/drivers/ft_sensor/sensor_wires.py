@@ -106,7 +106,7 @@ def resting_controller(q: tuple[float, ...]) -> ArmController:
 
 
 def reaction_of(controller: ArmController, sign: int = 1) -> Callable[[], Any]:
-    """Return what a sensor mounted at XYZ, RPY on the peer's flange feels."""
+    """Return what a sensor mounted at XYZ, RPY on the arm's flange measures."""
     return reaction_at(lambda: controller.raw_wrench, XYZ, RPY, sign)
 
 

@@ -41,7 +41,7 @@ PERIOD = 0.002  # s
 
 
 class ControllerDriver(Driver):
-    """An arm without a wire of its own: reads a simulated peer's plant, at 500 Hz."""
+    """An arm without a wire of its own: reads a simulated controller's plant, at 500 Hz."""
 
     def __init__(self, controller: ArmController, lead: float = 0.0) -> None:
         super().__init__(1.0 / PERIOD, Model(builtin_arm("ur10e")))

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 PAYLOAD = re.compile(r"^payload:.*$", re.MULTILINE)
 
 
-class PeerLink(DemoLink):
+class ControllerLink(DemoLink):
     """An arm whose controller is not informed of its payload: the cell file says it."""
 
     @property
@@ -62,9 +62,9 @@ class PeerLink(DemoLink):
         """Return the cell with this load as its payload, as its user would write it."""
         cog = ", ".join(f"{v:g}" for v in load.cog)
         text = cell.path.read_text(encoding="utf-8")
-        told, count = PAYLOAD.subn(f"payload: {{mass: {load.mass:g}, cog: [{cog}]}}", text)
+        declared, count = PAYLOAD.subn(f"payload: {{mass: {load.mass:g}, cog: [{cog}]}}", text)
         if count != 1:
             raise CellError(f"{cell.path}: payload: found {count} lines, expected one")
         path = cell.path.with_name(f"{cell.path.stem}-{load.name.replace(' ', '-')}.yaml")
-        write_text(path, told)
+        write_text(path, declared)
         return load_cell(path)
