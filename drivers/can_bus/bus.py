@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel, Field, field_validator
 
 from gapbridge.core.errors import LinkError
-from gapbridge.drivers.can_bus.slcan import BufferedPort
 
 if TYPE_CHECKING:
     import can
@@ -80,7 +79,9 @@ def _opened(settings: BusSettings, filters: Any, arguments: dict[str, Any]) -> A
     import can
 
     try:
-        bus: Any = can.Bus(can_filters=filters, **arguments)
+        if settings.interface == "slcan":
+            return _open_slcan(filters, arguments)
+        return can.Bus(can_filters=filters, **arguments)
     except (
         can.CanError,
         OSError,
@@ -90,9 +91,14 @@ def _opened(settings: BusSettings, filters: Any, arguments: dict[str, Any]) -> A
         NotImplementedError,
     ) as error:
         raise LinkError(f"{settings.where()}: cannot be opened: {first_line(error)}") from None
-    if settings.interface == "slcan":
-        _without_delay(bus)
-        bus.serialPortOrig = BufferedPort(bus.serialPortOrig)
+
+
+def _open_slcan(filters: Any, arguments: dict[str, Any]) -> Any:
+    from gapbridge.drivers.can_bus.slcan import SlcanBus
+
+    options = {name: value for name, value in arguments.items() if name != "interface"}
+    bus = SlcanBus(can_filters=filters, **options)
+    _without_delay(bus)
     return bus
 
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from can.interfaces.slcan import slcanBus
+
 PIECE = 4096  # bytes read at once, at most
 
 
@@ -50,3 +52,11 @@ class BufferedPort:
         """Forget what has come and was not read."""
         self._piece, self._next = b"", 0
         self._port.reset_input_buffer()
+
+
+class SlcanBus(slcanBus):
+    """python-can's bus on a serial adapter, whose port is read in pieces."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.serialPortOrig: Any = BufferedPort(self.serialPortOrig)
