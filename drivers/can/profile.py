@@ -109,11 +109,6 @@ class JointMap:
     setpoint_scale: Vector | None  # rad in one unit of the setpoint's signals
     resolution: Vector | None  # rad, one count of the setpoint's signals
 
-    def to_si(self, quantity: str, wire: Vector) -> Vector:
-        """Return a quantity (n,) in SI units."""
-        value = wire * self.scale[quantity]
-        return value + self.zero if quantity == "position" else value
-
     def to_wire(self, q: Vector) -> Vector:
         """Return a setpoint (n,) in the wire's units."""
         assert self.setpoint_scale is not None

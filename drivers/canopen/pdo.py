@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -75,12 +74,3 @@ class PdoLayout:
             whole |= (value & ((1 << entry.bits) - 1)) << start
             start += entry.bits
         return whole.to_bytes(self.length, "little")
-
-
-def entry_called(layouts: Sequence[PdoLayout], name: str) -> Entry | None:
-    """Return the entry of an object in any of the layouts."""
-    for layout in layouts:
-        for entry in layout.entries:
-            if entry.name == name:
-                return entry
-    return None

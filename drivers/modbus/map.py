@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from gapbridge.drivers.modbus.profile import MAILBOX_WORDS, Keys, Span, spans
-from gapbridge.drivers.modbus.registers import BIT_TABLES, MOST_REGISTERS, Table
+from gapbridge.drivers.modbus.registers import MOST_REGISTERS, Table
 from gapbridge.drivers.modbus.schema import ProfileFile
 
 
@@ -162,8 +162,3 @@ def _writable(profile: ProfileFile) -> set[tuple[Table, int]]:
         if span.keys[0] == "write" and span.keys[1] not in ("busy", "result"):
             found |= {(span.table, span.first + i) for i in range(span.count)}
     return found
-
-
-def word_count(table: Table, words: int) -> int:
-    """Return the addresses that a number takes in its table."""
-    return 1 if table in BIT_TABLES else words

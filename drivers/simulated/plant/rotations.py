@@ -131,10 +131,3 @@ def _half_turn(a: Rotation, skew: Vector3, angle: float) -> Vector3:
     if sum(c * s for c, s in zip(column, skew, strict=True)) < 0.0:
         length = -length
     return (column[0] / length * angle, column[1] / length * angle, column[2] / length * angle)
-
-
-def from_roll_pitch_yaw(rpy: Sequence[float]) -> Rotation:
-    """Return Rz(yaw) Ry(pitch) Rx(roll)."""
-    roll, pitch, yaw = rpy
-    turned = compose(from_vector((0.0, 0.0, yaw)), from_vector((0.0, pitch, 0.0)))
-    return compose(turned, from_vector((roll, 0.0, 0.0)))

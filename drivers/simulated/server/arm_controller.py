@@ -93,11 +93,6 @@ class ArmController:
         return tuple(self.memory["ft_raw_wrench"])
 
     @property
-    def tcp_pose(self) -> Joints:
-        """TCP as the controller reckons it (6,), base, m and rotation vector."""
-        return tuple(self.memory["actual_TCP_pose"])
-
-    @property
     def can_move(self) -> bool:
         """Whether no stop is active."""
         return not (self.protective or self.emergency)

@@ -13,7 +13,16 @@ from gapbridge.core.calibration.observables import Nuisance
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.loads import Loads
 from gapbridge.core.planning.design import Wish, plan
-from gapbridge.core.planning.expectation import expectation
+from gapbridge.core.planning.information import Reference, blocks, expectation_of
+
+
+def expectation(parameters, observable, readings, nuisance, sigma, reference):
+    """Return what the fitted readings determine, put together from what a plan is made of."""
+    fitted = readings[np.flatnonzero(~readings.held_out)]
+    begin = parameters.model(parameters.begin)
+    fitted = replace(fitted, value=observable.predict(begin, fitted, nuisance))
+    rows = blocks(parameters, observable, fitted, nuisance, sigma)
+    return expectation_of(parameters, rows, Reference.of(parameters, *reference))
 
 
 @pytest.fixture(scope="module")

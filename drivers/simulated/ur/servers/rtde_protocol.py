@@ -58,14 +58,6 @@ def split_names(payload: bytes) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-def text_message(version: int, message: str, source: str, level: int) -> bytes:
-    """Return a text frame to a client; levels: 0 exception, 1 error, 2 warning, 3 info."""
-    body, origin = message.encode()[:255], source.encode()[:255]
-    if version == 1:
-        return frame(TEXT, bytes([level]) + body)
-    return frame(TEXT, bytes([len(body)]) + body + bytes([len(origin)]) + origin + bytes([level]))
-
-
 def _types(names: list[str], table: Mapping[str, str]) -> list[str]:
     return [table.get(name, "NOT_FOUND") for name in names]
 
