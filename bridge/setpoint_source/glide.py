@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from pathlib import Path
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.bridge.setpoint_source.source import SourceDryError
+from gapbridge.bridge.cell.sections import SetpointSettings
+from gapbridge.bridge.setpoint_source.source import Source, SourceDryError
 from gapbridge.drivers.clock import SYSTEM, Clock
 
 Vector = NDArray[np.float64]
@@ -61,3 +66,34 @@ class Glide:
         else:
             self._present = self._from + share * (self._newest - self._from)
         return self._present
+
+
+class GlidingSource(Source):
+    """A source whose setpoints come when their sender likes; the stream glides between them."""
+
+    counted: ClassVar[str]  # what a sender sends anew, for messages
+
+    def __init__(
+        self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
+    ) -> None:
+        super().__init__(settings, n, moves_arm, folder, rate)
+        self._glide = Glide(settings.timeout, self.counted)
+
+    @abstractmethod
+    def _receive(self) -> bool:
+        """Take what has arrived; returns whether there is a new setpoint."""
+
+    def first(self, own_q: Vector) -> Vector | None:
+        """Return the newest setpoint where one has come lately."""
+        self._receive()
+        return self._glide.first()
+
+    def begin(self, timestamp: float, own_q: Vector) -> None:
+        """Start from where the arm stands."""
+        self._glide.begin(own_q)
+
+    def sample(self, timestamp: float, own_q: Vector) -> Vector:
+        """Return the setpoint of this moment. Raises SourceDryError where none came in time."""
+        if self._receive():
+            self._glide.turn()
+        return self._glide.sample()

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.sections import SetpointSettings
-from gapbridge.bridge.setpoint_source.glide import Glide
+from gapbridge.bridge.setpoint_source.glide import GlidingSource
 from gapbridge.bridge.setpoint_source.modbus_page import MOST_JOINTS, PlcPage
-from gapbridge.bridge.setpoint_source.source import Source, SourceStatus
+from gapbridge.bridge.setpoint_source.source import SourceStatus
 from gapbridge.core.errors import InputError, RunError
 
 Vector = NDArray[np.float64]
@@ -23,11 +23,13 @@ WRITTEN, LIMITED = 1, 2  # flags
 SERVER = "gapbridge.bridge.setpoint_source.modbus_server"  # module that the PLC talks to
 
 
-class ModbusSource(Source):
+class ModbusSource(GlidingSource):
     """Listens, in a process of its own, for a PLC; reports back what became of its setpoints.
 
     Raises InputError for an arm with more joints than the registers hold.
     """
+
+    counted = "new sequence number"
 
     def __init__(
         self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
@@ -35,7 +37,6 @@ class ModbusSource(Source):
         super().__init__(settings, n, moves_arm, folder, rate)
         if n > MOST_JOINTS:
             raise InputError(f"setpoints.source modbus: found {n} joints, expected {MOST_JOINTS}")
-        self._glide = Glide(settings.timeout, "new sequence number")
         self._page: PlcPage | None = None
         self._server: subprocess.Popen[str] | None = None
         self._sequence: int | None = None
@@ -77,21 +78,6 @@ class ModbusSource(Source):
         page, self._page = self._page, None
         if page is not None:
             page.close()
-
-    def first(self, own_q: Vector) -> Vector | None:
-        """Return the newest setpoint where one has come lately."""
-        self._receive()
-        return self._glide.first()
-
-    def begin(self, timestamp: float, own_q: Vector) -> None:
-        """Start from where the arm stands."""
-        self._glide.begin(own_q)
-
-    def sample(self, timestamp: float, own_q: Vector) -> Vector:
-        """Return the setpoint of this moment. Raises SourceDryError where the PLC fell silent."""
-        if self._receive():
-            self._glide.turn()
-        return self._glide.sample()
 
     def _receive(self) -> bool:
         found = None if self._page is None else self._page.setpoint()

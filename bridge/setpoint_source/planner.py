@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.ipc.control_socket import peer_of
-from gapbridge.bridge.setpoint_source.glide import Glide
-from gapbridge.bridge.setpoint_source.source import Source
+from gapbridge.bridge.setpoint_source.glide import GlidingSource
 from gapbridge.core.errors import RunError
 from gapbridge.drivers.clock import SYSTEM
 
@@ -102,11 +101,13 @@ class Connection:
         self._link.close()
 
 
-class PlannerSource(Source):
+class PlannerSource(GlidingSource):
     """Listens for one planner at a time on a Unix socket of mode 0600. Never blocks.
 
     A second planner is refused with a line as long as the first one sends.
     """
+
+    counted = "line"
 
     def __init__(
         self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
@@ -115,7 +116,6 @@ class PlannerSource(Source):
         self._listener: socket.socket | None = None
         self._planner: Connection | None = None
         self._waiting: list[Connection] = []
-        self._glide = Glide(settings.timeout, "line")
         self.refused = 0  # connections that were ended for what they sent
 
     def open(self) -> None:
@@ -178,21 +178,6 @@ class PlannerSource(Source):
         if self.settings.socket is not None:
             with contextlib.suppress(OSError):
                 self.settings.socket.unlink()
-
-    def first(self, own_q: Vector) -> Vector | None:
-        """Return the newest setpoint where one has come lately."""
-        self._receive()
-        return self._glide.first()
-
-    def begin(self, timestamp: float, own_q: Vector) -> None:
-        """Start from where the arm stands."""
-        self._glide.begin(own_q)
-
-    def sample(self, timestamp: float, own_q: Vector) -> Vector:
-        """Return the setpoint of this moment. Raises SourceDryError where no line came in time."""
-        if self._receive():
-            self._glide.turn()
-        return self._glide.sample()
 
     def _receive(self) -> bool:
         """Take what has arrived; returns whether there is a new setpoint."""

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, Self
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from gapbridge.core.errors import InputError
 from gapbridge.drivers.can_bus.bus import BusSettings
-from gapbridge.drivers.driver import DriverSettings
+from gapbridge.drivers.profile_settings import ProfileSettings
 
 SHIPPED = Path(__file__).with_name("profiles")
 
 
-class CanSettings(DriverSettings, BusSettings):
+class CanSettings(ProfileSettings, BusSettings):
     """How to reach an arm on CAN, and which map of frames it has.
 
     ``profile`` is the name of a shipped one (``piper``, ``openarm``, ``odrive``) or a path ending
     in .yaml, relative to the cell's folder.
     """
 
+    shipped: ClassVar[Path] = SHIPPED
     driver: Literal["can"] = "can"
     profile: str = Field(min_length=1, description="a shipped map of frames, or a path to one")
     direction: tuple[Literal[1, -1], ...] | None = Field(
@@ -52,35 +52,13 @@ class CanSettings(DriverSettings, BusSettings):
     )
 
     @property
-    def names_file(self) -> bool:
-        """Return whether ``profile`` is a path rather than a shipped name."""
-        return self.profile.endswith((".yaml", ".yml"))
-
-    @property
     def installation(self) -> dict[str, list[float]]:
         """Return what this arm's installation says instead of the profile."""
         given = {name: getattr(self, name) for name in ("direction", "zero", "gear")}
         return {name: list(value) for name, value in given.items() if value is not None}
-
-    @property
-    def profile_path(self) -> Path:
-        """Return the file of the map."""
-        return Path(self.profile) if self.names_file else SHIPPED / f"{self.profile}.yaml"
 
     def read_files(self) -> None:
         """Read profile and DBC; see DriverSettings."""
         from gapbridge.drivers.can.loading import read_profile
 
         read_profile(self.profile_path, self.installation)
-
-    def located(self, folder: Path) -> Self:
-        """Return the settings with the profile's path resolved; see DriverSettings."""
-        if self.names_file:
-            return self.model_copy(update={"profile": str((folder / self.profile).resolve())})
-        if not self.profile_path.is_file():
-            shipped = ", ".join(sorted(path.stem for path in SHIPPED.glob("*.yaml")))
-            raise InputError(
-                f"link.profile: found {self.profile!r}, expected one of {shipped}, or a path "
-                "ending in .yaml"
-            )
-        return self

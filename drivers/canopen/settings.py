@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, Self
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from gapbridge.core.errors import InputError
 from gapbridge.core.files import read_bytes
 from gapbridge.drivers.can_bus.bus import BusSettings
-from gapbridge.drivers.driver import DriverSettings
+from gapbridge.drivers.profile_settings import ProfileSettings
 
 SHIPPED = Path(__file__).with_name("profiles")
 
 
-class CanopenSettings(DriverSettings, BusSettings):
+class CanopenSettings(ProfileSettings, BusSettings):
     """How to reach an arm of CiA 402 drives, and which profile describes it.
 
     ``profile`` is the name of a shipped one (``lwa4p``, ``cia402``) or a path ending in .yaml,
     relative to the cell's folder.
     """
 
+    shipped: ClassVar[Path] = SHIPPED
     driver: Literal["canopen"] = "canopen"
     profile: str = Field(min_length=1, description="a shipped profile, or a path to one")
     bitrate: int = Field(500_000, ge=10_000, le=1_000_000, description="bit/s")
@@ -51,30 +51,8 @@ class CanopenSettings(DriverSettings, BusSettings):
         0.02, gt=0.0, le=0.5, description="rad of command from joint that counts as away"
     )
 
-    @property
-    def names_file(self) -> bool:
-        """Return whether ``profile`` is a path rather than a shipped name."""
-        return self.profile.endswith((".yaml", ".yml"))
-
-    @property
-    def profile_path(self) -> Path:
-        """Return the file of the profile."""
-        return Path(self.profile) if self.names_file else SHIPPED / f"{self.profile}.yaml"
-
     def read_files(self) -> None:
         """Read profile and EDS; see DriverSettings."""
         from gapbridge.drivers.canopen.profile import read_profile
 
         read_bytes(read_profile(self.profile_path).eds.path)
-
-    def located(self, folder: Path) -> Self:
-        """Return the settings with the profile's path resolved; see DriverSettings."""
-        if self.names_file:
-            return self.model_copy(update={"profile": str((folder / self.profile).resolve())})
-        if not self.profile_path.is_file():
-            shipped = ", ".join(sorted(path.stem for path in SHIPPED.glob("*.yaml")))
-            raise InputError(
-                f"link.profile: found {self.profile!r}, expected one of {shipped}, or a path "
-                "ending in .yaml"
-            )
-        return self

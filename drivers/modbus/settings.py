@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from gapbridge.core.errors import InputError
-from gapbridge.drivers.driver import DriverSettings
+from gapbridge.drivers.profile_settings import ProfileSettings
 
 SHIPPED = Path(__file__).with_name("profiles")
 
 
-class ModbusSettings(DriverSettings):
+class ModbusSettings(ProfileSettings):
     """How to reach a Modbus controller, and which register map it has.
 
     ``profile`` is the name of a shipped one (``ur``, ``igus``, ...) or a path ending in .yaml,
     relative to the cell's folder.
     """
 
+    shipped: ClassVar[Path] = SHIPPED
     driver: Literal["modbus"] = "modbus"
     profile: str = Field(min_length=1, description="a shipped register map, or a path to one")
     transport: Literal["tcp", "tls", "rtu"] = "tcp"
@@ -95,16 +95,6 @@ class ModbusSettings(DriverSettings):
         return read_profile(self.profile_path).write.mode != "mailbox"
 
     @property
-    def names_file(self) -> bool:
-        """Return whether ``profile`` is a path rather than a shipped name."""
-        return self.profile.endswith((".yaml", ".yml"))
-
-    @property
-    def profile_path(self) -> Path:
-        """Return the file of the register map."""
-        return Path(self.profile) if self.names_file else SHIPPED / f"{self.profile}.yaml"
-
-    @property
     def address(self) -> str:
         """Return what messages call the controller."""
         return self.serial or self.host if self.transport == "rtu" else self.host
@@ -122,12 +112,4 @@ class ModbusSettings(DriverSettings):
             for name in ("authority", "certificate", "key")
             if (path := getattr(self, name)) is not None
         }
-        if self.names_file:
-            update["profile"] = str((folder / self.profile).resolve())
-        elif not self.profile_path.is_file():
-            shipped = ", ".join(sorted(path.stem for path in SHIPPED.glob("*.yaml")))
-            raise InputError(
-                f"link.profile: found {self.profile!r}, expected one of {shipped}, or a path "
-                "ending in .yaml"
-            )
-        return self.model_copy(update=update)
+        return super().located(folder).model_copy(update=update)
