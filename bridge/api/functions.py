@@ -54,6 +54,7 @@ def predict(cell: Cell, log: Log, *, channels: bool = False) -> Predicted:
     return Predicted(
         poses.position, poses.rotation_vector, std,
         outside_rows(log, ranges) if ranges else None, further, lacking,
+        _sources(cell, log),
     )  # fmt: skip
 
 
@@ -61,7 +62,7 @@ def compensate(cell: Cell, log: Log) -> Corrected:
     """Return the setpoint of every row whose predicted real pose is the rigid arm's at it."""
     loads = log.loads(by_approach(cell.model.terms))
     found = correct(cell.model, log.require("target_q", "actual_q"), loads)
-    return Corrected(found.q, found.residual)  # type: ignore[arg-type]  # of N rows: an array
+    return Corrected(found.q, found.residual, _sources(cell, log))  # type: ignore[arg-type]  # of N
 
 
 def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
@@ -123,5 +124,8 @@ def diagnose(
 
 
 def _origin(cell: Cell, log: Log) -> dict[str, object]:
-    logs = [Path(log.path)] if Path(log.path).is_file() else []
-    return provenance({"log": logs, "cell": [cell.path]})
+    return provenance(_sources(cell, log))
+
+
+def _sources(cell: Cell, log: Log) -> dict[str, list[Path]]:
+    return {"log": [Path(log.path)] if Path(log.path).is_file() else [], "cell": [cell.path]}

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.bridge.cell import Cell, save_cell
+from gapbridge.bridge.document.provenance import provenance
 from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
@@ -26,6 +27,7 @@ class Predicted:
     outside: NDArray[np.bool_] | None = None  # (N,) outside what was fitted; None: nothing was
     channels: dict[str, Array] = field(default_factory=dict)  # (N, k) by name, where asked for
     lacking: dict[str, str] = field(default_factory=dict)  # what a channel needs that is not there
+    sources: dict[str, list[Path]] = field(default_factory=dict)  # log and cell, by role
 
     @property
     def columns(self) -> dict[str, Array]:
@@ -39,8 +41,12 @@ class Predicted:
         return {name: values for name, values in found.items() if values is not None}
 
     def to_json(self) -> dict[str, Any]:
-        """Return the predictions as lists, by the command's names; null where there is none."""
-        return {name: _plain(values) for name, values in self.columns.items()}
+        """Return the predictions as lists, by the command's names, null where there is none.
+
+        Beside them stands the provenance: version, time, arguments, SHA-256 of log and cell.
+        """
+        found: dict[str, Any] = {name: _plain(values) for name, values in self.columns.items()}
+        return {**found, "provenance": provenance(self.sources)}
 
 
 @dataclass(frozen=True)
@@ -49,10 +55,14 @@ class Corrected:
 
     q: Array  # (N, n) rad
     residual: Array  # (N,) m: distance of the predicted from the wanted pose
+    sources: dict[str, list[Path]] = field(default_factory=dict)  # log and cell, by role
 
     def to_json(self) -> dict[str, Any]:
-        """Return setpoints and residuals as lists."""
-        return {"corrected_q": self.q.tolist(), "residual": self.residual.tolist()}
+        """Return setpoints and residuals as lists, and their provenance; see Predicted."""
+        return {
+            "corrected_q": self.q.tolist(), "residual": self.residual.tolist(),
+            "provenance": provenance(self.sources),
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -106,7 +106,7 @@ def _table(found: Calibration) -> Table:
     for e in found.estimates:
         unit, factor = TOLD_IN.get(e.unit, (e.unit, 1.0))
         planned = "" if e.expected_std is None else figure(e.expected_std * factor)
-        spread = figure(e.std * factor) if e.shown else "not shown"
+        spread = figure(e.std * factor) if e.shown else "not identifiable"
         bound = " (bound)" if e.on_bound else ""
         table.add_row(e.name, figure(e.value * factor), spread, planned, unit + bound)
     return table

@@ -138,4 +138,4 @@ def _mm(rms: float) -> str:
 
 
 def _cells(value: float, std: float, shown: bool) -> tuple[str, str]:
-    return f"{value * 1e6:.4f}", f"{std * 1e6:.4f}" if shown else "not shown"
+    return f"{value * 1e6:.4f}", f"{std * 1e6:.4f}" if shown else "not identifiable"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from pathlib import Path
@@ -44,6 +45,11 @@ def test_predict_and_compensate_are_what_the_commands_write(desk: Path) -> None:
     np.testing.assert_allclose(poses.position, table_of(desk / "p.csv")[1][:, :3], atol=1e-12)
     np.testing.assert_allclose(corrected.q, table_of(desk / "c.csv")[1], atol=1e-12)
     json.dumps([poses.to_json(), corrected.to_json()], allow_nan=False)
+    for found in (poses.to_json(), corrected.to_json()):
+        files = {file["role"]: file for file in found["provenance"]["files"]}
+        for role, name in (("log", "log.csv"), ("cell", "cell.yaml")):
+            true = hashlib.sha256((desk / name).read_bytes()).hexdigest()
+            assert files[role]["sha256"] == true
 
 
 def test_what_cannot_be_used_raises_the_line_of_the_command(desk: Path) -> None:
